@@ -1,0 +1,21 @@
+"""The exceptions of this package: every one carries a sentence that a user can act on."""
+
+
+class SpaceRobotError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class RobotDescriptionError(SpaceRobotError):
+    """A robot description (URDF) that cannot be a free-floating robot; the sentence names the element."""
+
+
+class ParameterError(SpaceRobotError):
+    """A parameter or option whose value is refused; the sentence names it."""
+
+
+class PlanningError(SpaceRobotError):
+    """A goal that is refused or cannot be reached; the sentence says why."""
+
+
+class CommandError(SpaceRobotError):
+    """A joint command that the plant refuses; the sentence says why."""

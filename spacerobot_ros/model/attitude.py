@@ -1,0 +1,120 @@
+"""Attitude arithmetic with numpy: rotation matrices, unit quaternions (x, y, z, w), rotation vectors.
+
+A quaternion or matrix named ``R_WB`` turns vectors given in B into vectors given in W.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.model.description import Array
+
+
+def hat(a: npt.ArrayLike) -> Array:
+    """Return the skew matrix (3, 3) with ``hat(a) @ b == cross(a, b)``."""
+    x, y, z = np.asarray(a, dtype=float)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def matrix_from_rpy(rpy: npt.ArrayLike) -> Array:
+    """Return the rotation (3, 3) of URDF's fixed-axis roll, pitch and yaw (rad)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def matrix_from_quaternion(quaternion: npt.ArrayLike) -> Array:
+    """Return the rotation matrix (3, 3) of a unit quaternion (x, y, z, w)."""
+    x, y, z, w = np.asarray(quaternion, dtype=float)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_multiply(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
+    """Return the product of two quaternions (x, y, z, w): the rotation b followed by a."""
+    ax, ay, az, aw = np.asarray(a, dtype=float)
+    bx, by, bz, bw = np.asarray(b, dtype=float)
+    return np.array(
+        [
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ]
+    )
+
+
+def quaternion_inverse(quaternion: npt.ArrayLike) -> Array:
+    """Return the inverse of a unit quaternion (x, y, z, w)."""
+    return np.asarray(quaternion, dtype=float) * np.array([-1.0, -1.0, -1.0, 1.0])
+
+
+def quaternion_from_rotvec(rotvec: npt.ArrayLike) -> Array:
+    """Return the unit quaternion (x, y, z, w) of ``exp(hat(rotvec))``; rotvec (3,) in rad."""
+    vector = np.asarray(rotvec, dtype=float)
+    angle = float(np.linalg.norm(vector))
+    # np.sinc is sin(pi x)/(pi x), finite at zero.
+    return np.append(0.5 * np.sinc(angle / (2 * math.pi)) * vector, math.cos(angle / 2))
+
+
+def rotvec_from_quaternion(quaternion: npt.ArrayLike) -> Array:
+    """Return the rotation vector (3,) in rad, of length at most pi, of a unit quaternion."""
+    q = np.asarray(quaternion, dtype=float)
+    if q[3] < 0:
+        q = -q
+    sine = float(np.linalg.norm(q[:3]))
+    angle = 2 * math.atan2(sine, float(q[3]))
+    return q[:3] * (angle / sine if sine > 1e-12 else 2.0)
+
+
+def attitude_error(quaternion: npt.ArrayLike, target: npt.ArrayLike) -> Array:
+    """Return the rotation vector (3,), in rad and in body components, from an attitude to its target."""
+    return rotvec_from_quaternion(quaternion_multiply(quaternion_inverse(quaternion), target))
+
+
+def unit_quaternion(quaternion: npt.ArrayLike) -> Array:
+    """Return the quaternion (x, y, z, w) scaled to length one.
+
+    Raises
+    ------
+    ValueError
+        It is zero or not finite.
+    """
+    q = np.asarray(quaternion, dtype=float)
+    norm = float(np.linalg.norm(q))
+    if not math.isfinite(norm) or norm < 1e-6:
+        raise ValueError(f"the quaternion {q.tolist()} is not a rotation")
+    return q / norm
+
+
+def quaternion_from_matrix(R: Array) -> Array:
+    """Return the unit quaternion (x, y, z, w) of a rotation matrix (3, 3)."""
+    # The largest of the four squares is divided by, so that none is lost near half turns.
+    trace = float(R[0, 0] + R[1, 1] + R[2, 2])
+    squares = [*(1 + 2 * float(R[i, i]) - trace for i in range(3)), 1 + trace]
+    largest = max(range(4), key=squares.__getitem__)
+    s = 0.5 / math.sqrt(squares[largest])
+    q = np.empty(4)
+    if largest == 3:
+        q[:3] = (R[2, 1] - R[1, 2]) * s, (R[0, 2] - R[2, 0]) * s, (R[1, 0] - R[0, 1]) * s
+        q[3] = squares[3] * s
+        return q
+    i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+    q[i] = squares[i] * s
+    q[j] = (R[j, i] + R[i, j]) * s
+    q[k] = (R[k, i] + R[i, k]) * s
+    q[3] = (R[k, j] - R[j, k]) * s
+    return q

@@ -1,0 +1,161 @@
+"""What a robot is: rigid links and the joints between them, as read from a URDF."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+class JointKind(str, Enum):
+    """The joint types of URDF that a free-floating tree may have."""
+
+    REVOLUTE = "revolute"
+    CONTINUOUS = "continuous"
+    PRISMATIC = "prismatic"
+    FIXED = "fixed"
+
+
+@dataclass(frozen=True)
+class JointLimits:
+    """Stroke, rate and effort of a joint (m or rad, m/s or rad/s, N or N m); infinite where free."""
+
+    lower: float = -np.inf
+    upper: float = np.inf
+    velocity: float = np.inf
+    effort: float = np.inf
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Pose of a frame in its parent: rotation matrix ``R`` (3, 3) and position ``r`` (3,) in m."""
+
+    R: Array = field(default_factory=lambda: np.eye(3))
+    r: Array = field(default_factory=lambda: np.zeros(3))
+
+    def __matmul__(self, child: Pose) -> Pose:
+        """Chain two poses."""
+        return Pose(self.R @ child.R, self.r + self.R @ child.r)
+
+
+@dataclass(frozen=True)
+class Inertia:
+    """Mass (kg), centre of mass (3,) in m and inertia about it (3, 3) in kg m^2, in one frame."""
+
+    mass: float = 0.0
+    com: Array = field(default_factory=lambda: np.zeros(3))
+    about_com: Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def moved(self, pose: Pose) -> Inertia:
+        """Express the same body in the frame in which this one has ``pose``."""
+        return Inertia(
+            self.mass, pose.r + pose.R @ self.com, pose.R @ self.about_com @ pose.R.T
+        )
+
+    def __add__(self, other: Inertia) -> Inertia:
+        """Weld two bodies given in the same frame (parallel-axis theorem)."""
+        mass = self.mass + other.mass
+        com = (self.mass * self.com + other.mass * other.com) / mass if mass > 0 else np.zeros(3)
+        about = np.zeros((3, 3))
+        for part in (self, other):
+            d = part.com - com
+            about = about + part.about_com + part.mass * (d @ d * np.eye(3) - np.outer(d, d))
+        return Inertia(mass, com, about)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A visual primitive of a link.
+
+    ``kind`` is ``box`` (sizes x, y, z), ``cylinder`` (radius, length), ``sphere`` (radius) or
+    ``mesh`` (scale x, y, z; ``resource`` is its URI); sizes in m, ``rgba`` in 0..1.
+    """
+
+    kind: str
+    size: tuple[float, ...]
+    pose: Pose
+    rgba: tuple[float, float, float, float] = (0.6, 0.6, 0.65, 1.0)
+    resource: str = ""
+
+
+@dataclass(frozen=True)
+class Link:
+    """A named frame that may carry mass and may be drawn."""
+
+    name: str
+    inertia: Inertia = field(default_factory=Inertia)
+    shapes: tuple[Shape, ...] = ()
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint from ``parent`` to ``child`` link; ``origin`` is the child's pose at zero, ``axis`` a unit vector."""
+
+    name: str
+    kind: JointKind
+    parent: str
+    child: str
+    origin: Pose
+    axis: Array
+    limits: JointLimits
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body: the links that fixed joints weld together, in the frame of the first of them.
+
+    ``joint`` is the movable joint that carries the body (None for the base), ``parent`` the index
+    of the body it moves on, ``origin`` the body frame in the parent body's frame at joint zero.
+    """
+
+    name: str
+    inertia: Inertia
+    joint: Joint | None
+    parent: int
+    origin: Pose
+
+
+@dataclass(frozen=True)
+class RobotDescription:
+    """A free-floating tree of links; the root link is the base body (the spacecraft).
+
+    ``bodies`` are in topological order, the base first; the movable joints are those of
+    ``bodies[1:]``, in that order. ``frames`` maps every link to its body and its pose in it.
+    """
+
+    name: str
+    links: tuple[Link, ...]
+    joints: tuple[Joint, ...]
+    bodies: tuple[Body, ...]
+    frames: dict[str, tuple[int, Pose]]
+    urdf: str
+
+    @property
+    def base_link(self) -> str:
+        """Name of the root link."""
+        return self.bodies[0].name
+
+    @property
+    def movable_joints(self) -> tuple[Joint, ...]:
+        """The joints that are not fixed, in the order of the coordinates q."""
+        return tuple(body.joint for body in self.bodies[1:] if body.joint is not None)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the coordinates q."""
+        return tuple(joint.name for joint in self.movable_joints)
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of the whole system, kg."""
+        return float(sum(body.inertia.mass for body in self.bodies))
+
+    def limits(self, what: str) -> Array:
+        """Return one limit of all movable joints: ``lower``, ``upper``, ``velocity`` or ``effort``; (n,)."""
+        values: list[Any] = [getattr(joint.limits, what) for joint in self.movable_joints]
+        return np.array(values, dtype=float)

@@ -1,0 +1,123 @@
+"""Forward kinematics of the tree in base components, symbolic (paper 4, section II).
+
+The base frame B is the frame of the root link. All vectors here are expressed in B, which makes
+every quantity a function of the shape q alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.model.description import JointKind, Pose, RobotDescription
+
+
+def skew(a: ca.SX) -> ca.SX:
+    """Return the skew matrix (3, 3) with ``skew(a) @ b == cross(a, b)``."""
+    return ca.skew(a)
+
+
+@dataclass(frozen=True)
+class TreeKinematics:
+    """Where the bodies of a robot are, as functions of its shape q.
+
+    For body k, in base components: ``R[k]`` attitude ``R_BBk`` (paper 4: ``0T_k``), ``p[k]``
+    origin, ``com[k]`` centre of mass, ``inertia[k]`` inertia about that centre, ``axis[k]`` the
+    unit vector of the joint that carries it (None for the base).
+    """
+
+    robot: RobotDescription
+    q: ca.SX
+    R: tuple[ca.SX, ...]
+    p: tuple[ca.SX, ...]
+    com: tuple[ca.SX, ...]
+    inertia: tuple[ca.SX, ...]
+    axis: tuple[ca.SX | None, ...]
+    r_BC_B: ca.SX
+
+    @property
+    def n(self) -> int:
+        """Number of joint coordinates."""
+        return len(self.robot.bodies) - 1
+
+    def mass(self, k: int) -> float:
+        """Mass of body k, kg."""
+        return self.robot.bodies[k].inertia.mass
+
+    def parent(self, k: int) -> int:
+        """Index of the body that body k moves on; -1 for the base."""
+        return self.robot.bodies[k].parent
+
+    def is_revolute(self, k: int) -> bool:
+        """Whether body k turns (revolute, continuous) rather than slides."""
+        joint = self.robot.bodies[k].joint
+        return joint is not None and joint.kind is not JointKind.PRISMATIC
+
+    def ancestors(self, k: int) -> list[int]:
+        """Return the bodies from the first one on the base out to k itself, without the base."""
+        chain = []
+        while k > 0:
+            chain.append(k)
+            k = self.parent(k)
+        return chain[::-1]
+
+    def outboard(self, j: int) -> list[int]:
+        """Return the bodies that joint j carries, body j first."""
+        return [k for k in range(len(self.robot.bodies)) if j == 0 or j in self.ancestors(k)]
+
+    def frame(self, link: str) -> tuple[ca.SX, ca.SX, int]:
+        """Return attitude (3, 3), position (3,) in B, and the body, of a link's frame."""
+        body, pose = self.robot.frames[link]
+        R, r = _chain(self.R[body], self.p[body], pose)
+        return R, r, body
+
+    def angular_jacobian(self, k: int) -> ca.SX:
+        """Return ``0F_k`` (3, n): the joint rates' part of the angular velocity of body k (eq. 6)."""
+        F = ca.SX(3, self.n)
+        for j in self.ancestors(k):
+            if self.is_revolute(j):
+                F[:, j - 1] = self.axis[j]
+        return F
+
+
+def _chain(R: ca.SX, p: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
+    return R @ ca.sparsify(ca.DM(pose.R)), p + R @ ca.sparsify(ca.DM(pose.r))
+
+
+def _rotation(axis: np.ndarray, angle: ca.SX) -> ca.SX:
+    """Rotation matrix about a constant unit axis (Rodrigues)."""
+    a = ca.sparsify(ca.DM(axis))
+    cosine, sine = ca.cos(angle), ca.sin(angle)
+    return cosine * ca.DM.eye(3) + sine * ca.sparsify(ca.skew(a)) + (1 - cosine) * (a @ a.T)
+
+
+def tree_kinematics(robot: RobotDescription) -> TreeKinematics:
+    """Build the symbolic kinematics of a robot."""
+    n = len(robot.bodies) - 1
+    q = ca.SX.sym("q", n)
+    R: list[ca.SX] = [ca.SX.eye(3)]
+    p: list[ca.SX] = [ca.SX(3, 1)]
+    axis: list[ca.SX | None] = [None]
+    for k, body in enumerate(robot.bodies[1:], start=1):
+        joint = body.joint
+        assert joint is not None
+        R_joint, p_joint = _chain(R[body.parent], p[body.parent], body.origin)
+        direction = R_joint @ ca.sparsify(ca.DM(joint.axis))
+        if joint.kind is JointKind.PRISMATIC:
+            R.append(R_joint)
+            p.append(p_joint + direction * q[k - 1])
+        else:
+            R.append(R_joint @ _rotation(joint.axis, q[k - 1]))
+            p.append(p_joint)
+        axis.append(direction)
+    com, inertia = [], []
+    for k, body in enumerate(robot.bodies):
+        com.append(p[k] + R[k] @ ca.sparsify(ca.DM(body.inertia.com)))
+        inertia.append(R[k] @ ca.sparsify(ca.DM(body.inertia.about_com)) @ R[k].T)
+    r_BC_B = sum((b.inertia.mass * c for b, c in zip(robot.bodies, com, strict=True)), ca.SX(3, 1))
+    r_BC_B = r_BC_B / robot.total_mass
+    return TreeKinematics(
+        robot, q, tuple(R), tuple(p), tuple(com), tuple(inertia), tuple(axis), r_BC_B
+    )

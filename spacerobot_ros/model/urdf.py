@@ -1,0 +1,271 @@
+"""URDF text to :class:`RobotDescription`, refusing what cannot float, with a sentence."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from urdf_parser_py.urdf import URDF
+
+from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.model.attitude import matrix_from_rpy
+from spacerobot_ros.model.description import (
+    Array,
+    Body,
+    Inertia,
+    Joint,
+    JointKind,
+    JointLimits,
+    Link,
+    Pose,
+    RobotDescription,
+    Shape,
+)
+
+
+def load_robot(path: str | Path) -> RobotDescription:
+    """Read the robot of a URDF file.
+
+    Raises
+    ------
+    RobotDescriptionError
+        The file cannot be read, is not URDF, or does not describe a free-floating tree.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RobotDescriptionError(f"The URDF {path} cannot be read: {error}.") from error
+    try:
+        return parse_robot(text)
+    except RobotDescriptionError as error:
+        raise RobotDescriptionError(f"{path}: {error}") from error
+
+
+def parse_robot(text: str) -> RobotDescription:
+    """Read the robot of a URDF text.
+
+    Raises
+    ------
+    RobotDescriptionError
+        The text is not URDF, or does not describe a free-floating tree of prismatic, revolute,
+        continuous and fixed joints with positive definite inertia.
+    """
+    tree = _parse_xml(text)
+    colours = {
+        material.name: tuple(material.color.rgba)
+        for material in tree.materials
+        if material.color is not None and material.color.rgba is not None
+    }
+    links = {link.name: _link(link, colours) for link in tree.links}
+    joints = [_joint(joint, links) for joint in tree.joints]
+    for kind, names in (("link", [x.name for x in tree.links]), ("joint", [x.name for x in joints])):
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise RobotDescriptionError(f"The {kind} name '{twice[0]}' is used twice; names are unique.")
+    bodies, frames = _weld(links, joints)
+    description = RobotDescription(
+        name=tree.name or "robot",
+        links=tuple(links.values()),
+        joints=tuple(joints),
+        bodies=tuple(bodies),
+        frames=frames,
+        urdf=text,
+    )
+    _require_mass(description)
+    return description
+
+
+def _parse_xml(text: str) -> Any:
+    # The parser reports elements it does not know (ros2_control, gazebo plugins) on standard
+    # error; they are none of ours.
+    with contextlib.redirect_stderr(io.StringIO()):
+        try:
+            return URDF.from_xml_string(text.encode("utf-8"))
+        except Exception as error:  # lxml, assertion, key, value and type errors, by what is broken
+            reason = str(error) or type(error).__name__
+            raise RobotDescriptionError(f"The robot description is not valid URDF: {reason}.") from error
+
+
+def _pose(origin: Any, where: str) -> Pose:
+    if origin is None:
+        return Pose()
+    r = _finite(origin.xyz if origin.xyz is not None else (0, 0, 0), f"the origin of {where}")
+    rpy = _finite(origin.rpy if origin.rpy is not None else (0, 0, 0), f"the origin of {where}")
+    return Pose(matrix_from_rpy(rpy), r)
+
+
+def _finite(values: Any, where: str) -> Array:
+    array = np.array(values, dtype=float)
+    if not np.all(np.isfinite(array)):
+        raise RobotDescriptionError(f"A number in {where} is not finite: {array.tolist()}.")
+    return array
+
+
+def _link(link: Any, colours: dict[str, Any]) -> Link:
+    where = f"link '{link.name}'"
+    inertia = Inertia()
+    if link.inertial is not None:
+        pose = _pose(link.inertial.origin, where)
+        mass = float(_finite(link.inertial.mass, where))
+        about = np.zeros((3, 3))
+        if link.inertial.inertia is not None:
+            about = _finite(link.inertial.inertia.to_matrix(), where)
+        if mass < 0:
+            raise RobotDescriptionError(f"The mass of {where} is negative ({mass} kg).")
+        if np.linalg.eigvalsh(about)[0] < -1e-12 * max(1.0, float(np.abs(about).max())):
+            raise RobotDescriptionError(
+                f"The inertia of {where} has a negative principal moment; check its signs."
+            )
+        inertia = Inertia(mass, np.zeros(3), about).moved(pose)
+    return Link(link.name, inertia, tuple(_shapes(link, colours, where)))
+
+
+def _shapes(link: Any, colours: dict[str, Any], where: str) -> list[Shape]:
+    shapes = []
+    for visual in link.visuals:
+        geometry = visual.geometry
+        kind = type(geometry).__name__.lower()
+        resource = ""
+        if kind == "box":
+            size = tuple(float(x) for x in geometry.size)
+        elif kind == "cylinder":
+            size = (float(geometry.radius), float(geometry.length))
+        elif kind == "sphere":
+            size = (float(geometry.radius),)
+        elif kind == "mesh":
+            size = tuple(float(x) for x in (geometry.scale or (1.0, 1.0, 1.0)))
+            resource = str(geometry.filename)
+        else:
+            continue
+        rgba: Any = None
+        if visual.material is not None:
+            if visual.material.color is not None:
+                rgba = visual.material.color.rgba
+            rgba = rgba if rgba is not None else colours.get(visual.material.name)
+        colour = tuple(float(x) for x in rgba) if rgba is not None else Shape.rgba
+        shapes.append(Shape(kind, size, _pose(visual.origin, where), colour, resource))  # type: ignore[arg-type]
+    return shapes
+
+
+def _joint(joint: Any, links: dict[str, Link]) -> Joint:
+    where = f"joint '{joint.name}'"
+    for role, name in (("parent", joint.parent), ("child", joint.child)):
+        if name not in links:
+            raise RobotDescriptionError(f"The {role} of {where} is '{name}', but there is no such link.")
+    try:
+        kind = JointKind(joint.type)
+    except ValueError:
+        raise RobotDescriptionError(
+            f"The type of {where} is '{joint.type}'; a free-floating tree has "
+            "prismatic, revolute, continuous and fixed joints (the base floats by itself)."
+        ) from None
+    if joint.mimic is not None:
+        raise RobotDescriptionError(
+            f"The {where} mimics '{joint.mimic.joint}'; coupled joints are not supported: "
+            "remove <mimic> or make the joint fixed."
+        )
+    axis = np.array([1.0, 0.0, 0.0])
+    if joint.axis is not None:
+        axis = _finite(joint.axis, where)
+    if kind is not JointKind.FIXED:
+        norm = float(np.linalg.norm(axis))
+        if norm < 1e-9:
+            raise RobotDescriptionError(f"The axis of {where} is zero; give it a direction.")
+        axis = axis / norm
+    return Joint(
+        joint.name, kind, joint.parent, joint.child, _pose(joint.origin, where), axis, _limits(joint, kind, where)
+    )
+
+
+def _limits(joint: Any, kind: JointKind, where: str) -> JointLimits:
+    if kind is JointKind.FIXED:
+        return JointLimits()
+    limit = joint.limit
+    if limit is None:
+        if kind is JointKind.CONTINUOUS:
+            return JointLimits()
+        raise RobotDescriptionError(
+            f"The {where} is {kind.value} and has no <limit>: give lower, upper, velocity and effort."
+        )
+    values = {name: float(getattr(limit, name) or 0.0) for name in ("lower", "upper", "velocity", "effort")}
+    for name, value in values.items():
+        if math.isnan(value):
+            raise RobotDescriptionError(f"The limit '{name}' of {where} is not a number.")
+    for name in ("velocity", "effort"):
+        if values[name] < 0:
+            raise RobotDescriptionError(f"The limit '{name}' of {where} is negative ({values[name]}).")
+    if kind is JointKind.CONTINUOUS:
+        return JointLimits(velocity=values["velocity"], effort=values["effort"])
+    if values["lower"] > values["upper"]:
+        raise RobotDescriptionError(
+            f"The lower limit of {where} ({values['lower']}) is above its upper limit ({values['upper']})."
+        )
+    return JointLimits(**values)
+
+
+def _weld(links: dict[str, Link], joints: list[Joint]) -> tuple[list[Body], dict[str, tuple[int, Pose]]]:
+    """Order the tree from the root and merge what fixed joints hold together."""
+    children: dict[str, list[Joint]] = {name: [] for name in links}
+    parents: dict[str, str] = {}
+    for joint in joints:
+        if joint.child in parents:
+            raise RobotDescriptionError(
+                f"Link '{joint.child}' is the child of two joints ('{parents[joint.child]}' and "
+                f"'{joint.name}'); a robot is a tree."
+            )
+        parents[joint.child] = joint.name
+        children[joint.parent].append(joint)
+    roots = [name for name in links if name not in parents]
+    if len(roots) != 1:
+        found = ", ".join(f"'{name}'" for name in roots) or "none"
+        raise RobotDescriptionError(f"A robot has exactly one root link (the base); found: {found}.")
+
+    bodies = [Body(roots[0], links[roots[0]].inertia, None, -1, Pose())]
+    frames = {roots[0]: (0, Pose())}
+    queue = [roots[0]]
+    while queue:
+        parent = queue.pop(0)
+        index, parent_pose = frames[parent]
+        for joint in children[parent]:
+            inertia = links[joint.child].inertia
+            pose = parent_pose @ joint.origin
+            if joint.kind is JointKind.FIXED:
+                body = bodies[index]
+                welded = body.inertia + inertia.moved(pose)
+                bodies[index] = Body(body.name, welded, body.joint, body.parent, body.origin)
+                frames[joint.child] = (index, pose)
+            else:
+                frames[joint.child] = (len(bodies), Pose())
+                bodies.append(Body(joint.child, inertia, joint, index, pose))
+            queue.append(joint.child)
+    if len(frames) != len(links):
+        lost = sorted(set(links) - set(frames))
+        raise RobotDescriptionError(f"Link '{lost[0]}' is not connected to the root: its joints form a ring.")
+    return bodies, frames
+
+
+def _require_mass(robot: RobotDescription) -> None:
+    """Refuse what would make the inertia matrix singular: parts that move without inertia."""
+    base = robot.bodies[0].inertia
+    if base.mass <= 0:
+        raise RobotDescriptionError(
+            f"The base link '{robot.base_link}' has no mass; a free-floating base needs an <inertial> "
+            "with mass and inertia."
+        )
+    outboard_mass = [body.inertia.mass for body in robot.bodies]
+    outboard_moment = [float(np.trace(body.inertia.about_com)) for body in robot.bodies]
+    for index in range(len(robot.bodies) - 1, 0, -1):
+        parent = robot.bodies[index].parent
+        outboard_mass[parent] += outboard_mass[index]
+        outboard_moment[parent] += outboard_moment[index]
+    for body, mass, moment in zip(robot.bodies[1:], outboard_mass[1:], outboard_moment[1:], strict=True):
+        assert body.joint is not None
+        if mass <= 0 and (body.joint.kind is JointKind.PRISMATIC or moment <= 0):
+            raise RobotDescriptionError(
+                f"Joint '{body.joint.name}' moves link '{body.name}', which has no mass: "
+                "its motion would have no dynamics. Give it an <inertial> or make the joint fixed."
+            )

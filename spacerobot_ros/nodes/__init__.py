@@ -1,0 +1,7 @@
+"""The nodes: thin ROS 2 wrappers, parameters in, topics out."""
+
+from spacerobot_ros.nodes.flight_node import FlightNode
+from spacerobot_ros.nodes.planner import PlannerNode
+from spacerobot_ros.nodes.plant import PlantNode
+
+__all__ = ["FlightNode", "PlannerNode", "PlantNode"]

@@ -1,0 +1,193 @@
+"""Serialised messages patched in place: what makes thousands of ticks a second possible.
+
+rclpy spends most of a tick turning Python objects into bytes and back. A state message has the
+same layout every tick, so it is serialised once and its numbers are written straight into the
+bytes; a command is read the same way. Where a message does not have the expected layout (another
+client, other strings) the reader deserialises it the ordinary way and learns the new layout.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from rclpy.serialization import deserialize_message, serialize_message
+from rosidl_parser.definition import (
+    AbstractGenericString,
+    AbstractSequence,
+    Array,
+    BasicType,
+    NamespacedType,
+)
+
+from spacerobot_ros.model.description import Array as FloatArray
+
+_ENCAPSULATION = 4
+_SIZES = {
+    "boolean": 1, "octet": 1, "char": 1, "uint8": 1, "int8": 1, "uint16": 2, "int16": 2,
+    "uint32": 4, "int32": 4, "float": 4, "uint64": 8, "int64": 8, "double": 8,
+}  # fmt: skip
+_TIME = struct.Struct("<iI")
+NANOSECONDS = 1_000_000_000
+
+M = TypeVar("M")
+
+
+@dataclass
+class Layout:
+    """Where the fields of one serialised message lie (little-endian plain CDR).
+
+    ``offsets`` maps a field path such as ``pose.pose.position.x`` (or ``markers[2].pose``) to its
+    first byte; ``fixed`` are the spans of strings and lengths: another message has the same layout
+    when it has the same size and equal bytes there.
+    """
+
+    offsets: dict[str, int] = field(default_factory=dict)
+    fixed: list[tuple[int, int]] = field(default_factory=list)
+    end: int = _ENCAPSULATION
+
+    @classmethod
+    def of(cls, message: Any) -> Layout:
+        """Compute the layout of a message with the strings and lengths that it has now."""
+        layout = cls()
+        layout._message(message, "")
+        return layout
+
+    def _align(self, size: int) -> None:
+        self.end += -(self.end - _ENCAPSULATION) % size
+
+    def _length(self) -> None:
+        self._align(4)
+        self.fixed.append((self.end, self.end + 4))
+        self.end += 4
+
+    def _message(self, message: Any, prefix: str) -> None:
+        for name, kind in zip(message.get_fields_and_field_types(), message.SLOT_TYPES, strict=True):
+            self._field(getattr(message, name), kind, f"{prefix}{name}")
+
+    def _field(self, value: Any, kind: Any, path: str) -> None:
+        if isinstance(kind, BasicType):
+            size = _SIZES[kind.typename]
+            self._align(size)
+            self.offsets[path] = self.end
+            self.end += size
+        elif isinstance(kind, AbstractGenericString):
+            self._length()
+            text = len(value.encode()) + 1
+            self.fixed.append((self.end, self.end + text))
+            self.end += text
+        elif isinstance(kind, NamespacedType):
+            before = len(self.offsets)
+            self._message(value, f"{path}.")
+            if len(self.offsets) > before:
+                self.offsets[path] = next(
+                    offset for key, offset in self.offsets.items() if key.startswith(f"{path}.")
+                )
+        elif isinstance(kind, (AbstractSequence, Array)):
+            if isinstance(kind, AbstractSequence):
+                self._length()
+            for index, element in enumerate(value):
+                self._field(element, kind.value_type, f"{path}[{index}]")
+            if len(value) and f"{path}[0]" in self.offsets:
+                self.offsets[path] = self.offsets[f"{path}[0]"]
+        else:
+            raise TypeError(f"no layout for {path} of type {kind}")
+
+
+class MessageTemplate:
+    """A message serialised once, whose numbers are then written in place.
+
+    Every sequence must already have its final length and every string its final text.
+    """
+
+    def __init__(self, prototype: Any) -> None:
+        self._buffer = bytearray(serialize_message(prototype))
+        self._layout = Layout.of(prototype)
+        self._times = [
+            self._layout.offsets[path]
+            for path in self._layout.offsets
+            if path in ("header.stamp.sec", "clock.sec") or path.endswith(".header.stamp.sec")
+        ]
+
+    def floats(self, path: str, count: int) -> FloatArray:
+        """Return a writable view of ``count`` float64 values that follow each other from ``path``."""
+        return np.frombuffer(self._buffer, np.float64, count, self._layout.offsets[path])
+
+    def stamp(self, time_ns: int) -> None:
+        """Write the time into every header stamp (and a Clock's time)."""
+        seconds, nanoseconds = divmod(time_ns, NANOSECONDS)
+        for offset in self._times:
+            _TIME.pack_into(self._buffer, offset, seconds, nanoseconds)
+
+    def serialised(self) -> bytes:
+        """Return the message as it stands."""
+        return bytes(self._buffer)
+
+
+class TemplateReader(Generic[M]):
+    """Reads float arrays and the stamp of serialised messages that repeat one layout.
+
+    Parameters
+    ----------
+    message_type
+        The ROS message class.
+    spans
+        Returns, for a deserialised message, the paths to read and how many float64 follow each:
+        ``{"position": 3}``. Called only when the layout changes.
+    """
+
+    def __init__(self, message_type: type[M], spans: Callable[[M], dict[str, int]]) -> None:
+        self._type = message_type
+        self._spans = spans
+        self._size = -1
+        self._fixed: list[tuple[int, int, bytes]] = []
+        self._reads: dict[str, tuple[int, int]] = {}
+        self._stamp = 0
+        self.prototype: M | None = None
+        """The message whose layout is in use, deserialised."""
+        self.changes = 0
+        """How often the layout has changed."""
+
+    def accept(self, raw: bytes) -> None:
+        """Make ``raw`` the message to read from.
+
+        Raises
+        ------
+        RuntimeError
+            The bytes are not a message of the type.
+        """
+        if len(raw) != self._size or any(raw[a:b] != text for a, b, text in self._fixed):
+            self._learn(raw)
+        self._raw = raw
+
+    def floats(self, path: str) -> FloatArray:
+        """Return a read-only view of the values at ``path``."""
+        offset, count = self._reads[path]
+        return np.frombuffer(self._raw, np.float64, count, offset)
+
+    def has(self, path: str) -> bool:
+        """Whether the accepted message has values at ``path``."""
+        return path in self._reads
+
+    @property
+    def stamp_ns(self) -> int:
+        """Header stamp of the accepted message, ns."""
+        seconds, nanoseconds = _TIME.unpack_from(self._raw, self._stamp)
+        return int(seconds * NANOSECONDS + nanoseconds)
+
+    def _learn(self, raw: bytes) -> None:
+        message = deserialize_message(raw, self._type)
+        layout = Layout.of(message)
+        self.prototype = message
+        self._size = len(raw)
+        self._fixed = [(a, b, raw[a:b]) for a, b in layout.fixed]
+        self._stamp = layout.offsets["header.stamp.sec"]
+        self._reads = {
+            path: (layout.offsets[path], count)
+            for path, count in self._spans(message).items()
+            if count
+        }
+        self.changes += 1

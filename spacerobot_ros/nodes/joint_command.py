@@ -1,0 +1,89 @@
+"""Joint commands by name: read from bytes, checked, ordered as the model's joints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from sensor_msgs.msg import JointState
+
+from spacerobot_ros.errors import CommandError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.nodes.cdr import TemplateReader
+
+Quantity = Literal["position", "velocity", "effort"]
+
+
+class JointReader:
+    """Takes one quantity of JointState messages into the order of the model's joints.
+
+    Joints that a message does not name are left out (zero).
+
+    Parameters
+    ----------
+    joint_names
+        The model's joints.
+    quantities
+        What to read; the first is required in every message.
+    """
+
+    def __init__(self, joint_names: Sequence[str], quantities: Sequence[Quantity]) -> None:
+        self._index = {name: i for i, name in enumerate(joint_names)}
+        self._robot_joints = ", ".join(joint_names)
+        self._quantities = quantities
+        self._reader = TemplateReader(JointState, self._spans)
+        self._changes = 0
+        self._problem = ""
+        self._order: Array | slice = slice(0, 0)
+        self.values = {name: np.zeros(len(joint_names)) for name in quantities}
+
+    def accept(self, raw: bytes) -> int:
+        """Read a message into ``values`` and return its stamp in ns.
+
+        Raises
+        ------
+        CommandError
+            A joint is unknown or named twice, or a length is wrong.
+        """
+        self._reader.accept(raw)
+        if self._reader.changes != self._changes:
+            self._changes = self._reader.changes
+            self._check()
+        if self._problem:
+            raise CommandError(self._problem)
+        for name, target in self.values.items():
+            if self._reader.has(name):
+                target[self._order] = self._reader.floats(name)
+        return self._reader.stamp_ns
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the last message given to :meth:`accept`, refused or not, ns."""
+        return self._reader.stamp_ns
+
+    def _spans(self, message: JointState) -> dict[str, int]:
+        return {name: len(getattr(message, name)) for name in self._quantities}
+
+    def _check(self) -> None:
+        """Judge names and lengths, once for every layout."""
+        message = self._reader.prototype
+        names = list(message.name)
+        self._problem = ""
+        unknown = [name for name in names if name not in self._index]
+        for values in self.values.values():
+            values[:] = 0.0
+        if unknown:
+            self._problem = (
+                f"joint '{unknown[0]}' is unknown; the robot has {self._robot_joints}"
+            )
+        elif len(set(names)) != len(names):
+            self._problem = f"a joint is named twice in {names}"
+        else:
+            for i, quantity in enumerate(self._quantities):
+                count = len(getattr(message, quantity))
+                if count != len(names) and (count or i == 0):
+                    self._problem = f"{len(names)} joint(s) are named but {count} {quantity} value(s) given"
+        order = np.array([self._index.get(name, 0) for name in names], dtype=np.intp)
+        everything = np.array_equal(order, np.arange(len(self._index)))
+        self._order = slice(None) if everything else order

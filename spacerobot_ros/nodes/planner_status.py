@@ -1,0 +1,75 @@
+"""What the planner says of itself: one latched status, for people and for programs."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from spacerobot_ros.nodes.flight_node import LATCHED
+from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
+
+
+class PlannerState(str, Enum):
+    """The value of ``state`` in planner/status."""
+
+    IDLE = "idle"
+    PLANNING = "planning"
+    EXECUTING = "executing"
+    REACHED = "reached"
+    FAILED = "failed"
+    REFUSED = "refused"
+    ABORTED = "aborted"
+
+
+_LEVELS = {
+    PlannerState.FAILED: DiagnosticStatus.ERROR,
+    PlannerState.REFUSED: DiagnosticStatus.ERROR,
+    PlannerState.ABORTED: DiagnosticStatus.WARN,
+}
+
+
+class PlannerStatus:
+    """Publishes planner/status and logs the same sentence."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._publisher = node.create_publisher(DiagnosticStatus, "planner/status", LATCHED)
+
+    def publish(
+        self,
+        state: PlannerState,
+        sentence: str,
+        *,
+        goal: Goal | None = None,
+        error: PoseError | None = None,
+        corrections: int = 0,
+        schedule: GaitSchedule | None = None,
+    ) -> None:
+        """Publish the state with a sentence and what belongs to it."""
+        values = {"state": state.value, "corrections": str(corrections)}
+        if goal is not None:
+            values["goal"] = " ".join(f"{x:.9g}" for x in (*goal.position, *goal.quaternion))
+        if error is not None:
+            values["position_error_m"] = f"{error.distance:.9g}"
+            values["attitude_error_rad"] = f"{error.angle:.9g}"
+        if schedule is not None:
+            values["method"] = schedule.method
+            values["duration_s"] = f"{schedule.duration:.9g}"
+            for name, note in schedule.notes.items():
+                numbers = note if isinstance(note, list) else [note]
+                values[name] = " ".join(
+                    f"{x:.9g}" if isinstance(x, float) else str(x) for x in numbers
+                )
+        level = _LEVELS.get(state, DiagnosticStatus.OK)
+        self._publisher.publish(
+            DiagnosticStatus(
+                level=level,
+                name=self._node.get_fully_qualified_name(),
+                message=sentence,
+                values=[KeyValue(key=key, value=value) for key, value in values.items()],
+            )
+        )
+        logger = self._node.get_logger()
+        (logger.info if level == DiagnosticStatus.OK else logger.warning)(sentence)

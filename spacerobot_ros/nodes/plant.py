@@ -1,0 +1,292 @@
+"""The plant node: a free-floating robot behind ROS topics."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any, ClassVar
+
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from spacerobot_ros.errors import CommandError, ParameterError
+from spacerobot_ros.nodes.cdr import NANOSECONDS
+from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
+from spacerobot_ros.nodes.joint_command import JointReader
+from spacerobot_ros.nodes.parameters import ParameterSpec
+from spacerobot_ros.nodes.plant_report import PlantReport
+from spacerobot_ros.nodes.plant_topics import PlantTopics
+from spacerobot_ros.nodes.robot_source import ROBOT_SPECS, robot_of
+from spacerobot_ros.simulation import InitialState, VelocityPlant
+
+_LATE_JOINER_CHECK = 0.1
+"""How often a waiting lockstep plant looks for new subscribers, wall s."""
+
+_MOST_CATCH_UP = 10
+"""Ticks that a late real-time plant takes at once; what is beyond is a missed deadline."""
+
+
+class PlantNode(FlightNode):
+    """Integrates the momentum-conserving model and publishes what a real robot would.
+
+    In ``lockstep`` it publishes the state of tick k and steps when the command stamped with that
+    tick is there. In ``realtime`` it runs on the wall clock times ``real_time_factor``, holds the
+    last command, and brings the joints to rest when that is older than ``command_timeout``.
+    """
+
+    SPECS: ClassVar = (
+        *ROBOT_SPECS,
+        ParameterSpec(
+            "actuation", "velocity", "", "what joint_commands carry", choices=("velocity",)
+        ),
+        ParameterSpec(
+            "time_mode", "realtime", "", "who drives time", choices=("realtime", "lockstep")
+        ),
+        ParameterSpec("tick_rate", 20.0, "Hz", "ticks a second of simulated time", 1e-3, 1e5),
+        ParameterSpec("real_time_factor", 1.0, "", "simulated over wall time", 1e-3, 1e3),
+        ParameterSpec(
+            "command_timeout", 0.5, "s", "realtime: older commands stop the joints; 0: never", 0.0
+        ),
+        ParameterSpec("integration_step", 0.01, "s", "longest step of the attitude", 1e-6),
+        ParameterSpec("world_frame", "world", "", "name of the inertial frame"),
+        ParameterSpec(
+            "end_effector_frame", "", "", "link of end_effector_pose; '': 'end_effector', if any"
+        ),
+        ParameterSpec("marker_period", 0.5, "s", "simulated time between markers; 0: none", 0.0),
+        ParameterSpec(
+            "diagnostics_period", 1.0, "s", "simulated time between diagnostics; 0: none", 0.0
+        ),
+        ParameterSpec("initial_position", [0.0, 0.0, 0.0], "m", "base link in the world", length=3),
+        ParameterSpec(
+            "initial_orientation", [0.0, 0.0, 0.0, 1.0], "", "quaternion x, y, z, w", length=4
+        ),
+        ParameterSpec(
+            "initial_joint_positions", [], "m or rad", "by joint order of the URDF; []: zero"
+        ),
+        ParameterSpec("linear_momentum", [0.0, 0.0, 0.0], "kg m/s", "total, in world", length=3),
+        ParameterSpec(
+            "angular_momentum",
+            [0.0, 0.0, 0.0],
+            "kg m^2/s",
+            "total, about the centre of mass, in world",
+            length=3,
+        ),
+    )
+
+    def __init__(self, name: str = "plant", **kwargs: Any) -> None:
+        self._running = self._paused = self._waiting = False
+        self._tick = 0
+        super().__init__(name, **kwargs)
+
+    @property
+    def tick(self) -> int:
+        """The tick whose state was published last."""
+        return self._tick
+
+    @property
+    def time_ns(self) -> int:
+        """Simulated time of that tick, ns."""
+        return self._tick * self._period_ns
+
+    # -- life ---------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Build the plant and its topics; nothing is published yet but the robot description."""
+        values: dict[str, Any] = self.parameters
+        robot = robot_of(values)
+        if robot is None:
+            raise ParameterError(
+                "The plant needs a robot: set parameter 'robot' to a URDF file or the name of a "
+                "robot of this package, or 'robot_description' to a URDF text."
+            )
+        self._period_ns = round(NANOSECONDS / values["tick_rate"])
+        joints = values["initial_joint_positions"]
+        self.plant = VelocityPlant(
+            robot,
+            self._period_ns / NANOSECONDS,
+            InitialState(
+                np.array(values["initial_position"]),
+                np.array(values["initial_orientation"]),
+                np.array(joints) if joints else None,
+                np.array(values["linear_momentum"]),
+                np.array(values["angular_momentum"]),
+            ),
+            values["integration_step"],
+        )
+        self._tick = 0
+        self._rest = np.zeros(robot.n)
+        self._command = np.zeros(robot.n)
+        self._command_ns = -math.inf
+        self._commands = JointReader(robot.joint_names, ["velocity"])
+        self._topics = PlantTopics(
+            self, self.plant, values["world_frame"], values["end_effector_frame"]
+        )
+        self._report = PlantReport(self, self.plant)
+        self._marker_ticks = self._ticks(values["marker_period"])
+        self._report_ticks = self._ticks(values["diagnostics_period"])
+        description = self.create_publisher(String, "robot_description", LATCHED)
+        description.publish(String(data=robot.description.urdf))
+        self.create_subscription(
+            JointState, "joint_commands", self._on_command, STREAM, raw=True
+        )
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(SetBool, "~/pause", self._on_pause)
+
+    def activate(self) -> None:
+        """Publish the present state, and from now on step."""
+        self._running = True
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        if self.parameters["time_mode"] == "lockstep":
+            self._waiting = True
+            self._readers = self._topics.readers()
+            self._timer = self.create_timer(
+                _LATE_JOINER_CHECK, self._on_late_joiner_check, clock=steady
+            )
+        else:
+            pace = self._period_ns / float(self.parameters["real_time_factor"])  # type: ignore[arg-type]
+            self._pace_ns, self._steady = pace, steady
+            self._origin_ns = steady.now().nanoseconds - self._tick * pace
+            self._timer = self.create_timer(pace / NANOSECONDS, self._on_wall_tick, clock=steady)
+        self._publish()
+
+    def deactivate(self) -> None:
+        """Stop time; the joints are at rest when it goes on."""
+        if self._running:
+            self.destroy_timer(self._timer)
+        self._running = False
+        self._command_ns = -math.inf
+
+    # -- time ---------------------------------------------------------------------------------
+
+    def _step(self, command: Any) -> None:
+        if self.plant.step(command):
+            self._report.limited()
+        self._tick += 1
+        self._publish()
+
+    def _publish(self) -> None:
+        now = self._tick * self._period_ns
+        self._topics.publish(now)
+        if self._marker_ticks and self._tick % self._marker_ticks == 0:
+            self._topics.publish_markers(now)
+        if self._report_ticks and self._tick % self._report_ticks == 0:
+            self._report.publish(now)
+
+    def _ticks(self, seconds: float) -> int:
+        return max(1, round(seconds * NANOSECONDS / self._period_ns)) if seconds else 0
+
+    def _on_wall_tick(self) -> None:
+        if not self._running or self._paused:
+            return
+        due = int((self._steady.now().nanoseconds - self._origin_ns) / self._pace_ns) - self._tick
+        if due > _MOST_CATCH_UP:
+            self._report.deadlines_missed += due - _MOST_CATCH_UP
+            self._origin_ns += (due - _MOST_CATCH_UP) * self._pace_ns
+            due = _MOST_CATCH_UP
+        for _ in range(due):
+            self._step(self._held_command())
+
+    def _held_command(self) -> Any:
+        timeout = float(self.parameters["command_timeout"])  # type: ignore[arg-type]
+        age = (self._tick * self._period_ns - self._command_ns) / NANOSECONDS
+        if timeout and age > timeout:
+            if self._command_ns != -math.inf:
+                self._command_ns = -math.inf
+                self._report.timed_out(timeout)
+            return self._rest
+        return self._command
+
+    def _on_late_joiner_check(self) -> None:
+        """A lockstep plant waits for ever if nobody saw its last state: show it to newcomers."""
+        readers = self._topics.readers()
+        if self._waiting and not self._paused and readers > self._readers:
+            self._topics.publish(self._tick * self._period_ns)
+        self._readers = readers
+
+    # -- commands -----------------------------------------------------------------------------
+
+    def _on_command(self, raw: bytes) -> None:
+        if not self._running:
+            return
+        problem = ""
+        commands = self._commands
+        try:
+            stamp = commands.accept(raw)
+        except CommandError as error:
+            stamp, problem = commands.stamp_ns, str(error)
+        velocity = commands.values["velocity"]
+        # A sum is finite only if every term is.
+        if not problem and not math.isfinite(velocity.sum()):
+            problem = f"a velocity is not finite: {velocity.tolist()}"
+        if self.parameters["time_mode"] == "lockstep":
+            self._on_lockstep_command(stamp, velocity, problem)
+        else:
+            self._on_realtime_command(stamp, velocity, problem)
+
+    def _on_lockstep_command(self, stamp: int, velocity: Any, problem: str) -> None:
+        now = self._tick * self._period_ns
+        if stamp != now or not self._waiting:
+            kind = "stale" if stamp <= now else "ahead of time"
+            self._report.refused(
+                f"it is {kind}: stamped {stamp / NANOSECONDS:.9g} s, the plant is at "
+                f"{now / NANOSECONDS:.9g} s"
+            )
+            return
+        if problem:
+            # Time must go on for the others: a bad command is a tick at rest.
+            self._report.refused(problem)
+            velocity = self._rest
+        if self._paused:
+            self._waiting = False
+            self._command[:] = velocity
+            return
+        self._step(velocity)
+
+    def _on_realtime_command(self, stamp: int, velocity: Any, problem: str) -> None:
+        now = self._tick * self._period_ns
+        timeout = float(self.parameters["command_timeout"])  # type: ignore[arg-type]
+        stamp = stamp or now  # An unset stamp means now, as everywhere in ROS.
+        age = (now - stamp) / NANOSECONDS
+        if timeout and abs(age) > timeout:
+            problem = f"it is {abs(age):.3g} s {'old' if age > 0 else 'ahead of time'}"
+        if problem:
+            self._report.refused(problem)
+            return
+        self._command[:] = velocity
+        self._command_ns = stamp
+
+    # -- services -----------------------------------------------------------------------------
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.plant.reset()
+        self._command_ns = -math.inf
+        response.success = True
+        response.message = "The robot is back in its initial state; time goes on."
+        if self._running:
+            self._publish()
+        return response
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if self._paused and not request.data and self._running:
+            if self.parameters["time_mode"] == "realtime":
+                self._origin_ns = self._steady.now().nanoseconds - self._tick * self._pace_ns
+            elif not self._waiting:
+                self._waiting = True
+                self._paused = False
+                self._step(self._command.copy())
+        self._paused = bool(request.data)
+        response.success = True
+        response.message = "paused" if self._paused else "running"
+        return response
+
+
+def main() -> None:
+    """Run the plant until SIGINT or SIGTERM."""
+    sys.exit(run_node(PlantNode))
+
+
+if __name__ == "__main__":
+    main()

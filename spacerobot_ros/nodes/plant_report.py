@@ -1,0 +1,115 @@
+"""What the plant refuses and limits: counted, logged, and published as diagnostics."""
+
+from __future__ import annotations
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from spacerobot_ros.nodes.cdr import NANOSECONDS
+from spacerobot_ros.nodes.flight_node import STREAM
+from spacerobot_ros.simulation import VelocityPlant
+
+_LOG_PERIOD = 5.0
+"""Wall s between two log lines of one kind."""
+
+
+class PlantReport:
+    """Counters of one plant. Every refusal has a reason; the last one stays in the diagnostics."""
+
+    def __init__(self, node: Node, plant: VelocityPlant) -> None:
+        self._node, self._plant = node, plant
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
+        self.commands_refused = 0
+        self.command_timeouts = 0
+        self.deadlines_missed = 0
+        self.last_refusal = ""
+        self._reported = self._levels()
+
+    def refused(self, reason: str) -> None:
+        """Count a refused command."""
+        self.commands_refused += 1
+        self.last_refusal = f"A joint command was refused: {reason}."
+        self._node.get_logger().warning(self.last_refusal, throttle_duration_sec=_LOG_PERIOD)
+
+    def timed_out(self, timeout: float) -> None:
+        """Count a commander that fell silent."""
+        self.command_timeouts += 1
+        self._node.get_logger().warning(
+            f"No joint command for {timeout:g} s: the joints are brought to rest."
+        )
+
+    def limited(self) -> None:
+        """Log that joints were held back in the last step."""
+        plant = self._plant
+        texts = []
+        for what, counts in (("rate", plant.velocity_limited), ("stroke", plant.stroke_limited)):
+            names = [
+                name for name, count in zip(plant.robot.joint_names, counts, strict=True) if count
+            ]
+            if names:
+                texts.append(f"{what} of {', '.join(names)}")
+        self._node.get_logger().warning(
+            f"Limits of the URDF held joints back so far: {'; '.join(texts)}.",
+            throttle_duration_sec=_LOG_PERIOD,
+        )
+
+    def publish(self, time_ns: int) -> None:
+        """Publish the diagnostics; a level is a warning when its counters moved since the last."""
+        levels = self._levels()
+        moved = {key: levels[key] != self._reported[key] for key in levels}
+        self._reported = levels
+        plant, name = self._plant, self._node.get_fully_qualified_name()
+        joints = plant.robot.joint_names
+        array = DiagnosticArray()
+        array.header.stamp.sec, array.header.stamp.nanosec = divmod(time_ns, NANOSECONDS)
+        array.status = [
+            _status(
+                f"{name}: commands",
+                moved["commands"],
+                self.last_refusal if moved["commands"] and self.last_refusal else "commands arrive",
+                {
+                    "refused": self.commands_refused,
+                    "timeouts": self.command_timeouts,
+                    "deadlines_missed": self.deadlines_missed,
+                },
+            ),
+            _status(
+                f"{name}: actuators",
+                moved["limits"],
+                "limits of the URDF hold joints back" if moved["limits"] else "within limits",
+                {f"rate_limited.{j}": c for j, c in zip(joints, plant.velocity_limited, strict=True)}
+                | {f"stroke_limited.{j}": c for j, c in zip(joints, plant.stroke_limited, strict=True)},
+            ),
+            _status(
+                f"{name}: momentum",
+                False,
+                "total momentum without thrust",
+                {
+                    "linear_change": f"{self._drift(0):.3e}",
+                    "angular_change": f"{self._drift(3):.3e}",
+                },
+            ),
+        ]
+        self._publisher.publish(array)
+
+    def _levels(self) -> dict[str, tuple[int, ...]]:
+        plant = self._plant
+        return {
+            "commands": (self.commands_refused, self.command_timeouts, self.deadlines_missed),
+            "limits": (*plant.velocity_limited.tolist(), *plant.stroke_limited.tolist()),
+        }
+
+    def _drift(self, first: int) -> float:
+        start = self._plant.initial
+        initial = (start.linear_momentum, start.angular_momentum)[first // 3]
+        return float(np.linalg.norm(self._plant.momentum[first : first + 3] - initial))
+
+
+def _status(name: str, warn: bool, message: str, values: dict[str, object]) -> DiagnosticStatus:
+    return DiagnosticStatus(
+        level=DiagnosticStatus.WARN if warn else DiagnosticStatus.OK,
+        name=name,
+        message=message,
+        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+    )

@@ -1,0 +1,139 @@
+"""The plant's state as messages, each patched in place and published as bytes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension
+
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model.attitude import matrix_from_quaternion, quaternion_from_matrix
+from spacerobot_ros.nodes.cdr import MessageTemplate
+from spacerobot_ros.nodes.flight_node import STREAM
+from spacerobot_ros.nodes.markers import LinkMarkers
+from spacerobot_ros.simulation import VelocityPlant
+
+MOMENTUM_LABEL = "linear_x linear_y linear_z angular_x angular_y angular_z kinetic_energy"
+"""What the seven numbers of the momentum topic are (kg m/s, kg m^2/s, J; world components)."""
+
+DEFAULT_END_EFFECTOR = "end_effector"
+
+
+class PlantTopics:
+    """Publishers of one plant and the serialised messages behind them.
+
+    Parameters
+    ----------
+    node
+        The node that owns the publishers.
+    plant
+        Whose state they show.
+    world_frame, end_effector_frame
+        Frame names; an empty end-effector frame means the link ``end_effector``, if there is one.
+
+    Raises
+    ------
+    ParameterError
+        The robot has no link of the name ``end_effector_frame``.
+    """
+
+    def __init__(
+        self, node: Node, plant: VelocityPlant, world_frame: str, end_effector_frame: str
+    ) -> None:
+        self._plant = plant
+        robot = plant.robot
+        n = robot.n
+
+        clock = MessageTemplate(Clock())
+        odom_message = Odometry(child_frame_id=robot.base_link)
+        odom_message.header.frame_id = world_frame
+        odom = MessageTemplate(odom_message)
+        pose_message = PoseStamped()
+        pose_message.header.frame_id = world_frame
+        base_pose = MessageTemplate(pose_message)
+        joints_message = JointState(
+            name=list(robot.joint_names), position=[0.0] * n, velocity=[0.0] * n, effort=[0.0] * n
+        )
+        joints_message.header.frame_id = robot.base_link
+        joints = MessageTemplate(joints_message)
+        momentum_message = Float64MultiArray(data=[0.0] * 7)
+        momentum_message.layout.dim = [MultiArrayDimension(label=MOMENTUM_LABEL, size=7, stride=7)]
+        momentum = MessageTemplate(momentum_message)
+
+        odom_pose = odom.floats("pose.pose.position.x", 7)
+        base_pose_pose = base_pose.floats("pose.position.x", 7)
+        odom_twist = odom.floats("twist.twist.linear.x", 6)
+        ledger = momentum.floats("data", 7)
+        self._copies = [
+            (odom_pose, plant.pose),
+            (base_pose_pose, plant.pose),
+            (odom_twist, plant.twist),
+            (ledger, plant.momentum),
+        ]
+        if n:
+            self._copies += [
+                (joints.floats("position", n), plant.q),
+                (joints.floats("velocity", n), plant.qdot),
+            ]
+        # The clock first: whoever sees a state has seen its time.
+        self._streams = [
+            (node.create_publisher(kind, topic, STREAM), template)
+            for kind, topic, template in (
+                (Clock, "/clock", clock),
+                (PoseStamped, "base_pose", base_pose),
+                (Float64MultiArray, "momentum", momentum),
+                (Odometry, "odom", odom),
+                (JointState, "joint_states", joints),
+            )
+        ]
+        self._end_effector: tuple[int, Any] | None = None
+        self._add_end_effector(node, world_frame, end_effector_frame, pose_message)
+        self._markers = LinkMarkers(node, robot.description, world_frame)
+
+    def publish(self, time_ns: int) -> None:
+        """Publish the plant's state, stamped ``time_ns``."""
+        for target, source in self._copies:
+            target[:] = source
+        if self._end_effector is not None:
+            index, target = self._end_effector
+            R_WB, r_WB = self._base()
+            target[:3] = r_WB + R_WB @ self._plant.link_r[:, index]
+            R_WE = R_WB @ self._plant.link_R[:, 3 * index : 3 * index + 3]
+            target[3:] = quaternion_from_matrix(R_WE)
+        for publisher, template in self._streams:
+            template.stamp(time_ns)
+            publisher.publish(template.serialised())
+
+    def publish_markers(self, time_ns: int) -> None:
+        """Publish the links' shapes where they are."""
+        self._markers.publish(time_ns, self._base(), self._plant.link_R, self._plant.link_r)
+
+    def readers(self) -> int:
+        """Return how many subscriptions the state topics have now."""
+        return sum(publisher.get_subscription_count() for publisher, _ in self._streams)
+
+    def _base(self) -> tuple[Any, Any]:
+        return matrix_from_quaternion(self._plant.pose[3:]), self._plant.pose[:3]
+
+    def _add_end_effector(
+        self, node: Node, world_frame: str, name: str, prototype: PoseStamped
+    ) -> None:
+        links = self._plant.robot.link_names
+        if not name and DEFAULT_END_EFFECTOR not in links:
+            return
+        name = name or DEFAULT_END_EFFECTOR
+        if name not in links:
+            raise ParameterError(
+                f"Parameter 'end_effector_frame' is '{name}', but the robot has no such link; it has "
+                f"{', '.join(links)}."
+            )
+        template = MessageTemplate(prototype)
+        publisher = node.create_publisher(PoseStamped, "end_effector_pose", STREAM)
+        # Before odom and joint_states, which set the commanders off.
+        self._streams.insert(2, (publisher, template))
+        self._end_effector = links.index(name), template.floats("pose.position.x", 7)

@@ -1,0 +1,54 @@
+"""From a schedule and the measured shape to the command of each tick."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.schedule import GaitSchedule
+
+_ARRIVED = 1e-6
+"""A schedule has ended when every joint is this near its last position, m or rad."""
+
+_LONGEST_SETTLING = 5.0
+"""... or this long after its last tick, s."""
+
+
+class GaitFollower:
+    """Flies one schedule by its stamps, so that a missed tick delays nothing that follows.
+
+    Parameters
+    ----------
+    schedule
+        What to fly.
+    start_ns
+        Stamp of its first tick, ns.
+    shape_gain
+        Feedback from shape error to velocity, 1/s; what the plant could not do in time is made up.
+    """
+
+    def __init__(self, schedule: GaitSchedule, start_ns: int, shape_gain: float) -> None:
+        self.schedule = schedule
+        self._start_ns = start_ns
+        self._period_ns = round(schedule.tick_period * 1e9)
+        self._gain = min(shape_gain, 1.0 / schedule.tick_period)
+        self._positions = schedule.positions
+        # At rest after the last tick.
+        self._velocities = np.vstack([schedule.velocities, np.zeros(len(schedule.joint_names))])
+
+    def _tick(self, stamp_ns: int) -> int:
+        return min(max((stamp_ns - self._start_ns) // self._period_ns, 0), self.schedule.ticks)
+
+    def ended(self, stamp_ns: int, q: Array) -> bool:
+        """Whether the schedule is over and the shape ``q`` (n,) has arrived."""
+        late = stamp_ns - self._start_ns - self.schedule.ticks * self._period_ns
+        if late < 0:
+            return False
+        far = np.abs(self._positions[-1] - q).max(initial=0.0) > _ARRIVED
+        return not far or late > _LONGEST_SETTLING * 1e9
+
+    def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
+        """Write the wanted shape now and the velocities to hold from now (n,) into the arguments."""
+        k = self._tick(stamp_ns)
+        position[:] = self._positions[k]
+        velocity[:] = self._velocities[k] + self._gain * (self._positions[k] - q)

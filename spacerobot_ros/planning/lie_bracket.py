@@ -1,0 +1,334 @@
+"""Sliding masses, first-order Lie brackets: the manoeuvre of paper 1, section 5.
+
+Step 1 finds the final shape ``zf`` that puts the base where it is to be (eq. 9). Step 2 slides
+the masses there (eq. 10). Step 3 turns the base by n equal cycles of three frequencies whose
+brackets add up to the attitude that is missing.
+
+The plant holds each command for a tick, so the sliders trace polygons inside the smooth curves.
+Their area is smaller by ``sin(x)/x``, ``x`` the phase per tick; the amplitudes allow for it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.attitude import (
+    attitude_error,
+    matrix_from_quaternion,
+    quaternion_from_rotvec,
+    quaternion_inverse,
+    quaternion_multiply,
+    rotvec_from_quaternion,
+    unit_quaternion,
+)
+from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.planning.goal import Goal, RobotState, Tolerance
+from spacerobot_ros.planning.method import GaitMethod, Option
+from spacerobot_ros.planning.prediction import BasePrediction
+from spacerobot_ros.planning.schedule import BasePath, GaitSchedule
+
+_FEWEST_TICKS_A_CYCLE = 12
+_WORST_CONDITION = 1e6
+_MOST_REFINEMENTS = 40
+_NO_ROTATION = 1e-9
+_NO_MOTION = 1e-9
+_AT_REST = 1e-9
+
+
+class LieBracketGait(GaitMethod):
+    """Position and attitude of a base with three or more sliders, whose slots may be offset."""
+
+    name: ClassVar[str] = "lie_bracket"
+    options: ClassVar[tuple[Option, ...]] = (
+        Option("t1", 100.0, "s", "duration of step 2, the slide to the final shape", 1e-3),
+        Option("n1", 10, "", "periods of the sin^2 velocity profile in step 2", 1, 10_000),
+        Option("cycle_period", 3.0, "s", "duration of one cycle of step 3, (tf - t1) / n", 1e-3),
+        Option("cycles", 0, "", "n, the number of cycles of step 3; 0: by loop_area", 0, 1e8),
+        Option("loop_area", 0.04, "m^2", "|alpha| / n when cycles is 0", 1e-9),
+        Option("a22", 0.0, "", "free amplitude of the second slider; 0: balanced"),
+        Option("a31", 0.0, "", "free amplitude of the third slider; 0: balanced"),
+        Option("longest", 100_000.0, "s", "longest manoeuvre that is still planned", 1.0),
+    )
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        tick_period: float,
+        tolerance: Tolerance,
+        integration_step: float = DEFAULT_INTEGRATION_STEP,
+        *,
+        t1: float = 100.0,
+        n1: int = 10,
+        cycle_period: float = 3.0,
+        cycles: int = 0,
+        loop_area: float = 0.04,
+        a22: float = 0.0,
+        a31: float = 0.0,
+        longest: float = 100_000.0,
+    ) -> None:
+        super().__init__(robot, tick_period, tolerance, integration_step)
+        self.t1, self.n1 = t1, n1
+        self.cycles, self.loop_area, self.a22, self.a31 = cycles, loop_area, a22, a31
+        self.longest = longest
+        # Whole ticks a cycle: every cycle is then the same commands and the same rotation.
+        self.ticks_a_cycle = max(round(cycle_period / tick_period), _FEWEST_TICKS_A_CYCLE)
+        self.sliders = [
+            i
+            for i, joint in enumerate(robot.description.movable_joints)
+            if joint.kind is JointKind.PRISMATIC
+        ]
+        self._prediction = BasePrediction(robot, tick_period, integration_step)
+
+    def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
+        """Plan steps 1 to 3; see :meth:`GaitMethod.plan`."""
+        self._require_rest(state)
+        z_f = self.final_shape(state, goal)
+        slide = self._slide(state.q, z_f)
+        attitudes = self._prediction.attitudes(slide, state.quaternion, state.angular_momentum)
+        cycle, n, notes = self._turn(attitudes[-1], z_f, goal, correction)
+        turn = np.tile(cycle[1:], (n, 1)) if n else np.empty((0, self.robot.n))
+        return GaitSchedule(
+            method=self.name,
+            joint_names=self.robot.joint_names,
+            tick_period=self.tick_period,
+            positions=np.vstack([slide, turn]),
+            path=self._path(state, slide, attitudes, cycle, n),
+            goal=goal,
+            notes={
+                "zf": [float(z_f[i]) for i in self.sliders],
+                "c": [float(2 * (z_f - state.q)[i] / self.t1) for i in self.sliders],
+                **notes,
+            },
+        )
+
+    def final_shape(self, state: RobotState, goal: Goal) -> Array:
+        """Step 1: the shape ``zf`` (n,) that solves eq. (9), nearest to the present one.
+
+        Raises
+        ------
+        PlanningError
+            There are no three independent slots, or ``zf`` is beyond a stroke.
+        """
+        robot = self.robot
+        R0, Rf = matrix_from_quaternion(state.quaternion), matrix_from_quaternion(goal.quaternion)
+        c0 = robot.center_of_mass(state.q)
+        # The system's mass centre stays: r_f + R_f c(zf) = r_0 + R_0 c(z0).
+        shift = Rf.T @ (state.position + R0 @ c0 - goal.position) - c0
+        P = np.column_stack([self._center_rate(state.q, i, c0) for i in self.sliders] or [c0 * 0])
+        if len(self.sliders) < 3 or np.linalg.matrix_rank(P, tol=1e-9 * np.abs(P).max()) < 3:
+            raise PlanningError(
+                "lie_bracket needs three sliders with linearly independent slots "
+                f"(paper 1, section 4.1); robot '{robot.description.name}' has "
+                f"{len(self.sliders)} slider(s) of rank {np.linalg.matrix_rank(P)}."
+            )
+        z0, lower, upper = (x[self.sliders] for x in (state.q, robot.lower, robot.upper))
+        dz, *_ = np.linalg.lstsq(P, shift, rcond=None)
+        if np.any(z0 + dz < lower) or np.any(z0 + dz > upper):
+            dz = self._within_strokes(P, shift, z0, dz, lower, upper)
+        z_f = state.q.copy()
+        z_f[self.sliders] = np.clip(z0 + dz, lower, upper)
+        return z_f
+
+    def _center_rate(self, q: Array, i: int, c: Array) -> Array:
+        """Column of dc/dq of slider i; c is linear in it, so a unit step is exact."""
+        stepped = q.copy()
+        stepped[i] += 1.0
+        return self.robot.center_of_mass(stepped) - c
+
+    def _within_strokes(
+        self, P: Array, shift: Array, z0: Array, dz: Array, lower: Array, upper: Array
+    ) -> Array:
+        """Spread the displacement over more than three sliders, or say which stroke is too short."""
+        # Bounds must differ for the solver; a slider at its end gets a hair of room.
+        room = 1e-12 * (1.0 + np.abs(upper - lower))
+        bounded = lsq_linear(P, shift, (lower - z0 - room, upper - z0 + room), method="bvls")
+        if np.linalg.norm(P @ bounded.x - shift) <= 1e-9 * max(1.0, float(np.linalg.norm(shift))):
+            return np.asarray(bounded.x, dtype=float)
+        z = z0 + dz
+        worst = int(np.argmax(np.maximum(lower - z, z - upper)))
+        name = self.robot.joint_names[self.sliders[worst]]
+        raise PlanningError(
+            f"The goal is beyond stroke: it needs joint '{name}' at {z[worst]:.4g} m, and its stroke is "
+            f"[{lower[worst]:.4g}, {upper[worst]:.4g}] m."
+        )
+
+    def _slide(self, z0: Array, z_f: Array) -> Array:
+        """Step 2: shapes (N + 1, n) under ``v_i = c_i sin^2(2 pi n1 t / t1)``, eq. (10)."""
+        displacement = z_f - z0
+        if np.abs(displacement).max() <= _NO_MOTION:
+            return z_f[np.newaxis].copy()
+        # The peak speed is twice the mean: a slow servo stretches t1.
+        t1 = max(self.t1, float(np.max(2 * np.abs(displacement) / self.robot.velocity_limit)))
+        ticks = max(math.ceil(t1 / self.tick_period - 1e-9), 4 * self.n1)
+        phase = np.linspace(0.0, 1.0, ticks + 1)[:, np.newaxis]
+        progress = phase - np.sin(4 * np.pi * self.n1 * phase) / (4 * np.pi * self.n1)
+        shapes = z0 + progress * displacement
+        shapes[-1] = z_f
+        return shapes
+
+    def _turn(
+        self, quaternion: Array, z_f: Array, goal: Goal, correction: bool
+    ) -> tuple[Array, int, dict[str, list[float] | float | str]]:
+        """Step 3: one cycle of shapes (m + 1, n), how many of them, and the symbols of the paper."""
+        wanted = attitude_error(quaternion, goal.quaternion)
+        if np.linalg.norm(wanted) <= _NO_ROTATION:
+            return z_f[np.newaxis].copy(), 0, {"cycles": 0.0}
+        triple, brackets = self._best_triple(z_f)
+        omega_d = wanted
+        best: tuple[float, _Turn] | None = None
+        for _ in range(_MOST_REFINEMENTS):
+            turn = self._fit(np.linalg.solve(brackets, omega_d), triple, z_f, correction)
+            reached = turn.cycles * self._rotation(turn.shapes)
+            left = np.linalg.norm(
+                attitude_error(quaternion_from_rotvec(reached), quaternion_from_rotvec(wanted))
+            )
+            if best is None or left < best[0]:
+                best = float(left), turn
+            if left <= self.tolerance.attitude:
+                break
+            # First order is not enough for this goal: ask for what is missing as well.
+            omega_d = omega_d + wanted - reached
+            if not np.all(np.isfinite(omega_d)) or np.linalg.norm(omega_d) > 4 * np.pi:
+                break
+        assert best is not None
+        turn = best[1]
+        names = [self.robot.joint_names[i] for i in triple]
+        return (
+            turn.shapes,
+            turn.cycles,
+            {
+                "sliders": ", ".join(names),
+                "omega_d": [float(x) for x in wanted],
+                "alpha": [float(x) for x in turn.alpha],
+                "cycles": float(turn.cycles),
+                "amplitudes": [float(x) for x in turn.amplitudes],
+                "predicted_attitude_error": best[0],
+            },
+        )
+
+    def _best_triple(self, z_f: Array) -> tuple[tuple[int, int, int], Array]:
+        """The three sliders whose brackets ``[w12, w23, w13]`` at zf are best conditioned."""
+        w = self.robot.lie_brackets(z_f)
+        found = []
+        for i, j, k in itertools.combinations(self.sliders, 3):
+            brackets = np.column_stack([w[:, i, j], w[:, j, k], w[:, i, k]])
+            found.append((float(np.linalg.cond(brackets)), (i, j, k), brackets))
+        condition, triple, brackets = min(found, key=lambda entry: entry[0])
+        if not condition < _WORST_CONDITION:
+            raise PlanningError(
+                "The first-order Lie brackets of the sliders do not span the three axes of rotation "
+                f"at the final shape {np.round(z_f, 4).tolist()} (condition number {condition:.2g}): "
+                "the attitude cannot be controlled there by lie_bracket."
+            )
+        return triple, brackets
+
+    def _fit(
+        self, alpha: Array, triple: tuple[int, int, int], z_f: Array, correction: bool
+    ) -> _Turn:
+        """Choose n so that the cycle keeps rates and strokes; more cycles are smaller ones."""
+        n = 0 if correction else self.cycles
+        n = n or max(1, math.ceil(float(np.linalg.norm(alpha)) / self.loop_area))
+        amplitudes = self._amplitudes(alpha, free=not correction)
+        robot = self.robot
+        room = np.minimum(z_f - robot.lower, robot.upper - z_f)
+        while True:
+            if n * self.ticks_a_cycle * self.tick_period > self.longest:
+                raise PlanningError(
+                    f"The turn would take more than {self.longest:.6g} s within the strokes and rates "
+                    f"of the sliders at the final shape {np.round(z_f, 4).tolist()}; "
+                    "a goal that leaves the sliders more room takes less."
+                )
+            shapes = self._cycle(amplitudes, n, triple, z_f)
+            swing = np.abs(shapes - z_f).max(axis=0)
+            rate = np.abs(np.diff(shapes, axis=0)).max(axis=0) / self.tick_period
+            active = swing > 0
+            with np.errstate(divide="ignore"):
+                excess = max(
+                    float(np.max((swing / np.maximum(room, 1e-300))[active], initial=0.0)),
+                    float(np.max((rate / robot.velocity_limit)[active], initial=0.0)),
+                )
+            if excess <= 1.0:
+                return _Turn(shapes, n, alpha, amplitudes)
+            # Amplitudes go as 1/sqrt(n).
+            n = math.ceil(min(n * excess**2 * 1.001, 1e12)) + 1
+
+    def _amplitudes(self, alpha: Array, *, free: bool) -> Array:
+        """Return (b11, b12, b21, a22, a31): ``a22 b12 = 2 alpha1/pi``, ``a31 b21 = alpha2/pi``,
+        ``a31 b11 = alpha3/pi``, each product raised by what the polygons lose.
+        """
+        step = 2 * np.pi / self.ticks_a_cycle
+        first, second = np.sinc(step / np.pi), np.sinc(2 * step / np.pi)
+        p12 = 2 * alpha[0] / (np.pi * second)
+        p23, p13 = alpha[1] / (np.pi * first), alpha[2] / (np.pi * first)
+        a22 = (self.a22 if free else 0.0) or math.sqrt(abs(p12))
+        a31 = (self.a31 if free else 0.0) or math.sqrt(math.hypot(p23, p13))
+        b12 = p12 / a22 if a22 else 0.0
+        b21, b11 = (p23 / a31, p13 / a31) if a31 else (0.0, 0.0)
+        return np.array([b11, b12, b21, a22, a31])
+
+    def _cycle(
+        self, amplitudes: Array, n: int, triple: tuple[int, int, int], z_f: Array
+    ) -> Array:
+        """One cycle at its ticks: the integrals of v1, v2, v3 of step 3, from ``zf`` back to it."""
+        b11, b12, b21, a22, a31 = amplitudes / math.sqrt(n)
+        phi = np.linspace(0.0, 2 * np.pi, self.ticks_a_cycle + 1)
+        z1 = b11 * (1 - np.cos(phi)) + b12 * (1 - np.cos(2 * phi)) / 2
+        z2 = b21 * (1 - np.cos(phi)) + a22 * (np.sin(2 * phi) / 2 - np.sin(3 * phi) / 3)
+        z3 = a31 * (np.sin(phi) - np.sin(3 * phi) / 3)
+        shapes = np.tile(z_f, (len(phi), 1))
+        for index, z in zip(triple, (z1, z2, z3), strict=True):
+            shapes[:, index] += z
+        shapes[-1] = z_f
+        return shapes
+
+    def _rotation(self, cycle: Array) -> Array:
+        """Rotation vector (3,) of the base over one cycle."""
+        identity = np.array([0.0, 0.0, 0.0, 1.0])
+        return rotvec_from_quaternion(self._prediction.attitudes(cycle, identity, np.zeros(3))[-1])
+
+    def _path(
+        self, state: RobotState, slide: Array, attitudes: Array, cycle: Array, n: int
+    ) -> BasePath:
+        """Base path: step 2 as it goes, step 3 at the ends of (at most 1000 of the) cycles."""
+        stride = max(1, len(slide) // 200)
+        chosen = np.unique(np.append(np.arange(0, len(slide), stride), len(slide) - 1))
+        time, shapes, quaternions = chosen * self.tick_period, slide[chosen], attitudes[chosen]
+        if n:
+            done = np.unique(np.append(np.arange(0, n, max(1, n // 1000))[1:], n))
+            rotation = self._rotation(cycle)
+            turned = [
+                quaternion_multiply(attitudes[-1], quaternion_from_rotvec(k * rotation)) for k in done
+            ]
+            seconds = (len(slide) - 1 + done * self.ticks_a_cycle) * self.tick_period
+            time = np.append(time, seconds)
+            shapes = np.vstack([shapes, np.tile(cycle[-1], (len(done), 1))])
+            quaternions = np.vstack([quaternions, turned])
+        return BasePath(
+            time, self._prediction.positions(state, time, shapes, quaternions), quaternions
+        )
+
+    def _require_rest(self, state: RobotState) -> None:
+        p, L = np.linalg.norm(state.linear_momentum), np.linalg.norm(state.angular_momentum)
+        if p > _AT_REST * self.robot.total_mass or L > _AT_REST * self.robot.total_mass:
+            raise PlanningError(
+                "The robot drifts: its total momentum is not zero "
+                f"({p:.3g} kg m/s, {L:.3g} kg m^2/s), and lie_bracket plans for zero momentum "
+                "(paper 1); shape changes cannot remove it."
+            )
+
+
+@dataclass(frozen=True)
+class _Turn:
+    shapes: Array
+    cycles: int
+    alpha: Array
+    amplitudes: Array

@@ -1,0 +1,61 @@
+"""The base motion that a piece of a gait will cause, as the plant integrates it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.attitude import matrix_from_quaternion
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.goal import RobotState
+
+
+class BasePrediction:
+    """Attitude under held joint velocities, and the position that follows from it.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    tick_period
+        How long a command is held, s.
+    integration_step
+        Longest Runge-Kutta step of the attitude, s; the plant's, for equal numbers.
+    """
+
+    def __init__(self, robot: SpaceRobot, tick_period: float, integration_step: float) -> None:
+        self._robot = robot
+        self._step = robot.velocity_step(max(1, math.ceil(tick_period / integration_step - 1e-9)))
+        self._step.inputs[3][:] = tick_period
+
+    def attitudes(self, positions: Array, quaternion: Array, L_W: Array) -> Array:
+        """Return the attitude (N + 1, 4) at every tick of the shapes ``positions`` (N + 1, n)."""
+        state, qdot, momentum, h = self._step.inputs
+        result = self._step.outputs[0]
+        momentum[:] = L_W
+        n = self._robot.n
+        attitudes = np.empty((len(positions), 4))
+        attitudes[0] = quaternion
+        state[n:] = quaternion
+        rates = np.diff(positions, axis=0) / h[0]
+        for k, rate in enumerate(rates):
+            state[:n] = positions[k]
+            qdot[:] = rate
+            self._step.evaluate()
+            state[n:] = attitudes[k + 1] = result[n:]
+        return attitudes
+
+    def positions(self, state: RobotState, time: Array, shapes: Array, quaternions: Array) -> Array:
+        """Return the base position (K, 3) in W: the centre of mass coasts, the base is off it by c(q)."""
+        robot = self._robot
+        start = matrix_from_quaternion(state.quaternion) @ robot.center_of_mass(state.q)
+        r_cm = state.position + start
+        drift = state.linear_momentum / robot.total_mass
+        return np.array(
+            [
+                r_cm + t * drift - matrix_from_quaternion(quaternion) @ robot.center_of_mass(q)
+                for t, q, quaternion in zip(time, shapes, quaternions, strict=True)
+            ]
+        )

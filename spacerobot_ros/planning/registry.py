@@ -1,0 +1,10 @@
+"""The methods by name: a new one is one file and one line here."""
+
+from __future__ import annotations
+
+from spacerobot_ros.planning.lie_bracket import LieBracketGait
+from spacerobot_ros.planning.method import GaitMethod
+
+METHODS: dict[str, type[GaitMethod]] = {
+    LieBracketGait.name: LieBracketGait,
+}

@@ -1,0 +1,66 @@
+"""What a planner answers: the shape at every tick, and the base path that it predicts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.goal import Goal
+
+
+@dataclass(frozen=True)
+class BasePath:
+    """Predicted base poses: ``time`` (K,) in s from the start, ``position`` (K, 3), ``quaternion`` (K, 4)."""
+
+    time: Array
+    position: Array
+    quaternion: Array
+
+
+@dataclass(frozen=True)
+class GaitSchedule:
+    """A gait as held commands: the shape at each tick, joint velocities constant in between.
+
+    Attributes
+    ----------
+    method
+        Registry name of the method that made it.
+    joint_names
+        Names of the joints, the columns of ``positions``.
+    tick_period
+        s.
+    positions
+        (N + 1, n) shape at the ticks 0..N, m or rad.
+    path
+        Predicted base path at instants of the method's choice, the first and the last included.
+    goal
+        What it was planned for.
+    notes
+        Named results of the method, for reports (a paper's symbols where it has them).
+    """
+
+    method: str
+    joint_names: tuple[str, ...]
+    tick_period: float
+    positions: Array
+    path: BasePath
+    goal: Goal
+    notes: dict[str, list[float] | float | str] = field(default_factory=dict)
+
+    @property
+    def ticks(self) -> int:
+        """Number of held commands N."""
+        return len(self.positions) - 1
+
+    @property
+    def duration(self) -> float:
+        """Time the gait takes, s."""
+        return self.ticks * self.tick_period
+
+    @cached_property
+    def velocities(self) -> Array:
+        """The held joint velocities (N, n), m/s or rad/s: they carry the shape exactly from tick to tick."""
+        return np.diff(self.positions, axis=0) / self.tick_period

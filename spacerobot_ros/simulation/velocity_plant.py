@@ -1,0 +1,195 @@
+"""The plant under velocity actuation: servos hold joint velocities, the base follows from momentum.
+
+One tick is one compiled function: limits, step, and every quantity that is published. The total
+linear and angular momenta are constants of the motion, zero unless the run starts otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.attitude import matrix_from_quaternion, unit_quaternion
+from spacerobot_ros.model.compilation import BufferedFunction, compiled
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+
+
+@dataclass(frozen=True)
+class InitialState:
+    """Where a run starts: base pose in W (m; quaternion x, y, z, w), shape, and total momenta in W.
+
+    ``joint_positions`` None means zero, or the nearest end of a stroke that excludes zero.
+    ``angular_momentum`` (kg m^2/s) is about the system's centre of mass.
+    """
+
+    position: Array = field(default_factory=lambda: np.zeros(3))
+    quaternion: Array = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0]))
+    joint_positions: Array | None = None
+    linear_momentum: Array = field(default_factory=lambda: np.zeros(3))
+    angular_momentum: Array = field(default_factory=lambda: np.zeros(3))
+
+
+class VelocityPlant:
+    """A free-floating robot whose servos realise held joint velocities.
+
+    After :meth:`step`, the attributes are the state that a robot would report:
+
+    ``pose``
+        (7,) position ``r_WB`` in m and quaternion ``R_WB`` (x, y, z, w) of the base link.
+    ``twist``
+        (6,) ``v_WB_B`` in m/s and ``omega_WB_B`` in rad/s.
+    ``q``, ``qdot``
+        (n,) joint positions, and the velocities held up to now.
+    ``momentum``
+        (7,) linear momentum (kg m/s), angular momentum about the system's centre of mass
+        (kg m^2/s), both in W, and kinetic energy (J): summed body by body from the state above.
+    ``link_R``, ``link_r``
+        (3, 3 L) and (3, L): pose in B of every link, in the order of ``robot.link_names``.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    tick_period
+        Duration of a tick, s.
+    initial
+        Where to start.
+    integration_step
+        Longest Runge-Kutta step of the attitude within a tick, s.
+
+    Raises
+    ------
+    ParameterError
+        The initial shape has the wrong length or lies outside the strokes, or a number is bad.
+    """
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        tick_period: float,
+        initial: InitialState | None = None,
+        integration_step: float = DEFAULT_INTEGRATION_STEP,
+    ) -> None:
+        if not (math.isfinite(tick_period) and tick_period > 0):
+            raise ParameterError(f"The tick period must be positive, not {tick_period} s.")
+        self.robot = robot
+        self.tick_period = tick_period
+        self.initial = initial or InitialState()
+        substeps = max(1, math.ceil(tick_period / integration_step - 1e-9))
+        self._advance = BufferedFunction(compiled(_tick_function(robot, substeps)))
+        inputs, outputs = self._advance.inputs, self._advance.outputs
+        self._state, self._command, self._momenta, self._r_cm, self._h = inputs
+        self._next_state, self.pose, self.twist, self.qdot = outputs[:4]
+        self.momentum, self.link_R, self.link_r, self._limited, self._next_r_cm = outputs[4:]
+        self.q = self._next_state[: robot.n]
+        self.velocity_limited = np.zeros(robot.n, dtype=np.int64)
+        self.stroke_limited = np.zeros(robot.n, dtype=np.int64)
+        self.reset()
+
+    def reset(self) -> None:
+        """Return to the initial state, at rest; the limit counters go on."""
+        start = self.initial
+        q = self._initial_shape()
+        try:
+            quaternion = unit_quaternion(start.quaternion)
+        except ValueError as error:
+            raise ParameterError(f"The initial orientation is refused: {error}.") from None
+        momenta = np.concatenate([start.linear_momentum, start.angular_momentum])
+        if not np.all(np.isfinite(np.concatenate([start.position, momenta]))):
+            raise ParameterError("The initial position and momenta must be finite.")
+        self._state[: self.robot.n] = q
+        self._state[self.robot.n :] = quaternion
+        self._momenta[:] = momenta
+        self._r_cm[:] = start.position + matrix_from_quaternion(
+            quaternion
+        ) @ self.robot.center_of_mass(q)
+        # A step of zero duration at zero rates fills every output.
+        self._command[:] = 0.0
+        self._h[:] = 0.0
+        self._advance.evaluate()
+        self._h[:] = self.tick_period
+
+    def step(self, command: Array) -> bool:
+        """Advance one tick under the joint velocities ``command`` (n,), clipped to rate and stroke.
+
+        A joint that would leave its stroke within the tick moves at the rate that ends on it.
+        Returns whether any joint was limited; ``velocity_limited`` and ``stroke_limited`` count
+        the ticks by joint.
+        """
+        self._state[:] = self._next_state
+        self._command[:] = command
+        self._advance.evaluate()
+        self._r_cm[:] = self._next_r_cm
+        if self._limited[0] == 0.0:
+            return False
+        self.velocity_limited += (self._limited[1 : 1 + self.robot.n] != 0.0).astype(np.int64)
+        self.stroke_limited += (self._limited[1 + self.robot.n :] != 0.0).astype(np.int64)
+        return True
+
+    def _initial_shape(self) -> Array:
+        robot, given = self.robot, self.initial.joint_positions
+        if given is None:
+            return np.clip(np.zeros(robot.n), robot.lower, robot.upper)
+        q = np.asarray(given, dtype=float)
+        if q.shape != (robot.n,):
+            raise ParameterError(
+                f"The initial joint positions are {q.size} numbers; robot "
+                f"'{robot.description.name}' has {robot.n} joints: {', '.join(robot.joint_names)}."
+            )
+        for name, value, lower, upper in zip(
+            robot.joint_names, q, robot.lower, robot.upper, strict=True
+        ):
+            if not (lower <= value <= upper):
+                raise ParameterError(
+                    f"The initial position of joint '{name}', {value}, is outside its stroke "
+                    f"[{lower}, {upper}]."
+                )
+        return q
+
+
+def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
+    """Compose the tick from the model's functions; see :class:`VelocityPlant` for its results."""
+    n = robot.n
+    state, command = ca.MX.sym("state", n + 4), ca.MX.sym("command", n)
+    momenta, r_cm, h = ca.MX.sym("momenta", 6), ca.MX.sym("r_cm", 3), ca.MX.sym("h")
+    p_W, L_W = momenta[:3], momenta[3:]
+
+    rate = ca.fmin(ca.fmax(command, -robot.velocity_limit), robot.velocity_limit)
+    q = state[:n]
+    # A tick of no duration only reports the state: its strokes must not divide by zero.
+    duration = ca.fmax(h, 1e-12)
+    to_lower, to_upper = (ca.DM(robot.lower) - q) / duration, (ca.DM(robot.upper) - q) / duration
+    qdot = ca.fmin(ca.fmax(rate, to_lower), to_upper)
+    by_rate, by_stroke = command != rate, rate != qdot
+    limited = ca.vertcat(ca.sum1(by_rate) + ca.sum1(by_stroke), by_rate, by_stroke)
+
+    step = robot.function(f"velocity_step:{substeps}", compile=False)
+    next_state = step(state, qdot, L_W, h)
+    q_next, quaternion = next_state[:n], next_state[n:]
+    v, omega = robot.function("base_twist", compile=False)(quaternion, q_next, qdot, p_W, L_W)
+    r_cm_next = r_cm + p_W * (h / robot.total_mass)
+    center = robot.function("center_of_mass", compile=False)(q_next)
+    r_WB = r_cm_next - robot.function("rotate", compile=False)(quaternion, center)
+    ledger = robot.function("momentum", compile=False)(quaternion, q_next, v, omega, qdot)
+    link_R, link_r = robot.function("link_poses", compile=False)(q_next)
+    return ca.Function(
+        f"velocity_tick_{substeps}",
+        [state, command, momenta, r_cm, h],
+        [
+            next_state,
+            ca.vertcat(r_WB, quaternion),
+            ca.vertcat(v, omega),
+            qdot,
+            ca.vertcat(*ledger),
+            link_R,
+            link_r,
+            ca.densify(limited),
+            r_cm_next,
+        ],
+    )
