@@ -6,7 +6,7 @@ class SpaceRobotError(Exception):
 
 
 class RobotDescriptionError(SpaceRobotError):
-    """A robot description (URDF) that cannot be a free-floating robot; the sentence names the element."""
+    """A URDF that does not describe a free-floating robot; the sentence names the element."""
 
 
 class ParameterError(SpaceRobotError):

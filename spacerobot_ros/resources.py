@@ -28,7 +28,7 @@ def share_directory() -> Path:
         from ament_index_python.packages import get_package_share_directory
 
         candidates.insert(0, Path(get_package_share_directory(_PACKAGE)))
-    except (ImportError, LookupError):
+    except (ImportError, LookupError, OSError):
         pass  # Without an ament index (plain pip), the prefix is the place.
     for candidate in candidates:
         if (candidate / "urdf").is_dir():

@@ -1,4 +1,4 @@
-"""Attitude arithmetic with numpy: rotation matrices, unit quaternions (x, y, z, w), rotation vectors.
+"""Attitude with numpy: rotation matrices, unit quaternions (x, y, z, w), rotation vectors.
 
 A quaternion or matrix named ``R_WB`` turns vectors given in B into vectors given in W.
 """
@@ -81,7 +81,7 @@ def rotvec_from_quaternion(quaternion: npt.ArrayLike) -> Array:
 
 
 def attitude_error(quaternion: npt.ArrayLike, target: npt.ArrayLike) -> Array:
-    """Return the rotation vector (3,), in rad and in body components, from an attitude to its target."""
+    """Return the rotation vector (3,), rad, body components, from an attitude to its target."""
     return rotvec_from_quaternion(quaternion_multiply(quaternion_inverse(quaternion), target))
 
 

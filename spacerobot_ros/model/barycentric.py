@@ -95,7 +95,9 @@ def barycentric_inertia(kin: TreeKinematics) -> BarycentricInertia:
     slides = [j for j in bodies[1:] if not kin.is_revolute(j)]
     turns = [j for j in bodies[1:] if kin.is_revolute(j)]
     E = {
-        (i, j): ca.cross(sum((kin.mass(k) * v[i][k] for k in outboard[j]), ca.SX(3, 1)), kin.axis[j])
+        (i, j): ca.cross(
+            sum((kin.mass(k) * v[i][k] for k in outboard[j]), ca.SX(3, 1)), kin.axis[j]
+        )
         for i in bodies
         for j in slides
     }

@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sysconfig
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import casadi as ca
@@ -48,17 +48,31 @@ class BufferedFunction:
         )
 
     @staticmethod
-    def _attach(size: tuple[int, int], sparsity: ca.Sparsity, index: int, setter: object) -> Array:
+    def _attach(
+        size: tuple[int, int], sparsity: ca.Sparsity, index: int, setter: Callable[..., None]
+    ) -> Array:
         if not sparsity.is_dense():
             raise ValueError("a buffered function has dense arguments and results")
         memory = np.zeros(size[0] * size[1])
-        setter(index, memoryview(memory))  # type: ignore[operator]
+        setter(index, memory.data)
         # CasADi stores matrices by columns.
-        return memory if 1 in size else memory.reshape(size, order="F")
+        return memory if size[1] == 1 else memory.reshape(size, order="F")
 
     def __call__(self, *arguments: Array | float) -> tuple[Array, ...]:
-        """Evaluate at the given arguments and return copies of the results."""
-        for memory, value in zip(self.inputs, arguments, strict=True):
+        """Evaluate at the given arguments and return copies of the results.
+
+        Raises
+        ------
+        ValueError
+            An argument has the wrong size; the sentence names it.
+        """
+        for index, (memory, value) in enumerate(zip(self.inputs, arguments, strict=True)):
+            if np.size(value) != memory.size:
+                name = self.function.name_in(index)
+                raise ValueError(
+                    f"{self.function.name()}: {name} has {np.size(value)} number(s), "
+                    f"not {memory.size}"
+                )
             memory[...] = value
         self.evaluate()
         return tuple(output.copy() for output in self.outputs)
@@ -84,7 +98,7 @@ def compiled(function: ca.Function) -> ca.Function:
 
 
 def c_compiler() -> str | None:
-    """Return the C compiler that will be used: ``$CC``, ``cc``, ``gcc`` or ``clang``; None without."""
+    """Return the C compiler in use: ``$CC``, ``cc``, ``gcc`` or ``clang``; None without one."""
     if os.environ.get("SPACEROBOT_COMPILE", "1") == "0":
         return None
     for candidate in (os.environ.get("CC"), "cc", "gcc", "clang"):

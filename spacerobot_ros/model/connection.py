@@ -20,7 +20,7 @@ def solve_positive_definite(matrix: ca.SX, right: ca.SX) -> ca.SX:
 
 
 def connection(kin: TreeKinematics, inertia: BarycentricInertia) -> ca.SX:
-    """Return ``A(q)`` (6, n): ``[v_WB_B; omega_WB_B] = -A(q) qdot`` at zero momentum (paper 1, section 3).
+    """Return ``A(q)`` (6, n) of ``[v_WB_B; omega_WB_B] = -A(q) qdot``, zero momentum (paper 1, 3).
 
     The lower half is ``D^-1 D_q``; the upper keeps the system's centre of mass at rest:
     ``v = -omega x c - dc/dq qdot`` with ``c = r_BC_B``.
@@ -39,7 +39,7 @@ def body_bracket(a: ca.SX, b: ca.SX) -> ca.SX:
 
 
 def curvature(A: ca.SX, q: ca.SX) -> list[list[ca.SX]]:
-    """Return the curvature ``K[i][j]`` (6,) of the map ``qdot -> [v; omega]_B = F qdot``, ``F = -A``.
+    """Return the curvature ``K[i][j]`` (6,) of ``qdot -> [v; omega]_B = F qdot``, ``F = -A``.
 
     ``K_ij = dF_j/dq_i - dF_i/dq_j + [F_i, F_j]``. A small loop counter-clockwise in the plane
     (q_i, q_j) moves the base by ``exp(K_ij * area)`` in body coordinates (paper 2, with the

@@ -23,7 +23,7 @@ class JointKind(str, Enum):
 
 @dataclass(frozen=True)
 class JointLimits:
-    """Stroke, rate and effort of a joint (m or rad, m/s or rad/s, N or N m); infinite where free."""
+    """Stroke, rate and effort of a joint (m or rad, /s, N or N m); infinite where free."""
 
     lower: float = -np.inf
     upper: float = np.inf
@@ -53,9 +53,7 @@ class Inertia:
 
     def moved(self, pose: Pose) -> Inertia:
         """Express the same body in the frame in which this one has ``pose``."""
-        return Inertia(
-            self.mass, pose.r + pose.R @ self.com, pose.R @ self.about_com @ pose.R.T
-        )
+        return Inertia(self.mass, pose.r + pose.R @ self.com, pose.R @ self.about_com @ pose.R.T)
 
     def __add__(self, other: Inertia) -> Inertia:
         """Weld two bodies given in the same frame (parallel-axis theorem)."""
@@ -94,7 +92,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint from ``parent`` to ``child`` link; ``origin`` is the child's pose at zero, ``axis`` a unit vector."""
+    """A joint between two links; ``origin``: the child's pose at zero, ``axis``: a unit vector."""
 
     name: str
     kind: JointKind
@@ -156,6 +154,6 @@ class RobotDescription:
         return float(sum(body.inertia.mass for body in self.bodies))
 
     def limits(self, what: str) -> Array:
-        """Return one limit of all movable joints: ``lower``, ``upper``, ``velocity`` or ``effort``; (n,)."""
+        """Return one limit (n,) of the movable joints: lower, upper, velocity or effort."""
         values: list[Any] = [getattr(joint.limits, what) for joint in self.movable_joints]
         return np.array(values, dtype=float)

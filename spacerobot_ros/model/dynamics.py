@@ -82,9 +82,7 @@ def generalised_forces(kin: TreeKinematics, wrench_B: ca.SX, tau: ca.SX) -> ca.S
     return J_base.T @ wrench_B + ca.vertcat(ca.SX(6, 1), tau)
 
 
-def forward_dynamics(
-    inertia: BarycentricInertia, C_plus: ca.SX, Q: ca.SX
-) -> ca.SX:
+def forward_dynamics(inertia: BarycentricInertia, C_plus: ca.SX, Q: ca.SX) -> ca.SX:
     """Return ``z0ddot = H+^-1 (Q - C+)`` (6 + n,), eq. (19).
 
     The translation of the centre of mass decouples; rotation and shape are solved together.

@@ -74,7 +74,7 @@ class TreeKinematics:
         return R, r, body
 
     def angular_jacobian(self, k: int) -> ca.SX:
-        """Return ``0F_k`` (3, n): the joint rates' part of the angular velocity of body k (eq. 6)."""
+        """Return ``0F_k`` (3, n): what the joint rates add to the angular velocity of k (eq. 6)."""
         F = ca.SX(3, self.n)
         for j in self.ancestors(k):
             if self.is_revolute(j):

@@ -17,7 +17,7 @@ DEFAULT_INTEGRATION_STEP = 0.01
 
 
 def quaternion_rate(quaternion: ca.SX, omega_WB_B: ca.SX) -> ca.SX:
-    """Return the time derivative (4,) of ``R_WB`` as quaternion (x, y, z, w) at body rate ``omega``."""
+    """Return the rate (4,) of the quaternion (x, y, z, w) of ``R_WB`` at body rate ``omega``."""
     vector, scalar = quaternion[:3], quaternion[3]
     return 0.5 * ca.vertcat(
         scalar * omega_WB_B + ca.cross(vector, omega_WB_B), -ca.dot(vector, omega_WB_B)

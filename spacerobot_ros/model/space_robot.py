@@ -88,11 +88,15 @@ class SpaceRobot:
         return R[:, 3 * index : 3 * index + 3], r.reshape((3, -1), order="F")[:, index]
 
     def inertia_matrix(self, q: npt.ArrayLike) -> Array:
-        """Return ``H+`` (6 + n, 6 + n) of ``[v_cm; omega; qdot]`` in base components (paper 4, eq. 15)."""
+        """Return ``H+`` (6 + n, 6 + n) of ``[v_cm; omega; qdot]``, base components (eq. 15)."""
         return self._call("inertia_matrix", q)[0]
 
     def bias(
-        self, q: npt.ArrayLike, v_cm_B: npt.ArrayLike, omega_WB_B: npt.ArrayLike, qdot: npt.ArrayLike
+        self,
+        q: npt.ArrayLike,
+        v_cm_B: npt.ArrayLike,
+        omega_WB_B: npt.ArrayLike,
+        qdot: npt.ArrayLike,
     ) -> Array:
         """Return ``C+`` (6 + n,): the velocity terms of paper 4, eq. (19)."""
         return self._call("bias", q, v_cm_B, omega_WB_B, qdot)[0]
@@ -113,8 +117,9 @@ class SpaceRobot:
         return self._call("forward_dynamics", q, v_cm_B, omega_WB_B, qdot, wrench_B, tau)[0]
 
     def jacobian(self, link: str, q: npt.ArrayLike) -> Array:
-        """Return ``0J+`` (6, 6 + n) of a link's frame origin (paper 4, eq. 10): ``[v_cm; omega; qdot]``
-        to linear over angular velocity, base components.
+        """Return ``0J+`` (6, 6 + n) of a link's frame origin (paper 4, eq. 10), base components.
+
+        It maps ``[v_cm; omega; qdot]`` to linear over angular velocity.
 
         Raises
         ------
@@ -137,7 +142,7 @@ class SpaceRobot:
         return stacked.reshape((6, self.n, self.n), order="F")
 
     def lie_brackets(self, q: npt.ArrayLike) -> Array:
-        """Return ``w`` (3, n, n): paper 1's first-order brackets ``w[:, i, j] = omega_[Fi,Fj]``, eq. (7).
+        """Return ``w`` (3, n, n), ``w[:, i, j] = omega_[Fi,Fj]``: paper 1's brackets, eq. (7).
 
         They are minus the angular part of :meth:`curvature`.
         """
@@ -151,8 +156,8 @@ class SpaceRobot:
         omega_WB_B: npt.ArrayLike,
         qdot: npt.ArrayLike,
     ) -> tuple[Array, Array, float]:
-        """Return linear momentum (3,) kg m/s, angular momentum about the system's centre of mass (3,)
-        kg m^2/s, both in W, and kinetic energy in J; summed body by body.
+        """Return linear momentum (3,) in kg m/s and angular momentum about the system's centre of
+        mass (3,) in kg m^2/s, both in W, and kinetic energy in J; summed body by body.
         """
         p, L, energy = self._call("momentum", quaternion_WB, q, v_WB_B, omega_WB_B, qdot)
         return p, L, float(energy[0])
@@ -165,7 +170,7 @@ class SpaceRobot:
         p_W: npt.ArrayLike = (0, 0, 0),
         L_W: npt.ArrayLike = (0, 0, 0),
     ) -> tuple[Array, Array]:
-        """Return ``(v_WB_B, omega_WB_B)`` at the given joint rates and total momenta (about the CM)."""
+        """Return ``(v_WB_B, omega_WB_B)`` at given joint rates and momenta (L about the CM)."""
         v, omega = self._call("base_twist", quaternion_WB, q, qdot, p_W, L_W)
         return v, omega
 
@@ -322,15 +327,17 @@ class SpaceRobot:
             return self.link_names.index(link)
         except ValueError:
             raise KeyError(
-                f"robot '{self.description.name}' has no link '{link}'; it has {', '.join(self.link_names)}"
+                f"robot '{self.description.name}' has no link '{link}'; "
+                f"it has {', '.join(self.link_names)}"
             ) from None
 
     def _require_positive_inertia(self) -> None:
         H = ca.Function("H", [self._kin.q], [self._inertia.H_plus])
-        shape = 0.1 * np.arange(1, self.n + 1)
-        smallest = float(np.linalg.eigvalsh(np.array(H(shape)))[0])
+        middle = np.clip(np.zeros(self.n), self.lower, self.upper)
+        shapes = (np.zeros(self.n), middle, 0.1 * np.arange(1, self.n + 1))
+        smallest = min(float(np.linalg.eigvalsh(np.array(H(shape)))[0]) for shape in shapes)
         if smallest <= 1e-12 * self.total_mass:
             raise RobotDescriptionError(
                 f"The inertia matrix of robot '{self.description.name}' is not positive definite: "
-                "some joint moves parts without mass or without inertia about its axis."
+                "some part turns or moves without mass or without inertia about its axis."
             )

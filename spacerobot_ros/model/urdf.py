@@ -62,10 +62,15 @@ def parse_robot(text: str) -> RobotDescription:
     }
     links = {link.name: _link(link, colours) for link in tree.links}
     joints = [_joint(joint, links) for joint in tree.joints]
-    for kind, names in (("link", [x.name for x in tree.links]), ("joint", [x.name for x in joints])):
+    for kind, names in (
+        ("link", [x.name for x in tree.links]),
+        ("joint", [x.name for x in joints]),
+    ):
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise RobotDescriptionError(f"The {kind} name '{twice[0]}' is used twice; names are unique.")
+            raise RobotDescriptionError(
+                f"The {kind} name '{twice[0]}' is used twice; names are unique."
+            )
     bodies, frames = _weld(links, joints)
     description = RobotDescription(
         name=tree.name or "robot",
@@ -86,8 +91,10 @@ def _parse_xml(text: str) -> Any:
         try:
             return URDF.from_xml_string(text.encode("utf-8"))
         except Exception as error:  # lxml, assertion, key, value and type errors, by what is broken
-            reason = str(error) or type(error).__name__
-            raise RobotDescriptionError(f"The robot description is not valid URDF: {reason}.") from error
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise RobotDescriptionError(
+                f"The robot description is not valid URDF: {reason}."
+            ) from error
 
 
 def _pose(origin: Any, where: str) -> Pose:
@@ -155,7 +162,9 @@ def _joint(joint: Any, links: dict[str, Link]) -> Joint:
     where = f"joint '{joint.name}'"
     for role, name in (("parent", joint.parent), ("child", joint.child)):
         if name not in links:
-            raise RobotDescriptionError(f"The {role} of {where} is '{name}', but there is no such link.")
+            raise RobotDescriptionError(
+                f"The {role} of {where} is '{name}', but there is no such link."
+            )
     try:
         kind = JointKind(joint.type)
     except ValueError:
@@ -177,7 +186,13 @@ def _joint(joint: Any, links: dict[str, Link]) -> Joint:
             raise RobotDescriptionError(f"The axis of {where} is zero; give it a direction.")
         axis = axis / norm
     return Joint(
-        joint.name, kind, joint.parent, joint.child, _pose(joint.origin, where), axis, _limits(joint, kind, where)
+        joint.name,
+        kind,
+        joint.parent,
+        joint.child,
+        _pose(joint.origin, where),
+        axis,
+        _limits(joint, kind, where),
     )
 
 
@@ -189,25 +204,34 @@ def _limits(joint: Any, kind: JointKind, where: str) -> JointLimits:
         if kind is JointKind.CONTINUOUS:
             return JointLimits()
         raise RobotDescriptionError(
-            f"The {where} is {kind.value} and has no <limit>: give lower, upper, velocity and effort."
+            f"The {where} is {kind.value} and has no <limit>: "
+            "give lower, upper, velocity and effort."
         )
-    values = {name: float(getattr(limit, name) or 0.0) for name in ("lower", "upper", "velocity", "effort")}
+    values = {
+        name: float(getattr(limit, name) or 0.0)
+        for name in ("lower", "upper", "velocity", "effort")
+    }
     for name, value in values.items():
         if math.isnan(value):
             raise RobotDescriptionError(f"The limit '{name}' of {where} is not a number.")
     for name in ("velocity", "effort"):
         if values[name] < 0:
-            raise RobotDescriptionError(f"The limit '{name}' of {where} is negative ({values[name]}).")
+            raise RobotDescriptionError(
+                f"The limit '{name}' of {where} is negative ({values[name]})."
+            )
     if kind is JointKind.CONTINUOUS:
         return JointLimits(velocity=values["velocity"], effort=values["effort"])
-    if values["lower"] > values["upper"]:
+    if values["lower"] >= values["upper"]:
         raise RobotDescriptionError(
-            f"The lower limit of {where} ({values['lower']}) is above its upper limit ({values['upper']})."
+            f"The lower limit of {where} ({values['lower']}) is not below its upper limit "
+            f"({values['upper']}): it could not move; give a stroke, or make it fixed."
         )
     return JointLimits(**values)
 
 
-def _weld(links: dict[str, Link], joints: list[Joint]) -> tuple[list[Body], dict[str, tuple[int, Pose]]]:
+def _weld(
+    links: dict[str, Link], joints: list[Joint]
+) -> tuple[list[Body], dict[str, tuple[int, Pose]]]:
     """Order the tree from the root and merge what fixed joints hold together."""
     children: dict[str, list[Joint]] = {name: [] for name in links}
     parents: dict[str, str] = {}
@@ -222,7 +246,9 @@ def _weld(links: dict[str, Link], joints: list[Joint]) -> tuple[list[Body], dict
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
         found = ", ".join(f"'{name}'" for name in roots) or "none"
-        raise RobotDescriptionError(f"A robot has exactly one root link (the base); found: {found}.")
+        raise RobotDescriptionError(
+            f"A robot has exactly one root link (the base); found: {found}."
+        )
 
     bodies = [Body(roots[0], links[roots[0]].inertia, None, -1, Pose())]
     frames = {roots[0]: (0, Pose())}
@@ -244,7 +270,9 @@ def _weld(links: dict[str, Link], joints: list[Joint]) -> tuple[list[Body], dict
             queue.append(joint.child)
     if len(frames) != len(links):
         lost = sorted(set(links) - set(frames))
-        raise RobotDescriptionError(f"Link '{lost[0]}' is not connected to the root: its joints form a ring.")
+        raise RobotDescriptionError(
+            f"Link '{lost[0]}' is not connected to the root: its joints form a ring."
+        )
     return bodies, frames
 
 
@@ -253,8 +281,8 @@ def _require_mass(robot: RobotDescription) -> None:
     base = robot.bodies[0].inertia
     if base.mass <= 0:
         raise RobotDescriptionError(
-            f"The base link '{robot.base_link}' has no mass; a free-floating base needs an <inertial> "
-            "with mass and inertia."
+            f"The base link '{robot.base_link}' has no mass; a free-floating base needs an "
+            "<inertial> with mass and inertia."
         )
     outboard_mass = [body.inertia.mass for body in robot.bodies]
     outboard_moment = [float(np.trace(body.inertia.about_com)) for body in robot.bodies]
@@ -262,7 +290,9 @@ def _require_mass(robot: RobotDescription) -> None:
         parent = robot.bodies[index].parent
         outboard_mass[parent] += outboard_mass[index]
         outboard_moment[parent] += outboard_moment[index]
-    for body, mass, moment in zip(robot.bodies[1:], outboard_mass[1:], outboard_moment[1:], strict=True):
+    for body, mass, moment in zip(
+        robot.bodies[1:], outboard_mass[1:], outboard_moment[1:], strict=True
+    ):
         assert body.joint is not None
         if mass <= 0 and (body.joint.kind is JointKind.PRISMATIC or moment <= 0):
             raise RobotDescriptionError(

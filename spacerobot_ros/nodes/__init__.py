@@ -3,5 +3,6 @@
 from spacerobot_ros.nodes.flight_node import FlightNode
 from spacerobot_ros.nodes.planner import PlannerNode
 from spacerobot_ros.nodes.plant import PlantNode
+from spacerobot_ros.nodes.recorder import RecorderNode
 
-__all__ = ["FlightNode", "PlannerNode", "PlantNode"]
+__all__ = ["FlightNode", "PlannerNode", "PlantNode", "RecorderNode"]

@@ -39,6 +39,9 @@ AUTOSTART = ParameterSpec(
 )
 
 
+_DISCOVERY_CHOICES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
+
+
 class FlightNode(LifecycleNode):
     """A managed node whose parameters are declared, checked and named in every refusal.
 
@@ -91,7 +94,13 @@ class FlightNode(LifecycleNode):
     @property
     def is_active(self) -> bool:
         """Whether the node is in its active state."""
-        return bool(self._state_machine.current_state[0] == State.PRIMARY_STATE_ACTIVE)
+        machine = self._state_machine
+        return bool(machine and machine.current_state[0] == State.PRIMARY_STATE_ACTIVE)
+
+    def destroy_node(self) -> None:
+        """Destroy the node and let go of its state machine, which would keep it in the graph."""
+        super().destroy_node()
+        self._state_machine = None
 
     # -- hooks --------------------------------------------------------------------------------
 
@@ -178,9 +187,18 @@ class FlightNode(LifecycleNode):
 
 def use_loopback_discovery() -> None:
     """Keep discovery on this machine unless the user chose otherwise."""
-    chosen = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
-    if not any(os.environ.get(name) for name in chosen):
+    if not any(os.environ.get(name) for name in _DISCOVERY_CHOICES):
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+def use_private_discovery() -> None:
+    """Keep discovery in this process unless the user chose a range or a domain.
+
+    Two lockstep stacks that hear each other would refuse each other's commands.
+    """
+    if not any(os.environ.get(name) for name in (*_DISCOVERY_CHOICES, "ROS_DOMAIN_ID")):
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "OFF"
+    use_loopback_discovery()
 
 
 def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = None) -> int:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 from sensor_msgs.msg import JointState
 
 from spacerobot_ros.errors import CommandError
-from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.cdr import TemplateReader
 
 Quantity = Literal["position", "velocity", "effort"]
@@ -35,7 +35,7 @@ class JointReader:
         self._reader = TemplateReader(JointState, self._spans)
         self._changes = 0
         self._problem = ""
-        self._order: Array | slice = slice(0, 0)
+        self._order: npt.NDArray[np.intp] | slice = slice(0, 0)
         self.values = {name: np.zeros(len(joint_names)) for name in quantities}
 
     def accept(self, raw: bytes) -> int:
@@ -68,22 +68,23 @@ class JointReader:
     def _check(self) -> None:
         """Judge names and lengths, once for every layout."""
         message = self._reader.prototype
+        assert message is not None
         names = list(message.name)
         self._problem = ""
         unknown = [name for name in names if name not in self._index]
         for values in self.values.values():
             values[:] = 0.0
         if unknown:
-            self._problem = (
-                f"joint '{unknown[0]}' is unknown; the robot has {self._robot_joints}"
-            )
+            self._problem = f"joint '{unknown[0]}' is unknown; the robot has {self._robot_joints}"
         elif len(set(names)) != len(names):
             self._problem = f"a joint is named twice in {names}"
         else:
             for i, quantity in enumerate(self._quantities):
                 count = len(getattr(message, quantity))
                 if count != len(names) and (count or i == 0):
-                    self._problem = f"{len(names)} joint(s) are named but {count} {quantity} value(s) given"
+                    self._problem = (
+                        f"{len(names)} joint(s) are named but {count} {quantity} value(s) given"
+                    )
         order = np.array([self._index.get(name, 0) for name in names], dtype=np.intp)
         everything = np.array_equal(order, np.arange(len(self._index)))
         self._order = slice(None) if everything else order

@@ -10,7 +10,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from spacerobot_ros.model.attitude import quaternion_from_matrix
 from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
-from spacerobot_ros.nodes.cdr import MessageTemplate
+from spacerobot_ros.nodes.cdr import MessageTemplate, stamp_bytes
 from spacerobot_ros.nodes.flight_node import STREAM
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.schedule import BasePath
@@ -46,7 +46,7 @@ class LinkMarkers:
 
     def __init__(self, node: Node, robot: RobotDescription, world_frame: str) -> None:
         self._poses: list[tuple[int, Pose]] = []
-        markers = []
+        markers: list[Marker] = []
         for index, link in enumerate(robot.links):
             for shape in link.shapes:
                 markers.append(shape_marker(shape, world_frame, link.name, len(markers)))
@@ -68,19 +68,20 @@ class LinkMarkers:
             R_BL = link_R[:, 3 * index : 3 * index + 3]
             target[:3] = r_WB + R_WB @ (link_r[:, index] + R_BL @ pose.r)
             target[3:] = quaternion_from_matrix(R_WB @ R_BL @ pose.R)
-        self._template.stamp(time_ns)
-        self._publisher.publish(self._template.serialised())
+        self._publisher.publish(self._template.serialised(stamp_bytes(time_ns)))
 
 
 def goal_markers(
     goal: Goal, path: BasePath, base_shapes: Sequence[Shape], frame: str
 ) -> MarkerArray:
     """Return the base as a ghost at the goal, and the planned path of the base as a line."""
-    markers = []
+    markers: list[Marker] = []
     for shape in base_shapes:
         marker = shape_marker(shape, frame, "goal", len(markers))
         marker.color.a = 0.25
-        marker.pose.position.x, marker.pose.position.y, marker.pose.position.z = goal.position.tolist()
+        marker.pose.position.x, marker.pose.position.y, marker.pose.position.z = (
+            goal.position.tolist()
+        )
         o = marker.pose.orientation
         o.x, o.y, o.z, o.w = goal.quaternion.tolist()
         markers.append(marker)

@@ -17,7 +17,13 @@ from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.errors import CommandError, PlanningError, RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.nodes.cdr import NANOSECONDS, MessageTemplate, TemplateReader
+from spacerobot_ros.nodes.cdr import (
+    NANOSECONDS,
+    MessageTemplate,
+    TemplateReader,
+    raw_publish,
+    stamp_bytes,
+)
 from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
 from spacerobot_ros.nodes.joint_command import JointReader
 from spacerobot_ros.nodes.markers import goal_markers
@@ -68,6 +74,10 @@ class PlannerNode(FlightNode):
         self._robot: SpaceRobot | None = None
         self.plan_time = 0.0
         """Wall time that planning took for the present goal, s."""
+        self.flown_time = 0.0
+        """Simulated time that the schedules flown for the present goal take together, s."""
+        self.ends_at = 0.0
+        """Simulated time at which the present schedule ends, s."""
         super().__init__(name, **kwargs)
 
     # -- life ---------------------------------------------------------------------------------
@@ -83,7 +93,9 @@ class PlannerNode(FlightNode):
         self._odom = TemplateReader(
             Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
         )
-        self._command_topic = self.create_publisher(JointState, "joint_commands", STREAM)
+        self._send_command = raw_publish(
+            self.create_publisher(JointState, "joint_commands", STREAM)
+        )
         self._schedule_topic = self.create_publisher(JointTrajectory, "gait_schedule", LATCHED)
         self._path_topic = self.create_publisher(Path, "planned_path", LATCHED)
         self._marker_topic = self.create_publisher(MarkerArray, "markers", STREAM)
@@ -123,7 +135,8 @@ class PlannerNode(FlightNode):
             },
         )
         n = robot.n
-        self._joints = JointReader(robot.joint_names, ["position", "velocity"])
+        self._joints = JointReader(robot.joint_names, ["position"])
+        self._rates = JointReader(robot.joint_names, ["velocity"])
         self._command = MessageTemplate(
             JointState(
                 name=list(robot.joint_names),
@@ -132,8 +145,10 @@ class PlannerNode(FlightNode):
                 effort=[0.0] * n,
             )
         )
-        self._command_position = self._command.floats("position", n) if n else np.zeros(0)
-        self._command_velocity = self._command.floats("velocity", n) if n else np.zeros(0)
+        self._command_position, self._command_velocity = np.zeros(n), np.zeros(n)
+        if n:
+            self._command.feed("position", self._command_position)
+            self._command.feed("velocity", self._command_velocity)
 
     def _tolerance(self) -> Tolerance:
         values: dict[str, Any] = self.parameters
@@ -218,20 +233,20 @@ class PlannerNode(FlightNode):
         else:
             self._command_position[:] = q
             self._command_velocity[:] = 0.0
-        self._command.stamp(stamp)
-        self._command_topic.publish(self._command.serialised())
+        self._send_command(self._command.serialised(stamp_bytes(stamp)))
 
     def _measured(self) -> RobotState:
         assert self._robot is not None
         self._odom.accept(self._odom_raw)
         pose = self._odom.floats("pose.pose.position.x")
         twist = self._odom.floats("twist.twist.linear.x")
-        q, qdot = (self._joints.values[name].copy() for name in ("position", "velocity"))
+        self._rates.accept(self._joints_raw)
+        q, qdot = self._joints.values["position"].copy(), self._rates.values["velocity"]
         p, L, _ = self._robot.momentum(pose[3:], q, twist[:3], twist[3:], qdot)
         return RobotState(pose[:3].copy(), pose[3:].copy(), q, p, L)
 
     def _plan_proposed(self, stamp: int) -> None:
-        self.plan_time = 0.0
+        self.plan_time = self.flown_time = 0.0
         try:
             self._fly(self._plan(self._proposed, correction=False), stamp)
         except PlanningError as error:
@@ -251,6 +266,8 @@ class PlannerNode(FlightNode):
     def _fly(self, schedule: GaitSchedule, stamp: int) -> None:
         gain = float(self.parameters["shape_gain"])  # type: ignore[arg-type]
         self._follower = GaitFollower(schedule, stamp, gain)
+        self.flown_time += schedule.duration
+        self.ends_at = stamp / NANOSECONDS + schedule.duration
         frame = str(self.parameters["world_frame"])
         self._status.publish(
             PlannerState.EXECUTING,
@@ -292,7 +309,11 @@ class PlannerNode(FlightNode):
         state = self._measured()
         error = PoseError.between(state.position, state.quaternion, self._goal)
         self._follower = None
-        result = {"goal": self._goal, "error": error, "corrections": self._corrections}
+        result: dict[str, Any] = {
+            "goal": self._goal,
+            "error": error,
+            "corrections": self._corrections,
+        }
         left = f"{error.distance:.3g} m and {error.angle:.3g} rad from the goal"
         if self._tolerance().admits(error):
             self._status.publish(PlannerState.REACHED, f"The goal is met: {left}.", **result)

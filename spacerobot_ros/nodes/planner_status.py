@@ -72,4 +72,8 @@ class PlannerStatus:
             )
         )
         logger = self._node.get_logger()
-        (logger.info if level == DiagnosticStatus.OK else logger.warning)(sentence)
+        # Two calls: rclpy refuses one that changes its severity.
+        if level == DiagnosticStatus.OK:
+            logger.info(sentence)
+        else:
+            logger.warning(sentence)

@@ -94,7 +94,7 @@ class PlantNode(FlightNode):
     # -- life ---------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        """Build the plant and its topics; nothing is published yet but the robot description."""
+        """Build the plant and its topics; nothing is published yet."""
         values: dict[str, Any] = self.parameters
         robot = robot_of(values)
         if robot is None:
@@ -102,6 +102,7 @@ class PlantNode(FlightNode):
                 "The plant needs a robot: set parameter 'robot' to a URDF file or the name of a "
                 "robot of this package, or 'robot_description' to a URDF text."
             )
+        self._lockstep = values["time_mode"] == "lockstep"
         self._period_ns = round(NANOSECONDS / values["tick_rate"])
         joints = values["initial_joint_positions"]
         self.plant = VelocityPlant(
@@ -127,19 +128,17 @@ class PlantNode(FlightNode):
         self._report = PlantReport(self, self.plant)
         self._marker_ticks = self._ticks(values["marker_period"])
         self._report_ticks = self._ticks(values["diagnostics_period"])
-        description = self.create_publisher(String, "robot_description", LATCHED)
-        description.publish(String(data=robot.description.urdf))
-        self.create_subscription(
-            JointState, "joint_commands", self._on_command, STREAM, raw=True
-        )
+        self._description = self.create_publisher(String, "robot_description", LATCHED)
+        self.create_subscription(JointState, "joint_commands", self._on_command, STREAM, raw=True)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
 
     def activate(self) -> None:
-        """Publish the present state, and from now on step."""
+        """Publish the robot and its present state, and from now on step."""
         self._running = True
+        self._description.publish(String(data=self.plant.robot.description.urdf))
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        if self.parameters["time_mode"] == "lockstep":
+        if self._lockstep:
             self._waiting = True
             self._readers = self._topics.readers()
             self._timer = self.create_timer(
@@ -218,10 +217,10 @@ class PlantNode(FlightNode):
         except CommandError as error:
             stamp, problem = commands.stamp_ns, str(error)
         velocity = commands.values["velocity"]
-        # A sum is finite only if every term is.
-        if not problem and not math.isfinite(velocity.sum()):
+        # A sum is finite only if every term is; for a few joints a list is summed fastest.
+        if not problem and not math.isfinite(sum(velocity.tolist())):
             problem = f"a velocity is not finite: {velocity.tolist()}"
-        if self.parameters["time_mode"] == "lockstep":
+        if self._lockstep:
             self._on_lockstep_command(stamp, velocity, problem)
         else:
             self._on_realtime_command(stamp, velocity, problem)
@@ -271,7 +270,7 @@ class PlantNode(FlightNode):
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if self._paused and not request.data and self._running:
-            if self.parameters["time_mode"] == "realtime":
+            if not self._lockstep:
                 self._origin_ns = self._steady.now().nanoseconds - self._tick * self._pace_ns
             elif not self._waiting:
                 self._waiting = True

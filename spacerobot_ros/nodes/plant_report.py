@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
@@ -78,8 +80,14 @@ class PlantReport:
                 f"{name}: actuators",
                 moved["limits"],
                 "limits of the URDF hold joints back" if moved["limits"] else "within limits",
-                {f"rate_limited.{j}": c for j, c in zip(joints, plant.velocity_limited, strict=True)}
-                | {f"stroke_limited.{j}": c for j, c in zip(joints, plant.stroke_limited, strict=True)},
+                {
+                    f"rate_limited.{j}": c
+                    for j, c in zip(joints, plant.velocity_limited, strict=True)
+                }
+                | {
+                    f"stroke_limited.{j}": c
+                    for j, c in zip(joints, plant.stroke_limited, strict=True)
+                },
             ),
             _status(
                 f"{name}: momentum",
@@ -106,7 +114,7 @@ class PlantReport:
         return float(np.linalg.norm(self._plant.momentum[first : first + 3] - initial))
 
 
-def _status(name: str, warn: bool, message: str, values: dict[str, object]) -> DiagnosticStatus:
+def _status(name: str, warn: bool, message: str, values: Mapping[str, object]) -> DiagnosticStatus:
     return DiagnosticStatus(
         level=DiagnosticStatus.WARN if warn else DiagnosticStatus.OK,
         name=name,

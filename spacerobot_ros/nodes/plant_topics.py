@@ -13,7 +13,7 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.attitude import matrix_from_quaternion, quaternion_from_matrix
-from spacerobot_ros.nodes.cdr import MessageTemplate
+from spacerobot_ros.nodes.cdr import MessageTemplate, raw_publish, stamp_bytes
 from spacerobot_ros.nodes.flight_node import STREAM
 from spacerobot_ros.nodes.markers import LinkMarkers
 from spacerobot_ros.simulation import VelocityPlant
@@ -65,21 +65,13 @@ class PlantTopics:
         momentum_message.layout.dim = [MultiArrayDimension(label=MOMENTUM_LABEL, size=7, stride=7)]
         momentum = MessageTemplate(momentum_message)
 
-        odom_pose = odom.floats("pose.pose.position.x", 7)
-        base_pose_pose = base_pose.floats("pose.position.x", 7)
-        odom_twist = odom.floats("twist.twist.linear.x", 6)
-        ledger = momentum.floats("data", 7)
-        self._copies = [
-            (odom_pose, plant.pose),
-            (base_pose_pose, plant.pose),
-            (odom_twist, plant.twist),
-            (ledger, plant.momentum),
-        ]
+        odom.feed("pose.pose.position.x", plant.pose)
+        odom.feed("twist.twist.linear.x", plant.twist)
+        base_pose.feed("pose.position.x", plant.pose)
+        momentum.feed("data", plant.momentum)
         if n:
-            self._copies += [
-                (joints.floats("position", n), plant.q),
-                (joints.floats("velocity", n), plant.qdot),
-            ]
+            joints.feed("position", plant.q)
+            joints.feed("velocity", plant.qdot)
         # The clock first: whoever sees a state has seen its time.
         self._streams = [
             (node.create_publisher(kind, topic, STREAM), template)
@@ -93,21 +85,20 @@ class PlantTopics:
         ]
         self._end_effector: tuple[int, Any] | None = None
         self._add_end_effector(node, world_frame, end_effector_frame, pose_message)
+        self._sends = [(raw_publish(publisher), template) for publisher, template in self._streams]
         self._markers = LinkMarkers(node, robot.description, world_frame)
 
     def publish(self, time_ns: int) -> None:
         """Publish the plant's state, stamped ``time_ns``."""
-        for target, source in self._copies:
-            target[:] = source
         if self._end_effector is not None:
             index, target = self._end_effector
             R_WB, r_WB = self._base()
             target[:3] = r_WB + R_WB @ self._plant.link_r[:, index]
             R_WE = R_WB @ self._plant.link_R[:, 3 * index : 3 * index + 3]
             target[3:] = quaternion_from_matrix(R_WE)
-        for publisher, template in self._streams:
-            template.stamp(time_ns)
-            publisher.publish(template.serialised())
+        stamp = stamp_bytes(time_ns)
+        for send, template in self._sends:
+            send(template.serialised(stamp))
 
     def publish_markers(self, time_ns: int) -> None:
         """Publish the links' shapes where they are."""
@@ -129,8 +120,8 @@ class PlantTopics:
         name = name or DEFAULT_END_EFFECTOR
         if name not in links:
             raise ParameterError(
-                f"Parameter 'end_effector_frame' is '{name}', but the robot has no such link; it has "
-                f"{', '.join(links)}."
+                f"Parameter 'end_effector_frame' is '{name}', but the robot has no such link; "
+                f"it has {', '.join(links)}."
             )
         template = MessageTemplate(prototype)
         publisher = node.create_publisher(PoseStamped, "end_effector_pose", STREAM)

@@ -48,7 +48,9 @@ class GaitFollower:
         return not far or late > _LONGEST_SETTLING * 1e9
 
     def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
-        """Write the wanted shape now and the velocities to hold from now (n,) into the arguments."""
+        """Write the wanted shape now (n,) and the velocities to hold from now (n,)."""
         k = self._tick(stamp_ns)
         position[:] = self._positions[k]
-        velocity[:] = self._velocities[k] + self._gain * (self._positions[k] - q)
+        np.subtract(position, q, out=velocity)
+        velocity *= self._gain
+        velocity += self._velocities[k]

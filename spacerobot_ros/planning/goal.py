@@ -47,7 +47,7 @@ class Goal:
 
 @dataclass(frozen=True)
 class RobotState:
-    """Where the robot is: base pose in W, shape, and total momenta in W (about the centre of mass)."""
+    """Where the robot is: base pose in W, shape, total momenta in W (about the centre of mass)."""
 
     position: Array
     quaternion: Array
@@ -58,7 +58,7 @@ class RobotState:
 
 @dataclass(frozen=True)
 class PoseError:
-    """Distance from a goal: ``position`` (3,) in W, m, and ``rotvec`` (3,) in B, rad, still to go."""
+    """What is left to a goal: ``position`` (3,) in W, m, and ``rotvec`` (3,) in B, rad."""
 
     position: Array
     rotvec: Array

@@ -24,10 +24,8 @@ from spacerobot_ros.model.attitude import (
     attitude_error,
     matrix_from_quaternion,
     quaternion_from_rotvec,
-    quaternion_inverse,
     quaternion_multiply,
     rotvec_from_quaternion,
-    unit_quaternion,
 )
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
@@ -131,7 +129,7 @@ class LieBracketGait(GaitMethod):
                 f"{len(self.sliders)} slider(s) of rank {np.linalg.matrix_rank(P)}."
             )
         z0, lower, upper = (x[self.sliders] for x in (state.q, robot.lower, robot.upper))
-        dz, *_ = np.linalg.lstsq(P, shift, rcond=None)
+        dz: Array = np.linalg.lstsq(P, shift, rcond=None)[0].astype(float)
         if np.any(z0 + dz < lower) or np.any(z0 + dz > upper):
             dz = self._within_strokes(P, shift, z0, dz, lower, upper)
         z_f = state.q.copy()
@@ -147,7 +145,7 @@ class LieBracketGait(GaitMethod):
     def _within_strokes(
         self, P: Array, shift: Array, z0: Array, dz: Array, lower: Array, upper: Array
     ) -> Array:
-        """Spread the displacement over more than three sliders, or say which stroke is too short."""
+        """Spread the displacement over more than three sliders, or name the stroke too short."""
         # Bounds must differ for the solver; a slider at its end gets a hair of room.
         room = 1e-12 * (1.0 + np.abs(upper - lower))
         bounded = lsq_linear(P, shift, (lower - z0 - room, upper - z0 + room), method="bvls")
@@ -157,8 +155,8 @@ class LieBracketGait(GaitMethod):
         worst = int(np.argmax(np.maximum(lower - z, z - upper)))
         name = self.robot.joint_names[self.sliders[worst]]
         raise PlanningError(
-            f"The goal is beyond stroke: it needs joint '{name}' at {z[worst]:.4g} m, and its stroke is "
-            f"[{lower[worst]:.4g}, {upper[worst]:.4g}] m."
+            f"The goal is beyond stroke: it needs joint '{name}' at {z[worst]:.4g} m, and its "
+            f"stroke is [{lower[worst]:.4g}, {upper[worst]:.4g}] m."
         )
 
     def _slide(self, z0: Array, z_f: Array) -> Array:
@@ -178,7 +176,7 @@ class LieBracketGait(GaitMethod):
     def _turn(
         self, quaternion: Array, z_f: Array, goal: Goal, correction: bool
     ) -> tuple[Array, int, dict[str, list[float] | float | str]]:
-        """Step 3: one cycle of shapes (m + 1, n), how many of them, and the symbols of the paper."""
+        """Step 3: one cycle of shapes (m + 1, n), how many of them, and the paper's symbols."""
         wanted = attitude_error(quaternion, goal.quaternion)
         if np.linalg.norm(wanted) <= _NO_ROTATION:
             return z_f[np.newaxis].copy(), 0, {"cycles": 0.0}
@@ -186,7 +184,8 @@ class LieBracketGait(GaitMethod):
         omega_d = wanted
         best: tuple[float, _Turn] | None = None
         for _ in range(_MOST_REFINEMENTS):
-            turn = self._fit(np.linalg.solve(brackets, omega_d), triple, z_f, correction)
+            alpha = np.linalg.solve(brackets, omega_d).astype(float)
+            turn = self._fit(alpha, triple, z_f, correction)
             reached = turn.cycles * self._rotation(turn.shapes)
             left = np.linalg.norm(
                 attitude_error(quaternion_from_rotvec(reached), quaternion_from_rotvec(wanted))
@@ -225,9 +224,9 @@ class LieBracketGait(GaitMethod):
         condition, triple, brackets = min(found, key=lambda entry: entry[0])
         if not condition < _WORST_CONDITION:
             raise PlanningError(
-                "The first-order Lie brackets of the sliders do not span the three axes of rotation "
-                f"at the final shape {np.round(z_f, 4).tolist()} (condition number {condition:.2g}): "
-                "the attitude cannot be controlled there by lie_bracket."
+                "The first-order Lie brackets of the sliders do not span the three axes of "
+                f"rotation at the final shape {np.round(z_f, 4).tolist()} (condition number "
+                f"{condition:.2g}): the attitude cannot be controlled there by lie_bracket."
             )
         return triple, brackets
 
@@ -243,8 +242,8 @@ class LieBracketGait(GaitMethod):
         while True:
             if n * self.ticks_a_cycle * self.tick_period > self.longest:
                 raise PlanningError(
-                    f"The turn would take more than {self.longest:.6g} s within the strokes and rates "
-                    f"of the sliders at the final shape {np.round(z_f, 4).tolist()}; "
+                    f"The turn would take more than {self.longest:.6g} s within the strokes and "
+                    f"rates of the sliders at the final shape {np.round(z_f, 4).tolist()}; "
                     "a goal that leaves the sliders more room takes less."
                 )
             shapes = self._cycle(amplitudes, n, triple, z_f)
@@ -275,9 +274,7 @@ class LieBracketGait(GaitMethod):
         b21, b11 = (p23 / a31, p13 / a31) if a31 else (0.0, 0.0)
         return np.array([b11, b12, b21, a22, a31])
 
-    def _cycle(
-        self, amplitudes: Array, n: int, triple: tuple[int, int, int], z_f: Array
-    ) -> Array:
+    def _cycle(self, amplitudes: Array, n: int, triple: tuple[int, int, int], z_f: Array) -> Array:
         """One cycle at its ticks: the integrals of v1, v2, v3 of step 3, from ``zf`` back to it."""
         b11, b12, b21, a22, a31 = amplitudes / math.sqrt(n)
         phi = np.linspace(0.0, 2 * np.pi, self.ticks_a_cycle + 1)
@@ -306,7 +303,8 @@ class LieBracketGait(GaitMethod):
             done = np.unique(np.append(np.arange(0, n, max(1, n // 1000))[1:], n))
             rotation = self._rotation(cycle)
             turned = [
-                quaternion_multiply(attitudes[-1], quaternion_from_rotvec(k * rotation)) for k in done
+                quaternion_multiply(attitudes[-1], quaternion_from_rotvec(k * rotation))
+                for k in done
             ]
             seconds = (len(slide) - 1 + done * self.ticks_a_cycle) * self.tick_period
             time = np.append(time, seconds)

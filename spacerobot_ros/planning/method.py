@@ -14,7 +14,7 @@ from spacerobot_ros.planning.schedule import GaitSchedule
 
 @dataclass(frozen=True)
 class Option:
-    """A parameter of a method: its default sets its type; ``unit`` and ``meaning`` are for people."""
+    """A parameter of a method; the default sets its type, unit and meaning are for people."""
 
     name: str
     default: float | int

@@ -48,7 +48,7 @@ class BasePrediction:
         return attitudes
 
     def positions(self, state: RobotState, time: Array, shapes: Array, quaternions: Array) -> Array:
-        """Return the base position (K, 3) in W: the centre of mass coasts, the base is off it by c(q)."""
+        """Return the base position (K, 3) in W: off the coasting centre of mass by c(q)."""
         robot = self._robot
         start = matrix_from_quaternion(state.quaternion) @ robot.center_of_mass(state.q)
         r_cm = state.position + start

@@ -13,7 +13,7 @@ from spacerobot_ros.planning.goal import Goal
 
 @dataclass(frozen=True)
 class BasePath:
-    """Predicted base poses: ``time`` (K,) in s from the start, ``position`` (K, 3), ``quaternion`` (K, 4)."""
+    """Predicted base: ``time`` (K,) from the start, ``position`` (K, 3), ``quaternion`` (K, 4)."""
 
     time: Array
     position: Array
@@ -62,5 +62,5 @@ class GaitSchedule:
 
     @cached_property
     def velocities(self) -> Array:
-        """The held joint velocities (N, n), m/s or rad/s: they carry the shape exactly from tick to tick."""
+        """Held joint velocities (N, n), m/s or rad/s; they carry the shape from tick to tick."""
         return np.diff(self.positions, axis=0) / self.tick_period

@@ -1,0 +1,83 @@
+# Needs make and Python 3.10 or later, nothing else: all the rest goes into .venv.
+
+PYTHON ?= python3
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/stamp
+# -qq leaves errors only.
+PIP := $(BIN)/python3 -m pip -qq --disable-pip-version-check
+
+# What decides on the dependencies, and what is installed with the package. Directories are among
+# the latter because a deleted file changes nothing else.
+DECLARATION := setup.py setup.cfg
+SOURCES := package.xml LICENSE $(shell find $(wildcard bags config launch resource scripts \
+    spacerobot_ros urdf) -not -path '*/__pycache__*' -not -name '.*')
+
+# The environment has a ROS 2 of its own, which one that the shell has sourced would be mixed with.
+ifdef AMENT_PREFIX_PATH
+unexport LD_LIBRARY_PATH
+endif
+unexport AMENT_PREFIX_PATH PYTHONPATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.SUFFIXES:
+
+.PHONY: help
+help: ## show this list
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
+
+.PHONY: demo
+demo: $(STAMP)/demo ## fly sliding_masses; bag and report are in out/
+	@mkdir -p out
+	$(BIN)/spacerobot run sliding_masses \
+	    --bag out/sliding_masses.mcap --report out/sliding_masses.html
+
+.PHONY: test
+test: $(STAMP)/test ## check style and types, run the tests
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python3 -m pytest
+
+.PHONY: test-slow
+test-slow: $(STAMP)/test ## run the slow tests: long flights, builds with pip and colcon
+	$(BIN)/python3 -m pytest -m slow
+
+.PHONY: clean
+clean: ## remove .venv, caches, and the demo's bag and report
+	rm -rf $(VENV) build/lib build/bdist.* spacerobot_ros.egg-info
+	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -f out/sliding_masses.mcap out/sliding_masses.html
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+	@rmdir build out 2>/dev/null || true
+
+$(STAMP)/venv:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || { \
+	    echo "$(PYTHON) is not a Python 3.10 or later; name one: make PYTHON=python3.12" >&2; \
+	    exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	    echo "$(PYTHON) cannot make a virtual environment;" \
+	    "install its venv module (Debian, Ubuntu: apt install python3-venv)." >&2; \
+	    exit 1; }
+	@echo "Creating $(VENV) (once) ..."
+	@$(PYTHON) -m venv --clear $(VENV)
+	@$(PIP) install 'setuptools>=70.1'
+	@mkdir -p $(STAMP)
+	@touch $@
+
+$(STAMP)/demo: EXTRAS := jazzy
+$(STAMP)/test: EXTRAS := jazzy,test
+
+# A changed declaration or a new stamp: the package with its dependencies. Changed sources: the
+# package alone. What is left in build/lib would be installed again, deleted files too.
+$(STAMP)/demo $(STAMP)/test: $(DECLARATION) $(SOURCES) | $(STAMP)/venv
+	@rm -rf build/lib
+	@echo "Installing spacerobot_ros[$(EXTRAS)] into $(VENV)$(if $(ALL), (once; a minute or two)) ..."
+	@$(PIP) install --no-build-isolation $(if $(ALL),'.[$(EXTRAS)]',--no-deps --force-reinstall .)
+	@rm -rf build/lib build/bdist.* spacerobot_ros.egg-info
+	@rmdir build 2>/dev/null || true
+	@touch $@
+
+ALL = $(filter $(DECLARATION),$?)

@@ -1,0 +1,87 @@
+"""Installation by `pip install .` and, in a ROS 2 workspace, by `colcon build`."""
+
+import os
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = "spacerobot_ros"
+
+
+def files(pattern: str) -> list[str]:
+    """Return the regular files that match `pattern`; hidden files and byte code are left out."""
+    return sorted(
+        path
+        for path in glob(pattern, recursive=True)
+        if os.path.isfile(path) and not path.endswith(".pyc")
+    )
+
+
+def share(folder: str) -> list[tuple[str, list[str]]]:
+    """Return the `data_files` entries that copy `folder`, with its subfolders, to the share."""
+    contents: dict[str, list[str]] = {}
+    for path in files(f"{folder}/**"):
+        contents.setdefault(f"share/{NAME}/{os.path.dirname(path)}", []).append(path)
+    return sorted(contents.items())
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description=(
+        "A ROS 2 flight stack for free-floating space robots: "
+        "plant, gait planner, coordinated control, MCAP recorder."
+    ),
+    maintainer="spacerobot_ros developers",
+    maintainer_email="maintainers@spacerobot.example.org",
+    license="Apache-2.0",
+    python_requires=">=3.10",
+    packages=find_packages(include=["spacerobot_ros*"]),
+    package_data={NAME: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        *share("urdf"),
+        *share("config"),
+        *share("launch"),
+        *share("bags"),
+        # The nodes are files and not console scripts because pip puts every console script into
+        # bin/, where `ros2 run` does not look and a command called `plant` is out of place. As
+        # files they are in lib/spacerobot_ros/ with pip and with colcon.
+        (f"lib/{NAME}", files("scripts/*")),
+    ],
+    entry_points={"console_scripts": ["spacerobot = spacerobot_ros.app.cli:main"]},
+    # rclpy and the messages are no requirement: where ROS 2 is installed they are the system's;
+    # elsewhere the extra `jazzy` brings them.
+    install_requires=[
+        "casadi",
+        "click",
+        "lz4",
+        "matplotlib",
+        "mcap",
+        "numpy>=1.26",
+        "PyYAML",
+        "rosbags",
+        "scipy",
+        "urdf-parser-py",
+        "zstandard",
+    ],
+    extras_require={
+        "jazzy": [
+            "ros-jazzy-common-interfaces",
+            "ros-jazzy-rclpy[fastrtps]",
+        ],
+        "test": [
+            "catkin_pkg",
+            "hypothesis",
+            "mcap-ros2-support",
+            'mujoco>=4; python_version >= "3.11"',
+            "mypy",
+            "pin",
+            "pytest>=8",
+            "ruff",
+            "setuptools",
+            "types-PyYAML",
+        ],
+    },
+)

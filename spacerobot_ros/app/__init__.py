@@ -1,0 +1,1 @@
+"""Command line, scenario runner and reports; composes the nodes in one process."""

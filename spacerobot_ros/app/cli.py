@@ -1,0 +1,239 @@
+"""The command ``spacerobot``."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import click
+
+from spacerobot_ros import __version__
+from spacerobot_ros.app.scenario import (
+    Scenario,
+    goal_from_rotvec,
+    load_scenario,
+    parse_setting,
+    scenario_names,
+)
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.planning import METHODS, Goal
+
+GOAL_NOT_REACHED = 1
+BAD_INPUT = 2
+
+
+def _sentences(command: Callable[..., None]) -> Callable[..., None]:
+    """End a command with one sentence and exit code 2 where its input is refused."""
+
+    @wraps(command)
+    def wrapped(*arguments: Any, **options: Any) -> None:
+        try:
+            command(*arguments, **options)
+        except SpaceRobotError as error:
+            click.echo(str(error), err=True)
+            sys.exit(BAD_INPUT)
+        except ImportError as error:
+            if error.name and error.name.split(".")[0] in (
+                "rclpy",
+                "rosidl_parser",
+                "ament_index_python",
+            ):
+                click.echo(
+                    f"ROS 2 was not found ({error}); source its setup file, or install "
+                    "spacerobot_ros with its extra [jazzy].",
+                    err=True,
+                )
+                sys.exit(BAD_INPUT)
+            raise
+
+    return wrapped
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(__version__, prog_name="spacerobot")
+def main() -> None:
+    """Fly free-floating space robots: plan gaits, run them through ROS 2, record and report."""
+
+
+@main.command()
+@click.argument("scenario")
+@click.option(
+    "--goal", nargs=7, type=float, metavar="X Y Z QX QY QZ QW", help="Goal pose (m, quaternion)."
+)
+@click.option(
+    "--goal-rotvec",
+    nargs=3,
+    type=float,
+    metavar="RX RY RZ",
+    help="Attitude of the goal as exponential coordinates (rad).",
+)
+@click.option("--method", type=click.Choice(sorted(METHODS)), help="Gait method of the planner.")
+@click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE")
+@click.option("--bag", type=click.Path(path_type=Path), help="Bag to write [out/SCENARIO.mcap].")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the result.")
+@click.option("--report", type=click.Path(path_type=Path), help="Write a picture report (HTML).")
+@click.option(
+    "--realtime",
+    is_flag=False,
+    flag_value=1.0,
+    type=click.FloatRange(min=0.0, min_open=True),
+    metavar="[FACTOR]",
+    help="Run on the wall clock, FACTOR times as fast.",
+)
+@_sentences
+def run(
+    scenario: str,
+    goal: tuple[float, ...] | None,
+    goal_rotvec: tuple[float, ...] | None,
+    method: str | None,
+    settings: tuple[str, ...],
+    bag: Path | None,
+    json_file: Path | None,
+    report: Path | None,
+    realtime: float | None,
+) -> None:
+    """Fly SCENARIO (a name or a parameter file) to its goal and record it.
+
+    Exit code 0: the goal was reached within tolerance; 1: it was not; 2: bad input.
+    """
+    chosen = _chosen(scenario, goal, goal_rotvec, method, settings, realtime)
+    path = bag or Path("out") / f"{chosen.name}.mcap"
+    from spacerobot_ros.app.run import run_scenario
+
+    with _progress(chosen.name) as progress:
+        result = run_scenario(chosen, path, progress)
+    if json_file is not None:
+        result.write_json(json_file)
+    for line in (*_summary_lines(result.summary), *_published_lines(chosen, result.summary)):
+        click.echo(line)
+    if report is not None:
+        from spacerobot_ros.app.report import write_report
+
+        write_report(path, report)
+        click.echo(f"report      {report}")
+    if not result.succeeded:
+        click.echo(result.sentence, err=True)
+        sys.exit(GOAL_NOT_REACHED)
+
+
+@main.command()
+def scenarios() -> None:
+    """List the scenarios that come with the package."""
+    for name in scenario_names():
+        click.echo(f"{name:<22}{load_scenario(name).description}")
+
+
+@main.command("report")
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option("--output", "-o", type=click.Path(path_type=Path), help="HTML file [beside the bag].")
+@_sentences
+def report_command(bag: Path, output: Path | None) -> None:
+    """Make a picture report of a BAG."""
+    from spacerobot_ros.app.report import write_report
+
+    target = output or bag.with_suffix(".html")
+    write_report(bag, target)
+    click.echo(f"report      {target}")
+
+
+@main.command()
+@click.option("--ticks", default=20_000, show_default=True, type=click.IntRange(min=100))
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures.")
+@_sentences
+def bench(ticks: int, json_file: Path | None) -> None:
+    """Measure the speed of the stack against a bare ping-pong in the same run."""
+    from spacerobot_ros.app.bench import run_benchmark
+
+    for line in run_benchmark(ticks, json_file):
+        click.echo(line)
+
+
+def _chosen(
+    name: str,
+    goal: tuple[float, ...] | None,
+    goal_rotvec: tuple[float, ...] | None,
+    method: str | None,
+    settings: tuple[str, ...],
+    realtime: float | None,
+) -> Scenario:
+    """Return the scenario with what the command line changes."""
+    scenario = load_scenario(name)
+    # Published figures belong to the published goal.
+    if goal is not None:
+        scenario = replace(scenario, goal=Goal.checked(goal[:3], goal[3:]), published=())
+    if goal_rotvec is not None:
+        position = scenario.goal.position.tolist()
+        scenario = replace(scenario, goal=goal_from_rotvec(position, goal_rotvec), published=())
+    for text in settings:
+        node, parameter, value = parse_setting(text)
+        scenario = scenario.with_overrides(node, {parameter: value})
+    if method is not None:
+        scenario = scenario.with_overrides("planner", {"method": method})
+    if realtime is not None:
+        pace = {"time_mode": "realtime", "real_time_factor": realtime}
+        scenario = scenario.with_overrides("plant", pace)
+    return scenario
+
+
+@contextmanager
+def _progress(label: str) -> Iterator[Callable[[float, float], None]]:
+    """Show simulated time against the end of the schedule, where somebody is looking."""
+    with click.progressbar(
+        length=1000, label=label, file=sys.stderr, hidden=not sys.stderr.isatty()
+    ) as bar:
+
+        def show(now: float, end: float) -> None:
+            share = min(now / end, 1.0) if end > 0 else 0.0
+            bar.update(max(0, int(1000 * share) - bar.pos))
+
+        yield show
+
+
+def _summary_lines(summary: dict[str, Any]) -> list[str]:
+    """Return the result as lines for people."""
+
+    def numbers(values: list[float], digits: int = 5) -> str:
+        return ", ".join(f"{x:.{digits}f}" for x in values)
+
+    degrees = math.degrees(summary["attitude_error_rad"])
+    return [
+        f"{summary['scenario']}, {summary['method']}: {summary['message']}",
+        f"position    ({numbers(summary['final_position_m'])}) m, "
+        f"{summary['position_error_m']:.3g} m from the goal",
+        f"attitude    ({numbers(summary['final_attitude_rotvec_rad'])}) rad, "
+        f"{summary['attitude_error_rad']:.3g} rad = {degrees:.3g} deg from the goal",
+        f"shape       ({numbers(summary['final_joint_positions'])})",
+        f"manoeuvre   {summary['manoeuvre_time_s']:.6g} s, "
+        f"{summary['corrections']} correction(s), planned in {summary['plan_time_s']:.3f} s",
+        f"flight      {summary['ticks']} ticks in {summary['wall_time_s']:.2f} s: "
+        f"{summary['ticks_per_s']:.0f} ticks/s, {summary['real_time_factor']:.0f} times real time",
+        f"momentum    changed by at most {summary['linear_momentum_drift']:.1e} kg m/s and "
+        f"{summary['angular_momentum_drift']:.1e} kg m^2/s",
+        f"bag         {summary['bag']} ({summary['messages_recorded']} messages)",
+    ]
+
+
+def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
+    """Return what a publication prints beside what was measured."""
+    lines = []
+    for row in scenario.published:
+        measured = summary.get(row.quantity, summary["gait"].get(row.quantity))
+        if isinstance(measured, list):
+            printed, found = (
+                "(" + ", ".join(f"{x:.4f}" for x in values) + ")"
+                for values in (row.printed, measured)
+            )
+            lines.append(f"  {row.quantity:<26}{printed:<30}{found}")
+            if row.note:
+                lines.append(f"    {row.note}")
+    return [f"  {'':<26}{'printed in the paper':<30}here", *lines] if lines else []
+
+
+if __name__ == "__main__":
+    main()

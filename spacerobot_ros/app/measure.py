@@ -1,0 +1,74 @@
+"""What a run came to, measured from what the plant published."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spacerobot_ros.model.attitude import rotvec_from_quaternion
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning import Goal, PoseError
+from spacerobot_ros.recording import Bag, RecordingError
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Time series of a bag: ``time`` (N,) s, base ``position`` (N, 3) m and ``quaternion`` (N, 4),
+    ``joints`` and ``joint_rates`` (N, n), ``momentum`` (N, 7) as on the topic.
+    """
+
+    time: Array
+    position: Array
+    quaternion: Array
+    joint_names: list[str]
+    joints: Array
+    joint_rates: Array
+    momentum: Array
+
+    @classmethod
+    def of(cls, bag: Bag, namespace: str = "") -> Measured:
+        """Take the series out of a bag.
+
+        Raises
+        ------
+        RecordingError
+            A topic is missing or empty.
+        """
+        topics = [f"{namespace}/{name}" for name in ("odom", "joint_states", "momentum")]
+        for topic in topics:
+            if topic not in bag.topics or not bag.message_count(topic):
+                raise RecordingError(f"The bag holds no message on {topic}: no plant was recorded.")
+        odom, joints, momentum = (bag[topic] for topic in topics)
+        pose = "pose.pose"
+        return cls(
+            time=odom.stamp,
+            position=np.column_stack([odom.field(f"{pose}.position.{x}") for x in "xyz"]),
+            quaternion=np.column_stack([odom.field(f"{pose}.orientation.{x}") for x in "xyzw"]),
+            joint_names=list(joints.field("name")[0]),
+            joints=np.asarray(joints.field("position")),
+            joint_rates=np.asarray(joints.field("velocity")),
+            momentum=np.asarray(momentum.field("data")),
+        )
+
+    @property
+    def linear_drift(self) -> float:
+        """Largest change of the total linear momentum, kg m/s."""
+        return _largest_change(self.momentum[:, :3])
+
+    @property
+    def angular_drift(self) -> float:
+        """Largest change of the total angular momentum about the centre of mass, kg m^2/s."""
+        return _largest_change(self.momentum[:, 3:6])
+
+    def rotvecs(self) -> Array:
+        """Return the attitude as exponential coordinates (N, 3), rad."""
+        return np.array([rotvec_from_quaternion(q) for q in self.quaternion])
+
+    def final_error(self, goal: Goal) -> PoseError:
+        """Return what the last pose leaves to the goal."""
+        return PoseError.between(self.position[-1], self.quaternion[-1], goal)
+
+
+def _largest_change(vectors: Array) -> float:
+    return float(np.linalg.norm(vectors - vectors[0], axis=1).max())

@@ -1,0 +1,161 @@
+"""Scenarios: ROS parameter files with a section that says what is to be reached."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.model.attitude import quaternion_from_rotvec
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.resources import resource_names, share_directory
+
+NODES = ("plant", "planner", "recorder")
+"""The nodes that a scenario may set parameters of."""
+
+_KEYS = ("description", "goal_position", "goal_orientation", "goal_rotvec", "published")
+
+
+@dataclass(frozen=True)
+class Published:
+    """A figure that a publication prints for this scenario, to stand beside the measured one.
+
+    ``quantity`` is a key of the run's summary, or a value of the planner's status; ``note`` says
+    what is known about the printed figure (a misprint, an integration error).
+    """
+
+    quantity: str
+    printed: list[float]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A parameter file and its goal; ``overrides``, parameters by node, go before the file."""
+
+    name: str
+    path: Path
+    description: str
+    goal: Goal
+    published: tuple[Published, ...]
+    overrides: Mapping[str, Mapping[str, Any]]
+
+    @property
+    def lockstep(self) -> bool:
+        """Whether the plant waits for commands instead of the wall clock (unless overridden)."""
+        return self.overrides.get("plant", {}).get("time_mode", "lockstep") == "lockstep"
+
+    def with_overrides(self, node: str, values: Mapping[str, Any]) -> Scenario:
+        """Return the scenario with more parameters of one node set."""
+        merged = {**self.overrides, node: {**self.overrides.get(node, {}), **values}}
+        return replace(self, overrides=merged)
+
+
+def load_scenario(name: str) -> Scenario:
+    """Return a scenario of this package by name, or of any parameter file by path.
+
+    Raises
+    ------
+    ParameterError
+        There is no such scenario, or its file is broken; the sentence names it.
+    """
+    path = Path(name)
+    if path.suffix not in (".yaml", ".yml"):
+        path = share_directory() / "config" / f"{name}.yaml"
+    if not path.is_file():
+        known = ", ".join(scenario_names())
+        raise ParameterError(
+            f"There is no scenario '{name}'; there are: {known}, or any YAML file."
+        )
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise ParameterError(f"The scenario file {path} cannot be read: {reason}.") from error
+    section = content.get("scenario") if isinstance(content, dict) else None
+    values = section.get("ros__parameters") if isinstance(section, dict) else None
+    if not isinstance(values, dict):
+        raise ParameterError(
+            f"The scenario file {path} has no 'scenario: ros__parameters:' section with a goal."
+        )
+    unknown = sorted(set(values) - set(_KEYS))
+    if unknown:
+        raise ParameterError(
+            f"The scenario file {path} has an unknown key '{unknown[0]}' in its scenario section; "
+            f"it takes {', '.join(_KEYS)}."
+        )
+    return Scenario(
+        name=path.stem,
+        path=path.resolve(),
+        description=str(values.get("description", "")),
+        goal=_goal(values, path),
+        published=_published(values.get("published", {}), path),
+        overrides={},
+    )
+
+
+def scenario_names() -> list[str]:
+    """Return the names of the scenarios that come with the package."""
+    return resource_names("config", ".yaml")
+
+
+def goal_from_rotvec(position: Sequence[float], rotvec: Sequence[float]) -> Goal:
+    """Return the goal at a position (m) with the attitude ``exp(hat(rotvec))`` (rad)."""
+    if not np.all(np.isfinite(rotvec)):
+        raise PlanningError(f"The rotation vector {list(rotvec)} is not finite.")
+    return Goal.checked(position, quaternion_from_rotvec(rotvec))
+
+
+def parse_setting(text: str) -> tuple[str, str, Any]:
+    """Split ``node.parameter=value``; the value is read as YAML.
+
+    Raises
+    ------
+    ParameterError
+        The text has another form, or names no node.
+    """
+    key, equals, value = text.partition("=")
+    node, dot, name = key.strip().partition(".")
+    if not equals or not dot or node not in NODES or not name:
+        raise ParameterError(
+            f"'{text}' is not node.parameter=value with one of the nodes {', '.join(NODES)}."
+        )
+    try:
+        parsed = yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise ParameterError(f"The value in '{text}' cannot be read.") from None
+    if isinstance(parsed, str):
+        # YAML wants a dot in 1e-3; people do not write it.
+        try:
+            return node, name, float(parsed)
+        except ValueError:
+            return node, name, parsed
+    return node, name, parsed
+
+
+def _published(rows: Any, path: Path) -> tuple[Published, ...]:
+    try:
+        return tuple(
+            Published(quantity, [float(x) for x in row["printed"]], str(row.get("note", "")))
+            for quantity, row in rows.items()
+        )
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ParameterError(
+            f"The section 'published' of the scenario file {path} is not "
+            f"quantity: {{printed: [numbers], note: text}}: {error!r}."
+        ) from error
+
+
+def _goal(values: Mapping[str, Any], path: Path) -> Goal:
+    try:
+        position = values.get("goal_position", [0.0, 0.0, 0.0])
+        if "goal_rotvec" in values:
+            return goal_from_rotvec(position, values["goal_rotvec"])
+        return Goal.checked(position, values.get("goal_orientation", [0.0, 0.0, 0.0, 1.0]))
+    except (PlanningError, ValueError, TypeError) as error:
+        raise ParameterError(f"The goal of the scenario file {path} is refused: {error}") from error

@@ -1,0 +1,266 @@
+"""The recorder node: every topic as it was published, into an MCAP bag."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+from rclpy.clock import Clock, ClockType
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from spacerobot_ros import __version__
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.nodes.cdr import NANOSECONDS
+from spacerobot_ros.nodes.flight_node import FlightNode, run_node
+from spacerobot_ros.nodes.parameters import ParameterSpec
+from spacerobot_ros.recording import BagWriter, QosProfile, RecordingError
+
+_QUEUE = 2000
+"""Messages a subscription may be behind; the events executor wedges above 5000."""
+
+_SCAN_PERIOD = 0.1
+"""Wall s between two looks for new topics."""
+
+_NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event")
+"""Ends of topics with the middleware's own chatter, left out unless asked for by name."""
+
+
+class RecorderNode(FlightNode):
+    """Records topics as raw bytes, as rosbag2 would.
+
+    Messages carry the time of /clock; without a clock, wall time. What comes before the first
+    clock message gets that one's time.
+    """
+
+    SPECS: ClassVar = (
+        ParameterSpec("bag", "", "", "file to write; '': spacerobot-<date>-<time>.mcap here"),
+        ParameterSpec(
+            "topics", "", "", "names to record, separated by spaces; '': all of the stack"
+        ),
+        ParameterSpec(
+            "compression", "zstd", "", "of the bag's chunks", choices=("zstd", "lz4", "none")
+        ),
+        ParameterSpec("flush_period", 0.5, "s", "wall time that a kill can lose at most", 0.01),
+    )
+
+    def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
+        self._writer: BagWriter | None = None
+        self._context: dict[str, dict[str, str]] = {}
+        super().__init__(name, **kwargs)
+
+    # -- life ---------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Open the bag and look for topics; they are subscribed, and recorded once active."""
+        path = str(self.parameters["bag"]) or time.strftime("spacerobot-%Y%m%d-%H%M%S.mcap")
+        self._writer = BagWriter(path, compression=str(self.parameters["compression"]))
+        self._wanted = {
+            self.resolve_topic_name(topic) for topic in str(self.parameters["topics"]).split()
+        }
+        self._recorded: dict[str, int] = {}
+        self._unknown: set[str] = set()
+        self._early: list[tuple[int, bytes, int]] | None = []
+        self._now = 0
+        self._now_stamp = b""
+        self._active = False
+        self.messages_recorded = 0
+        self.failure: RecordingError | None = None
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_SCAN_PERIOD, self.scan, clock=steady)
+        flush_period = float(self.parameters["flush_period"])  # type: ignore[arg-type]
+        self.create_timer(flush_period, self._flush, clock=steady)
+        self.describe("spacerobot", {"version": __version__})
+        self.scan()
+
+    def activate(self) -> None:
+        """Record from now on."""
+        self._active = True
+
+    def deactivate(self) -> None:
+        """Pause: what arrives is not recorded."""
+        self._active = False
+
+    def cleanup(self) -> None:
+        """Complete the bag.
+
+        Raises
+        ------
+        RecordingError
+            The disk refused what was left.
+        """
+        if self._writer is not None:
+            self._release_early(self._wall_ns())
+            writer, self._writer = self._writer, None
+            writer.close()
+
+    # -- for whoever composes the nodes -------------------------------------------------------
+
+    @property
+    def bag_path(self) -> str:
+        """File that is being written, or was last."""
+        return str(self._writer.path) if self._writer is not None else ""
+
+    @property
+    def topics(self) -> set[str]:
+        """Full names of the topics that are subscribed."""
+        return set(self._recorded)
+
+    def describe(self, name: str, values: dict[str, str]) -> None:
+        """Put named values into the bag (parameters, seed, version)."""
+        if self._writer is not None:
+            self._guarded(lambda writer: writer.add_metadata(name, values))
+
+    def attach(self, name: str, data: bytes, media_type: str) -> None:
+        """Put a whole file into the bag (the URDF)."""
+        self._guarded(lambda writer: writer.add_attachment(name, data, media_type, self._now))
+
+    def scan(self) -> None:
+        """Subscribe to topics that have appeared."""
+        if self._writer is None:
+            return
+        for topic, types in self.get_topic_names_and_types():
+            chosen = topic in self._wanted if self._wanted else not topic.endswith(_NOT_RECORDED)
+            if chosen and topic not in self._recorded and topic not in self._unknown:
+                self._record(topic, types[0])
+
+    # -- recording ----------------------------------------------------------------------------
+
+    def _record(self, topic: str, type_name: str) -> None:
+        infos = self.get_publishers_info_by_topic(topic)
+        if not infos:
+            return  # Only readers so far: its quality of service is not known yet.
+        try:
+            message_type = _message_class(type_name)
+            channel = self._add_topic(topic, type_name, infos[0].qos_profile)
+        except SpaceRobotError as error:
+            self._unknown.add(topic)
+            self.get_logger().warning(f"Topic '{topic}' is not recorded: {error}")
+            return
+        reliable = all(i.qos_profile.reliability == ReliabilityPolicy.RELIABLE for i in infos)
+        latched = all(i.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for i in infos)
+        qos = QoSProfile(
+            depth=_QUEUE,
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE),
+        )
+        self._recorded[topic] = channel
+        self.create_subscription(
+            message_type, topic, self._callback(topic, type_name, channel), qos, raw=True
+        )
+
+    def _add_topic(self, topic: str, type_name: str, qos: QoSProfile) -> int:
+        assert self._writer is not None
+        return self._writer.add_topic(
+            topic,
+            type_name,
+            QosProfile(
+                history=qos.history.name.lower(),
+                depth=qos.depth,
+                reliability=qos.reliability.name.lower(),
+                durability=qos.durability.name.lower(),
+                liveliness=qos.liveliness.name.lower(),
+            ),
+        )
+
+    def _callback(self, topic: str, type_name: str, channel: int) -> Callable[[bytes], None]:
+        """Return what takes a topic's messages: the clock sets the time of all others."""
+        assert self._writer is not None
+        write = self._writer.write
+
+        def store(raw: bytes, published_ns: int) -> None:
+            if not self._active:
+                return
+            if self._early is not None:
+                self._early.append((channel, raw, published_ns))
+                return
+            try:
+                write(channel, raw, self._now, published_ns)
+            except RecordingError as error:
+                self._fail(error)
+                return
+            self.messages_recorded += 1
+
+        def on_clock(raw: bytes) -> None:
+            self._now, self._now_stamp = _time_at(raw), raw[4:12]
+            if self._early is not None:
+                self._release_early(self._now)
+            store(raw, self._now)
+
+        def on_stamped(raw: bytes) -> None:
+            now = raw[4:12] == self._now_stamp
+            store(raw, self._now if now else _time_at(raw) or self._now)
+
+        if topic == "/clock":
+            return on_clock
+        header = next(iter(_message_class(type_name).get_fields_and_field_types().values()), "")
+        if header == "std_msgs/Header":
+            return on_stamped
+        return lambda raw: store(raw, self._now)
+
+    def _release_early(self, now_ns: int) -> None:
+        """Write what came before the first time was known."""
+        early, self._early = self._early or [], None
+        self._now = now_ns
+
+        def write_all(writer: BagWriter) -> None:
+            for channel, raw, published_ns in early:
+                writer.write(channel, raw, now_ns, published_ns or now_ns)
+                self.messages_recorded += 1
+
+        self._guarded(write_all)
+
+    def _flush(self) -> None:
+        if self._early and not self.count_publishers("/clock"):
+            self._release_early(self._wall_ns())
+        if "/clock" not in self._recorded and self._early is None:
+            self._now = self._wall_ns()
+        self._guarded(lambda writer: writer.flush())
+
+    def _wall_ns(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
+
+    def _guarded(self, act: Callable[[BagWriter], None]) -> None:
+        if self._writer is None or self.failure is not None:
+            return
+        try:
+            act(self._writer)
+        except RecordingError as error:
+            self._fail(error)
+
+    def _fail(self, error: RecordingError) -> None:
+        """The disk is full or gone: say so once, keep what is written, let the others fly on."""
+        self.failure = error
+        self._active = False
+        self.get_logger().error(f"Recording has ended: {error}")
+
+
+def parameters_of(node: FlightNode) -> dict[str, str]:
+    """Return a node's parameters as JSON texts by name, for a bag's metadata."""
+    return {name: json.dumps(value) for name, value in node.parameters.items()}
+
+
+def _message_class(type_name: str) -> Any:
+    package, _, name = type_name.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError):
+        raise SpaceRobotError(f"its type {type_name} is not installed here.") from None
+
+
+def _time_at(raw: bytes) -> int:
+    """Stamp in ns of a message that begins with a time or a header; 0 if it is before zero."""
+    seconds = int.from_bytes(raw[4:8], "little", signed=True)
+    return max(seconds * NANOSECONDS + int.from_bytes(raw[8:12], "little"), 0)
+
+
+def main() -> None:
+    """Record until SIGINT or SIGTERM."""
+    sys.exit(run_node(RecorderNode))
+
+
+if __name__ == "__main__":
+    main()

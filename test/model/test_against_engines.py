@@ -1,0 +1,240 @@
+"""The model against Pinocchio and MuJoCo on random robots; compiled code against interpreted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from support.oracles import (
+    ENGINES,
+    Array,
+    Motion,
+    Oracle,
+    assert_agrees,
+    random_motion,
+)
+from support.random_robots import random_chain_urdf, random_robot_urdf
+
+from spacerobot_ros.model import SpaceRobot
+
+SEEDS = range(10)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A random robot in a random state, with forces on it, and the engines that know it too."""
+
+    robot: SpaceRobot
+    motion: Motion
+    v_WB_B: Array
+    wrench_B: Array
+    tau: Array
+    momentum_W: Array
+    engines: dict[str, Oracle]
+
+
+@cache
+def random_case(seed: int) -> Case:
+    rng = np.random.default_rng(seed)
+    urdf = random_robot_urdf(rng, joints=3 + seed % 4)
+    robot = SpaceRobot.from_urdf(urdf)
+    return Case(
+        robot=robot,
+        motion=random_motion(rng, robot.n),
+        v_WB_B=rng.uniform(-1.0, 1.0, 3),
+        wrench_B=rng.uniform(-10.0, 10.0, 6),
+        tau=rng.uniform(-5.0, 5.0, robot.n),
+        momentum_W=rng.uniform(-5.0, 5.0, 6),
+        engines={engine.__name__: engine(urdf, robot.joint_names) for engine in ENGINES},
+    )
+
+
+@pytest.fixture(params=SEEDS, ids=lambda seed: f"robot{seed}")
+def case(request: pytest.FixtureRequest) -> Case:
+    return random_case(request.param)
+
+
+@pytest.fixture(params=[engine.__name__ for engine in ENGINES])
+def engine(request: pytest.FixtureRequest, case: Case) -> Oracle:
+    return case.engines[request.param]
+
+
+def test_robots_have_every_kind_of_joint() -> None:
+    for seed in SEEDS:
+        robot = random_case(seed).robot
+        kinds = {joint.kind.value for joint in robot.description.joints}
+        assert kinds == {"prismatic", "revolute", "continuous", "fixed"}
+        assert np.linalg.norm(robot.description.bodies[0].inertia.com) > 0.01
+        children = [body.parent for body in robot.description.bodies[1:]]
+        assert len(set(children)) < len(children), "the tree branches"
+
+
+def test_inertia_matrix(case: Case, engine: Oracle) -> None:
+    H = case.robot.inertia_matrix(case.motion.q)
+    assert_agrees(H, engine.mass_matrix(case.motion))
+    assert np.linalg.eigvalsh(H)[0] > 0
+
+
+def test_bias(case: Case, engine: Oracle) -> None:
+    m = case.motion
+    C = case.robot.bias(m.q, m.v_cm_B, m.omega_WB_B, m.qdot)
+    assert_agrees(C, engine.bias(m))
+
+
+def test_bias_from_force_free_motion(case: Case, engine: Oracle) -> None:
+    m = case.motion
+    C = case.robot.bias(m.q, m.v_cm_B, m.omega_WB_B, m.qdot)
+    z0ddot = engine.forward_dynamics(m, np.zeros(6), np.zeros(case.robot.n))
+    assert_agrees(C, -case.robot.inertia_matrix(m.q) @ z0ddot)
+
+
+def test_forward_dynamics(case: Case, engine: Oracle) -> None:
+    m = case.motion
+    z0ddot = case.robot.forward_dynamics(
+        m.q, m.v_cm_B, m.omega_WB_B, m.qdot, case.wrench_B, case.tau
+    )
+    assert_agrees(z0ddot, engine.forward_dynamics(m, case.wrench_B, case.tau))
+
+
+def test_connection(case: Case, engine: Oracle) -> None:
+    assert_agrees(case.robot.connection(case.motion.q), engine.connection(case.motion.q))
+
+
+def test_base_twist(case: Case, engine: Oracle) -> None:
+    m = case.motion
+    p_W, L_W = np.split(case.momentum_W, 2)
+    twist = np.concatenate(case.robot.base_twist(m.quaternion_WB, m.q, m.qdot, p_W, L_W))
+    assert_agrees(twist, engine.base_twist(m.q, m.qdot, m.quaternion_WB, case.momentum_W))
+
+
+def test_center_of_mass(case: Case, engine: Oracle) -> None:
+    assert_agrees(case.robot.center_of_mass(case.motion.q), engine.center_of_mass(case.motion.q))
+
+
+def test_link_poses(case: Case, engine: Oracle) -> None:
+    for link in case.robot.link_names:
+        R, r = case.robot.link_pose(link, case.motion.q)
+        R_expected, r_expected = engine.link_pose(link, case.motion.q)
+        assert_agrees(R, R_expected)
+        assert_agrees(r, r_expected)
+
+
+def test_link_jacobians(case: Case, engine: Oracle) -> None:
+    for link in case.robot.link_names:
+        assert_agrees(case.robot.jacobian(link, case.motion.q), engine.jacobian(link, case.motion))
+
+
+def test_momentum_and_energy(case: Case, engine: Oracle) -> None:
+    m = case.motion
+    found = case.robot.momentum(m.quaternion_WB, m.q, case.v_WB_B, m.omega_WB_B, m.qdot)
+    expected = engine.momentum(m, case.v_WB_B)
+    for index in range(3):
+        assert_agrees(found[index], expected[index])
+
+
+QUANTITIES: dict[str, Callable[[SpaceRobot, Case], Array]] = {
+    "center_of_mass": lambda robot, c: robot.center_of_mass(c.motion.q),
+    "link_poses": lambda robot, c: np.column_stack(robot.link_pose("tool_frame", c.motion.q)),
+    "inertia_matrix": lambda robot, c: robot.inertia_matrix(c.motion.q),
+    "bias": lambda robot, c: robot.bias(
+        c.motion.q, c.motion.v_cm_B, c.motion.omega_WB_B, c.motion.qdot
+    ),
+    "forward_dynamics": lambda robot, c: robot.forward_dynamics(
+        c.motion.q, c.motion.v_cm_B, c.motion.omega_WB_B, c.motion.qdot, c.wrench_B, c.tau
+    ),
+    "jacobian:tool_frame": lambda robot, c: robot.jacobian("tool_frame", c.motion.q),
+    "connection": lambda robot, c: robot.connection(c.motion.q),
+    "momentum": lambda robot, c: np.concatenate(
+        [
+            np.atleast_1d(x)
+            for x in robot.momentum(
+                c.motion.quaternion_WB, c.motion.q, c.v_WB_B, c.motion.omega_WB_B, c.motion.qdot
+            )
+        ]
+    ),
+    "base_twist": lambda robot, c: np.concatenate(
+        robot.base_twist(
+            c.motion.quaternion_WB, c.motion.q, c.motion.qdot, *np.split(c.momentum_W, 2)
+        )
+    ),
+}
+
+
+def test_compiled_and_interpreted_numbers_agree(
+    compiled_code: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = random_case(0)
+    compiled = SpaceRobot(case.robot.description)
+    numbers = {name: evaluate(compiled, case) for name, evaluate in QUANTITIES.items()}
+    assert {compiled.function(name).class_name() for name in QUANTITIES} == {"External"}
+    assert len(list(compiled_code.glob("*.so"))) >= len(QUANTITIES)
+
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    interpreted = SpaceRobot(case.robot.description)
+    for name, evaluate in QUANTITIES.items():
+        assert_agrees(numbers[name], evaluate(interpreted, case), tolerance=1e-14)
+        assert interpreted.function(name).class_name() != "External"
+
+
+def test_compiled_numbers_agree_with_the_engines(compiled_code: Path) -> None:
+    case = random_case(0)
+    robot, m = SpaceRobot(case.robot.description), case.motion
+    for engine in case.engines.values():
+        assert_agrees(QUANTITIES["inertia_matrix"](robot, case), engine.mass_matrix(m))
+        assert_agrees(QUANTITIES["bias"](robot, case), engine.bias(m))
+        assert_agrees(
+            QUANTITIES["forward_dynamics"](robot, case),
+            engine.forward_dynamics(m, case.wrench_B, case.tau),
+        )
+        assert_agrees(QUANTITIES["connection"](robot, case), engine.connection(m.q))
+
+
+def test_buffers_keep_the_last_arguments_and_results_in_place() -> None:
+    case = random_case(0)
+    buffer = case.robot.buffered("inertia_matrix")
+    (H,) = buffer.outputs
+    for shape in (case.motion.q, -case.motion.q):
+        buffer.inputs[0][:] = shape
+        buffer.evaluate()
+        assert_agrees(H, case.robot.inertia_matrix(shape), tolerance=0.0)
+        plain = case.robot.function("inertia_matrix")(shape)
+        assert isinstance(plain, ca.DM)
+        assert_agrees(H, np.array(plain), tolerance=0.0)
+
+
+def test_unknown_link_is_named() -> None:
+    robot = random_case(0).robot
+    with pytest.raises(KeyError, match=r"no link 'thumb'; it has .*base_link"):
+        robot.link_pose("thumb", np.zeros(robot.n))
+    with pytest.raises(KeyError, match="no link 'thumb'"):
+        robot.jacobian("thumb", np.zeros(robot.n))
+
+
+def test_one_joint_keeps_its_shapes() -> None:
+    rng = np.random.default_rng(11)
+    urdf = random_chain_urdf(rng, 1)
+    robot = SpaceRobot.from_urdf(urdf)
+    q = np.array([0.4])
+    for engine in ENGINES:
+        assert_agrees(robot.connection(q), engine(urdf, robot.joint_names).connection(q))
+    assert not robot.curvature(q).any()
+    assert robot.curvature(q).shape == (6, 1, 1)
+
+
+def test_a_body_without_joints() -> None:
+    robot = SpaceRobot.from_urdf(random_chain_urdf(np.random.default_rng(12), 0))
+    inertia = robot.description.bodies[0].inertia
+    assert robot.connection([]).shape == (6, 0)
+    R, r = robot.link_pose("base_link", [])
+    assert_agrees(R, np.eye(3))
+    assert_agrees(r, np.zeros(3))
+    # Euler's equations: a torque turns it, the gyroscopic moment of its own spin remains.
+    omega, torque = np.array([0.3, -0.7, 0.5]), np.array([1.0, 2.0, -1.0])
+    rate = np.linalg.solve(inertia.about_com, torque - np.cross(omega, inertia.about_com @ omega))
+    z0ddot = robot.forward_dynamics([], np.zeros(3), omega, [], [0, 0, 0, *torque], [])
+    assert_agrees(z0ddot, [0, 0, 0, *rate])

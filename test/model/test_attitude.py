@@ -1,0 +1,151 @@
+"""Attitude arithmetic against scipy's rotations, on whatever hypothesis comes up with."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from support.oracles import Array
+
+from spacerobot_ros.model.attitude import (
+    attitude_error,
+    hat,
+    matrix_from_quaternion,
+    matrix_from_rpy,
+    quaternion_from_rotvec,
+    quaternion_inverse,
+    quaternion_multiply,
+    rotvec_from_quaternion,
+    unit_quaternion,
+)
+
+# The same examples every time, however long one takes.
+repeatable = settings(derandomize=True, deadline=None, max_examples=60)
+
+
+def assert_near(actual: npt.ArrayLike, expected: npt.ArrayLike, within: float = 1e-14) -> None:
+    assert np.shape(actual) == np.shape(expected)
+    assert float(np.abs(np.subtract(actual, expected)).max()) <= within
+
+
+def vectors(limit: float) -> st.SearchStrategy[Array]:
+    return st.tuples(*3 * [st.floats(-limit, limit)]).map(np.array)
+
+
+@st.composite
+def rotation_vectors(draw: st.DrawFn) -> Array:
+    """A rotation vector of any angle up to pi, tiny ones and ones just short of half a turn too."""
+    direction = draw(vectors(1.0).filter(lambda v: np.linalg.norm(v) > 1e-3))
+    angle = draw(
+        st.one_of(
+            st.floats(0.0, math.pi),
+            st.floats(-16, -1).map(lambda e: 10**e),
+            st.floats(-9, -1).map(lambda e: math.pi - 10**e),
+        )
+    )
+    return np.asarray(angle * direction / np.linalg.norm(direction))
+
+
+@st.composite
+def quaternions(draw: st.DrawFn) -> Array:
+    """A unit quaternion (x, y, z, w) of either sign."""
+    q = Rotation.from_rotvec(draw(rotation_vectors())).as_quat()
+    return np.asarray(q * draw(st.sampled_from([-1.0, 1.0])))
+
+
+@repeatable
+@given(a=vectors(1e3), b=vectors(1e3))
+def test_hat_is_the_cross_product(a: Array, b: Array) -> None:
+    assert np.array_equal(hat(a), -hat(a).T)
+    assert_near(hat(a) @ b, np.cross(a, b), within=1e-9)
+
+
+@repeatable
+@given(rpy=vectors(7.0))
+def test_matrix_from_rpy(rpy: Array) -> None:
+    # URDF: about the fixed axes x, y, z in that order.
+    expected = Rotation.from_euler("xyz", rpy).as_matrix()
+    assert_near(matrix_from_rpy(rpy), expected)
+
+
+@repeatable
+@given(q=quaternions())
+def test_matrix_from_quaternion(q: Array) -> None:
+    assert_near(matrix_from_quaternion(q), Rotation.from_quat(q).as_matrix())
+
+
+@repeatable
+@given(a=quaternions(), b=quaternions())
+def test_quaternion_product_is_the_product_of_rotations(a: Array, b: Array) -> None:
+    expected = (Rotation.from_quat(a) * Rotation.from_quat(b)).as_matrix()
+    product = quaternion_multiply(a, b)
+    assert_near(np.linalg.norm(product), 1.0)
+    assert_near(Rotation.from_quat(product).as_matrix(), expected)
+
+
+@repeatable
+@given(q=quaternions())
+def test_quaternion_inverse(q: Array) -> None:
+    expected = Rotation.from_quat(q).inv().as_matrix()
+    inverse = quaternion_inverse(q)
+    assert_near(Rotation.from_quat(inverse).as_matrix(), expected)
+    assert_near(quaternion_multiply(q, inverse), [0, 0, 0, 1])
+
+
+@repeatable
+@given(vector=vectors(20.0))
+def test_quaternion_from_rotvec(vector: Array) -> None:
+    q = quaternion_from_rotvec(vector)
+    assert_near(np.linalg.norm(q), 1.0)
+    expected = Rotation.from_rotvec(vector).as_matrix()
+    assert_near(Rotation.from_quat(q).as_matrix(), expected, within=1e-13)
+
+
+@repeatable
+@given(q=quaternions())
+def test_rotvec_from_quaternion(q: Array) -> None:
+    vector = rotvec_from_quaternion(q)
+    assert np.linalg.norm(vector) <= math.pi + 1e-15
+    expected = Rotation.from_quat(q).as_rotvec()
+    # At half a turn both ends of the axis are right.
+    if np.linalg.norm(expected) > math.pi - 1e-8 and np.dot(vector, expected) < 0:
+        expected = -expected
+    np.testing.assert_allclose(vector, expected, rtol=1e-12, atol=1e-15)
+
+
+@repeatable
+@given(vector=rotation_vectors())
+def test_rotation_vectors_survive_the_way_there_and_back(vector: Array) -> None:
+    back = rotvec_from_quaternion(quaternion_from_rotvec(vector))
+    if np.linalg.norm(vector) > math.pi - 1e-8 and np.dot(back, vector) < 0:
+        back = -back
+    np.testing.assert_allclose(back, vector, rtol=1e-12, atol=1e-15)
+
+
+@repeatable
+@given(a=quaternions(), b=quaternions())
+def test_attitude_error_turns_one_attitude_into_the_other(a: Array, b: Array) -> None:
+    error = attitude_error(a, b)
+    assert np.linalg.norm(error) <= math.pi + 1e-15
+    # In body components: the turn is applied on the right.
+    reached = (Rotation.from_quat(a) * Rotation.from_rotvec(error)).as_matrix()
+    assert_near(reached, Rotation.from_quat(b).as_matrix())
+
+
+@repeatable
+@given(q=quaternions(), scale=st.floats(1e-5, 1e5))
+def test_unit_quaternion(q: Array, scale: float) -> None:
+    assert_near(unit_quaternion(scale * q), q)
+
+
+@pytest.mark.parametrize(
+    "q", [[0, 0, 0, 0], [1e-9, 0, 0, 0], [0, 0, 0, math.nan], [math.inf, 0, 0, 1]]
+)
+def test_unit_quaternion_refuses_what_is_no_rotation(q: list[float]) -> None:
+    with pytest.raises(ValueError, match="is not a rotation"):
+        unit_quaternion(q)

@@ -1,0 +1,373 @@
+"""What a URDF is read as, and what is refused, with a sentence that names the culprit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from support.oracles import PinocchioOracle, assert_agrees
+from support.random_robots import random_robot_urdf
+
+from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
+from spacerobot_ros.model.description import JointKind, Shape
+
+BODY = """
+  <inertial><mass value="2"/>
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>"""
+LIMIT = '<limit lower="-1" upper="1" velocity="0.5" effort="3"/>'
+
+
+def link(name: str, content: str = BODY) -> str:
+    return f'<link name="{name}">{content}</link>'
+
+
+def joint(
+    name: str, kind: str, parent: str, child: str, content: str = f'<axis xyz="0 0 1"/>{LIMIT}'
+) -> str:
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}{content}</joint>'
+
+
+def robot(*elements: str) -> str:
+    return f'<robot name="probe">{"".join(elements)}</robot>'
+
+
+HULL, ARM, HAND = link("Hull"), link("Arm"), link("Hand")
+ELBOW = joint("Elbow", "revolute", "Hull", "Arm")
+
+
+def arm_with(inertial: str) -> str:
+    return robot(HULL, link("Arm", f"<inertial>{inertial}</inertial>"), ELBOW)
+
+
+def elbow_with(content: str, kind: str = "revolute") -> str:
+    return robot(HULL, ARM, joint("Elbow", kind, "Hull", "Arm", content))
+
+
+def moments(**changes: str) -> str:
+    """Return a unit inertia with some entries replaced."""
+    values = {"ixx": "1", "ixy": "0", "ixz": "0", "iyy": "1", "iyz": "0", "izz": "1"} | changes
+    entries = " ".join(f'{name}="{value}"' for name, value in values.items())
+    return f"<inertia {entries}/>"
+
+
+REFUSED = {
+    # Not a URDF.
+    "broken XML": ("<robot name='probe'><link", r"not valid URDF: .*line 1"),
+    "empty text": ("", r"not valid URDF"),
+    "no name": (f"<robot>{HULL}</robot>", r"not valid URDF: .*\s.*name"),
+    "missing attribute": (
+        arm_with('<mass value="1"/><inertia iyy="1" ixy="0" ixz="0" iyz="0" izz="1"/>'),
+        r"not valid URDF: .*link\[@name='Arm'\](.|\n)*ixx",
+    ),
+    "missing mass": (
+        arm_with(moments()),
+        r"not valid URDF: .*link\[@name='Arm'\](.|\n)*mass",
+    ),
+    "missing effort": (
+        elbow_with('<axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1"/>'),
+        r"not valid URDF: .*joint\[@name='Elbow'\](.|\n)*effort",
+    ),
+    "no such joint type": (elbow_with("", kind="ball"), r"joint\[@name='Elbow'\](.|\n)*ball"),
+    "short origin": (
+        elbow_with(f'<origin xyz="0 1"/>{LIMIT}'),
+        r"joint\[@name='Elbow'\](.|\n)*Invalid vector length",
+    ),
+    # Not a tree.
+    "no link": (robot(), r"exactly one root link .*found: none"),
+    "two roots": (robot(HULL, ARM), r"exactly one root link .*found: 'Hull', 'Arm'"),
+    "no root": (
+        robot(HULL, ARM, joint("A", "fixed", "Hull", "Arm"), joint("B", "fixed", "Arm", "Hull")),
+        r"exactly one root link .*found: none",
+    ),
+    "ring": (
+        robot(
+            HULL, ARM, HAND, joint("A", "fixed", "Hand", "Arm"), joint("B", "fixed", "Arm", "Hand")
+        ),
+        r"Link 'Arm' is not connected to the root: its joints form a ring",
+    ),
+    "two parents": (
+        robot(HULL, ARM, ELBOW, joint("Brace", "fixed", "Hull", "Arm")),
+        r"Link 'Arm' is the child of two joints \('Elbow' and 'Brace'\)",
+    ),
+    "unknown parent": (
+        robot(HULL, ARM, joint("Elbow", "fixed", "Hall", "Arm")),
+        r"parent of joint 'Elbow' is 'Hall', but there is no such link",
+    ),
+    "unknown child": (
+        robot(HULL, joint("Elbow", "fixed", "Hull", "Arn")),
+        r"child of joint 'Elbow' is 'Arn', but there is no such link",
+    ),
+    "link twice": (robot(HULL, ARM, ARM, ELBOW), r"link name 'Arm' is used twice"),
+    "joint twice": (
+        robot(HULL, ARM, HAND, ELBOW, joint("Elbow", "revolute", "Arm", "Hand")),
+        r"joint name 'Elbow' is used twice",
+    ),
+    # Not a joint that a floating tree can have.
+    "floating joint": (elbow_with("", "floating"), r"type of joint 'Elbow' is 'floating'"),
+    "planar joint": (elbow_with('<axis xyz="0 0 1"/>', "planar"), r"'Elbow' is 'planar'"),
+    "mimic": (
+        robot(
+            HULL,
+            ARM,
+            HAND,
+            ELBOW,
+            joint("Wrist", "revolute", "Arm", "Hand", f'<mimic joint="Elbow"/>{LIMIT}'),
+        ),
+        r"joint 'Wrist' mimics 'Elbow'",
+    ),
+    "zero axis": (elbow_with(f'<axis xyz="0 0 0"/>{LIMIT}'), r"axis of joint 'Elbow' is zero"),
+    "axis not finite": (
+        elbow_with(f'<axis xyz="0 inf 0"/>{LIMIT}'),
+        r"joint 'Elbow' is not finite",
+    ),
+    "origin not finite": (
+        elbow_with(f'<origin xyz="0 nan 0"/>{LIMIT}'),
+        r"origin of joint 'Elbow' is not finite",
+    ),
+    "turn not finite": (
+        elbow_with(f'<origin rpy="0 nan 0"/>{LIMIT}'),
+        r"origin of joint 'Elbow' is not finite",
+    ),
+    # Limits.
+    "revolute without limit": (elbow_with(""), r"joint 'Elbow' is revolute and has no <limit>"),
+    "prismatic without limit": (
+        elbow_with("", "prismatic"),
+        r"joint 'Elbow' is prismatic and has no <limit>",
+    ),
+    "lower above upper": (
+        elbow_with('<limit lower="2" upper="1" velocity="1" effort="1"/>'),
+        r"lower limit of joint 'Elbow' \(2.0\) is not below its upper limit \(1.0\)",
+    ),
+    "limit without a stroke": (
+        elbow_with('<limit velocity="1" effort="1"/>'),
+        r"lower limit of joint 'Elbow' \(0.0\) is not below its upper limit \(0.0\)",
+    ),
+    "limit not a number": (
+        elbow_with('<limit lower="-1" upper="nan" velocity="1" effort="1"/>'),
+        r"limit 'upper' of joint 'Elbow' is not a number",
+    ),
+    "negative rate": (
+        elbow_with('<limit lower="-1" upper="1" velocity="-1" effort="1"/>'),
+        r"limit 'velocity' of joint 'Elbow' is negative",
+    ),
+    "negative effort": (
+        elbow_with('<limit velocity="1" effort="-1"/>', "continuous"),
+        r"limit 'effort' of joint 'Elbow' is negative",
+    ),
+    # Masses.
+    "base without mass": (robot(link("Hull", ""), ARM, ELBOW), r"base link 'Hull' has no mass"),
+    "revolute leaf without mass": (
+        robot(HULL, link("Arm", ""), ELBOW),
+        r"Joint 'Elbow' moves link 'Arm', which has no mass",
+    ),
+    "prismatic leaf without mass": (
+        robot(
+            HULL,
+            link("Arm", f'<inertial><mass value="0"/>{moments()}</inertial>'),
+            joint("Slide", "prismatic", "Hull", "Arm"),
+        ),
+        r"Joint 'Slide' moves link 'Arm', which has no mass",
+    ),
+    "negative mass": (
+        arm_with(f'<mass value="-2"/>{moments()}'),
+        r"mass of link 'Arm' is negative",
+    ),
+    "mass not a number": (arm_with(f'<mass value="nan"/>{moments()}'), r"link 'Arm' is not finite"),
+    "mass infinite": (arm_with(f'<mass value="inf"/>{moments()}'), r"link 'Arm' is not finite"),
+    "inertia not a number": (
+        arm_with(f'<mass value="2"/>{moments(ixz="nan")}'),
+        r"link 'Arm' is not finite",
+    ),
+    "centre of mass not finite": (
+        arm_with(f'<origin xyz="0 0 nan"/><mass value="2"/>{moments()}'),
+        r"origin of link 'Arm' is not finite",
+    ),
+    "negative moment": (
+        arm_with(f'<mass value="2"/>{moments(iyy="-1")}'),
+        r"inertia of link 'Arm' has a negative principal moment",
+    ),
+    "negative principal moment": (
+        arm_with(f'<mass value="2"/>{moments(ixy="1.5")}'),
+        r"inertia of link 'Arm' has a negative principal moment",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "sentence"), REFUSED.values(), ids=REFUSED.keys())
+def test_refused(text: str, sentence: str) -> None:
+    with pytest.raises(RobotDescriptionError, match=sentence):
+        parse_robot(text)
+
+
+def test_point_mass_on_its_own_axis_is_refused() -> None:
+    zero = moments(ixx="0", iyy="0", izz="0")
+    description = parse_robot(arm_with(f'<origin xyz="0 0 1"/><mass value="2"/>{zero}'))
+    with pytest.raises(RobotDescriptionError, match=r"robot 'probe' is not positive definite"):
+        SpaceRobot(description)
+
+
+def test_base_without_inertia_is_refused() -> None:
+    """Three point masses through the centre leave a point-mass base no moment at zero."""
+    zero = moments(ixx="0", iyy="0", izz="0")
+    point = f'<inertial><mass value="2"/>{zero}</inertial>'
+    sliders = (
+        link(f"M{axis}", point)
+        + joint(f"S{axis}", "prismatic", "Hull", f"M{axis}", f'<axis xyz="{xyz}"/>{LIMIT}')
+        for axis, xyz in (("x", "1 0 0"), ("y", "0 1 0"), ("z", "0 0 1"))
+    )
+    with pytest.raises(RobotDescriptionError, match=r"robot 'probe' is not positive definite"):
+        SpaceRobot(parse_robot(robot(link("Hull", point), *sliders)))
+
+
+def test_shape_of_the_wrong_length_is_refused() -> None:
+    found = SpaceRobot(parse_robot(robot(HULL, ARM, ELBOW)))
+    with pytest.raises(ValueError, match=r"connection: q has 2 number\(s\), not 1"):
+        found.connection([0.1, 0.2])
+
+
+def test_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RobotDescriptionError, match=r"nowhere\.urdf cannot be read"):
+        load_robot(tmp_path / "nowhere.urdf")
+    binary = tmp_path / "binary.urdf"
+    binary.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(RobotDescriptionError, match=r"binary\.urdf cannot be read"):
+        load_robot(binary)
+    broken = tmp_path / "broken.urdf"
+    broken.write_text(robot(link("Hull", ""), ARM, ELBOW), encoding="utf-8")
+    with pytest.raises(RobotDescriptionError, match=r"broken\.urdf: The base link 'Hull'"):
+        load_robot(broken)
+
+
+# -- what is accepted -------------------------------------------------------------------------
+
+
+def test_unknown_elements_are_left_alone(capfd: pytest.CaptureFixture[str]) -> None:
+    control = (
+        '<ros2_control name="arm" type="system"><hardware><plugin>a/b</plugin></hardware>'
+        '<joint name="Elbow"><command_interface name="effort"/></joint></ros2_control>'
+    )
+    gazebo = '<gazebo reference="Arm"><mu1>0.2</mu1></gazebo><gazebo><plugin name="p"/></gazebo>'
+    found = parse_robot(robot(control, HULL, ARM, gazebo, ELBOW))
+    assert found.joint_names == ("Elbow",)
+    assert [entry.name for entry in found.links] == ["Hull", "Arm"]
+    captured = capfd.readouterr()
+    assert captured.out + captured.err == ""
+
+
+def test_text_with_an_encoding_declaration() -> None:
+    text = '<?xml version="1.0" encoding="UTF-8"?>' + robot(link("Hülle"), ARM)
+    text = text.replace("</robot>", joint("Élan", "revolute", "Hülle", "Arm") + "</robot>")
+    assert parse_robot(text).joint_names == ("Élan",)
+    assert parse_robot(text).base_link == "Hülle"
+
+
+def test_limits() -> None:
+    names = ("turns", "slides", "spins", "free")
+    found = parse_robot(
+        robot(
+            HULL,
+            *(link(f"l_{name}") for name in names),
+            joint("turns", "revolute", "Hull", "l_turns"),
+            joint("slides", "prismatic", "Hull", "l_slides", LIMIT.replace("-1", "-0.2")),
+            joint("spins", "continuous", "Hull", "l_spins", LIMIT),
+            joint("free", "continuous", "Hull", "l_free", ""),
+        )
+    )
+    inf = np.inf
+    assert found.joint_names == names
+    assert found.limits("lower").tolist() == [-1.0, -0.2, -inf, -inf]
+    assert found.limits("upper").tolist() == [1.0, 1.0, inf, inf]
+    assert found.limits("velocity").tolist() == [0.5, 0.5, 0.5, inf]
+    assert found.limits("effort").tolist() == [3.0, 3.0, 3.0, inf]
+
+
+def test_axis_is_scaled_to_length_one_and_x_by_default() -> None:
+    found = parse_robot(elbow_with(f'<axis xyz="0 3 4"/>{LIMIT}'))
+    assert_agrees(found.movable_joints[0].axis, [0.0, 0.6, 0.8])
+    assert parse_robot(elbow_with(LIMIT)).movable_joints[0].axis.tolist() == [1.0, 0.0, 0.0]
+
+
+def test_base_may_carry_its_mass_on_a_fixed_link() -> None:
+    text = robot(
+        link("base_link", ""), HULL, ARM, joint("Mount", "fixed", "base_link", "Hull"), ELBOW
+    )
+    found = parse_robot(text)
+    assert found.base_link == "base_link"
+    assert found.total_mass == 4.0
+    assert found.joint_names == ("Elbow",)
+
+
+def test_rotor_without_mass_but_with_inertia() -> None:
+    rotor = link("Arm", f'<inertial><mass value="0"/>{moments()}</inertial>')
+    found = SpaceRobot(parse_robot(robot(HULL, rotor, ELBOW)))
+    # Two equal moments about z: the hull turns back by half of what the rotor turns.
+    assert_agrees(found.connection([0.3])[:, 0], [0, 0, 0, 0, 0, 0.5])
+
+
+def test_visuals() -> None:
+    content = """
+      <visual><origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/>
+        <geometry><box size="1 2 3"/></geometry><material name="red"/></visual>
+      <visual><geometry><cylinder radius="0.5" length="2"/></geometry>
+        <material name="own"><color rgba="0 1 0 0.5"/></material></visual>
+      <visual><geometry><sphere radius="0.25"/></geometry></visual>
+      <visual><geometry><mesh filename="package://a/b.stl" scale="1 1 2"/></geometry></visual>"""
+    red = '<material name="red"><color rgba="1 0 0 1"/></material>'
+    box, cylinder, sphere, mesh = (
+        parse_robot(robot(red, link("Hull", BODY + content))).links[0].shapes
+    )
+    assert (box.kind, box.size, box.rgba) == ("box", (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 1.0))
+    assert box.pose.r.tolist() == [1.0, 2.0, 3.0]
+    assert_agrees(box.pose.R @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    assert (cylinder.kind, cylinder.size) == ("cylinder", (0.5, 2.0))
+    assert cylinder.rgba == (0.0, 1.0, 0.0, 0.5)
+    assert (sphere.kind, sphere.size, sphere.rgba) == ("sphere", (0.25,), Shape.rgba)
+    assert (mesh.kind, mesh.size) == ("mesh", (1.0, 1.0, 2.0))
+    assert mesh.resource == "package://a/b.stl"
+
+
+# -- welding ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(60, 66))
+def test_fixed_joints_are_welded_as_pinocchio_welds_them(seed: int) -> None:
+    urdf = random_robot_urdf(np.random.default_rng(seed), joints=3 + seed % 4)
+    found = parse_robot(urdf)
+    model = PinocchioOracle(urdf, found.joint_names).model
+    assert found.total_mass == pytest.approx(sum(i.mass for i in model.inertias), rel=1e-14)
+    for body in found.bodies:
+        name = body.joint.name if body.joint is not None else "root_joint"
+        expected = model.inertias[model.getJointId(name)]
+        assert_agrees(body.inertia.mass, expected.mass)
+        assert_agrees(body.inertia.com, expected.lever)
+        assert_agrees(body.inertia.about_com, expected.inertia)
+    for name, (index, pose) in found.frames.items():
+        frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
+        carrier = found.bodies[index].joint
+        assert model.names[frame.parentJoint] == (carrier.name if carrier else "root_joint")
+        assert_agrees(pose.R, frame.placement.rotation)
+        assert_agrees(pose.r, frame.placement.translation)
+
+
+def test_bodies_are_in_topological_order() -> None:
+    for seed in range(60, 66):
+        found = parse_robot(random_robot_urdf(np.random.default_rng(seed), joints=5))
+        assert found.bodies[0].joint is None
+        assert found.bodies[0].parent == -1
+        for index, body in enumerate(found.bodies[1:], start=1):
+            assert 0 <= body.parent < index
+        assert all(joint.kind is not JointKind.FIXED for joint in found.movable_joints)
+
+
+def test_compiled_robot_with_welded_links(compiled_code: Path) -> None:
+    urdf = random_robot_urdf(np.random.default_rng(60), joints=3)
+    found = SpaceRobot.from_urdf(urdf)
+    q = np.array([0.3, -0.8, 0.5])
+    assert_agrees(
+        found.center_of_mass(q), PinocchioOracle(urdf, found.joint_names).center_of_mass(q)
+    )
+    assert found.function("center_of_mass").class_name() == "External"

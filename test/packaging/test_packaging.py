@@ -1,0 +1,191 @@
+"""What `pip install .` and `colcon build` install, and that every file names one version."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from catkin_pkg.package import Package, parse_package
+
+import spacerobot_ros
+
+ROOT = Path(__file__).resolve().parents[2]
+NODES = sorted(path.name for path in (ROOT / "scripts").iterdir() if path.is_file())
+COLCON = [
+    "catkin_pkg",
+    "colcon-core",
+    "colcon-library-path",
+    "colcon-metadata",
+    "colcon-package-information",
+    "colcon-parallel-executor",
+    "colcon-python-setup-py",
+    "colcon-recursive-crawl",
+    "colcon-ros",
+    "setuptools<80",
+]
+# That of Ubuntu 24.04, the last that colcon takes, the newest.
+SETUPTOOLS = ["setuptools==68.1.*", "setuptools<80", "setuptools"]
+
+STUB = """
+import json
+import sys
+
+
+def main():
+    print(json.dumps({"module": __name__, "prefix": sys.prefix, "arguments": sys.argv[1:]}))
+"""
+
+
+def run(command: list[str | Path], cwd: Path | None = None, path: str = "") -> str:
+    """Return the output of `command` in an environment that nothing has been sourced in."""
+    kept = {"HOME", "LANG", "LC_ALL", "TMPDIR"}
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if name in kept or name.startswith(("PIP_", "SSL_"))
+    }
+    environment["PATH"] = os.pathsep.join(filter(None, [path, os.defpath]))
+    done = subprocess.run(
+        [str(word) for word in command], cwd=cwd, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, f"{command}:\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def new_environment(prefix: Path) -> Path:
+    """Create a virtual environment and return its Python."""
+    run([sys.executable, "-m", "venv", prefix])
+    return prefix / "bin" / "python3"
+
+
+@pytest.fixture
+def manifest() -> Package:
+    return parse_package(ROOT / "package.xml", warnings=[])
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """Return a copy of the project in which each node prints how it was called and ends."""
+    project = tmp_path / "project"
+    project.mkdir()
+    for name in ("LICENSE", "package.xml", "pyproject.toml", "setup.cfg", "setup.py"):
+        shutil.copy2(ROOT / name, project)
+    for name in ("bags", "config", "launch", "resource", "scripts", "urdf"):
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, project / name)
+    for folder in ("urdf/meshes", "config"):
+        (project / folder).mkdir(parents=True, exist_ok=True)
+        (project / folder / "packaging_test.txt").touch()
+    for module in ("__init__", "app/__init__", "app/cli", "nodes/__init__"):
+        source = project / "spacerobot_ros" / f"{module}.py"
+        source.parent.mkdir(parents=True, exist_ok=True)
+        source.write_text(STUB)
+    for node in NODES:
+        (project / "spacerobot_ros" / "nodes" / f"{node}.py").write_text(STUB)
+    return project
+
+
+def check_installed(prefix: Path) -> None:
+    """Check everything that ROS 2 tools look for below `prefix`."""
+    marker = prefix / "share/ament_index/resource_index/packages/spacerobot_ros"
+    assert marker.is_file()
+    share = prefix / "share" / "spacerobot_ros"
+    assert (share / "package.xml").is_file()
+    assert (share / "urdf" / "meshes" / "packaging_test.txt").is_file()
+    assert (share / "config" / "packaging_test.txt").is_file()
+    for node in NODES:
+        assert os.access(prefix / "lib" / "spacerobot_ros" / node, os.X_OK)
+
+
+def test_the_manifest_is_a_package_of_format_3_that_colcon_builds(manifest: Package) -> None:
+    warnings: list[str] = []
+    manifest.validate(warnings=warnings)
+    assert warnings == []
+    assert manifest.package_format == 3
+    assert manifest.get_build_type() == "ament_python"
+
+
+def test_manifest_setup_and_module_say_the_same(manifest: Package) -> None:
+    fields = ["name", "version", "description", "license", "maintainer", "maintainer-email"]
+    options = [f"--{field}" for field in fields]
+    said = run([sys.executable, "setup.py", *options], cwd=ROOT).splitlines()
+    maintainer = manifest.maintainers[0]
+    assert said == [
+        manifest.name,
+        manifest.version,
+        manifest.description,
+        manifest.licenses[0],
+        maintainer.name,
+        maintainer.email,
+    ]
+    assert spacerobot_ros.__version__ == manifest.version
+
+
+def test_a_node_has_a_script_that_runs_its_module() -> None:
+    assert {"plant", "planner", "recorder"} <= set(NODES)
+    for node in NODES:
+        script = ROOT / "scripts" / node
+        assert os.access(script, os.X_OK)
+        assert f"from spacerobot_ros.nodes.{node} import main\n" in script.read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setuptools", SETUPTOOLS)
+def test_pip_installs_nodes_that_run_outside_an_active_environment(
+    project: Path, tmp_path: Path, setuptools: str
+) -> None:
+    prefix = tmp_path / "prefix"
+    python = new_environment(prefix)
+    run([python, "-m", "pip", "install", "--upgrade", setuptools, "wheel"])
+    run([python, "-m", "pip", "install", "--no-deps", "--no-build-isolation", project])
+    check_installed(prefix)
+    assert (prefix / "bin" / "spacerobot").is_file()
+    for node in NODES:
+        assert not (prefix / "bin" / node).exists()
+        called = json.loads(run([prefix / "lib" / "spacerobot_ros" / node, "-r", "a:=b c"]))
+        assert called == {
+            "module": f"spacerobot_ros.nodes.{node}",
+            "prefix": str(prefix),
+            "arguments": ["-r", "a:=b c"],
+        }
+
+
+@pytest.fixture(scope="module")
+def colcon(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the machine's colcon, or else one in an environment that lasts for these tests."""
+    found = shutil.which("colcon")
+    if found:
+        return Path(found)
+    prefix = tmp_path_factory.mktemp("colcon")
+    run([new_environment(prefix), "-m", "pip", "install", *COLCON])
+    return prefix / "bin" / "colcon"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [[], ["--symlink-install"]], ids=["copies", "symlinks"])
+def test_colcon_builds_a_package_in_which_ros2_run_finds_the_nodes(
+    project: Path, tmp_path: Path, colcon: Path, options: list[str]
+) -> None:
+    listed = run([colcon, "--log-base", os.devnull, "list", "--base-paths", project])
+    assert listed.split() == ["spacerobot_ros", str(project), "(ros.ament_python)"]
+
+    workspace = tmp_path / "workspace"
+    workspace.mkdir()
+    run([colcon, "build", "--base-paths", project, *options], cwd=workspace)
+    install = workspace / "install"
+    prefix = install / "spacerobot_ros"
+    check_installed(prefix)
+    assert os.access(prefix / "lib" / "spacerobot_ros" / "spacerobot", os.X_OK)
+
+    for node in NODES:
+        executable = prefix / "lib" / "spacerobot_ros" / node
+        script = f". {install}/local_setup.sh && echo $AMENT_PREFIX_PATH && exec {executable} a"
+        prefixes, called = run(
+            ["sh", "-c", script], cwd=install, path=str(Path(sys.executable).parent)
+        ).splitlines()
+        assert str(prefix) in prefixes.split(os.pathsep)
+        assert json.loads(called)["module"] == f"spacerobot_ros.nodes.{node}"
+        assert json.loads(called)["arguments"] == ["a"]

@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from nav_msgs.msg import Odometry
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from spacerobot_ros.recording import (
+    BagWriter,
+    iterate_raw,
+    read_bag,
+)
+
+Sample = tuple[str, str, Any]
+AssertSame = Callable[[Any, Any], None]
+
+STRING = "std_msgs/msg/String"
+N = 500
+
+
+def string(text: str) -> bytes:
+    """Serialise a std_msgs/String by hand."""
+    data = text.encode() + b"\0"
+    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
+
+
+def flight() -> list[tuple[str, str, int, Any]]:
+    """Topic, type, log time in ns and message, 1 ms apart, stamped half a millisecond before."""
+    messages: list[tuple[str, str, int, Any]] = []
+    for k in range(N):
+        time_ns = 5 * 10**9 + k * 1_000_000
+        stamp = Time(sec=(time_ns - 500_000) // 10**9, nanosec=(time_ns - 500_000) % 10**9)
+        header = Header(stamp=stamp, frame_id="world")
+        odom = Odometry(header=header, child_frame_id="base_link")
+        odom.pose.pose.position.x = math.sin(0.01 * k)
+        odom.pose.covariance = np.arange(36.0) + k
+        joints = JointState(
+            header=header,
+            name=["slider_1", "slider_2"],
+            position=[0.1 * k, -0.2 * k],
+            velocity=[1.0, 2.0],
+            effort=[0.0, float(k)],
+        )
+        messages += [
+            ("/odom", "nav_msgs/msg/Odometry", time_ns, odom),
+            ("/joint_states", "sensor_msgs/msg/JointState", time_ns, joints),
+        ]
+    return messages
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bags") / "flight.mcap"
+    with BagWriter(path, chunk_size=20_000) as writer:
+        writer.add_topic("/silent", STRING)
+        for topic, type_name, time_ns, message in flight():
+            channel = writer.add_topic(topic, type_name)
+            writer.write(channel, serialize_message(message), time_ns, time_ns - 300)
+        writer.add_metadata("parameters", {"plant.seed": "7"})
+        writer.add_attachment("robot.urdf", b"<robot/>", "application/xml", 1)
+    return path
+
+
+def test_what_a_bag_holds(path: Path) -> None:
+    bag = read_bag(path)
+    assert bag.topics == {
+        "/silent": STRING,
+        "/odom": "nav_msgs/msg/Odometry",
+        "/joint_states": "sensor_msgs/msg/JointState",
+    }
+    assert bag.message_count() == 2 * N
+    assert bag.message_count("/odom") == N
+    assert bag.message_count("/silent") == 0
+    assert bag.start_time == 5.0
+    assert bag.end_time == pytest.approx(5.0 + 1e-3 * (N - 1), abs=1e-12)
+    assert bag.metadata["parameters"] == {"plant.seed": "7"}
+    assert "message_count: 1000" in bag.metadata["rosbag2"]["serialized_metadata"]
+    assert bag.attachments == {"robot.urdf": b"<robot/>"}
+
+
+def test_times(path: Path) -> None:
+    bag = read_bag(path)
+    expected = 5.0 + 1e-3 * np.arange(N)
+    assert bag.times("/odom") == pytest.approx(expected, abs=1e-12)
+    assert bag["/odom"].time.dtype == np.float64
+    assert bag["/odom"].time_ns.tolist() == [5 * 10**9 + k * 10**6 for k in range(N)]
+    assert bag["/odom"].stamp == pytest.approx(expected - 5e-4, abs=1e-12)
+    assert len(bag["/odom"]) == N
+
+
+def test_a_topic_without_headers_is_stamped_by_its_log_time(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        writer.write(writer.add_topic("/a", STRING), string("a"), 1_500_000_000, 0)
+    assert read_bag(tmp_path / "a.mcap")["/a"].stamp.tolist() == [1.5]
+
+
+def test_a_number_of_every_message(path: Path) -> None:
+    x = read_bag(path)["/odom"].field("pose.pose.position.x")
+    assert x.dtype == np.float64
+    assert x.tolist() == [math.sin(0.01 * k) for k in range(N)]
+
+
+def test_numbers_of_every_message(path: Path) -> None:
+    bag = read_bag(path)
+    covariance = bag["/odom"].field("pose.covariance")
+    assert np.array_equal(covariance, np.arange(36.0) + np.arange(N)[:, None])
+    position = bag["/joint_states"].field("position")
+    assert np.array_equal(position, [[0.1 * k, -0.2 * k] for k in range(N)])
+
+
+def test_words_of_every_message(path: Path) -> None:
+    bag = read_bag(path)
+    assert bag["/odom"].field("child_frame_id") == ["base_link"] * N
+    assert bag["/joint_states"].field("name") == [["slider_1", "slider_2"]] * N
+
+
+def test_whole_numbers_do_not_overflow(path: Path) -> None:
+    seconds = read_bag(path)["/odom"].field("header.stamp.sec")
+    assert seconds.dtype == np.int64
+    assert (seconds * 10**9)[-1] == 5 * 10**9
+
+
+def test_messages_inside_of_messages(path: Path) -> None:
+    positions = read_bag(path)["/odom"].field("pose.pose.position")
+    assert [p.x for p in positions] == [math.sin(0.01 * k) for k in range(N)]
+
+
+def test_a_list_of_messages_is_looked_into(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        channel = writer.add_topic("/a", "trajectory_msgs/msg/JointTrajectory")
+        for count in (2, 0, 3):
+            points = [JointTrajectoryPoint(positions=[1.0 * k, 2.0]) for k in range(count)]
+            writer.write(channel, serialize_message(JointTrajectory(points=points)), count, 0)
+    series = read_bag(tmp_path / "a.mcap")["/a"]
+    found = [[list(point) for point in points] for points in series.field("points.positions")]
+    assert found == [
+        [],
+        [[0.0, 2.0], [1.0, 2.0]],
+        [[0.0, 2.0], [1.0, 2.0], [2.0, 2.0]],
+    ]
+    assert series.field("points.time_from_start.sec") == [[], [0, 0], [0, 0, 0]]
+
+
+def test_lists_that_differ_in_length(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        channel = writer.add_topic("/a", "sensor_msgs/msg/JointState")
+        for k in range(4):
+            message = JointState(position=[0.5] * k, header=Header(frame_id="f" * k))
+            writer.write(channel, serialize_message(message), k, k)
+    series = read_bag(tmp_path / "a.mcap")["/a"]
+    assert [list(p) for p in series.field("position")] == [[0.5] * k for k in range(4)]
+    assert series.field("velocity").shape == (4, 0)
+    assert series.field("header.frame_id") == ["", "f", "ff", "fff"]
+
+
+def test_a_topic_without_messages(path: Path, tmp_path: Path) -> None:
+    assert read_bag(path)["/silent"].field("data") == []
+    assert list(read_bag(path).messages("/silent")) == []
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        writer.add_topic("/odom", "nav_msgs/msg/Odometry")
+    bag = read_bag(tmp_path / "a.mcap")
+    assert bag["/odom"].field("pose.pose.position.x").shape == (0,)
+    assert bag["/odom"].field("pose.covariance").shape == (0, 0)
+    assert bag["/odom"].time.shape == bag["/odom"].stamp.shape == (0,)
+    assert math.isnan(bag.start_time)
+    assert math.isnan(bag.end_time)
+
+
+def test_decoded_messages(path: Path, assert_same: AssertSame) -> None:
+    expected = [(time, message) for topic, _, time, message in flight() if topic == "/odom"]
+    found = list(read_bag(path).messages("/odom"))
+    assert [time_ns for time_ns, _ in found] == [time_ns for time_ns, _ in expected]
+    for (_, message), (_, original) in zip(found, expected, strict=True):
+        assert_same(original, message)
+
+
+def test_every_type(tmp_path: Path, samples: list[Sample], assert_same: AssertSame) -> None:
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        for topic, type_name, message in samples:
+            writer.write(writer.add_topic(topic, type_name), serialize_message(message), 1, 1)
+    bag = read_bag(tmp_path / "a.mcap")
+    for topic, _, message in samples:
+        ((time_ns, decoded),) = bag.messages(topic)
+        assert time_ns == 1
+        assert_same(message, decoded)
+
+
+def test_meaningless_bytes_at_the_end_do_no_harm(tmp_path: Path) -> None:
+    message = JointState(name=["a", "b"], position=[1.0, 2.0])
+    data = serialize_message(message)
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        channel = writer.add_topic("/a", "sensor_msgs/msg/JointState")
+        writer.write(channel, data + b"\xff" * 8, 1, 1)
+        writer.write(channel, data, 2, 2)
+    for _, decoded in read_bag(tmp_path / "a.mcap").messages("/a"):
+        assert decoded.position.tolist() == [1.0, 2.0]
+        assert decoded.effort.tolist() == []
+
+
+def test_the_raw_messages(path: Path) -> None:
+    raw = list(iterate_raw(path))
+    assert raw == [
+        (topic, type_name, time_ns, time_ns - 300, raw[n][4])
+        for n, (topic, type_name, time_ns, _) in enumerate(flight())
+    ]
+    expected = [(topic, serialize_message(message)) for topic, _, _, message in flight()]
+    # What pads a message is not set, so that equal messages may differ in bytes: compare lengths.
+    assert [(topic, len(data)) for topic, _, _, _, data in raw] == [
+        (topic, len(data)) for topic, data in expected
+    ]

@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from spacerobot_ros.recording import RecordingError, message_definition, type_hash
+
+TYPES = [
+    "diagnostic_msgs/msg/DiagnosticArray",
+    "diagnostic_msgs/msg/DiagnosticStatus",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/WrenchStamped",
+    "nav_msgs/msg/Odometry",
+    "nav_msgs/msg/Path",
+    "rosgraph_msgs/msg/Clock",
+    "sensor_msgs/msg/JointState",
+    "std_msgs/msg/Float64MultiArray",
+    "std_msgs/msg/String",
+    "trajectory_msgs/msg/JointTrajectory",
+    "visualization_msgs/msg/MarkerArray",
+]
+
+Install = Callable[[str, dict[str, str]], None]
+
+
+@pytest.mark.parametrize("type_name", TYPES)
+def test_a_definition_describes_the_types_of_jazzy(type_name: str) -> None:
+    jazzy = get_typestore(Stores.ROS2_JAZZY)
+    types = get_types_from_msg(message_definition(type_name), type_name)
+    assert type_name in types
+    for name, (_, fields) in types.items():
+        assert fields == jazzy.fielddefs[name][1], name
+
+
+@pytest.mark.parametrize("type_name", TYPES)
+def test_a_definition_holds_each_type_that_the_package_says_it_uses(type_name: str) -> None:
+    text = message_definition(type_name)
+    package, _, name = type_name.split("/")
+    description = json.loads(_installed(f"{package}/msg/{name}.json").read_text())
+    used = description["type_description_msg"]["referenced_type_descriptions"]
+    expected = sorted(entry["type_name"].replace("/msg/", "/") for entry in used)
+    assert sorted(_sections(text)) == expected
+
+
+@pytest.mark.parametrize("type_name", TYPES)
+def test_a_hash_is_that_of_the_definition(type_name: str) -> None:
+    typestore = get_typestore(Stores.EMPTY)
+    typestore.register(get_types_from_msg(message_definition(type_name), type_name))
+    assert type_hash(type_name) == typestore.hash_rihs01(type_name)
+
+
+def test_types_follow_depth_first_and_sorted() -> None:
+    assert _sections(message_definition("nav_msgs/msg/Odometry")) == [
+        "geometry_msgs/PoseWithCovariance",
+        "geometry_msgs/Pose",
+        "geometry_msgs/Point",
+        "geometry_msgs/Quaternion",
+        "geometry_msgs/TwistWithCovariance",
+        "geometry_msgs/Twist",
+        "geometry_msgs/Vector3",
+        "std_msgs/Header",
+        "builtin_interfaces/Time",
+    ]
+
+
+def test_the_text_is_that_of_rosbag2(prefix_with_package: Install) -> None:
+    # The expectation of rosbag2's own test of its message definitions.
+    prefix_with_package(
+        "rosbag2_like_a", {"ComplexMsg": "rosbag2_like_a/BasicMsg b\n", "BasicMsg": "float32 c\n"}
+    )
+    assert message_definition("rosbag2_like_a/msg/ComplexMsg") == (
+        "rosbag2_like_a/BasicMsg b\n"
+        "\n"
+        "================================================================================\n"
+        "MSG: rosbag2_like_a/BasicMsg\n"
+        "float32 c\n"
+    )
+
+
+def test_only_types_of_fields_count_as_dependencies(prefix_with_package: Install) -> None:
+    text = (
+        "# Leaf in a comment\r\n"
+        "uint8 CONSTANT=1  # Leaf\n"
+        "string<=10 bounded\n"
+        "string<=10[<=3] bounded_list\n"
+        "wstring wide\n"
+        "float64[<=3] numbers\n"
+        "Leaf[2] leaves\n"
+        "  Leaf indented\n"
+        "std_msgs/Header header\n"
+    )
+    prefix_with_package("rosbag2_like_b", {"Tree": text, "Leaf": "bool green"})
+    definition = message_definition("rosbag2_like_b/msg/Tree")
+    assert definition.startswith(text + f"\n{'=' * 80}\nMSG: rosbag2_like_b/Leaf\nbool green\n===")
+    assert _sections(definition) == [
+        "rosbag2_like_b/Leaf",
+        "std_msgs/Header",
+        "builtin_interfaces/Time",
+    ]
+
+
+def test_a_type_may_be_named_without_its_folder() -> None:
+    assert message_definition("std_msgs/String") == message_definition("std_msgs/msg/String")
+    assert type_hash("std_msgs/String") == type_hash("std_msgs/msg/String")
+
+
+def test_the_environment_is_searched_without_a_search_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not (Path(sys.prefix) / "share" / "std_msgs").is_dir():
+        pytest.skip("the messages are not installed in this environment")
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    message_definition.cache_clear()
+    assert message_definition("std_msgs/msg/String").endswith("string data\n")
+
+
+def test_a_package_without_descriptions_has_no_hashes(prefix_with_package: Install) -> None:
+    prefix_with_package("rosbag2_like_c", {"Leaf": "bool green\n"})
+    assert type_hash("rosbag2_like_c/msg/Leaf") == ""
+
+
+@pytest.mark.parametrize("function", [message_definition, type_hash])
+@pytest.mark.parametrize(
+    ("type_name", "words"),
+    [
+        ("Odometry", "'Odometry' is not the name of a message type"),
+        ("nav_msgs/srv/GetMap", "'nav_msgs/srv/GetMap' is not the name of a message type"),
+        ("../etc/msg/passwd", "is not the name of a message type"),
+        ("no_such_msgs/msg/A", "no_such_msgs is neither on AMENT_PREFIX_PATH nor in"),
+        ("nav_msgs/msg/NoSuch", "has no message NoSuch"),
+    ],
+)
+def test_what_is_not_there_is_said(
+    function: Callable[[str], Any], type_name: str, words: str
+) -> None:
+    with pytest.raises(RecordingError, match=words) as caught:
+        function(type_name)
+    assert str(caught.value).endswith(".")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_dependency_is_named(prefix_with_package: Install) -> None:
+    prefix_with_package("rosbag2_like_d", {"Tree": "no_such_msgs/Leaf leaf\n"})
+    with pytest.raises(RecordingError, match="no_such_msgs"):
+        message_definition("rosbag2_like_d/msg/Tree")
+
+
+def _sections(text: str) -> list[str]:
+    return [line.removeprefix("MSG: ") for line in text.splitlines() if line.startswith("MSG: ")]
+
+
+def _installed(path: str) -> Path:
+    # The message classes tell where their package is: <prefix>/lib/.../<package>/msg.
+    package = path.split("/")[0]
+    module = Path(__import__(package).__file__ or "")
+    return next(p for p in (q / "share" / path for q in module.parents) if p.is_file())
