@@ -222,7 +222,7 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
 def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
     """Return what a publication prints beside what was measured."""
     lines = []
-    for row in scenario.published:
+    for row in scenario.published if summary["state"] in ("reached", "failed") else ():
         measured = summary.get(row.quantity, summary["gait"].get(row.quantity))
         if isinstance(measured, list):
             printed, found = (

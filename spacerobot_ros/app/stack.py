@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.experimental import EventsExecutor
+from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -76,6 +77,8 @@ class FlightStack:
             self.plant: PlantNode = nodes["plant"]
             self.planner: PlannerNode = nodes["planner"]
             self.recorder: RecorderNode | None = nodes.get("recorder")
+            # Its warnings are its status, which whoever runs the stack is told anyway.
+            self.planner.get_logger().set_level(LoggingSeverity.ERROR)
             self.operator = rclpy.create_node("operator", context=context)
             self._nodes.append(self.operator)
             self._goal_topic = self.operator.create_publisher(PoseStamped, "goal_pose", STREAM)
@@ -84,10 +87,10 @@ class FlightStack:
             )
             for name in wanted:
                 if name != "recorder":
-                    self._configure(nodes[name])
+                    nodes[name].require(nodes[name].trigger_configure)
             if self.recorder is not None:
                 # Last, when every topic has its publisher.
-                self._configure(self.recorder)
+                self.recorder.require(self.recorder.trigger_configure)
                 self._describe(wanted, nodes)
             for node in self._nodes:
                 self.executor.add_node(node)
@@ -198,11 +201,6 @@ class FlightStack:
             raise ParameterError(f"Node '{name}': {error}") from error
         self._nodes.append(node)
         return node
-
-    def _configure(self, node: FlightNode) -> None:
-        node.trigger_configure()
-        if node.fault is not None:
-            raise node.fault
 
     def _describe(self, names: list[str], nodes: Mapping[str, FlightNode]) -> None:
         assert self.recorder is not None

@@ -69,6 +69,7 @@ class FlightNode(LifecycleNode):
         super().__init__(name, **kwargs)
         self._specs = [AUTOSTART, *self.SPECS]
         self.fault: SpaceRobotError | None = None
+        self._raising = False
         try:
             self.parameters: dict[str, Value] = declare(self, self._specs)
             self.add_on_set_parameters_callback(self._on_set_parameters)
@@ -87,9 +88,25 @@ class FlightNode(LifecycleNode):
         SpaceRobotError
             A transition failed; the sentence says why.
         """
-        for trigger in (self.trigger_configure, self.trigger_activate):
+        self.require(self.trigger_configure)
+        self.require(self.trigger_activate)
+
+    def require(self, trigger: Callable[[], TransitionCallbackReturn]) -> None:
+        """Take a transition (``trigger_configure``, ...) that must succeed.
+
+        Raises
+        ------
+        SpaceRobotError
+            It failed; the sentence, which is not logged as well, says why.
+        """
+        self._raising = True
+        try:
             if trigger() is not TransitionCallbackReturn.SUCCESS:
-                raise self.fault or SpaceRobotError(f"Node '{self.get_name()}' could not start.")
+                raise self.fault or SpaceRobotError(
+                    f"Node '{self.get_name()}' refused to {trigger.__name__.split('_')[-1]}."
+                )
+        finally:
+            self._raising = False
 
     @property
     def is_active(self) -> bool:
@@ -149,7 +166,8 @@ class FlightNode(LifecycleNode):
             hook()
         except SpaceRobotError as error:
             self.fault = error
-            self.get_logger().error(str(error))
+            if not self._raising:
+                self.get_logger().error(str(error))
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
             # rclpy drops what a transition raises; a defect must at least be seen.

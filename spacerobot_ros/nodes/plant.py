@@ -25,8 +25,11 @@ from spacerobot_ros.simulation import InitialState, VelocityPlant
 _LATE_JOINER_CHECK = 0.1
 """How often a waiting lockstep plant looks for new subscribers, wall s."""
 
-_MOST_CATCH_UP = 10
-"""Ticks that a late real-time plant takes at once; what is beyond is a missed deadline."""
+_LONGEST_LAG = 10
+"""Ticks that a real-time plant may be late and still make up; what is beyond is lost for good."""
+
+_CATCH_UP = 2
+"""Ticks that a late plant takes at once: commands must get a word in between."""
 
 
 class PlantNode(FlightNode):
@@ -181,11 +184,10 @@ class PlantNode(FlightNode):
         if not self._running or self._paused:
             return
         due = int((self._steady.now().nanoseconds - self._origin_ns) / self._pace_ns) - self._tick
-        if due > _MOST_CATCH_UP:
-            self._report.deadlines_missed += due - _MOST_CATCH_UP
-            self._origin_ns += (due - _MOST_CATCH_UP) * self._pace_ns
-            due = _MOST_CATCH_UP
-        for _ in range(due):
+        if due > _LONGEST_LAG:
+            self._report.deadlines_missed += due - _LONGEST_LAG
+            self._origin_ns += (due - _LONGEST_LAG) * self._pace_ns
+        for _ in range(min(due, _CATCH_UP)):
             self._step(self._held_command())
 
     def _held_command(self) -> Any:

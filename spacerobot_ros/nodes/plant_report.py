@@ -38,7 +38,8 @@ class PlantReport:
         """Count a commander that fell silent."""
         self.command_timeouts += 1
         self._node.get_logger().warning(
-            f"No joint command for {timeout:g} s: the joints are brought to rest."
+            f"No joint command for {timeout:g} s: the joints are brought to rest.",
+            throttle_duration_sec=_LOG_PERIOD,
         )
 
     def limited(self) -> None:
