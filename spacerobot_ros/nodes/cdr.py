@@ -43,12 +43,14 @@ class Layout:
     """Where the fields of one serialised message lie (little-endian plain CDR).
 
     ``offsets`` maps a field path such as ``pose.pose.position.x`` (or ``markers[2].pose``) to its
-    first byte; ``fixed`` are the spans of strings and lengths: another message has the same layout
-    when it has the same size and equal bytes there.
+    first byte, ``lengths`` that of a sequence to its number of elements; ``fixed`` are the spans of
+    strings and lengths: another message has the same layout when it has the same size and equal
+    bytes there.
     """
 
     offsets: dict[str, int] = field(default_factory=dict)
     fixed: list[tuple[int, int]] = field(default_factory=list)
+    lengths: dict[str, int] = field(default_factory=dict)
     end: int = _ENCAPSULATION
 
     @classmethod
@@ -93,6 +95,7 @@ class Layout:
         elif isinstance(kind, (AbstractSequence, Array)):
             if isinstance(kind, AbstractSequence):
                 self._length()
+                self.lengths[path] = self.end - 4
             for index, element in enumerate(value):
                 self._field(element, kind.value_type, f"{path}[{index}]")
             if len(value) and f"{path}[0]" in self.offsets:

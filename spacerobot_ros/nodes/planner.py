@@ -34,6 +34,9 @@ from spacerobot_ros.nodes.trajectory_message import serialised_trajectory
 from spacerobot_ros.planning import METHODS, GaitSchedule, Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.follower import GaitFollower
 
+_AT_REST = 1e-9
+"""Joint rates below which the joints rest, m/s or rad/s."""
+
 _METHOD_SPECS = tuple(
     ParameterSpec(
         f"{name}.{option.name}",
@@ -88,6 +91,7 @@ class PlannerNode(FlightNode):
         self._pending = False
         self._corrections = 0
         self._follower: GaitFollower | None = None
+        self._momenta = np.zeros(3), np.zeros(3)
         self._odom_raw = b""
         self._joints_raw = b""
         self._odom = TemplateReader(
@@ -242,8 +246,11 @@ class PlannerNode(FlightNode):
         twist = self._odom.floats("twist.twist.linear.x")
         self._rates.accept(self._joints_raw)
         q, qdot = self._joints.values["position"].copy(), self._rates.values["velocity"]
-        p, L, _ = self._robot.momentum(pose[3:], q, twist[:3], twist[3:], qdot)
-        return RobotState(pose[:3].copy(), pose[3:].copy(), q, p, L)
+        if np.abs(qdot).max(initial=0.0) <= _AT_REST:
+            # While joints move, the momentum of a robot whose masses are not quite known is
+            # uncertain; at rest the base alone shows it, and without thrust it stays.
+            self._momenta = self._robot.momentum(pose[3:], q, twist[:3], twist[3:], qdot)[:2]
+        return RobotState(pose[:3].copy(), pose[3:].copy(), q, *self._momenta)
 
     def _plan_proposed(self, stamp: int) -> None:
         self.plan_time = self.flown_time = 0.0

@@ -30,7 +30,8 @@ def serialised_trajectory(schedule: GaitSchedule, stamp_ns: int, frame: str) -> 
         for _ in range(3)
     ]
     raw = serialize_message(prototype)
-    offsets = Layout.of(prototype).offsets
+    layout = Layout.of(prototype)
+    offsets = layout.offsets
     fields = ("positions", "velocities", "time_from_start.sec")
     at = [[offsets[f"points[{i}].{name}"] for name in fields] for i in range(3)]
     # A point ends with its time; the first may be padded differently, all others are alike.
@@ -50,15 +51,6 @@ def serialised_trajectory(schedule: GaitSchedule, stamp_ns: int, frame: str) -> 
 
     # The first point's own bytes up to its positions, then what it shares with the others.
     head = bytearray(raw[: at[0][0]])
-    length_at = _points_length(raw, at[0][0])
-    struct.pack_into("<I", head, length_at, count)
+    struct.pack_into("<I", head, layout.lengths["points"], count)
     body = records.reshape(-1)[at[0][0] - start :]
     return bytes(head) + body.tobytes()
-
-
-def _points_length(raw: bytes, first_positions: int) -> int:
-    """Offset of the number of points: the last value 3 before the length of the first positions."""
-    for offset in range(first_positions - 8, 0, -4):
-        if struct.unpack_from("<I", raw, offset)[0] == 3:
-            return offset
-    raise ValueError("the layout of JointTrajectory is not as expected")

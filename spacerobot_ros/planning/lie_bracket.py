@@ -52,8 +52,8 @@ class LieBracketGait(GaitMethod):
         Option("cycle_period", 3.0, "s", "duration of one cycle of step 3, (tf - t1) / n", 1e-3),
         Option("cycles", 0, "", "n, the number of cycles of step 3; 0: by loop_area", 0, 1e8),
         Option("loop_area", 0.04, "m^2", "|alpha| / n when cycles is 0", 1e-9),
-        Option("a22", 0.0, "", "free amplitude of the second slider; 0: balanced"),
-        Option("a31", 0.0, "", "free amplitude of the third slider; 0: balanced"),
+        Option("a22_ratio", 1.0, "", "free amplitude a22 over sqrt(|a22 b12|); 1: balanced", 1e-3),
+        Option("a31_ratio", 1.0, "", "a31 over sqrt(|a31 (b21, b11)|); 1: balanced", 1e-3),
         Option("longest", 100_000.0, "s", "longest manoeuvre that is still planned", 1.0),
     )
 
@@ -69,13 +69,14 @@ class LieBracketGait(GaitMethod):
         cycle_period: float = 3.0,
         cycles: int = 0,
         loop_area: float = 0.04,
-        a22: float = 0.0,
-        a31: float = 0.0,
+        a22_ratio: float = 1.0,
+        a31_ratio: float = 1.0,
         longest: float = 100_000.0,
     ) -> None:
         super().__init__(robot, tick_period, tolerance, integration_step)
         self.t1, self.n1 = t1, n1
-        self.cycles, self.loop_area, self.a22, self.a31 = cycles, loop_area, a22, a31
+        self.cycles, self.loop_area = cycles, loop_area
+        self.a22_ratio, self.a31_ratio = a22_ratio, a31_ratio
         self.longest = longest
         # Whole ticks a cycle: every cycle is then the same commands and the same rotation.
         self.ticks_a_cycle = max(round(cycle_period / tick_period), _FEWEST_TICKS_A_CYCLE)
@@ -236,7 +237,7 @@ class LieBracketGait(GaitMethod):
         """Choose n so that the cycle keeps rates and strokes; more cycles are smaller ones."""
         n = 0 if correction else self.cycles
         n = n or max(1, math.ceil(float(np.linalg.norm(alpha)) / self.loop_area))
-        amplitudes = self._amplitudes(alpha, free=not correction)
+        amplitudes = self._amplitudes(alpha)
         robot = self.robot
         room = np.minimum(z_f - robot.lower, robot.upper - z_f)
         while True:
@@ -258,20 +259,19 @@ class LieBracketGait(GaitMethod):
             if excess <= 1.0:
                 return _Turn(shapes, n, alpha, amplitudes)
             # Amplitudes go as 1/sqrt(n).
-            n = math.ceil(min(n * excess**2 * 1.001, 1e12)) + 1
+            n = math.ceil(min(n * min(excess, 1e6) ** 2 * 1.001, 1e12)) + 1
 
-    def _amplitudes(self, alpha: Array, *, free: bool) -> Array:
+    def _amplitudes(self, alpha: Array) -> Array:
         """Return (b11, b12, b21, a22, a31): ``a22 b12 = 2 alpha1/pi``, ``a31 b21 = alpha2/pi``,
         ``a31 b11 = alpha3/pi``, each product raised by what the polygons lose.
         """
+        p12, p23, p13 = 2 * alpha[0] / np.pi, alpha[1] / np.pi, alpha[2] / np.pi
+        a22 = self.a22_ratio * math.sqrt(abs(p12))
+        a31 = self.a31_ratio * math.sqrt(math.hypot(p23, p13))
         step = 2 * np.pi / self.ticks_a_cycle
         first, second = np.sinc(step / np.pi), np.sinc(2 * step / np.pi)
-        p12 = 2 * alpha[0] / (np.pi * second)
-        p23, p13 = alpha[1] / (np.pi * first), alpha[2] / (np.pi * first)
-        a22 = (self.a22 if free else 0.0) or math.sqrt(abs(p12))
-        a31 = (self.a31 if free else 0.0) or math.sqrt(math.hypot(p23, p13))
-        b12 = p12 / a22 if a22 else 0.0
-        b21, b11 = (p23 / a31, p13 / a31) if a31 else (0.0, 0.0)
+        b12 = p12 / (second * a22) if a22 else 0.0
+        b21, b11 = (p23 / (first * a31), p13 / (first * a31)) if a31 else (0.0, 0.0)
         return np.array([b11, b12, b21, a22, a31])
 
     def _cycle(self, amplitudes: Array, n: int, triple: tuple[int, int, int], z_f: Array) -> Array:

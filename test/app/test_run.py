@@ -1,0 +1,242 @@
+"""Whole runs in one process: what they record, that they repeat, what they sum up."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+from spacerobot_ros.app.run import RunResult, run_scenario
+from spacerobot_ros.app.scenario import Scenario, goal_from_rotvec, load_scenario
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.recording import iterate_raw, read_bag
+
+SHORT = {"lie_bracket.t1": 5.0, "lie_bracket.cycle_period": 1.0, "lie_bracket.cycles": 0}
+
+
+@pytest.fixture(autouse=True)
+def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
+
+
+def short(**settings: Any) -> Scenario:
+    """Return a flight of about ten seconds that moves and turns the base."""
+    scenario = load_scenario("sliding_masses").with_overrides("planner", {**SHORT, **settings})
+    return replace(scenario, goal=goal_from_rotvec([0.02, -0.01, 0.01], [0.02, 0.01, -0.015]))
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> RunResult:
+    return run_scenario(short(attitude_tolerance=1e-4), tmp_path / "run.mcap")
+
+
+def test_summary_is_what_the_bag_says(result: RunResult, tmp_path: Path) -> None:
+    """The summary against the bag decoded by another library."""
+    result.write_json(tmp_path / "sub" / "run.json")
+    summary = json.loads((tmp_path / "sub" / "run.json").read_text())
+    with AnyReader([Path(summary["bag"])]) as reader:
+        last: dict[str, Any] = {}
+        count = 0
+        for connection, _, raw in reader.messages():
+            count += 1
+            last[connection.topic] = reader.deserialize(raw, connection.msgtype)
+    pose = last["/odom"].pose.pose
+    position = np.array([pose.position.x, pose.position.y, pose.position.z])
+    attitude = Rotation.from_quat(
+        [pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w]
+    )
+    goal = Rotation.from_quat(summary["goal"][3:])
+    assert summary["succeeded"] is True
+    assert summary["scenario"] == "sliding_masses"
+    assert summary["method"] == "lie_bracket"
+    assert summary["messages_recorded"] == count
+    assert summary["final_position_m"] == position.tolist()
+    np.testing.assert_allclose(
+        summary["final_attitude_rotvec_rad"], attitude.as_rotvec(), atol=1e-14
+    )
+    assert summary["final_joint_positions"] == last["/joint_states"].position.tolist()
+    distance = np.linalg.norm(position - summary["goal"][:3])
+    assert summary["position_error_m"] == pytest.approx(distance, abs=1e-15)
+    angle = (attitude.inv() * goal).magnitude()
+    assert summary["attitude_error_rad"] == pytest.approx(angle, abs=1e-12)
+    assert summary["attitude_error_rad"] <= 1e-4
+    assert summary["ticks"] == round(summary["sim_time_s"] * 20)
+    assert summary["sim_time_s"] == pytest.approx(summary["manoeuvre_time_s"])
+    assert {"plan_time_s", "wall_time_s", "ticks_per_s", "real_time_factor"} <= set(summary)
+
+
+def test_momentum_against_the_momentum_in_motion(result: RunResult) -> None:
+    """At most 1e-12 of what the moving parts carry, which the base's own part measures."""
+    odom = read_bag(result.summary["bag"])["/odom"]
+    v, omega = (
+        np.column_stack([odom.field(f"twist.twist.{part}.{x}") for x in "xyz"])
+        for part in ("linear", "angular")
+    )
+    base_linear = 10.0 * np.linalg.norm(v, axis=1).max()
+    base_angular = np.linalg.norm(omega * [1.0, 1.5, 1.5], axis=1).max()
+    assert base_linear > 0.01
+    assert base_angular > 1e-4
+    assert result.summary["linear_momentum_drift"] <= 1e-12 * base_linear
+    assert result.summary["angular_momentum_drift"] <= 1e-12 * base_angular
+
+
+def test_every_message_opens_with_other_libraries(result: RunResult) -> None:
+    """rosbags and mcap-ros2-support decode the same messages, every one of them."""
+    path = Path(result.summary["bag"])
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        by_mcap = [(c.topic, m.log_time, d) for _, c, m, d in reader.iter_decoded_messages()]
+        assert summary.statistics.message_count == len(by_mcap)
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
+        by_rosbags = [
+            (c.topic, time, bag.deserialize(raw, c.msgtype)) for c, time, raw in bag.messages()
+        ]
+    assert len(by_mcap) == len(by_rosbags) == result.summary["messages_recorded"]
+    topics = {"/clock", "/odom", "/base_pose", "/joint_states", "/momentum", "/joint_commands"}
+    topics |= {"/goal_pose", "/gait_schedule", "/planned_path", "/planner/status", "/markers"}
+    assert {topic for topic, _, _ in by_mcap} == topics | {"/diagnostics", "/robot_description"}
+
+    def positions(entries: list[tuple[str, int, Any]]) -> list[float]:
+        return [d.pose.pose.position.x for topic, _, d in entries if topic == "/odom"]
+
+    assert positions(by_mcap) == positions(by_rosbags)
+
+
+def test_nothing_is_lost_or_recorded_twice(result: RunResult) -> None:
+    bag = read_bag(result.summary["bag"])
+    ticks = result.summary["ticks"]
+    for topic in ("/clock", "/odom", "/base_pose", "/joint_states", "/momentum"):
+        times = bag.times(topic)
+        assert len(times) == ticks + 1, topic
+        np.testing.assert_allclose(times, np.arange(ticks + 1) * 0.05, atol=1e-9)
+    np.testing.assert_allclose(bag["/odom"].stamp, bag.times("/odom"), atol=1e-9)
+
+
+def test_bag_says_how_it_was_made(result: RunResult) -> None:
+    bag = read_bag(result.summary["bag"])
+    assert bag.metadata["scenario"]["name"] == "sliding_masses"
+    assert json.loads(bag.metadata["parameters/plant"]["tick_rate"]) == 20.0
+    assert json.loads(bag.metadata["parameters/planner"]["lie_bracket.t1"]) == 5.0
+    assert "version" in bag.metadata["spacerobot"]
+    assert b'<robot name="sliding_masses">' in bag.attachments["robot_description.urdf"]
+
+
+def test_two_runs_are_the_same_to_the_last_message(tmp_path: Path) -> None:
+    from rclpy.serialization import deserialize_message
+
+    bags = [tmp_path / f"{i}.mcap" for i in range(2)]
+    for bag in bags:
+        run_scenario(short(), bag)
+    first, second = (list(iterate_raw(bag)) for bag in bags)
+    assert len(first) == len(second) > 500
+    for a, b in zip(first, second, strict=True):
+        assert a[:4] == b[:4]
+        if a[4] != b[4]:  # Padding is not initialised; what is in it must be equal.
+            kind = message_class(a[1])
+            assert deserialize_message(a[4], kind) == deserialize_message(b[4], kind)
+
+
+def message_class(type_name: str) -> Any:
+    import importlib
+
+    package, _, name = type_name.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), name)
+
+
+def test_without_a_compiler_the_numbers_are_the_same(
+    result: RunResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    again = run_scenario(short(attitude_tolerance=1e-4), tmp_path / "interpreted.mcap")
+    for key in ("final_position_m", "final_attitude_rotvec_rad", "final_joint_positions"):
+        np.testing.assert_allclose(again.summary[key], result.summary[key], atol=1e-12)
+
+
+def test_corrections_follow_until_the_tolerance_is_met(tmp_path: Path) -> None:
+    """A base heavier than the planner believes leaves an error, which the next plans remove."""
+    scenario = short(attitude_tolerance=1e-3, position_tolerance=1e-6, max_corrections=3)
+    urdf = (
+        load_scenario("sliding_masses").path.parent.parent / "urdf/sliding_masses.urdf"
+    ).read_text()
+    heavier = urdf.replace('<mass value="10"/>', '<mass value="11"/>')
+    (tmp_path / "heavier.urdf").write_text(heavier)
+    scenario = scenario.with_overrides("plant", {"robot": str(tmp_path / "heavier.urdf")})
+    result = run_scenario(scenario, tmp_path / "run.mcap")
+    assert result.summary["corrections"] >= 1
+    assert result.succeeded
+    assert result.summary["attitude_error_rad"] <= 1e-3
+    assert result.summary["position_error_m"] <= 1e-6
+
+
+def test_unreachable_goal_is_summed_up_too(tmp_path: Path) -> None:
+    scenario = replace(short(), goal=goal_from_rotvec([9.0, 0.0, 0.0], [0.0, 0.0, 0.0]))
+    result = run_scenario(scenario, tmp_path / "run.mcap")
+    assert not result.succeeded
+    assert result.summary["state"] == "refused"
+    assert "beyond stroke" in result.sentence
+    assert "slider_1" in result.sentence
+
+
+def test_interrupted_run_leaves_a_complete_bag(tmp_path: Path) -> None:
+    """The signal comes from the run's own progress, so it hits in mid-flight for certain."""
+    looks = []
+
+    def progress(now: float, end: float) -> None:
+        looks.append(now)
+        if now > 0 and len(looks) < 50:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    result = run_scenario(load_scenario("sliding_masses"), tmp_path / "run.mcap", progress)
+    assert result.summary["state"] == "interrupted"
+    assert not result.succeeded
+    assert 0 < result.summary["sim_time_s"] < 4900
+    assert read_bag(tmp_path / "run.mcap").message_count("/odom") == result.summary["ticks"] + 1
+
+
+@pytest.mark.parametrize(
+    ("node", "setting", "sentence"),
+    [
+        ("plant", {"tick_rate": -1.0}, r"Node 'plant': Parameter 'tick_rate' is -1"),
+        ("plant", {"robot": "nothing"}, r"Parameter 'robot' is 'nothing'"),
+        ("planner", {"method": "magic"}, r"Node 'planner': Parameter 'method' is 'magic'"),
+        ("planner", {"spin": 1}, r"Node 'planner' has no parameter 'spin'"),
+    ],
+)
+def test_bad_parameters_are_named(
+    tmp_path: Path, node: str, setting: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        run_scenario(short().with_overrides(node, setting), tmp_path / "run.mcap")
+
+
+@pytest.mark.slow
+def test_the_published_manoeuvre(tmp_path: Path) -> None:
+    """4900 s: the end state that was recomputed at high accuracy from the printed controls."""
+    result = run_scenario(load_scenario("sliding_masses"), tmp_path / "run.mcap")
+    summary = result.summary
+    attitude = np.array(summary["final_attitude_rotvec_rad"])
+    position = np.array(summary["final_position_m"])
+    assert np.abs(attitude - [0.55055, -0.14255, 0.09554]).max() <= 0.002
+    assert np.abs(position - [0.30135, -0.25412, 0.08435]).max() <= 0.002
+    zf = [-2.378408, 1.687252, -1.377082]
+    np.testing.assert_allclose(summary["final_joint_positions"], zf, atol=1e-4)
+    np.testing.assert_allclose(summary["gait"]["c"], [-0.047568, 0.033745, -0.027542], atol=1e-6)
+    np.testing.assert_allclose(summary["gait"]["alpha"], [-0.84377, -61.0928, -18.8194], atol=1e-4)
+    assert summary["sim_time_s"] == pytest.approx(4900.0)
+    assert summary["ticks"] == 98_000
+    assert summary["momentum_drift"] <= 1e-12
+    assert result.succeeded

@@ -1,0 +1,80 @@
+"""The environment of all tests: message checks on, discovery on this machine, nothing left behind."""
+
+from __future__ import annotations
+
+import fcntl
+import itertools
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    import rclpy
+
+_WORKER = "PYTEST_XDIST_WORKER" in os.environ
+"""Workers inherit what their controller has set."""
+
+_scratch: Path | None = None
+
+if not _WORKER:
+    _scratch = Path(tempfile.mkdtemp(prefix="spacerobot_ros_test_"))
+    os.environ["ROS_LOG_DIR"] = str(_scratch / "log")
+    os.environ.setdefault("SPACEROBOT_CACHE_DIR", str(_scratch / "compiled"))
+    # Generated message classes read it when they are imported.
+    os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    for name in ("ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY", "ROS_DOMAIN_ID"):
+        os.environ.pop(name, None)
+
+_DOMAINS = 101
+"""Higher domains take ports that Linux hands out to others."""
+
+_turn = itertools.count(os.getpid())
+"""Two tests of one process do not follow each other in one domain."""
+
+
+def pytest_unconfigure() -> None:
+    if _scratch is not None:
+        shutil.rmtree(_scratch, ignore_errors=True)
+
+
+@contextmanager
+def _free_domain() -> Iterator[int]:
+    """Hold a domain that no other test on this machine, of whatever process, is in."""
+    folder = Path(tempfile.gettempdir()) / f"spacerobot_ros_domains_{os.getuid()}"
+    folder.mkdir(exist_ok=True)
+    for _ in range(_DOMAINS):
+        domain = 1 + next(_turn) % _DOMAINS
+        with (folder / str(domain)).open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            # The lock goes with the file that is closed, and with a process that is killed.
+            yield domain
+            return
+    raise RuntimeError("every ROS domain from 1 to 101 is taken by another test")
+
+
+@pytest.fixture
+def ros_domain() -> Iterator[int]:
+    """Return the number of a ROS domain that is this test's own."""
+    with _free_domain() as domain:
+        yield domain
+
+
+@pytest.fixture
+def ros_context(ros_domain: int) -> Iterator[rclpy.Context]:
+    """Return an initialised context in a domain of its own."""
+    import rclpy
+
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, domain_id=ros_domain)
+    yield context
+    rclpy.try_shutdown(context=context)
