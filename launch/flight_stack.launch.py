@@ -1,0 +1,59 @@
+"""Plant, planner and recorder, each its own process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from launch import LaunchContext, LaunchDescription
+
+PACKAGE = "spacerobot_ros"
+
+
+def nodes(context: LaunchContext) -> list[Node]:
+    """Return the nodes with the parameter file that the arguments name."""
+    chosen = LaunchConfiguration("params_file").perform(context)
+    scenario = LaunchConfiguration("scenario").perform(context)
+    share = Path(get_package_share_directory(PACKAGE))
+    common = {
+        "package": PACKAGE,
+        "namespace": LaunchConfiguration("namespace"),
+        "output": "screen",
+    }
+    parameters = [
+        chosen or str(share / "config" / f"{scenario}.yaml"),
+        {"use_sim_time": LaunchConfiguration("use_sim_time")},
+    ]
+    return [
+        Node(executable="plant", name="plant", parameters=parameters, **common),
+        Node(executable="planner", name="planner", parameters=parameters, **common),
+        Node(
+            executable="recorder",
+            name="recorder",
+            parameters=parameters,
+            condition=IfCondition(LaunchConfiguration("record")),
+            **common,
+        ),
+    ]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Declare the arguments and the nodes."""
+    arguments = (
+        ("scenario", "sliding_masses", "name of a parameter file in the package's config/"),
+        ("params_file", "", "another parameter file, before the scenario's"),
+        ("namespace", "", "namespace of all nodes and relative topics"),
+        ("use_sim_time", "false", "whether the nodes' own clocks follow /clock"),
+        ("record", "true", "whether to record into an MCAP bag"),
+    )
+    return LaunchDescription(
+        [
+            *(DeclareLaunchArgument(n, default_value=d, description=t) for n, d, t in arguments),
+            OpaqueFunction(function=nodes),
+        ]
+    )

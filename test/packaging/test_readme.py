@@ -1,0 +1,32 @@
+"""The README's tables of parameters are the nodes' own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from spacerobot_ros.nodes import FlightNode, PlannerNode, PlantNode, RecorderNode
+from spacerobot_ros.nodes.flight_node import AUTOSTART
+
+README = Path(__file__).resolve().parents[2] / "README.md"
+
+
+@pytest.mark.parametrize(
+    ("heading", "node"),
+    [("plant", PlantNode), ("planner", PlannerNode), ("recorder", RecorderNode)],
+)
+def test_parameters_are_documented_with_their_defaults(
+    heading: str, node: type[FlightNode]
+) -> None:
+    section = README.read_text(encoding="utf-8").split(f"\n### {heading}\n")[1].split("\n#")[0]
+    rows = [
+        [cell.strip().strip("`") for cell in line.strip("|").split("|")]
+        for line in section.splitlines()
+        if line.startswith("| `")
+    ]
+    documented = {row[0]: row[1] for row in rows}
+    for spec in (AUTOSTART, *node.SPECS):
+        default = str(spec.default).lower() if isinstance(spec.default, bool) else spec.default
+        assert documented.pop(spec.name) == (str(default) or "''"), spec.name
+    assert documented == {}
