@@ -132,14 +132,18 @@ def scenarios() -> None:
 @main.command("report")
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("--output", "-o", type=click.Path(path_type=Path), help="HTML file [beside the bag].")
+@click.option("--picture", type=click.Path(path_type=Path), help="Also draw an overview (PNG).")
 @_sentences
-def report_command(bag: Path, output: Path | None) -> None:
+def report_command(bag: Path, output: Path | None, picture: Path | None) -> None:
     """Make a picture report of a BAG."""
-    from spacerobot_ros.app.report import write_report
+    from spacerobot_ros.app.report import write_picture, write_report
 
     target = output or bag.with_suffix(".html")
     write_report(bag, target)
     click.echo(f"report      {target}")
+    if picture is not None:
+        write_picture(bag, picture)
+        click.echo(f"picture     {picture}")
 
 
 @main.command()

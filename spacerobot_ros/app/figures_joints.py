@@ -89,8 +89,10 @@ def loops_plate(flight: Flight) -> Plate | str:
     part = flight.shape
     if cycles is not None:
         part = part.between(*cycles.last(SHOWN_CYCLES))
-    figure, (row, *_) = sheet([[1.0] * len(pairs)], [2.35 if len(pairs) > 1 else 3.2])
-    for axes, (i, j) in zip(row, pairs, strict=True):
+    figure, (row, *_) = sheet([[1.0] * _LOOP_JOINTS], [2.35])
+    for axes in row[len(pairs) :]:
+        axes.set_visible(False)
+    for axes, (i, j) in zip(row[: len(pairs)], pairs, strict=True):
         x, y = part.values[:, i], part.values[:, j]
         axes.plot(x, y, color=colour(0), rasterized=len(part) > 4 * COLUMNS)
         axes.plot(x[:1], y[:1], "o", color=colour(0), mfc="white", ms=5, zorder=4)
@@ -110,9 +112,9 @@ def loops_plate(flight: Flight) -> Plate | str:
         caption = "Path in shape space; a circle marks the first shape, a dot the last."
     else:
         caption = (
-            f"The last {SHOWN_CYCLES} of {cycles.count} cycles in shape space. Each begins and ends "
-            "at the circle and turns the base by what its loops enclose; the areas are those of one "
-            "cycle, positive where it runs counter-clockwise."
+            f"The last {SHOWN_CYCLES} of {cycles.count} cycles in shape space. Each begins and "
+            "ends at the circle and, to first order, displaces the base in proportion to the areas "
+            "it encloses: those of one cycle are given, positive where it runs counter-clockwise."
         )
     if len(flight.joint_names) > _LOOP_JOINTS:
         caption += f" The first three of {len(flight.joint_names)} joints are shown."
@@ -121,7 +123,7 @@ def loops_plate(flight: Flight) -> Plate | str:
 
 def _set_across(axes: Axes, values: Array) -> None:
     low, high = float(values.min()), float(values.max())
-    half = max(high - low, 1e-6) / 2
+    half = (high - low if high - low > 1e-6 else 0.1) / 2
     axes.set_xlim((low + high) / 2 - 1.12 * half, (low + high) / 2 + 1.12 * half)
     axes.locator_params(axis="x", nbins=4)
 

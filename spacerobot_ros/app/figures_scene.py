@@ -9,11 +9,12 @@ import math
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.lines import Line2D
 
 from spacerobot_ros.app.figures import DASHES, NO_STATES
 from spacerobot_ros.app.report_flight import Flight
-from spacerobot_ros.app.report_solids import Face, robot_faces, robot_outlines
+from spacerobot_ros.app.report_render import Canvas, View
+from spacerobot_ros.app.report_solids import Solids, base_outlines, robot_solids
 from spacerobot_ros.app.report_style import (
     COLUMNS,
     INK,
@@ -29,43 +30,28 @@ from spacerobot_ros.model.attitude import matrix_from_quaternion
 from spacerobot_ros.model.description import Array, Pose
 
 GHOST = PALETTE[3]
+_VIEW = View()
+PIXELS = 720
+"""Across the picture of a robot."""
+
 _PATH = PALETTE[0]
 _PLAN = PALETTE[1]
-
-
-class View:
-    """A parallel projection from azimuth and elevation (deg): world points to the paper."""
-
-    def __init__(self, azimuth: float = -58.0, elevation: float = 24.0) -> None:
-        a, e = math.radians(azimuth), math.radians(elevation)
-        self.toward = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
-        right = np.array([-math.sin(a), math.cos(a), 0.0])
-        self._paper = np.array([right, np.cross(self.toward, right)])
-
-    def __call__(self, points: Array) -> Array:
-        """Return points (..., 3) on the paper (..., 2)."""
-        return np.asarray(points @ self._paper.T)
 
 
 def robot_plate(flight: Flight) -> Plate | str:
     """The robot as it was first and last, and the goal."""
     if flight.robot is None:
         return "The bag holds no robot description, so there is no picture of the robot."
-    scenes = [faces_at(flight, index) for index in (0, -1)]
+    scenes = [solids_at(flight, index) for index in (0, -1)]
     if scenes[0] is None or scenes[1] is None:
         return "The bag does not hold base pose and joint positions for a picture of the robot."
     figure, (row, *_) = sheet([[1.0, 1.0]], [3.9], bottom=0.15, left=0.2)
-    view = View()
-    both = [view(face.corners) for scene in scenes if scene for face in scene]
-    for axes, faces, index, title in zip(row, scenes, (0, -1), ("start", "end"), strict=True):
-        assert faces is not None
-        draw_faces(axes, view, faces)
-        keys = []
-        if index == -1:
-            keys = draw_goal_and_path(axes, view, flight)
-        frame_scene(axes, view, np.concatenate(both))
+    points = np.concatenate([scene.points() for scene in scenes if scene is not None])
+    for axes, solids, title in zip(row, scenes, ("start", "end"), strict=True):
+        assert solids is not None
+        draw_robot(axes, solids, points)
         axes.set_title(title)
-        legend_above(axes, keys)
+    legend_above(row[1], draw_goal_and_path(row[1], flight))
     caption = (
         "The robot at the first and at the last recorded state, from the shapes of its URDF; "
         "each moving link in the colour that its joint has in the figures above."
@@ -77,7 +63,7 @@ def robot_plate(flight: Flight) -> Plate | str:
     return Plate("robot", "The robot", caption, svg_of(figure))
 
 
-def faces_at(flight: Flight, index: int) -> list[Face] | None:
+def solids_at(flight: Flight, index: int) -> Solids | None:
     """Return the robot at the first (0) or last (-1) state; None if the bag lacks one."""
     robot = flight.robot
     if robot is None or not len(flight.position):
@@ -89,70 +75,53 @@ def faces_at(flight: Flight, index: int) -> list[Face] | None:
     chosen = [flight.joint_names.index(name) for name in robot.joint_names]
     q = flight.shape.values[index, chosen] if chosen else np.empty(0)
     R = matrix_from_quaternion(flight.quaternion[index])
-    return robot_faces(robot, q, Pose(R, flight.position.values[index]))
+    return robot_solids(robot, q, Pose(R, flight.position.values[index]))
 
 
-def draw_faces(axes: Axes, view: View, faces: list[Face]) -> None:
-    """Draw faces from the farthest to the nearest, without those that look away."""
-    seen = [face for face in faces if face.seen(view.toward)]
-    seen.sort(key=lambda face: float(face.corners.mean(axis=0) @ view.toward) + face.nearer)
-    light = view.toward + np.array([0.35, -0.1, 0.9])
-    light /= np.linalg.norm(light)
-    fills = [face.shaded(light) for face in seen]
-    lines = [face.line or fill for face, fill in zip(seen, fills, strict=True)]
-    axes.add_collection(
-        PolyCollection(
-            [view(face.corners) for face in seen],
-            facecolors=fills,
-            edgecolors=lines,
-            linewidths=[0.7 if face.line else 0.4 for face in seen],
-            closed=False,
-            capstyle="round",
-        )
-    )
-
-
-def draw_goal_and_path(axes: Axes, view: View, flight: Flight) -> list[object]:
-    """Draw the ghost of the base at the goal and the path of the base; return legend entries."""
-    keys: list[object] = []
-    path = flight.position.values
-    stride = max(1, len(path) // 4000)
-    if float(np.ptp(path, axis=0).max()) > 0.0:
-        flat = view(path[::stride])
-        axes.plot(flat[:, 0], flat[:, 1], color=INK, lw=0.8, zorder=5, rasterized=stride > 1)
-        keys.append(key(INK, "path of the base"))
-    if flight.goal is not None and flight.robot is not None:
-        pose = Pose(matrix_from_quaternion(flight.goal.quaternion), flight.goal.position)
-        lines = [view(line) for line in robot_outlines(flight.robot, pose)]
-        axes.add_collection(
-            LineCollection(lines, colors=GHOST, linewidths=0.9, linestyles=[(0, DASHES)], zorder=6)
-        )
-        keys.append(key(GHOST, "goal", DASHES))
-    return keys
-
-
-def frame_scene(axes: Axes, view: View, points: Array) -> None:
-    """Fit the axes to projected points, to scale; draw the world's directions and a scale."""
+def draw_robot(axes: Axes, solids: Solids, points: Array) -> None:
+    """Draw a robot to scale in axes that hold ``points`` (k, 3), with directions and a scale."""
     box = axes.get_window_extent()
-    low, high = points.min(axis=0), points.max(axis=0)
     size = np.array([box.width, box.height])
-    span = 1.06 * max(float(((high - low) / size).max()), 1e-6) * size
-    low = (low + high) / 2 - span / 2
-    axes.set_xlim(low[0], low[0] + span[0])
-    axes.set_ylim(low[1], low[1] + span[1])
+    flat = _VIEW(points)
+    middle = (flat.max(axis=0) + flat.min(axis=0)) / 2
+    span = 1.06 * max(float((np.ptp(flat, axis=0) / size).max()), 1e-6) * size
+    low, high = middle - span / 2, middle + span / 2
+    canvas = Canvas(_VIEW, low, high, PIXELS)
+    canvas.draw(solids.faces, solids.edges)
+    axes.imshow(canvas.image(), extent=(low[0], high[0], low[1], high[1]), aspect="auto")
     axes.axis("off")
     across = float(span[0])
     corner = low + 0.07 * across
     for direction, name in zip(np.eye(3), "xyz", strict=True):
-        tip = corner + 0.075 * across * view(direction)
+        tip = corner + 0.075 * across * _VIEW(direction)
         arrow = {"arrowstyle": "-|>", "color": MUTED, "lw": 0.9, "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", tip, corner, arrowprops=arrow)
-        end = corner + 0.1 * across * view(direction)
-        axes.text(*end, name, color=MUTED, ha="center", va="center")
+        end = corner + 0.1 * across * _VIEW(direction)
+        axes.text(end[0], end[1], name, color=MUTED, ha="center", va="center")
     length = _round_length(0.25 * across)
     x, y = low[0] + 0.99 * across, low[1] + 0.02 * across
     axes.plot([x - length, x], [y, y], color=MUTED, lw=1.6)
     axes.text(x - length / 2, y + 0.015 * across, f"{length:g} m", color=MUTED, ha="center")
+
+
+def draw_goal_and_path(axes: Axes, flight: Flight) -> list[Line2D]:
+    """Draw the ghost of the base at the goal and the path of the base; return legend entries."""
+    keys = []
+    path = flight.position.values
+    limits = axes.axis()
+    if float(np.ptp(path, axis=0).max()) > 0.0:
+        flat = _VIEW(path)
+        dense = len(path) > 2 * COLUMNS
+        axes.plot(flat[:, 0], flat[:, 1], color=INK, lw=0.8, zorder=5, rasterized=dense)
+        keys.append(key(INK, "path of the base"))
+    if flight.goal is not None and flight.robot is not None:
+        pose = Pose(matrix_from_quaternion(flight.goal.quaternion), flight.goal.position)
+        for line in base_outlines(flight.robot, pose):
+            flat = _VIEW(line)
+            axes.plot(flat[:, 0], flat[:, 1], color=GHOST, lw=0.9, ls=(0, DASHES), zorder=6)
+        keys.append(key(GHOST, "goal", DASHES))
+    axes.axis(limits)
+    return keys
 
 
 def path_plate(flight: Flight) -> Plate | str:
@@ -187,7 +156,8 @@ def path_plate(flight: Flight) -> Plate | str:
     caption += "start; full circle, end"
     caption += "; cross, goal" if goal is not None else ""
     caption += "; dashed, the path that the planner published" if flight.planned else ""
-    return Plate("path", "Path of the base", f"{caption}.", svg_of(figure))
+    caption += ". Every recorded state is drawn."
+    return Plate("path", "Path of the base", caption, svg_of(figure))
 
 
 def _round_length(longest: float) -> float:

@@ -45,7 +45,7 @@ class Measured:
             time=odom.stamp,
             position=np.column_stack([odom.field(f"{pose}.position.{x}") for x in "xyz"]),
             quaternion=np.column_stack([odom.field(f"{pose}.orientation.{x}") for x in "xyzw"]),
-            joint_names=list(joints.field("name")[0]),
+            joint_names=list(next(joints.messages())[1].name),
             joints=np.asarray(joints.field("position")),
             joint_rates=np.asarray(joints.field("velocity")),
             momentum=np.asarray(momentum.field("data")),

@@ -1,0 +1,124 @@
+"""The picture report of a flight, from its bag alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from spacerobot_ros.app.figures import (
+    NO_STATES,
+    attitude_group,
+    attitude_plate,
+    draw_whole,
+    momentum_plate,
+    position_group,
+    position_plate,
+    shape_groups,
+    shape_plate,
+)
+from spacerobot_ros.app.figures_joints import loops_plate, rates_plate
+from spacerobot_ros.app.figures_scene import (
+    draw_goal_and_path,
+    draw_robot,
+    path_plate,
+    robot_plate,
+    solids_at,
+)
+from spacerobot_ros.app.report_flight import Flight
+from spacerobot_ros.app.report_page import page
+from spacerobot_ros.app.report_reading import read_flight
+from spacerobot_ros.app.report_style import (
+    WIDTH,
+    legend_above,
+    new_figure,
+    panel,
+    paper_style,
+    png_of,
+    room_for,
+)
+from spacerobot_ros.errors import SpaceRobotError
+
+_PICTURE_WIDTH = 1000
+"""Pixels."""
+
+_ROBOT_WIDTH = 3.9
+"""Of the robot in the picture, inches."""
+
+_PLATES = (
+    position_plate,
+    attitude_plate,
+    shape_plate,
+    rates_plate,
+    loops_plate,
+    momentum_plate,
+    robot_plate,
+    path_plate,
+)
+
+
+def write_report(bag: Path, html: Path) -> None:
+    """Write the report of a bag as one HTML file, which needs nothing besides itself.
+
+    Any bag makes a page: what it does not hold is left out, with a sentence that says so.
+
+    Raises
+    ------
+    SpaceRobotError
+        There is no such bag, it is damaged, or the file cannot be written.
+    """
+    flight = read_flight(bag)
+    with paper_style():
+        text = page(flight, [plate(flight) for plate in _PLATES])
+    _write(html, text.encode())
+
+
+def write_picture(bag: Path, png: Path) -> None:
+    """Write one picture of a flight, 1000 pixels wide: pose and shape over time, and the robot.
+
+    Raises
+    ------
+    SpaceRobotError
+        There is no such bag, it is damaged or holds no base poses, or the file cannot be written.
+    """
+    flight = read_flight(bag)
+    if not len(flight.position):
+        raise SpaceRobotError(NO_STATES)
+    with paper_style():
+        _write(png, png_of(_overview(flight), _PICTURE_WIDTH))
+
+
+def _overview(flight: Flight) -> Figure:
+    """Base pose and shape over time, beside the robot where it can be drawn."""
+    groups = [position_group(flight), attitude_group(flight)]
+    if len(flight.shape):
+        groups += shape_groups(flight)[:1]
+    robot = solids_at(flight, -1)
+    height, gap, left = 1.25, 0.42, 0.72
+    up = 0.5 + (height + gap) * len(groups) + 0.35
+    figure = new_figure(up)
+    right = room_for([name for group in groups for name in group.names])
+    width = WIDTH - left - right - (_ROBOT_WIDTH if robot else 0.1)
+    for number, group in enumerate(groups):
+        y = up - 0.35 - (number + 1) * (height + gap)
+        axes = panel(figure, left, y + 0.05, width, height)
+        draw_whole(axes, flight, group, width / WIDTH)
+        if number < len(groups) - 1:
+            axes.set_xlabel("")
+            axes.tick_params(labelbottom=False)
+    if robot is not None:
+        size = _ROBOT_WIDTH - 0.15
+        axes = panel(figure, WIDTH - size - 0.1, 0.2, size, up - 1.0)
+        draw_robot(axes, robot, robot.points())
+        legend_above(axes, draw_goal_and_path(axes, flight))
+    title = f"{flight.scenario}: {flight.description}" if flight.description else flight.scenario
+    figure.text(0.1 / WIDTH, 1 - 0.24 / up, title, size=10.5, weight="bold")
+    return figure
+
+
+def _write(path: Path, data: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    except OSError as error:
+        raise SpaceRobotError(f"The file {path} cannot be written: {error.strerror}.") from error

@@ -1,0 +1,158 @@
+"""Arithmetic on recorded time series: windows, envelopes, continuous attitude, repeated cycles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spacerobot_ros.model.description import Array
+
+_FEWEST_CYCLES = 12
+_LONGEST_LOOK = 1 << 14
+"""Samples at the end of a gait in which a period is looked for."""
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Samples ``values`` (N, k) at ``time`` (N,) in s since the start of the flight."""
+
+    time: Array
+    values: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def width(self) -> int:
+        """Number of values in a sample."""
+        return int(self.values.shape[1])
+
+    def between(self, start: float, end: float) -> Signal:
+        """Return the samples from ``start`` to ``end``, both included."""
+        first, last = np.searchsorted(self.time, [start - 1e-9, end + 1e-9])
+        return Signal(self.time[first:last], self.values[first:last])
+
+    def since_first(self) -> Signal:
+        """Return what has changed since the first sample."""
+        return Signal(self.time, self.values - self.values[:1])
+
+
+@dataclass(frozen=True)
+class Cycles:
+    """A part of a flight, ``start`` to ``end`` in s, that repeats itself every ``period`` s."""
+
+    start: float
+    end: float
+    period: float
+
+    @property
+    def count(self) -> int:
+        """Number of whole cycles."""
+        return int((self.end - self.start) / self.period + 0.05)
+
+    def last(self, count: int) -> tuple[float, float]:
+        """Return start and end of the last few cycles."""
+        return self.end - count * self.period, self.end
+
+
+def envelope(signal: Signal, column: int, columns: int) -> tuple[Array, Array, Array]:
+    """Return times and the smallest and largest value of one column in so many slices of time.
+
+    A slice reaches to the first sample of the next one, so that the band is connected.
+    """
+    edges = np.unique(np.linspace(0, len(signal) - 1, columns + 1).astype(int))
+    values = signal.values[:, column]
+    following = values[edges[1:]]
+    low = np.minimum(np.minimum.reduceat(values, edges[:-1]), following)
+    high = np.maximum(np.maximum.reduceat(values, edges[:-1]), following)
+    time = (signal.time[edges[:-1]] + signal.time[edges[1:]]) / 2
+    # The band reaches from the very first sample to the very last.
+    time[0], time[-1] = signal.time[0], signal.time[-1]
+    return time, low, high
+
+
+def rotvecs(quaternions: Array) -> Array:
+    """Return attitudes (N, 4) as rotation vectors (N, 3), continuous beyond half turns.
+
+    The first has a length of at most pi; each other one is the vector of the same attitude that
+    is nearest to the one before.
+    """
+    q = np.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
+    sine = np.linalg.norm(q[:, :3], axis=1)
+    angle = 2 * np.arctan2(sine, q[:, 3])
+    small = sine < 1e-12
+    scale = np.where(small, 2.0, angle / np.where(small, 1.0, sine))
+    wrapped = q[:, :3] * scale[:, np.newaxis]
+    jumps = np.linalg.norm(np.diff(wrapped, axis=0), axis=1) > np.pi
+    if not jumps.any():
+        return wrapped
+    # Between its passages through half turns and through zero a vector keeps its number of turns.
+    flips = np.einsum("ij,ij->i", wrapped[1:], wrapped[:-1]) < 0
+    breaks = np.append(np.flatnonzero(jumps | flips) + 1, len(wrapped))
+    continuous = wrapped.copy()
+    for first, last in zip(breaks[:-1].tolist(), breaks[1:].tolist(), strict=True):
+        before = continuous[first - 1]
+        turns = nearest_rotvec(wrapped[first], before) - wrapped[first]
+        direction = wrapped[first:last]
+        lengths = np.linalg.norm(direction, axis=1, keepdims=True)
+        added = float(turns @ wrapped[first]) / max(float(lengths[0, 0]), 1e-12)
+        continuous[first:last] += added * direction / np.maximum(lengths, 1e-12)
+    return continuous
+
+
+def nearest_rotvec(rotvec: Array, near: Array) -> Array:
+    """Return the rotation vector (3,) of the same attitude that is nearest to ``near`` (3,)."""
+    length = float(np.linalg.norm(rotvec))
+    if length < 1e-12:
+        return rotvec
+    turns = round((float(near @ rotvec) / length - length) / (2 * np.pi))
+    return rotvec * (1 + 2 * np.pi * turns / length)
+
+
+def find_cycles(rates: Signal) -> Cycles | None:
+    """Find out whether a gait ends with many equal cycles, from its joint velocities.
+
+    None unless there are at least twelve cycles, equal within a tenth of the peak velocity.
+    """
+    peak = np.abs(rates.values).max(axis=0, initial=0.0)
+    moving = np.flatnonzero((np.abs(rates.values) > 1e-6 * peak).any(axis=1))
+    if len(moving) < 4 * _FEWEST_CYCLES:
+        return None
+    values = rates.values[: int(moving[-1]) + 1] / np.where(peak > 0, peak, 1.0)
+    # What comes before the cycles may be a good part of all.
+    looks = (values[-min(_LONGEST_LOOK, len(values) // part) :] for part in (1, 2, 4))
+    lag = next((lag for look in looks if (lag := _period(look))), None)
+    if lag is None:
+        return None
+    different = np.abs(values[lag:] - values[:-lag]).max(axis=1) > 0.1
+    # The last stretch, between samples that are different, of enough cycles.
+    bounds = np.concatenate([[-1], np.flatnonzero(different), [len(different)]])
+    enough = np.flatnonzero(np.diff(bounds) - 1 >= (_FEWEST_CYCLES - 1) * lag)
+    if not len(enough):
+        return None
+    first, stop = int(bounds[enough[-1]]) + 1, int(bounds[enough[-1] + 1]) + lag
+    last = min(stop, len(rates) - 1)
+    start, end = float(rates.time[first]), float(rates.time[last])
+    return Cycles(start, end, lag * (end - start) / (last - first))
+
+
+def _period(values: Array) -> int | None:
+    """Shortest shift, in samples, by which the columns match themselves; None without one."""
+    n = len(values)
+    spectrum = np.fft.rfft(values, 2 * n, axis=0)
+    product = np.fft.irfft((spectrum * spectrum.conj()).sum(axis=1))[:n]
+    energy = np.cumsum((values**2).sum(axis=1))
+    # Energy of the parts that overlap: the first n - lag samples, and the last ones.
+    lags = np.arange(n // 3)
+    first, last = energy[n - 1 - lags], energy[-1] - np.append(0.0, energy)[lags]
+    match = product[lags] / np.maximum(np.sqrt(first * last), 1e-300)
+    below = np.flatnonzero(match < 0.9)
+    if not len(below):
+        return None
+    good = np.flatnonzero(match[below[0] :] > 0.97) + below[0]
+    if not len(good):
+        return None
+    # The top of the first hill that is high enough.
+    hill = np.split(good, np.flatnonzero(np.diff(good) > 1) + 1)[0]
+    return int(hill[np.argmax(match[hill])])

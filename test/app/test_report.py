@@ -1,0 +1,296 @@
+"""The picture report, from bags of a few hundred states written for the purpose."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import struct
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from support.flight_bags import (
+    EXECUTING,
+    FINAL,
+    GOAL,
+    REACHED,
+    TICK,
+    Story,
+    cyclic_shapes,
+    goal_value,
+    rates_of,
+    still,
+    tell,
+    urdf_of,
+)
+from support.html_page import Page
+
+from spacerobot_ros.app import figures_scene
+from spacerobot_ros.app.figures import shape_plate
+from spacerobot_ros.app.report import write_picture, write_report
+from spacerobot_ros.app.report_reading import read_flight
+from spacerobot_ros.app.report_style import Plate, paper_style
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.recording import RecordingError
+
+FIGURES = ["position", "attitude", "shape", "velocities", "loops", "momentum", "robot", "path"]
+
+
+def numbers_in(text: str) -> list[float]:
+    return [float(x) for x in re.findall(r"-?\d+\.?\d*(?:e[-+]?\d+)?", text)]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _coarse_pictures() -> Iterator[None]:
+    """Draw robots with few pixels: what is tested is that they are drawn."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures_scene, "PIXELS", 120)
+        yield
+
+
+def report_of(tmp_path: Path, story: Story) -> Page:
+    html = tmp_path / "out" / "report.html"
+    write_report(tell(tmp_path / "flight.mcap", story), html)
+    return Page(html.read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def story() -> Story:
+    """A slide and twenty cycles that reach a goal, in a scenario with published figures."""
+    end = TICK * (len(cyclic_shapes()) - 1)
+    published = [
+        {"quantity": "zf", "printed": [-2.3784, 1.7], "note": "a misprint <of> ours"},
+        {"quantity": "final_position_m", "printed": [0.2995, -0.25, 0.1], "note": ""},
+        {"quantity": "unheard_of", "printed": [1.0], "note": ""},
+    ]
+    return Story(
+        cyclic_shapes(),
+        statuses=[
+            (0.0, "Waiting for a goal pose.", {"state": "idle"}),
+            (0.0, "Flying.", EXECUTING | goal_value()),
+            (end, "The goal is met: <b> & done.", REACHED | goal_value()),
+        ],
+        goals=[(0.0, *GOAL)],
+        metadata={
+            "scenario": {
+                "name": "test_flight",
+                "description": "A flight & more",
+                "published": json.dumps(published),
+            },
+            "parameters/planner": {"position_tolerance": "0.02", "method": '"lie_bracket"'},
+        },
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("report")
+
+
+@pytest.fixture(scope="module")
+def flown(folder: Path, story: Story) -> Page:
+    return report_of(folder, story)
+
+
+def test_says_what_was_flown(flown: Page) -> None:
+    for words in ("test_flight", "A flight & more", "lie_bracket", "test_robot", "3 joints"):
+        assert words in flown.text
+    assert "Reached" in flown.text
+    assert "The goal is met: <b> & done." in flown.text
+
+
+def test_has_every_figure_in_order(flown: Page) -> None:
+    assert list(flown.figures) == FIGURES
+    assert "Meshes are not drawn." in flown.text
+    assert "last 3 of 20 cycles" in flown.text
+    for svg in flown.figures.values():
+        assert ET.fromstring(svg).tag.endswith("svg")
+
+
+def test_needs_nothing_besides_itself(flown: Page) -> None:
+    for tag, key, value in flown.attributes:
+        assert tag not in ("script", "iframe", "object", "embed", "base")
+        if key in ("src", "href", "srcset", "data", "action", "poster"):
+            assert value.startswith("data:"), (tag, key)
+        assert not re.search(r"https?:|file:|//", value.partition(";base64,")[0])
+    for svg in flown.figures.values():
+        for element in ET.fromstring(svg).iter():
+            for key, value in element.attrib.items():
+                if key.endswith("href"):
+                    assert value.startswith(("#", "data:"))
+                assert not re.search(r"https?:|file:", value.partition(";base64,")[0])
+
+
+def test_numbers_are_those_of_the_bag(flown: Page, story: Story) -> None:
+    assert numbers_in(flown.number("Goal position")) == GOAL[0]
+    assert numbers_in(flown.number("Goal attitude"))[:3] == GOAL[1]
+    assert numbers_in(flown.number("Final position")) == FINAL[0]
+    assert numbers_in(flown.number("Final attitude"))[:3] == FINAL[1]
+    error = numbers_in(flown.number("Position error"))
+    assert error == [pytest.approx(math.dist(GOAL[0], FINAL[0]), rel=1e-3), 0.02]
+    angle = numbers_in(flown.number("Attitude error"))
+    assert angle[1] == pytest.approx(math.degrees(angle[0]), rel=1e-3)
+    assert 0.9 < angle[0] / math.dist(GOAL[1], FINAL[1]) < 1.1
+    last = len(story.shapes) - 1
+    assert numbers_in(flown.number("Manoeuvre time")) == [pytest.approx(TICK * last)]
+    assert numbers_in(flown.number("Recorded")) == [pytest.approx(TICK * last), last, TICK]
+    linear, angular = flown.number("Momentum drift").split(", ")
+    assert numbers_in(linear)[0] == pytest.approx(1e-16 * last, rel=1e-2)
+    assert numbers_in(angular)[0] == pytest.approx(2e-16 * last, rel=1e-2)
+
+
+def test_joints_stand_beside_their_limits(flown: Page, story: Story) -> None:
+    head, *rows = flown.tables["joints"]
+    peaks = np.abs(rates_of(story.shapes)).max(axis=0)
+    for row, joint, last, peak in zip(rows, range(3), story.shapes[-1], peaks, strict=True):
+        cells = dict(zip(head, row, strict=True))
+        assert cells["Joint"] == f"joint_{joint}"
+        assert cells["Unit"] == ("m" if joint == 0 else "rad")
+        assert float(cells["Final"]) == pytest.approx(last, abs=1e-5)
+        assert cells["Stroke"] == "-1.5 to 1.5"
+        assert numbers_in(cells["Peak velocity"]) == [pytest.approx(peak, abs=1e-5)]
+        assert numbers_in(cells["Used"]) == [pytest.approx(100 * peak / 0.8, abs=0.06)]
+
+
+def test_published_figures_stand_beside_measured_ones(flown: Page) -> None:
+    _, *rows = flown.tables["published"]
+    assert rows == [
+        ["zf", "-2.3784, 1.7", "-2.3784, 1.7", "planner", "a misprint <of> ours"],
+        ["final_position_m", "0.2995, -0.25, 0.1", "0.3100, -0.26, 0.1", "flight", ""],
+        ["unheard_of", "1", "–", "", ""],
+    ]
+
+
+def test_the_same_bag_makes_the_same_report(folder: Path, flown: Page) -> None:
+    assert flown.figures
+    write_report(folder / "flight.mcap", folder / "again.html")
+    assert (folder / "again.html").read_bytes() == (folder / "out/report.html").read_bytes()
+
+
+def test_dense_traces_become_bands_and_say_so(tmp_path: Path) -> None:
+    bag = tell(tmp_path / "flight.mcap", Story(cyclic_shapes(cycles=70)))
+    with paper_style():
+        plate = shape_plate(read_flight(bag))
+    assert isinstance(plate, Plate)
+    assert "the smallest and the largest value in each slice of time" in plate.caption
+    assert len(plate.svg) < 250_000
+
+
+def test_a_robot_without_joints(tmp_path: Path) -> None:
+    page = report_of(tmp_path, Story(np.empty((50, 0)), goals=[(0.0, *GOAL)]))
+    assert list(page.figures) == ["position", "attitude", "momentum", "robot", "path"]
+    assert "The robot has no joints in this bag." in page.text
+    assert "joints" not in page.tables
+
+
+@pytest.mark.parametrize("n", [1, 9])
+def test_any_number_of_joints(tmp_path: Path, n: int) -> None:
+    t = np.linspace(0, 1, 60)[:, np.newaxis]
+    page = report_of(tmp_path, Story(np.sin(t * np.arange(1, n + 1)) * 0.5))
+    assert len(page.tables["joints"]) == n + 1
+    assert ("loops" in page.figures) == (n > 1)
+    assert "velocities" in page.figures
+
+
+def test_without_goal_and_planner_and_in_a_namespace(tmp_path: Path) -> None:
+    page = report_of(tmp_path, Story(still(), prefix="/free_flyer"))
+    assert list(page.figures) == FIGURES
+    assert "The bag holds no goal pose." in page.text
+    assert "no word of a planner" in page.text
+    assert "Position error" not in dict(page.tables["numbers"])
+
+
+def test_a_refused_goal(tmp_path: Path) -> None:
+    statuses = [
+        (0.0, "Waiting for a goal pose.", {"state": "idle"}),
+        (0.0, "The goal is beyond stroke.", {"state": "refused"} | goal_value()),
+    ]
+    page = report_of(tmp_path, Story(still(), statuses, goals=[(0.0, *GOAL)]))
+    assert "The goal is beyond stroke." in page.text
+    assert numbers_in(page.number("Goal position (refused)")) == GOAL[0]
+    assert "Manoeuvre time" not in dict(page.tables["numbers"])
+
+
+def test_what_was_sent_and_is_no_pose(tmp_path: Path) -> None:
+    goals = [(0.0, [math.nan, 0.0, 0.0], [0.0, 0.0, 0.0])]
+    page = report_of(tmp_path, Story(still(2), goals=goals, urdf="<robot/>"))
+    assert "The bag holds no goal pose." in page.text
+    assert "nan" not in page.text
+    assert "robot" not in page.figures
+
+
+def test_several_schedules(tmp_path: Path) -> None:
+    other = ([0.0, 0.0, 1.0], [0.0, 0.0, 0.1])
+    statuses = [
+        (0.0, "Flying.", EXECUTING | goal_value(*other)),
+        (10.0, "Flying.", EXECUTING | goal_value()),
+        (20.0, "Flying.", EXECUTING | goal_value()),
+        (30.0, "The goal is not met.", {"state": "failed"} | goal_value()),
+    ]
+    goals = [(0.0, *other), (10.0, *GOAL)]
+    page = report_of(tmp_path, Story(still(), statuses, goals))
+    time = page.number("Manoeuvre time")
+    assert numbers_in(time) == [20.0, 3]
+    assert "Failed" in page.text
+    assert numbers_in(page.number("Goal position")) == GOAL[0]
+
+
+def test_cut_short_right_after_the_start(tmp_path: Path) -> None:
+    statuses = [(0.0, "Flying a gait.", EXECUTING | goal_value())]
+    page = report_of(tmp_path, Story(still(count=1), statuses, goals=[(0.0, *GOAL)]))
+    assert list(page.figures) == FIGURES
+    assert "Flying a gait. The recording ends before that is decided." in page.text
+
+
+@pytest.mark.parametrize("topics", [(), ("odom",), ("joint_states",), ("momentum",)])
+def test_what_is_missing_is_left_out(tmp_path: Path, topics: tuple[str, ...]) -> None:
+    page = report_of(tmp_path, Story(still(), urdf=None, topics=topics))
+    expected = {
+        (): [],
+        ("odom",): ["position", "attitude", "path"],
+        ("joint_states",): ["shape", "velocities", "loops"],
+        ("momentum",): ["momentum"],
+    }
+    assert list(page.figures) == expected[topics]
+    assert "The bag holds no robot description" in page.text
+
+
+def test_a_robot_without_shapes_and_with_odd_names(tmp_path: Path) -> None:
+    bare = re.sub(r"<visual>.*?</visual>", "", urdf_of(2), flags=re.DOTALL)
+    story = Story(still(2), urdf=bare.replace("joint_", "a$^_b$" * 8), name="a$^_b$" * 8)
+    page = report_of(tmp_path, story)
+    assert list(page.figures) == FIGURES
+    assert page.tables["joints"][1][0] == "a$^_b$" * 8 + "0"
+
+
+def test_picture(tmp_path: Path, folder: Path, flown: Page) -> None:
+    assert flown.figures
+    png = tmp_path / "deep" / "picture.png"
+    write_picture(folder / "flight.mcap", png)
+    data = png.read_bytes()
+    assert data.startswith(b"\x89PNG")
+    assert struct.unpack(">I", data[16:20])[0] == 1000
+    assert len(data) < 300_000
+    bare = tell(tmp_path / "bare.mcap", Story(still(1), topics=("momentum",)))
+    with pytest.raises(SpaceRobotError, match="no base poses"):
+        write_picture(bare, png)
+
+
+def test_refusals(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError):
+        write_report(tmp_path / "none.mcap", tmp_path / "report.html")
+    bag = tell(tmp_path / "flight.mcap", Story(still(1), topics=()))
+    with pytest.raises(SpaceRobotError, match="cannot be written"):
+        write_report(bag, bag / "report.html")
+
+
+def test_leaves_the_style_of_others_alone(folder: Path, flown: Page) -> None:
+    before = dict(mpl.rcParams)
+    assert flown.figures
+    with paper_style():
+        assert isinstance(shape_plate(read_flight(folder / "flight.mcap")), Plate)
+    assert dict(mpl.rcParams) == before

@@ -1,0 +1,57 @@
+"""A page of a report, taken apart."""
+
+from __future__ import annotations
+
+import base64
+from html.parser import HTMLParser
+
+
+class Page(HTMLParser):
+    """A parsed report: its tables as rows of cells, its figures as SVG, all text and attributes."""
+
+    _VOID = ("meta", "link", "img", "br")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.attributes: list[tuple[str, str, str]] = []
+        self.tables: dict[str, list[list[str]]] = {}
+        self.figures: dict[str, bytes] = {}
+        self.text = ""
+        self._table = self._figure = ""
+        self.feed(text)
+        self.close()
+        assert not self.open, f"left open: {self.open}"
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = {key: value or "" for key, value in attrs}
+        self.attributes += [(tag, key, value) for key, value in values.items()]
+        if tag not in self._VOID:
+            self.open.append(tag)
+        if tag == "table":
+            self._table = values.get("id", "")
+            self.tables[self._table] = []
+        elif tag == "tr":
+            self.tables[self._table].append([])
+        elif tag in ("td", "th"):
+            self.tables[self._table][-1].append("")
+        elif tag == "figure":
+            self._figure = values["id"]
+        elif tag == "img":
+            kind, _, data = values["src"].partition(",")
+            assert kind == "data:image/svg+xml;base64"
+            assert values["alt"]
+            self.figures[self._figure] = base64.b64decode(data, validate=True)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" in self.open:
+            return
+        self.text += data
+        if self.open and self.open[-1] in ("td", "th"):
+            self.tables[self._table][-1][-1] += data
+
+    def number(self, label: str) -> str:
+        return {row[0]: row[1] for row in self.tables["numbers"]}[label]
