@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -105,6 +105,30 @@ class ParameterSpec:
         unit = f" ({self.unit})" if self.unit else ""
         shown = value if not isinstance(value, str) else f"'{value[:60]}'"
         return ParameterError(f"Parameter '{self.name}' is {shown}; it must be {wanted}{unit}.")
+
+
+class _Optioned(Protocol):
+    """A method or a law: its options have the fields of a :class:`ParameterSpec`."""
+
+    options: ClassVar[tuple[Any, ...]]
+
+
+def option_specs(registry: Mapping[str, type[_Optioned]]) -> tuple[ParameterSpec, ...]:
+    """Return the parameters ``<name>.<option>`` of everything in a registry."""
+    specs = []
+    for name, entry in registry.items():
+        for option in entry.options:
+            specs.append(
+                ParameterSpec(
+                    f"{name}.{option.name}",
+                    option.default,
+                    option.unit,
+                    option.meaning,
+                    option.minimum,
+                    option.maximum,
+                )
+            )
+    return tuple(specs)
 
 
 def declare(node: Node, specs: Sequence[ParameterSpec]) -> dict[str, Value]:

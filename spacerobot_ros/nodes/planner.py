@@ -27,7 +27,7 @@ from spacerobot_ros.nodes.cdr import (
 from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
 from spacerobot_ros.nodes.joint_command import JointReader
 from spacerobot_ros.nodes.markers import goal_markers
-from spacerobot_ros.nodes.parameters import ParameterSpec
+from spacerobot_ros.nodes.parameters import ParameterSpec, option_specs
 from spacerobot_ros.nodes.planner_status import PlannerState, PlannerStatus
 from spacerobot_ros.nodes.robot_source import ROBOT_SPECS, robot_of
 from spacerobot_ros.nodes.trajectory_message import serialised_trajectory
@@ -36,19 +36,6 @@ from spacerobot_ros.planning.follower import GaitFollower
 
 _AT_REST = 1e-9
 """Joint rates below which the joints rest, m/s or rad/s."""
-
-_METHOD_SPECS = tuple(
-    ParameterSpec(
-        f"{name}.{option.name}",
-        option.default,
-        option.unit,
-        option.meaning,
-        option.minimum,
-        option.maximum,
-    )
-    for name, method in METHODS.items()
-    for option in method.options
-)
 
 
 class PlannerNode(FlightNode):
@@ -69,7 +56,7 @@ class PlannerNode(FlightNode):
         ParameterSpec("attitude_tolerance", 1e-3, "rad", "a goal is met within", 0.0, live=True),
         ParameterSpec("max_corrections", 3, "", "new plans after the first", 0, 1000, live=True),
         ParameterSpec("shape_gain", 2.0, "1/s", "feedback on the shape while flying", 0.0, 1e3),
-        *_METHOD_SPECS,
+        *option_specs(METHODS),
     )
 
     def __init__(self, name: str = "planner", **kwargs: Any) -> None:

@@ -29,11 +29,10 @@ from support.flight_bags import (
 )
 from support.html_page import Page
 
-from spacerobot_ros.app import figures_scene
-from spacerobot_ros.app.figures import shape_plate
-from spacerobot_ros.app.report import write_picture, write_report
-from spacerobot_ros.app.report_reading import read_flight
-from spacerobot_ros.app.report_style import Plate, paper_style
+from spacerobot_ros.app.report import figures_scene, write_picture, write_report
+from spacerobot_ros.app.report.figures import shape_plate
+from spacerobot_ros.app.report.reading import read_flight
+from spacerobot_ros.app.report.style import Plate, paper_style
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.recording import RecordingError
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support.flight_bags import TICK, cyclic_shapes, rates_of
 
-from spacerobot_ros.app.report_render import Canvas, Edge, Face, View
-from spacerobot_ros.app.report_signals import Signal, envelope, find_cycles, rotvecs
+from spacerobot_ros.app.report.render import Canvas, Edge, Face, View
+from spacerobot_ros.app.report.signals import Signal, envelope, find_cycles, rotvecs
 from spacerobot_ros.model.attitude import quaternion_from_rotvec
 from spacerobot_ros.model.description import Array
 

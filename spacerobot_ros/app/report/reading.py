@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.app.report_flight import Flight, Status
-from spacerobot_ros.app.report_signals import Signal, rotvecs
+from spacerobot_ros.app.report.flight import Flight, Status
+from spacerobot_ros.app.report.signals import Signal, rotvecs
 from spacerobot_ros.errors import PlanningError, RobotDescriptionError
 from spacerobot_ros.model import RobotDescription, parse_robot
 from spacerobot_ros.model.description import Array

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from spacerobot_ros.app.report_signals import Signal, envelope
+from spacerobot_ros.app.report.signals import Signal, envelope
 from spacerobot_ros.model.description import Array
 
 INK, MUTED, FAINT = "#1f2328", "#667085", "#c3c8d0"

@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 from matplotlib.colors import to_rgb
 
-from spacerobot_ros.app.report_render import Edge, Face
-from spacerobot_ros.app.report_style import colour
+from spacerobot_ros.app.report.render import Edge, Face
+from spacerobot_ros.app.report.style import colour
 from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
 from spacerobot_ros.model.kinematics import tree_kinematics
 

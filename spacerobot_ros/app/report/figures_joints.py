@@ -10,10 +10,10 @@ import itertools
 import numpy as np
 from matplotlib.axes import Axes
 
-from spacerobot_ros.app.figures import BAND, DOTS, NO_JOINTS, SHOWN_CYCLES, joint_unit
-from spacerobot_ros.app.report_flight import Flight
-from spacerobot_ros.app.report_signals import Signal
-from spacerobot_ros.app.report_style import (
+from spacerobot_ros.app.report.figures import BAND, DOTS, NO_JOINTS, SHOWN_CYCLES, joint_unit
+from spacerobot_ros.app.report.flight import Flight
+from spacerobot_ros.app.report.signals import Signal
+from spacerobot_ros.app.report.style import (
     COLUMNS,
     INK,
     MUTED,

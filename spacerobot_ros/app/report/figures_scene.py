@@ -11,11 +11,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from spacerobot_ros.app.figures import DASHES, NO_STATES
-from spacerobot_ros.app.report_flight import Flight
-from spacerobot_ros.app.report_render import Canvas, View
-from spacerobot_ros.app.report_solids import Solids, base_outlines, robot_solids
-from spacerobot_ros.app.report_style import (
+from spacerobot_ros.app.report.figures import DASHES, NO_STATES
+from spacerobot_ros.app.report.flight import Flight
+from spacerobot_ros.app.report.render import Canvas, View
+from spacerobot_ros.app.report.solids import Solids, base_outlines, robot_solids
+from spacerobot_ros.app.report.style import (
     COLUMNS,
     INK,
     MUTED,

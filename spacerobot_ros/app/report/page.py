@@ -6,9 +6,9 @@ import base64
 from collections.abc import Sequence
 from html import escape
 
-from spacerobot_ros.app.report_flight import Flight
-from spacerobot_ros.app.report_style import Plate
-from spacerobot_ros.app.report_tables import Table, joint_table, published_table, result_table
+from spacerobot_ros.app.report.flight import Flight
+from spacerobot_ros.app.report.style import Plate
+from spacerobot_ros.app.report.tables import Table, joint_table, published_table, result_table
 
 _CSS = """
 :root { color-scheme: light; --ink: #1f2328; --muted: #5b6472; --line: #dfe3e8; --wash: #f6f7f9;

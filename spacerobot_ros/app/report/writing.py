@@ -6,7 +6,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from spacerobot_ros.app.figures import (
+from spacerobot_ros.app.report.figures import (
     NO_STATES,
     attitude_group,
     attitude_plate,
@@ -17,18 +17,18 @@ from spacerobot_ros.app.figures import (
     shape_groups,
     shape_plate,
 )
-from spacerobot_ros.app.figures_joints import loops_plate, rates_plate
-from spacerobot_ros.app.figures_scene import (
+from spacerobot_ros.app.report.figures_joints import loops_plate, rates_plate
+from spacerobot_ros.app.report.figures_scene import (
     draw_goal_and_path,
     draw_robot,
     path_plate,
     robot_plate,
     solids_at,
 )
-from spacerobot_ros.app.report_flight import Flight
-from spacerobot_ros.app.report_page import page
-from spacerobot_ros.app.report_reading import read_flight
-from spacerobot_ros.app.report_style import (
+from spacerobot_ros.app.report.flight import Flight
+from spacerobot_ros.app.report.page import page
+from spacerobot_ros.app.report.reading import read_flight
+from spacerobot_ros.app.report.style import (
     WIDTH,
     legend_above,
     new_figure,

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.app.report_signals import Cycles, Signal, find_cycles, nearest_rotvec
+from spacerobot_ros.app.report.signals import Cycles, Signal, find_cycles, nearest_rotvec
 from spacerobot_ros.app.scenario import Published
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import RobotDescription

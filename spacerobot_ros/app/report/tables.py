@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spacerobot_ros.app.figures import joint_unit
-from spacerobot_ros.app.report_flight import Flight
+from spacerobot_ros.app.report.figures import joint_unit
+from spacerobot_ros.app.report.flight import Flight
 from spacerobot_ros.app.scenario import Published
 from spacerobot_ros.model.attitude import rotvec_from_quaternion
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from matplotlib.axes import Axes
 
-from spacerobot_ros.app.report_flight import Flight
-from spacerobot_ros.app.report_signals import Cycles, Signal
-from spacerobot_ros.app.report_style import (
+from spacerobot_ros.app.report.flight import Flight
+from spacerobot_ros.app.report.signals import Cycles, Signal
+from spacerobot_ros.app.report.style import (
     FAINT,
     MUTED,
     PALETTE,
