@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import sys
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
-from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from spacerobot_ros.errors import CommandError, ParameterError
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.nodes.cdr import NANOSECONDS
+from spacerobot_ros.nodes.command_channel import NEVER, CommandChannel, JointChannel
 from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
-from spacerobot_ros.nodes.joint_command import JointReader
 from spacerobot_ros.nodes.parameters import ParameterSpec
 from spacerobot_ros.nodes.plant_report import PlantReport
 from spacerobot_ros.nodes.plant_topics import PlantTopics
@@ -80,7 +79,7 @@ class PlantNode(FlightNode):
     )
 
     def __init__(self, name: str = "plant", **kwargs: Any) -> None:
-        self._running = self._paused = self._waiting = False
+        self._running = self._paused = False
         self._tick = 0
         super().__init__(name, **kwargs)
 
@@ -121,10 +120,7 @@ class PlantNode(FlightNode):
             values["integration_step"],
         )
         self._tick = 0
-        self._rest = np.zeros(robot.n)
-        self._command = np.zeros(robot.n)
-        self._command_ns = -math.inf
-        self._commands = JointReader(robot.joint_names, ["velocity"])
+        self._channels: list[CommandChannel] = [JointChannel(robot, "velocity")]
         self._topics = PlantTopics(
             self, self.plant, values["world_frame"], values["end_effector_frame"]
         )
@@ -132,7 +128,14 @@ class PlantNode(FlightNode):
         self._marker_ticks = self._ticks(values["marker_period"])
         self._report_ticks = self._ticks(values["diagnostics_period"])
         self._description = self.create_publisher(String, "robot_description", LATCHED)
-        self.create_subscription(JointState, "joint_commands", self._on_command, STREAM, raw=True)
+        for channel in self._channels:
+            self.create_subscription(
+                channel.message_type,
+                channel.topic,
+                partial(self._on_command, channel),
+                STREAM,
+                raw=True,
+            )
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
 
@@ -142,8 +145,7 @@ class PlantNode(FlightNode):
         self._description.publish(String(data=self.plant.robot.description.urdf))
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if self._lockstep:
-            self._waiting = True
-            self._readers = self._topics.readers()
+            self._look_round()
             self._timer = self.create_timer(
                 _LATE_JOINER_CHECK, self._on_late_joiner_check, clock=steady
             )
@@ -155,19 +157,26 @@ class PlantNode(FlightNode):
         self._publish()
 
     def deactivate(self) -> None:
-        """Stop time; the joints are at rest when it goes on."""
+        """Stop time; nothing is commanded when it goes on."""
         if self._running:
             self.destroy_timer(self._timer)
         self._running = False
-        self._command_ns = -math.inf
+        self._rest()
 
     # -- time ---------------------------------------------------------------------------------
 
-    def _step(self, command: Any) -> None:
-        if self.plant.step(command):
+    def _step(self) -> None:
+        for channel in self._channels:
+            channel.arrived = False
+        if self.plant.step(*(channel.command for channel in self._channels)):
             self._report.limited()
         self._tick += 1
         self._publish()
+
+    def _rest(self) -> None:
+        for channel in self._channels:
+            channel.rest()
+            channel.arrived = False
 
     def _publish(self) -> None:
         now = self._tick * self._period_ns
@@ -188,65 +197,68 @@ class PlantNode(FlightNode):
             self._report.deadlines_missed += due - _LONGEST_LAG
             self._origin_ns += (due - _LONGEST_LAG) * self._pace_ns
         for _ in range(min(due, _CATCH_UP)):
-            self._step(self._held_command())
+            self._drop_old_commands()
+            self._step()
 
-    def _held_command(self) -> Any:
+    def _drop_old_commands(self) -> None:
+        """Bring to rest what nobody has commanded for the timeout."""
         timeout = float(self.parameters["command_timeout"])  # type: ignore[arg-type]
-        age = (self._tick * self._period_ns - self._command_ns) / NANOSECONDS
-        if timeout and age > timeout:
-            if self._command_ns != -math.inf:
-                self._command_ns = -math.inf
-                self._report.timed_out(timeout)
-            return self._rest
-        return self._command
+        for channel in self._channels:
+            age = self._tick * self._period_ns - channel.stamp_ns
+            if timeout and NEVER != channel.stamp_ns and age > timeout * NANOSECONDS:
+                channel.rest()
+                self._report.timed_out(channel.topic, timeout)
 
     def _on_late_joiner_check(self) -> None:
         """A lockstep plant waits for ever if nobody saw its last state: show it to newcomers."""
-        readers = self._topics.readers()
-        if self._waiting and not self._paused and readers > self._readers:
+        if self._paused:
+            return  # Who comes now is shown the state after the pause.
+        before = self._readers
+        self._look_round()
+        if self._readers > before:
             self._topics.publish(self._tick * self._period_ns)
-        self._readers = readers
+
+    def _look_round(self) -> None:
+        """See who listens and who commands; the joints are waited for, a wrench if one comes."""
+        self._readers = self._topics.readers()
+        for channel in self._channels[1:]:
+            channel.required = self.count_publishers(channel.topic) > 0
 
     # -- commands -----------------------------------------------------------------------------
 
-    def _on_command(self, raw: bytes) -> None:
+    def _on_command(self, channel: CommandChannel, raw: bytes) -> None:
         if not self._running:
             return
-        problem = ""
-        commands = self._commands
-        try:
-            stamp = commands.accept(raw)
-        except CommandError as error:
-            stamp, problem = commands.stamp_ns, str(error)
-        velocity = commands.values["velocity"]
-        # A sum is finite only if every term is; for a few joints a list is summed fastest.
-        if not problem and not math.isfinite(sum(velocity.tolist())):
-            problem = f"a velocity is not finite: {velocity.tolist()}"
+        stamp, problem = channel.check(raw)
         if self._lockstep:
-            self._on_lockstep_command(stamp, velocity, problem)
+            self._on_lockstep_command(channel, stamp, problem)
         else:
-            self._on_realtime_command(stamp, velocity, problem)
+            self._on_realtime_command(channel, stamp, problem)
 
-    def _on_lockstep_command(self, stamp: int, velocity: Any, problem: str) -> None:
+    def _on_lockstep_command(self, channel: CommandChannel, stamp: int, problem: str) -> None:
         now = self._tick * self._period_ns
-        if stamp != now or not self._waiting:
+        if stamp != now or channel.arrived:
             kind = "stale" if stamp <= now else "ahead of time"
             self._report.refused(
+                channel.topic,
                 f"it is {kind}: stamped {stamp / NANOSECONDS:.9g} s, the plant is at "
-                f"{now / NANOSECONDS:.9g} s"
+                f"{now / NANOSECONDS:.9g} s",
             )
             return
         if problem:
             # Time must go on for the others: a bad command is a tick at rest.
-            self._report.refused(problem)
-            velocity = self._rest
-        if self._paused:
-            self._waiting = False
-            self._command[:] = velocity
-            return
-        self._step(velocity)
+            self._report.refused(channel.topic, problem)
+            channel.rest()
+        else:
+            channel.take(stamp)
+        self._step_if_complete()
 
-    def _on_realtime_command(self, stamp: int, velocity: Any, problem: str) -> None:
+    def _step_if_complete(self) -> None:
+        if self._paused or not all(c.arrived or not c.required for c in self._channels):
+            return
+        self._step()
+
+    def _on_realtime_command(self, channel: CommandChannel, stamp: int, problem: str) -> None:
         now = self._tick * self._period_ns
         timeout = float(self.parameters["command_timeout"])  # type: ignore[arg-type]
         stamp = stamp or now  # An unset stamp means now, as everywhere in ROS.
@@ -254,16 +266,15 @@ class PlantNode(FlightNode):
         if timeout and abs(age) > timeout:
             problem = f"it is {abs(age):.3g} s {'old' if age > 0 else 'ahead of time'}"
         if problem:
-            self._report.refused(problem)
+            self._report.refused(channel.topic, problem)
             return
-        self._command[:] = velocity
-        self._command_ns = stamp
+        channel.take(stamp)
 
     # -- services -----------------------------------------------------------------------------
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.plant.reset()
-        self._command_ns = -math.inf
+        self._rest()
         response.success = True
         response.message = "The robot is back in its initial state; time goes on."
         if self._running:
@@ -271,14 +282,13 @@ class PlantNode(FlightNode):
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        if self._paused and not request.data and self._running:
-            if not self._lockstep:
-                self._origin_ns = self._steady.now().nanoseconds - self._tick * self._pace_ns
-            elif not self._waiting:
-                self._waiting = True
-                self._paused = False
-                self._step(self._command.copy())
+        resumed = self._paused and not request.data
         self._paused = bool(request.data)
+        if resumed and self._running:
+            if self._lockstep:
+                self._step_if_complete()
+            else:
+                self._origin_ns = self._steady.now().nanoseconds - self._tick * self._pace_ns
         response.success = True
         response.message = "paused" if self._paused else "running"
         return response

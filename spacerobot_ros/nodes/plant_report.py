@@ -28,17 +28,17 @@ class PlantReport:
         self.last_refusal = ""
         self._reported = self._levels()
 
-    def refused(self, reason: str) -> None:
+    def refused(self, topic: str, reason: str) -> None:
         """Count a refused command."""
         self.commands_refused += 1
-        self.last_refusal = f"A joint command was refused: {reason}."
+        self.last_refusal = f"A command on '{topic}' was refused: {reason}."
         self._node.get_logger().warning(self.last_refusal, throttle_duration_sec=_LOG_PERIOD)
 
-    def timed_out(self, timeout: float) -> None:
+    def timed_out(self, topic: str, timeout: float) -> None:
         """Count a commander that fell silent."""
         self.command_timeouts += 1
         self._node.get_logger().warning(
-            f"No joint command for {timeout:g} s: the joints are brought to rest.",
+            f"No command on '{topic}' for {timeout:g} s: its actuators are brought to rest.",
             throttle_duration_sec=_LOG_PERIOD,
         )
 
