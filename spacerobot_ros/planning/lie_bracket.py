@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -36,7 +36,7 @@ from spacerobot_ros.planning.schedule import BasePath, GaitSchedule
 
 _FEWEST_TICKS_A_CYCLE = 12
 _WORST_CONDITION = 1e6
-_MOST_REFINEMENTS = 40
+_MOST_REFINEMENTS = 20
 _NO_ROTATION = 1e-9
 _NO_MOTION = 1e-9
 _AT_REST = 1e-9
@@ -92,6 +92,7 @@ class LieBracketGait(GaitMethod):
         self._require_rest(state)
         z_f = self.final_shape(state, goal)
         slide = self._slide(state.q, z_f)
+        t1 = (len(slide) - 1) * self.tick_period or self.t1
         attitudes = self._prediction.attitudes(slide, state.quaternion, state.angular_momentum)
         cycle, n, notes = self._turn(attitudes[-1], z_f, goal, correction)
         turn = np.tile(cycle[1:], (n, 1)) if n else np.empty((0, self.robot.n))
@@ -104,7 +105,7 @@ class LieBracketGait(GaitMethod):
             goal=goal,
             notes={
                 "zf": [float(z_f[i]) for i in self.sliders],
-                "c": [float(2 * (z_f - state.q)[i] / self.t1) for i in self.sliders],
+                "c": [2 * float((z_f - state.q)[i]) / t1 for i in self.sliders],
                 **notes,
             },
         )
@@ -165,14 +166,28 @@ class LieBracketGait(GaitMethod):
         displacement = z_f - z0
         if np.abs(displacement).max() <= _NO_MOTION:
             return z_f[np.newaxis].copy()
-        # The peak speed is twice the mean: a slow servo stretches t1.
-        t1 = max(self.t1, float(np.max(2 * np.abs(displacement) / self.robot.velocity_limit)))
+        t1 = self._slide_time(displacement)
         ticks = max(math.ceil(t1 / self.tick_period - 1e-9), 4 * self.n1)
         phase = np.linspace(0.0, 1.0, ticks + 1)[:, np.newaxis]
         progress = phase - np.sin(4 * np.pi * self.n1 * phase) / (4 * np.pi * self.n1)
         shapes = z0 + progress * displacement
         shapes[-1] = z_f
         return shapes
+
+    def _slide_time(self, displacement: Array) -> float:
+        """Return t1 (s), longer where a servo is slow: the peak speed is twice the mean."""
+        slowest = self.t1
+        for name, distance, rate in zip(
+            self.robot.joint_names, np.abs(displacement), self.robot.velocity_limit, strict=True
+        ):
+            if distance > _NO_MOTION and 2 * distance > rate * self.longest:
+                raise PlanningError(
+                    f"The slide would take more than {self.longest:.6g} s: joint '{name}' is to "
+                    f"move {distance:.4g} m at no more than {rate:.4g} m/s."
+                )
+            if distance > _NO_MOTION:
+                slowest = max(slowest, 2 * distance / rate)
+        return float(slowest)
 
     def _turn(
         self, quaternion: Array, z_f: Array, goal: Goal, correction: bool
@@ -182,38 +197,56 @@ class LieBracketGait(GaitMethod):
         if np.linalg.norm(wanted) <= _NO_ROTATION:
             return z_f[np.newaxis].copy(), 0, {"cycles": 0.0}
         triple, brackets = self._best_triple(z_f)
-        omega_d = wanted
-        best: tuple[float, _Turn] | None = None
-        for _ in range(_MOST_REFINEMENTS):
-            alpha = np.linalg.solve(brackets, omega_d).astype(float)
-            turn = self._fit(alpha, triple, z_f, correction)
-            reached = turn.cycles * self._rotation(turn.shapes)
-            left = np.linalg.norm(
-                attitude_error(quaternion_from_rotvec(reached), quaternion_from_rotvec(wanted))
-            )
-            if best is None or left < best[0]:
-                best = float(left), turn
-            if left <= self.tolerance.attitude:
-                break
-            # First order is not enough for this goal: ask for what is missing as well.
-            omega_d = omega_d + wanted - reached
-            if not np.all(np.isfinite(omega_d)) or np.linalg.norm(omega_d) > 4 * np.pi:
-                break
-        assert best is not None
-        turn = best[1]
+        least = 0 if correction else self.cycles
+        best = self._refine(wanted, brackets, triple, z_f, least)
+        while (
+            best.miss > self.tolerance.attitude
+            and 2 * best.cycles * self.ticks_a_cycle * self.tick_period <= self.longest
+        ):
+            # The error of the first order goes as 1/sqrt(n).
+            best = self._refine(wanted, brackets, triple, z_f, 2 * best.cycles)
         names = [self.robot.joint_names[i] for i in triple]
         return (
-            turn.shapes,
-            turn.cycles,
+            best.shapes,
+            best.cycles,
             {
                 "sliders": ", ".join(names),
                 "omega_d": [float(x) for x in wanted],
-                "alpha": [float(x) for x in turn.alpha],
-                "cycles": float(turn.cycles),
-                "amplitudes": [float(x) for x in turn.amplitudes],
-                "predicted_attitude_error": best[0],
+                "alpha": [float(x) for x in best.alpha],
+                "cycles": float(best.cycles),
+                "amplitudes": [float(x) for x in best.amplitudes],
+                "predicted_attitude_error": best.miss,
             },
         )
+
+    def _refine(
+        self,
+        wanted: Array,
+        brackets: Array,
+        triple: tuple[int, int, int],
+        z_f: Array,
+        least: int,
+    ) -> _Turn:
+        """Ask for what the first order misses as well, until the turn is within tolerance.
+
+        The number of cycles is chosen once, from ``least`` up, so that the answer is smooth.
+        """
+        omega_d, best = wanted, None
+        target = quaternion_from_rotvec(wanted)
+        for _ in range(_MOST_REFINEMENTS):
+            alpha = np.linalg.solve(brackets, omega_d).astype(float)
+            turn = self._fit(alpha, triple, z_f, least)
+            least = turn.cycles
+            reached = turn.cycles * self._rotation(turn.shapes)
+            miss = attitude_error(quaternion_from_rotvec(reached), target)
+            turn = replace(turn, miss=float(np.linalg.norm(miss)))
+            if best is None or turn.miss < best.miss:
+                best = turn
+            omega_d = omega_d + wanted - reached
+            if turn.miss <= self.tolerance.attitude or np.linalg.norm(omega_d) > 4 * np.pi:
+                break
+        assert best is not None
+        return best
 
     def _best_triple(self, z_f: Array) -> tuple[tuple[int, int, int], Array]:
         """The three sliders whose brackets ``[w12, w23, w13]`` at zf are best conditioned."""
@@ -231,12 +264,11 @@ class LieBracketGait(GaitMethod):
             )
         return triple, brackets
 
-    def _fit(
-        self, alpha: Array, triple: tuple[int, int, int], z_f: Array, correction: bool
-    ) -> _Turn:
-        """Choose n so that the cycle keeps rates and strokes; more cycles are smaller ones."""
-        n = 0 if correction else self.cycles
-        n = n or max(1, math.ceil(float(np.linalg.norm(alpha)) / self.loop_area))
+    def _fit(self, alpha: Array, triple: tuple[int, int, int], z_f: Array, least: int) -> _Turn:
+        """Choose n, from ``least`` up, so that the cycle keeps rates and strokes; more cycles are
+        smaller ones. With ``least`` 0 it is what ``loop_area`` gives.
+        """
+        n = least or max(1, math.ceil(float(np.linalg.norm(alpha)) / self.loop_area))
         amplitudes = self._amplitudes(alpha)
         robot = self.robot
         room = np.minimum(z_f - robot.lower, robot.upper - z_f)
@@ -326,7 +358,10 @@ class LieBracketGait(GaitMethod):
 
 @dataclass(frozen=True)
 class _Turn:
+    """Step 3 as chosen; ``miss`` is the angle (rad) that its n cycles leave to the wanted turn."""
+
     shapes: Array
     cycles: int
     alpha: Array
     amplitudes: Array
+    miss: float = math.inf
