@@ -81,6 +81,7 @@ class PlannerNode(FlightNode):
         self._momenta = np.zeros(3), np.zeros(3)
         self._odom_raw = b""
         self._joints_raw = b""
+        self._odom_fresh = self._joints_fresh = False
         self._odom = TemplateReader(
             Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
         )
@@ -105,6 +106,8 @@ class PlannerNode(FlightNode):
         """Answer states with commands from now on."""
         self._running = True
         self._status.publish(PlannerState.IDLE, "Waiting for a goal pose.")
+        # A lockstep plant may have been waiting for an answer since before.
+        self._on_part()
 
     def deactivate(self) -> None:
         """Give up the present goal and command nothing any more."""
@@ -158,6 +161,8 @@ class PlannerNode(FlightNode):
                 self._use(SpaceRobot.from_urdf(message.data))
             except RobotDescriptionError as error:
                 self.get_logger().error(f"robot_description: {error}")
+                return
+            self._on_part()
 
     def _on_goal(self, message: PoseStamped) -> None:
         if not self._running:
@@ -183,13 +188,25 @@ class PlannerNode(FlightNode):
 
     def _on_odom(self, raw: bytes) -> None:
         self._odom_raw = raw
-        # Header first in both messages: bytes 4 to 12 are the stamp.
-        if raw[4:12] == self._joints_raw[4:12]:
-            self._on_state()
+        self._odom_fresh = True
+        self._on_part()
 
     def _on_joints(self, raw: bytes) -> None:
         self._joints_raw = raw
-        if raw[4:12] == self._odom_raw[4:12]:
+        self._joints_fresh = True
+        self._on_part()
+
+    def _on_part(self) -> None:
+        """Answer a state once, as soon as both of its messages are there and the planner is."""
+        # Header first in both messages: bytes 4 to 12 are the stamp.
+        if (
+            self._running
+            and self._odom_fresh
+            and self._joints_fresh
+            and self._robot is not None
+            and self._odom_raw[4:12] == self._joints_raw[4:12]
+        ):
+            self._odom_fresh = self._joints_fresh = False
             self._on_state()
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -206,8 +223,6 @@ class PlannerNode(FlightNode):
 
     def _on_state(self) -> None:
         """Answer one measured state with one command of the same stamp."""
-        if not self._running or self._robot is None:
-            return
         try:
             stamp = self._joints.accept(self._joints_raw)
         except CommandError as error:

@@ -9,8 +9,10 @@ import time
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock as RosClock
+from rclpy.clock import ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 
 from spacerobot_ros import __version__
 from spacerobot_ros.errors import SpaceRobotError
@@ -32,8 +34,9 @@ _NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event")
 class RecorderNode(FlightNode):
     """Records topics as raw bytes, as rosbag2 would.
 
-    Messages carry the time of /clock; without a clock, wall time. What comes before the first
-    clock message gets that one's time.
+    Messages carry the time of /clock, what comes before its first message that one's time. Where
+    nobody publishes a clock for ``clock_wait`` all carry the wall time of their arrival. A bag has
+    one time: what was decided stays.
     """
 
     SPECS: ClassVar = (
@@ -43,6 +46,9 @@ class RecorderNode(FlightNode):
         ),
         ParameterSpec(
             "compression", "zstd", "", "of the bag's chunks", choices=("zstd", "lz4", "none")
+        ),
+        ParameterSpec(
+            "clock_wait", 2.0, "s", "wall time to wait for a clock before using the wall's"
         ),
         ParameterSpec("flush_period", 0.5, "s", "wall time that a kill can lose at most", 0.01),
     )
@@ -63,17 +69,21 @@ class RecorderNode(FlightNode):
         }
         self._recorded: dict[str, int] = {}
         self._unknown: set[str] = set()
-        self._early: list[tuple[int, bytes, int]] | None = []
+        self._early: list[tuple[int, bytes, int, int]] | None = []
+        self._wall = False
         self._now = 0
         self._now_stamp = b""
         self._active = False
         self.messages_recorded = 0
         self.failure: RecordingError | None = None
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        steady = RosClock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_SCAN_PERIOD, self.scan, clock=steady)
         flush_period = float(self.parameters["flush_period"])  # type: ignore[arg-type]
         self.create_timer(flush_period, self._flush, clock=steady)
         self.describe("spacerobot", {"version": __version__})
+        if self._wanted and "/clock" not in self._wanted:
+            depth = QoSProfile(depth=_QUEUE)
+            self.create_subscription(Clock, "/clock", self._on_time, depth, raw=True)
         self.scan()
 
     def activate(self) -> None:
@@ -93,7 +103,7 @@ class RecorderNode(FlightNode):
             The disk refused what was left.
         """
         if self._writer is not None:
-            self._release_early(self._wall_ns())
+            self._release_early(None)
             writer, self._writer = self._writer, None
             writer.close()
 
@@ -175,53 +185,58 @@ class RecorderNode(FlightNode):
             if not self._active:
                 return
             if self._early is not None:
-                self._early.append((channel, raw, published_ns))
+                self._early.append((channel, raw, published_ns, time.time_ns()))
                 return
+            if self._wall:
+                self._now = time.time_ns()
             try:
-                write(channel, raw, self._now, published_ns)
+                write(channel, raw, self._now, published_ns or self._now)
             except RecordingError as error:
                 self._fail(error)
                 return
             self.messages_recorded += 1
 
         def on_clock(raw: bytes) -> None:
-            self._now, self._now_stamp = _time_at(raw), raw[4:12]
-            if self._early is not None:
-                self._release_early(self._now)
-            store(raw, self._now)
+            self._on_time(raw)
+            store(raw, 0)
 
         def on_stamped(raw: bytes) -> None:
             now = raw[4:12] == self._now_stamp
-            store(raw, self._now if now else _time_at(raw) or self._now)
+            store(raw, 0 if now else _time_at(raw))
 
         if topic == "/clock":
             return on_clock
         header = next(iter(_message_class(type_name).get_fields_and_field_types().values()), "")
         if header == "std_msgs/Header":
             return on_stamped
-        return lambda raw: store(raw, self._now)
+        return lambda raw: store(raw, 0)
 
-    def _release_early(self, now_ns: int) -> None:
-        """Write what came before the first time was known."""
+    def _on_time(self, raw: bytes) -> None:
+        if self._wall:
+            return
+        self._now, self._now_stamp = _time_at(raw), raw[4:12]
+        if self._early is not None and self._active:
+            self._release_early(self._now)
+
+    def _release_early(self, now_ns: int | None) -> None:
+        """Write what came before the time was known; None: at the wall time that it came."""
         early, self._early = self._early or [], None
-        self._now = now_ns
 
         def write_all(writer: BagWriter) -> None:
-            for channel, raw, published_ns in early:
-                writer.write(channel, raw, now_ns, published_ns or now_ns)
+            for channel, raw, published_ns, arrival_ns in early:
+                log_ns = arrival_ns if now_ns is None else now_ns
+                writer.write(channel, raw, log_ns, published_ns or log_ns)
                 self.messages_recorded += 1
 
         self._guarded(write_all)
 
     def _flush(self) -> None:
         if self._early and not self.count_publishers("/clock"):
-            self._release_early(self._wall_ns())
-        if "/clock" not in self._recorded and self._early is None:
-            self._now = self._wall_ns()
+            waited = time.time_ns() - self._early[0][3]
+            if waited > float(self.parameters["clock_wait"]) * NANOSECONDS:  # type: ignore[arg-type]
+                self._wall = True
+                self._release_early(None)
         self._guarded(lambda writer: writer.flush())
-
-    def _wall_ns(self) -> int:
-        return int(self.get_clock().now().nanoseconds)
 
     def _guarded(self, act: Callable[[BagWriter], None]) -> None:
         if self._writer is None or self.failure is not None:

@@ -1,0 +1,320 @@
+"""The nodes as processes of their own, started, signalled and watched from outside."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
+from mcap.records import Channel, Message
+from mcap.stream_reader import StreamReader
+from nav_msgs.msg import Odometry
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
+from support.ros_harness import Harness, Probe, assert_one_sentence, nanoseconds
+
+ROOT = Path(__file__).parents[2]
+START = 60.0
+"""Wall s in which a process is up, or has ended, on a machine with other things to do."""
+
+TICK_NS = 50_000_000
+FAST = {"robot": "sliding_masses", "tick_rate": "20", "real_time_factor": "5.0"}
+GAIT = {"lie_bracket.t1": "2.0", "lie_bracket.n1": "1", "lie_bracket.cycle_period": "1.0"}
+
+
+class Process:
+    """One node in a process group of its own; its standard error goes to a file."""
+
+    def __init__(
+        self,
+        folder: Path,
+        domain: int,
+        node: str,
+        parameters: dict[str, str],
+        namespace: str = "",
+        arguments: Sequence[str] = (),
+        prepare: Callable[[], None] | None = None,
+    ) -> None:
+        self.name = f"{namespace}/{node}"
+        self.errors = folder / f"{namespace.strip('/')}_{node}.txt"
+        words = ["--ros-args", "-r", f"__ns:={namespace or '/'}", *arguments]
+        for key, value in parameters.items():
+            words += ["-p", f"{key}:={value}"]
+        with self.errors.open("wb") as errors:
+            self.process = subprocess.Popen(
+                # runpy warns that the package has imported the module before.
+                [
+                    *(sys.executable, "-W", "ignore::RuntimeWarning:runpy"),
+                    *("-m", f"spacerobot_ros.nodes.{node}", *words),
+                ],
+                cwd=ROOT,
+                env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+                stdout=errors,
+                stderr=errors,
+                start_new_session=True,
+                preexec_fn=prepare,
+            )
+
+    def signal(self, number: signal.Signals) -> None:
+        self.process.send_signal(number)
+
+    def end(self) -> int:
+        """Wait for the end, and return the exit code."""
+        return self.process.wait(timeout=START)
+
+    @property
+    def said(self) -> str:
+        """Standard output and error up to now."""
+        return self.errors.read_text("utf-8")
+
+    def kill(self) -> None:
+        """End the whole group, whatever state it is in."""
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait(timeout=START)
+
+
+Start = Callable[..., Process]
+
+
+@pytest.fixture
+def start(tmp_path: Path, ros_domain: int) -> Iterator[Start]:
+    """Return what starts a node in this test's domain; nothing of it outlives the test."""
+    processes: list[Process] = []
+
+    def start(node: str, parameters: dict[str, str], **options: Any) -> Process:
+        process = Process(tmp_path, ros_domain, node, parameters, **options)
+        processes.append(process)
+        return process
+
+    try:
+        yield start
+    finally:
+        for process in processes:
+            process.kill()
+
+
+def test_a_bad_start_ends_with_a_sentence_and_exit_code_2(start: Start, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.urdf"
+    broken.write_text("<robot name='half'><link name='base_link'>", "utf-8")
+    light = tmp_path / "light.urdf"
+    light.write_text("<robot name='light'><link name='hull'/></robot>", "utf-8")
+    robot = {"robot": "sliding_masses"}
+    cases = [
+        ("plant", {**robot, "tick_rate": "0.0"}, ["'tick_rate'"]),
+        ("plant", {"robot": str(broken)}, [str(broken), "not valid URDF"]),
+        ("plant", {"robot": str(light)}, ["'hull'", "mass"]),
+        ("planner", {**robot, "method": "wings"}, ["'method'", "wings"]),
+        ("recorder", {"bag": str(tmp_path)}, [str(tmp_path)]),
+    ]
+    # All at once: it takes them a while to start.
+    started = [
+        start(node, parameters, namespace=f"/case_{k}")
+        for k, (node, parameters, _) in enumerate(cases)
+    ]
+    for process, (_, _, mentions) in zip(started, cases, strict=True):
+        assert process.end() == 2, process.said
+        sentence = process.said.strip().splitlines()[-1]
+        assert_one_sentence(sentence, *mentions)
+        assert "Traceback" not in process.said
+
+
+def test_bad_ros_arguments_end_with_a_sentence_and_exit_code_2(
+    start: Start, tmp_path: Path
+) -> None:
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("plant:\n  ros__parameters: [", "utf-8")
+    cases = [["--params-file", str(tmp_path / "missing.yaml")], ["--params-file", str(broken)]]
+    started = [
+        start("plant", {"robot": "sliding_masses"}, namespace=f"/case_{k}", arguments=arguments)
+        for k, arguments in enumerate(cases)
+    ]
+    for process, (_, file) in zip(started, cases, strict=True):
+        assert process.end() == 2, process.said
+        assert "Traceback" not in process.said
+        assert file in process.said
+
+
+def test_a_signal_ends_a_node_with_exit_code_0(
+    start: Start, harness: Harness, tmp_path: Path
+) -> None:
+    bag = tmp_path / "flight.mcap"
+    ends = {
+        start("plant", {**FAST, "time_mode": "lockstep"}, namespace="/one"): signal.SIGINT,
+        start("plant", FAST, namespace="/two"): signal.SIGTERM,
+        start("planner", {"robot": "sliding_masses"}, namespace="/three"): signal.SIGTERM,
+        start("recorder", {"bag": str(bag)}, namespace="/four"): signal.SIGTERM,
+    }
+    await_nodes(harness, harness.probe({}), list(ends))
+    for process, number in ends.items():
+        process.signal(number)
+    for process in ends:
+        assert process.end() == 0, process.said
+        assert "Traceback" not in process.said
+    with bag.open("rb") as file:
+        assert make_reader(file).get_summary() is not None
+
+
+def await_nodes(harness: Harness, probe: Probe, processes: list[Process]) -> None:
+    """Wait until every process answers as a node that is active."""
+    for process in processes:
+        await_node(harness, probe, process)
+
+
+def await_node(harness: Harness, probe: Probe, process: Process) -> None:
+    client = probe.create_client(GetState, f"{process.name}/get_state")
+    harness.spin_until(
+        lambda: process.process.poll() is not None or client.service_is_ready(),
+        f"{process.name} is up",
+        timeout=START,
+    )
+    assert process.process.poll() is None, process.said
+    state = harness.call(client, GetState.Request()).current_state
+    assert state.label == "active", process.said
+
+
+def goal(x: float) -> PoseStamped:
+    message = PoseStamped()
+    message.header.frame_id = "world"
+    message.pose.position.x, message.pose.orientation.w = x, 1.0
+    return message
+
+
+def state_of(probe: Probe) -> str:
+    kept = probe.messages["planner/status"]
+    return next((v.value for v in kept[-1].values if v.key == "state"), "") if kept else ""
+
+
+def test_three_processes_fly_to_a_goal_and_record_it(
+    start: Start, harness: Harness, tmp_path: Path
+) -> None:
+    bag = tmp_path / "flight.mcap"
+    topics = {"odom": Odometry, "joint_states": JointState, "planner/status": DiagnosticStatus}
+    probe = harness.probe(topics, latched=("planner/status",))
+    goals = probe.create_publisher(PoseStamped, "goal_pose", 10)
+    recorder = start("recorder", {"bag": str(bag)})
+    planner = start("planner", GAIT)  # Its robot comes from the plant.
+    await_nodes(harness, probe, [recorder, planner])
+    plant = start("plant", FAST)
+    await_nodes(harness, probe, [plant])
+    harness.matched(goals)
+    goals.publish(goal(0.05))
+    harness.spin_until(
+        lambda: state_of(probe) in ("reached", "failed", "refused"), "the goal", timeout=START
+    )
+    assert state_of(probe) == "reached", probe.last("planner/status").message
+    reached = probe.last("odom").pose.pose.position
+    assert abs(reached.x - 0.05) <= 1e-3
+
+    # Time stands still, and everything that was published arrives.
+    change = probe.create_client(ChangeState, "plant/change_state")
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+    assert harness.call(change, request).success
+    harness.settle(probe)
+    state = probe.create_client(GetState, "recorder/get_state")
+    for _ in range(3):
+        harness.call(state, GetState.Request())
+    for process in (recorder, plant, planner):
+        process.signal(signal.SIGINT)
+    for process in (recorder, plant, planner):
+        assert process.end() == 0, process.said
+        assert "Traceback" not in process.said
+
+    recorded = messages_of(bag)
+    heard = {topic: probe.messages[topic] for topic in ("odom", "joint_states")}
+    for topic, kept in heard.items():
+        stamps = [nanoseconds(m.header.stamp) for m in recorded[f"/{topic}"]]
+        assert set(np.diff(stamps)) == {TICK_NS}, "no tick is missing"
+        assert stamps[-1] == nanoseconds(kept[-1].header.stamp)
+        by_stamp = {nanoseconds(m.header.stamp): m for m in recorded[f"/{topic}"]}
+        assert all(by_stamp[t] == m for m in kept if (t := nanoseconds(m.header.stamp)) in by_stamp)
+    assert set(recorded) >= {
+        "/clock", "/odom", "/base_pose", "/joint_states", "/joint_commands", "/momentum",
+        "/goal_pose", "/gait_schedule", "/planned_path", "/planner/status", "/robot_description",
+    }  # fmt: skip
+
+
+def messages_of(bag: Path) -> dict[str, list[Any]]:
+    """Return the decoded messages of a bag by topic, in the order they were written."""
+    content: dict[str, list[Any]] = {}
+    with bag.open("rb") as file:
+        for schema, channel, record in make_reader(file).iter_messages(log_time_order=False):
+            assert schema is not None
+            package, _, name = schema.name.split("/")
+            kind = getattr(import_module(f"{package}.msg"), name)
+            content.setdefault(channel.topic, []).append(deserialize_message(record.data, kind))
+    return content
+
+
+@pytest.mark.slow
+def test_a_killed_recorder_leaves_whole_chunks(
+    start: Start, harness: Harness, tmp_path: Path
+) -> None:
+    bag = tmp_path / "flight.mcap"
+    probe = harness.probe({"odom": Odometry})
+    recorder = start("recorder", {"bag": str(bag), "flush_period": "0.1"})
+    plant = start("plant", {**FAST, "real_time_factor": "20"})
+    await_nodes(harness, probe, [recorder, plant])
+    count = probe.count("odom")
+    harness.spin_until(lambda: probe.count("odom") >= count + 400, "a second of flight")
+    recorder.signal(signal.SIGKILL)
+    recorder.end()
+    stamps = stamps_of_cut_bag(bag, "/odom")
+    assert len(stamps) > 200
+    assert set(np.diff(stamps)) == {TICK_NS}
+
+
+def stamps_of_cut_bag(bag: Path, topic: str) -> list[int]:
+    """Return the stamps of a topic from the whole chunks of a bag that has no end."""
+    stamps = []
+    topics: dict[int, str] = {}
+    with bag.open("rb") as file, suppress(EndOfFile):
+        for record in StreamReader(file).records:
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Message) and topics[record.channel_id] == topic:
+                odom = deserialize_message(record.data, Odometry)
+                stamps.append(nanoseconds(odom.header.stamp))
+    return stamps
+
+
+@pytest.mark.slow
+def test_a_full_disk_ends_the_recording_and_nothing_else(
+    start: Start, harness: Harness, tmp_path: Path
+) -> None:
+    # A file may not grow beyond this: what a full disk looks like to the process.
+    room = 40_000
+
+    def prepare() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
+
+    bag = tmp_path / "flight.mcap"
+    probe = harness.probe({"odom": Odometry})
+    recorder = start("recorder", {"bag": str(bag), "flush_period": "0.1"}, prepare=prepare)
+    plant = start("plant", {**FAST, "real_time_factor": "20"})
+    await_nodes(harness, probe, [recorder, plant])
+    harness.spin_until(lambda: "has ended" in recorder.said, "the sentence", timeout=START)
+    count = probe.count("odom")
+    harness.spin_until(lambda: probe.count("odom") >= count + 200, "the flight goes on")
+    for process in (plant, recorder):
+        assert process.process.poll() is None, process.said
+        process.signal(signal.SIGTERM)
+        assert process.end() == 0, process.said
+    (sentence,) = (line for line in recorder.said.splitlines() if "has ended" in line)
+    assert_one_sentence(sentence, str(bag))
+    assert "Traceback" not in recorder.said

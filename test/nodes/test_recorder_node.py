@@ -1,0 +1,471 @@
+"""The recorder node beside a plant and a planner: what is in the bag against what was heard."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from mcap.reader import make_reader
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header, String
+from support.ros_harness import (
+    LATCHED,
+    Harness,
+    Probe,
+    assert_one_sentence,
+    construction,
+    nanoseconds,
+)
+
+from spacerobot_ros import __version__
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.nodes import PlannerNode, PlantNode, RecorderNode
+from spacerobot_ros.nodes.recorder import parameters_of
+from spacerobot_ros.recording import BagWriter, RecordingError
+
+URDF = Path(__file__).parents[2] / "urdf" / "sliding_masses.urdf"
+
+PLANT = {
+    "robot": "sliding_masses",
+    "time_mode": "lockstep",
+    "tick_rate": 20.0,
+    "marker_period": 0.5,
+    "diagnostics_period": 0.5,
+}
+PLANNER = {
+    "robot": "sliding_masses",
+    "tick_rate": 20.0,
+    "lie_bracket.t1": 2.0,
+    "lie_bracket.n1": 1,
+    "lie_bracket.cycle_period": 1.0,
+}
+LATCHED_TOPICS = ("/robot_description", "/gait_schedule", "/planned_path", "/planner/status")
+STREAMS = (
+    "/clock", "/odom", "/base_pose", "/joint_states", "/joint_commands", "/momentum", "/markers",
+    "/diagnostics", "/goal_pose",
+)  # fmt: skip
+ERROR = 40  # of rcl_interfaces/msg/Log
+
+
+def message_class(type_name: str) -> Any:
+    package, _, name = type_name.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), name)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One message of a bag: its times in ns, and what it says."""
+
+    log_ns: int
+    publish_ns: int
+    message: Any
+
+
+class BagContent:
+    """A bag, read with nothing of this package."""
+
+    def __init__(self, path: Path) -> None:
+        self.by_topic: dict[str, list[Recorded]] = {}
+        self.log_times: list[int] = []
+        with path.open("rb") as file:
+            reader = make_reader(file)
+            for schema, channel, record in reader.iter_messages(log_time_order=False):
+                assert schema is not None
+                message = deserialize_message(record.data, message_class(schema.name))
+                entry = Recorded(record.log_time, record.publish_time, message)
+                self.by_topic.setdefault(channel.topic, []).append(entry)
+                self.log_times.append(record.log_time)
+            self.metadata = {m.name: dict(m.metadata) for m in reader.iter_metadata()}
+            self.attachments = {a.name: (a.media_type, a.data) for a in reader.iter_attachments()}
+
+    def __getitem__(self, topic: str) -> list[Any]:
+        return [entry.message for entry in self.by_topic.get(topic, [])]
+
+    @property
+    def count(self) -> int:
+        return len(self.log_times)
+
+
+class Stack:
+    """A plant, a planner, a recorder and a probe that listens to whatever is recorded."""
+
+    def __init__(self, harness: Harness, bag: Path, **recorder: Any) -> None:
+        self.harness, self.bag = harness, bag
+        self.plant = harness.make(PlantNode, PLANT, autostart=False)
+        self.planner = harness.make(PlannerNode, PLANNER, autostart=False)
+        self.probe: Probe = harness.probe({"/rosout": Log})
+        self.goals = self.probe.create_publisher(PoseStamped, "goal_pose", 10)
+        for node in (self.plant, self.planner):
+            assert node.trigger_configure() is TransitionCallbackReturn.SUCCESS
+        self.recorder = harness.make(RecorderNode, {"bag": str(bag), **recorder}, autostart=False)
+
+    def configure(self, *topics: str) -> None:
+        """Open the bag, and wait until these are listened to by the recorder and by the probe."""
+        assert self.recorder.trigger_configure() is TransitionCallbackReturn.SUCCESS
+        self.await_topics(*topics)
+        types = dict(self.probe.get_topic_names_and_types())
+        for topic in self.recorder.topics:
+            latched = topic in LATCHED_TOPICS
+            self.probe.watch(topic, message_class(types[topic][0]), latched=latched)
+        self.harness.connect()
+
+    def await_topics(self, *topics: str) -> None:
+        self.harness.spin_until(
+            lambda: set(topics) <= self.recorder.topics, f"subscriptions of {topics}"
+        )
+
+    def fly(self, x: float = 0.05) -> None:
+        """Fly to a goal, and let everything arrive that is on its way."""
+        if not self.planner.is_active:
+            assert self.planner.trigger_activate() is TransitionCallbackReturn.SUCCESS
+        goal = PoseStamped()
+        goal.header.frame_id = "world"
+        goal.pose.position.x, goal.pose.orientation.w = x, 1.0
+        self.goals.publish(goal)
+        if not self.plant.is_active:
+            assert self.plant.trigger_activate() is TransitionCallbackReturn.SUCCESS
+        heard = self.probe.count("/planner/status")
+        self.harness.spin_until(
+            lambda: any(
+                value.value in ("reached", "failed", "refused")
+                for status in self.probe.messages["/planner/status"][heard:]
+                for value in status.values
+                if value.key == "state"
+            ),
+            "the goal is decided",
+        )
+        assert "met" in self.probe.last("/planner/status").message
+
+    def stop(self) -> None:
+        """Stop time, and let everything arrive that is on its way."""
+        self.plant.trigger_deactivate()
+        self.harness.settle(self.probe)
+
+    def close_bag(self) -> BagContent:
+        if self.recorder.is_active:
+            self.recorder.trigger_deactivate()
+        assert self.recorder.trigger_cleanup() is TransitionCallbackReturn.SUCCESS
+        return BagContent(self.bag)
+
+
+@pytest.fixture
+def stack(harness: Harness, tmp_path: Path) -> Stack:
+    """Return a stack whose recorder is active before anything happens."""
+    stack = Stack(harness, tmp_path / "bags" / "flight.mcap")
+    stack.configure(*STREAMS, *LATCHED_TOPICS)
+    stack.recorder.trigger_activate()
+    return stack
+
+
+# -- what is in the bag -----------------------------------------------------------------------
+
+
+def test_recorded_is_published_on_every_topic(stack: Stack) -> None:
+    stack.fly()
+    stack.stop()
+    bag = stack.close_bag()
+    heard = {topic: kept for topic, kept in stack.probe.messages.items() if topic != "/rosout"}
+    assert set(bag.by_topic) == {topic for topic, kept in heard.items() if kept}
+    assert set(bag.by_topic) == {*STREAMS, *LATCHED_TOPICS}
+    for topic, kept in heard.items():
+        assert len(bag[topic]) == len(kept), topic
+        assert bag[topic] == kept, topic
+    assert len(bag["/odom"]) > 40
+    assert stack.recorder.messages_recorded == bag.count
+    assert bag["/robot_description"][0].data == URDF.read_text("utf-8")
+
+
+def test_messages_carry_simulated_time(stack: Stack) -> None:
+    stack.fly()
+    stack.stop()
+    bag = stack.close_bag()
+    assert bag.log_times == sorted(bag.log_times)
+    ticks = {k * 50_000_000 for k in range(len(bag["/clock"]))}
+    for entry in bag.by_topic["/clock"]:
+        assert entry.log_ns == entry.publish_ns == nanoseconds(entry.message.clock)
+    for topic in ("/odom", "/base_pose", "/joint_states", "/joint_commands"):
+        for entry in bag.by_topic[topic]:
+            stamp = nanoseconds(entry.message.header.stamp)
+            assert entry.publish_ns == stamp
+            assert entry.log_ns == stamp, "a state is there at its own time"
+    for topic in ("/momentum", "/planner/status", "/markers", "/robot_description"):
+        for entry in bag.by_topic[topic]:
+            assert entry.log_ns in ticks
+            assert entry.publish_ns == entry.log_ns
+    # What came before the first clock message has that one's time.
+    for topic in ("/robot_description", "/goal_pose"):
+        assert bag.by_topic[topic][0].log_ns == 0
+    momentum = [entry.log_ns for entry in bag.by_topic["/momentum"]]
+    assert momentum == [entry.log_ns for entry in bag.by_topic["/odom"]]
+
+
+def test_description_parameters_and_version_are_in_the_bag(stack: Stack) -> None:
+    for node in (stack.plant, stack.planner):
+        stack.recorder.describe(f"parameters/{node.get_name()}", parameters_of(node))
+    urdf = stack.plant.plant.robot.description.urdf
+    stack.recorder.attach("robot_description.urdf", urdf.encode(), "application/xml")
+    stack.fly()
+    stack.stop()
+    bag = stack.close_bag()
+    assert bag.metadata["spacerobot"]["version"] == __version__
+    media_type, data = bag.attachments["robot_description.urdf"]
+    assert media_type == "application/xml"
+    assert data == URDF.read_bytes()
+    for name, given in (("plant", PLANT), ("planner", PLANNER)):
+        written = {k: json.loads(v) for k, v in bag.metadata[f"parameters/{name}"].items()}
+        node = getattr(stack, name)
+        for key, value in given.items():
+            assert written[key] == value
+        declared = node.get_parameters_by_prefix("")
+        assert set(declared) - set(written) <= {"use_sim_time", "start_type_description_service"}
+        for key, value in written.items():
+            known = declared[key].value
+            # An empty list is declared without a value.
+            assert value == ([] if known is None else np.array(known).tolist()), key
+
+
+@pytest.mark.parametrize("compression", ["lz4", "none"])
+def test_compression_is_chosen(harness: Harness, tmp_path: Path, compression: str) -> None:
+    stack = Stack(harness, tmp_path / "flight.mcap", compression=compression)
+    stack.configure(*STREAMS, *LATCHED_TOPICS)
+    stack.recorder.trigger_activate()
+    stack.fly()
+    stack.stop()
+    stack.close_bag()
+    with stack.bag.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    used = {index.compression for index in summary.chunk_indexes}
+    assert used == {"" if compression == "none" else compression}
+
+
+def test_topics_can_be_chosen(harness: Harness, tmp_path: Path) -> None:
+    stack = Stack(harness, tmp_path / "flight.mcap", topics="/clock odom planner/status")
+    stack.configure("/clock", "/odom", "/planner/status")
+    stack.recorder.trigger_activate()
+    stack.fly()
+    stack.stop()
+    bag = stack.close_bag()
+    assert set(bag.by_topic) == {"/clock", "/odom", "/planner/status"}
+    assert bag["/odom"] == stack.probe.messages["/odom"]
+
+
+def test_chosen_topics_carry_simulated_time_without_the_clock_among_them(
+    harness: Harness, tmp_path: Path
+) -> None:
+    stack = Stack(harness, tmp_path / "flight.mcap", topics="odom momentum planner/status")
+    stack.configure("/odom", "/momentum", "/planner/status")
+    stack.recorder.trigger_activate()
+    stack.fly()
+    stack.stop()
+    # Not kept in memory until the end, where a kill would lose it.
+    harness.spin_until(
+        lambda: stack.recorder.messages_recorded >= stack.probe.count("/odom"), "the bag is written"
+    )
+    bag = stack.close_bag()
+    assert set(bag.by_topic) == {"/odom", "/momentum", "/planner/status"}
+    for odom, momentum in zip(bag.by_topic["/odom"], bag.by_topic["/momentum"], strict=True):
+        assert odom.log_ns == momentum.log_ns == nanoseconds(odom.message.header.stamp)
+
+
+# -- when it records --------------------------------------------------------------------------
+
+
+def test_a_topic_that_appears_in_flight_is_recorded(stack: Stack) -> None:
+    stack.fly()
+    stack.stop()
+    before = stack.recorder.messages_recorded
+    late = stack.probe.create_publisher(String, "/notes", LATCHED)
+    late.publish(String(data="before anybody listened"))
+    stack.harness.spin_until(
+        lambda: stack.recorder.messages_recorded == before + 1, "the latched message"
+    )
+    late.publish(String(data="after"))
+    stack.fly(0.0)
+    stack.stop()
+    bag = stack.close_bag()
+    assert [m.data for m in bag["/notes"]] == ["before anybody listened", "after"]
+
+
+def test_nothing_is_recorded_while_inactive(harness: Harness, tmp_path: Path) -> None:
+    stack = Stack(harness, tmp_path / "flight.mcap")
+    stack.configure(*STREAMS, *LATCHED_TOPICS)
+    stack.fly()
+    stack.stop()
+    assert stack.recorder.messages_recorded == 0
+    first = stack.probe.count("/odom")
+    stack.recorder.trigger_activate()
+    stack.fly(0.02)
+    stack.stop()
+    second = stack.probe.count("/odom")
+    stack.recorder.trigger_deactivate()
+    stack.fly(0.0)
+    stack.stop()
+    bag = stack.close_bag()
+    assert bag["/odom"] == stack.probe.messages["/odom"][first:second]
+
+
+def test_a_bag_is_whole_while_the_flight_goes_on(stack: Stack, tmp_path: Path) -> None:
+    stack.fly()
+    stack.stop()
+    bag = stack.close_bag()
+    before = bag.count
+    stack.fly(0.0)
+    assert BagContent(stack.bag).count == before
+    # Configured again, it writes a new one.
+    assert stack.recorder.trigger_configure() is TransitionCallbackReturn.SUCCESS
+    stack.await_topics(*STREAMS)
+    stack.harness.connect()
+    stack.recorder.trigger_activate()
+    heard = stack.probe.count("/odom")
+    stack.fly(0.02)
+    stack.stop()
+    again = stack.close_bag()
+    assert len(again["/odom"]) <= stack.probe.count("/odom") - heard
+    assert len(again["/odom"]) > 40
+
+
+def test_a_shutdown_completes_the_bag(stack: Stack) -> None:
+    stack.fly()
+    stack.stop()
+    assert stack.recorder.trigger_shutdown() is TransitionCallbackReturn.SUCCESS
+    assert BagContent(stack.bag)["/odom"] == stack.probe.messages["/odom"]
+
+
+def test_without_a_clock_messages_carry_wall_time(harness: Harness, tmp_path: Path) -> None:
+    bag = tmp_path / "notes.mcap"
+    probe = harness.probe({"/heard": String})
+    publisher = probe.create_publisher(String, "/heard", 10)
+    stamped = probe.create_publisher(JointState, "/stamped", 10)
+    recorder = harness.make(RecorderNode, {"bag": str(bag)})
+    harness.spin_until(lambda: {"/heard", "/stamped"} <= recorder.topics, "subscriptions")
+    harness.connect()
+    sent = []
+    for k in range(5):
+        publisher.publish(String(data=str(k)))
+        stamped.publish(JointState(header=Header(frame_id=str(k))))
+        sent.append(time.time_ns())
+        harness.spin_for(0.2)
+    recorder.trigger_shutdown()
+    content = BagContent(bag)
+    assert [entry.message.data for entry in content.by_topic["/heard"]] == list("01234")
+    assert content.log_times == sorted(content.log_times)
+    for topic in ("/heard", "/stamped"):
+        for entry, sent_ns in zip(content.by_topic[topic], sent, strict=True):
+            assert abs(entry.log_ns - sent_ns) < 100_000_000
+            assert abs(entry.publish_ns - sent_ns) < 100_000_000
+
+
+def test_a_recorder_that_is_up_before_the_plant_keeps_one_time(
+    harness: Harness, tmp_path: Path
+) -> None:
+    bag = tmp_path / "flight.mcap"
+    recorder = harness.make(RecorderNode, {"bag": str(bag), "flush_period": 0.05})
+    probe = harness.probe({"odom": Odometry})
+    probe.create_publisher(String, "/notes", LATCHED).publish(String(data="before the clock"))
+    harness.spin_until(lambda: "/notes" in recorder.topics, "a subscription")
+    harness.spin_for(0.3)
+    plant = harness.make(PlantNode, {**PLANT, "time_mode": "realtime", "real_time_factor": 10.0})
+    harness.spin_until(lambda: plant.tick > 30, "some ticks")
+    plant.trigger_deactivate()
+    harness.settle(probe)
+    recorder.trigger_shutdown()
+    content = BagContent(bag)
+    assert [m.data for m in content["/notes"]] == ["before the clock"]
+    # What comes before the first clock message has that one's time, and not wall time.
+    assert max(content.log_times) <= plant.time_ns
+    assert content.log_times == sorted(content.log_times)
+
+
+# -- what goes wrong --------------------------------------------------------------------------
+
+
+def errors(probe: Probe) -> list[str]:
+    return [m.msg for m in probe.messages["/rosout"] if m.level >= ERROR]
+
+
+def test_a_full_disk_ends_the_recording_with_one_sentence_and_not_the_flight(
+    harness: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, room = BagWriter.write, 100
+
+    def write(self: BagWriter, *message: Any) -> None:
+        nonlocal room
+        room -= 1
+        if room < 0:
+            raise RecordingError(f"The bag {self.path} cannot be written: no space left.")
+        whole(self, *message)
+
+    monkeypatch.setattr(BagWriter, "write", write)
+    stack = Stack(harness, tmp_path / "flight.mcap")
+    stack.configure(*STREAMS, *LATCHED_TOPICS)
+    stack.recorder.trigger_activate()
+    for x in (0.05, 0.0, 0.05):
+        stack.fly(x)
+    stack.stop()
+    (sentence,) = errors(stack.probe)
+    assert_one_sentence(sentence, "Recording has ended", str(stack.bag), "no space left")
+    assert str(stack.recorder.failure) in sentence
+    assert stack.recorder.messages_recorded == 100
+    assert stack.recorder.trigger_shutdown() is TransitionCallbackReturn.SUCCESS
+    assert BagContent(stack.bag).count == 100
+
+
+def test_a_device_without_room_is_refused_in_a_sentence(harness: Harness) -> None:
+    stack = Stack(harness, Path("/dev/full"))
+    assert stack.recorder.trigger_configure() is not TransitionCallbackReturn.SUCCESS
+    assert_one_sentence(str(stack.recorder.fault), "/dev/full", "space")
+    stack.probe.watch("/planner/status", message_class("diagnostic_msgs/msg/DiagnosticStatus"))
+    harness.connect()
+    stack.fly()
+
+
+def test_a_bag_that_cannot_be_made_is_refused_in_a_sentence(
+    ros_context: rclpy.Context, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    for bag in (tmp_path, tmp_path / "file" / "flight.mcap"):
+        with pytest.raises(SpaceRobotError) as refusal:
+            RecorderNode(**construction(ros_context, {"bag": str(bag)}))
+        assert_one_sentence(str(refusal.value), str(bag))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("compression", "zip"), ("flush_period", 0.0), ("flush_period", "often"), ("topics", 3)],
+)
+def test_a_bad_parameter_is_refused_with_a_sentence_that_names_it(
+    ros_context: rclpy.Context, tmp_path: Path, name: str, value: Any
+) -> None:
+    parameters = {"bag": str(tmp_path / "flight.mcap"), name: value}
+    with pytest.raises(SpaceRobotError) as refusal:
+        RecorderNode(**construction(ros_context, parameters))
+    assert_one_sentence(str(refusal.value), f"'{name}'", str(value))
+    assert not (tmp_path / "flight.mcap").exists()
+
+
+def test_a_recording_in_a_namespace_has_the_topics_of_it(harness: Harness, tmp_path: Path) -> None:
+    bag = tmp_path / "flight.mcap"
+    recorder = harness.make(
+        RecorderNode, {"bag": str(bag), "topics": "odom /clock"}, namespace="/craft"
+    )
+    harness.make(PlantNode, PLANT, namespace="/craft")
+    harness.spin_until(lambda: {"/craft/odom", "/clock"} <= recorder.topics, "subscriptions")
+    # A lockstep plant shows newcomers its state again.
+    harness.spin_until(lambda: recorder.messages_recorded >= 2, "the state of tick 0")
+    recorder.trigger_shutdown()
+    content = BagContent(bag)
+    assert set(content.by_topic) == {"/craft/odom", "/clock"}
+    np.testing.assert_array_equal([e.log_ns for e in content.by_topic["/craft/odom"]], 0)
