@@ -1,4 +1,4 @@
-"""The environment of all tests: message checks on, discovery on this machine, nothing left behind."""
+"""The environment of all tests: messages checked, discovery on this machine, nothing left."""
 
 from __future__ import annotations
 

@@ -21,6 +21,7 @@ from spacerobot_ros.app.scenario import (
     parse_setting,
     scenario_names,
 )
+from spacerobot_ros.control import LAWS
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.planning import METHODS, Goal
 
@@ -73,7 +74,9 @@ def main() -> None:
     metavar="RX RY RZ",
     help="Attitude of the goal as exponential coordinates (rad).",
 )
-@click.option("--method", type=click.Choice(sorted(METHODS)), help="Gait method of the planner.")
+@click.option(
+    "--method", type=click.Choice(sorted({*METHODS, *LAWS})), help="Gait method, or control law."
+)
 @click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE")
 @click.option("--bag", type=click.Path(path_type=Path), help="Bag to write [out/SCENARIO.mcap].")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the result.")
@@ -178,7 +181,10 @@ def _chosen(
         node, parameter, value = parse_setting(text)
         scenario = scenario.with_overrides(node, {parameter: value})
     if method is not None:
-        scenario = scenario.with_overrides("planner", {"method": method})
+        node, parameter = (
+            ("planner", "method") if method in METHODS else ("coordinated_control", "law")
+        )
+        scenario = scenario.with_overrides(node, {parameter: method})
     if realtime is not None:
         pace = {"time_mode": "realtime", "real_time_factor": realtime}
         scenario = scenario.with_overrides("plant", pace)
@@ -212,6 +218,7 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         f"{summary['position_error_m']:.3g} m from the goal",
         f"attitude    ({numbers(summary['final_attitude_rotvec_rad'])}) rad, "
         f"{summary['attitude_error_rad']:.3g} rad = {degrees:.3g} deg from the goal",
+        *_end_effector_line(summary),
         f"shape       ({numbers(summary['final_joint_positions'])})",
         f"manoeuvre   {summary['manoeuvre_time_s']:.6g} s, "
         f"{summary['corrections']} correction(s), planned in {summary['plan_time_s']:.3f} s",
@@ -221,6 +228,14 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         f"{summary['angular_momentum_drift']:.1e} kg m^2/s",
         f"bag         {summary['bag']} ({summary['messages_recorded']} messages)",
     ]
+
+
+def _end_effector_line(summary: dict[str, Any]) -> list[str]:
+    if "end_effector_position_error_m" not in summary:
+        return []
+    position = ", ".join(f"{x:.5f}" for x in summary["end_effector_final_position_m"])
+    error = summary["end_effector_position_error_m"]
+    return [f"end-effector ({position}) m, {error:.3g} m from its goal"]
 
 
 def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:

@@ -9,7 +9,7 @@ import numpy as np
 from spacerobot_ros.model.attitude import rotvec_from_quaternion
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import Goal, PoseError
-from spacerobot_ros.recording import Bag, RecordingError
+from spacerobot_ros.recording import Bag, RecordingError, TopicSeries
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,10 @@ class Measured:
     joints: Array
     joint_rates: Array
     momentum: Array
+    expected: Array
+    """Momenta (N, 6) by what the run began with and the thrusters gave."""
+    end_effector: tuple[Array, Array] | None = None
+    """Its last position (3,) and quaternion (4,), where it was published."""
 
     @classmethod
     def of(cls, bag: Bag, namespace: str = "") -> Measured:
@@ -49,17 +53,19 @@ class Measured:
             joints=np.asarray(joints.field("position")),
             joint_rates=np.asarray(joints.field("velocity")),
             momentum=np.asarray(momentum.field("data")),
+            expected=_expected(bag, f"{namespace}/momentum_expected", momentum),
+            end_effector=_last_pose(bag, f"{namespace}/end_effector_pose"),
         )
 
     @property
     def linear_drift(self) -> float:
-        """Largest change of the total linear momentum, kg m/s."""
-        return _largest_change(self.momentum[:, :3])
+        """Largest change of the total linear momentum without thrust, kg m/s."""
+        return _largest_change(self.momentum[:, :3] - self.expected[:, :3])
 
     @property
     def angular_drift(self) -> float:
-        """Largest change of the total angular momentum about the centre of mass, kg m^2/s."""
-        return _largest_change(self.momentum[:, 3:6])
+        """Largest change of the total angular momentum without thrust, kg m^2/s."""
+        return _largest_change(self.momentum[:, 3:6] - self.expected[:, 3:6])
 
     def rotvecs(self) -> Array:
         """Return the attitude as exponential coordinates (N, 3), rad."""
@@ -68,6 +74,21 @@ class Measured:
     def final_error(self, goal: Goal) -> PoseError:
         """Return what the last pose leaves to the goal."""
         return PoseError.between(self.position[-1], self.quaternion[-1], goal)
+
+
+def _expected(bag: Bag, topic: str, momentum: TopicSeries) -> Array:
+    """Where there are no thrusters nothing is published, and nothing is to change."""
+    if topic in bag.topics and bag.message_count(topic) == len(momentum):
+        return np.asarray(bag[topic].field("data"))
+    return np.zeros((len(momentum), 6))
+
+
+def _last_pose(bag: Bag, topic: str) -> tuple[Array, Array] | None:
+    if topic not in bag.topics or not bag.message_count(topic):
+        return None
+    series = bag[topic]
+    position = np.array([series.field(f"pose.position.{x}")[-1] for x in "xyz"])
+    return position, np.array([series.field(f"pose.orientation.{x}")[-1] for x in "xyzw"])
 
 
 def _largest_change(vectors: Array) -> float:

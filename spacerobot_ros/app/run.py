@@ -20,6 +20,7 @@ from spacerobot_ros.app.scenario import Scenario
 from spacerobot_ros.app.stack import FlightStack
 from spacerobot_ros.model.attitude import rotvec_from_quaternion
 from spacerobot_ros.nodes.flight_node import use_loopback_discovery, use_private_discovery
+from spacerobot_ros.planning import PoseError
 from spacerobot_ros.recording import read_bag
 
 _NO_GAIT = ("state", "goal", "corrections", "method")
@@ -78,13 +79,13 @@ def run_scenario(scenario: Scenario, bag: Path, progress: Progress | None = None
 
             def look() -> bool:
                 if progress is not None:
-                    progress(stack.plant.time_ns / 1e9, stack.planner.ends_at)
+                    progress(stack.plant.time_ns / 1e9, _ends_at(stack))
                 return stopped()
 
             stack.spin(look)
             wall_time = time.perf_counter() - began
             if progress is not None and not stopped():
-                progress(stack.planner.ends_at, stack.planner.ends_at)
+                progress(1.0, 1.0)
             stack.finish()
             facts = _Facts.of(stack, wall_time, stopped())
         finally:
@@ -116,15 +117,31 @@ class _Facts:
         return cls(
             state="interrupted" if stopped else stack.status.get("state", ""),
             sentence=sentence,
-            method=str(stack.planner.parameters["method"]),
-            plan_time=stack.planner.plan_time,
+            method=_method(stack),
+            plan_time=stack.planner.plan_time if stack.planner else 0.0,
             wall_time=wall_time,
             ticks=stack.plant.tick,
             messages=stack.recorder.messages_recorded,
-            manoeuvre_time=stack.planner.flown_time,
+            manoeuvre_time=(
+                stack.planner.flown_time if stack.planner else stack.plant.time_ns / 1e9
+            ),
             corrections=int(stack.status.get("corrections", 0)),
             gait=stack.gait,
         )
+
+
+def _method(stack: FlightStack) -> str:
+    """Name the gait method, or the control law where nobody plans."""
+    node, name = (stack.planner, "method") if stack.planner else (stack.controller, "law")
+    return str(node.parameters[name]) if node is not None else ""
+
+
+def _ends_at(stack: FlightStack) -> float:
+    """Simulated time at which the flight will end as far as is known, s; 0 if it is not."""
+    if stack.planner is not None:
+        return stack.planner.ends_at
+    assert stack.controller is not None
+    return float(stack.controller.parameters["time_limit"])  # type: ignore[arg-type]
 
 
 def _summarise(scenario: Scenario, path: Path, facts: _Facts) -> RunResult:
@@ -161,6 +178,11 @@ def _summarise(scenario: Scenario, path: Path, facts: _Facts) -> RunResult:
         "message": facts.sentence,
         "succeeded": facts.state == "reached",
     }
+    if scenario.end_effector_goal is not None and measured.end_effector is not None:
+        end = PoseError.between(*measured.end_effector, scenario.end_effector_goal)
+        summary["end_effector_final_position_m"] = measured.end_effector[0].tolist()
+        summary["end_effector_position_error_m"] = end.distance
+        summary["end_effector_attitude_error_rad"] = end.angle
     return RunResult(summary, facts.sentence, measured)
 
 

@@ -15,10 +15,18 @@ from spacerobot_ros.model.attitude import quaternion_from_rotvec
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import resource_names, share_directory
 
-NODES = ("plant", "planner", "recorder")
+NODES = ("plant", "planner", "coordinated_control", "recorder")
 """The nodes that a scenario may set parameters of."""
 
-_KEYS = ("description", "goal_position", "goal_orientation", "goal_rotvec", "published")
+COMMANDERS = ("planner", "coordinated_control")
+"""Those of them that take goals; a scenario runs the ones its file has a section for."""
+
+_GOALS = ("goal", "end_effector_goal")
+_KEYS = (
+    "description",
+    "published",
+    *(f"{goal}_{part}" for goal in _GOALS for part in ("position", "orientation", "rotvec")),
+)
 
 
 @dataclass(frozen=True)
@@ -36,12 +44,18 @@ class Published:
 
 @dataclass(frozen=True)
 class Scenario:
-    """A parameter file and its goal; ``overrides``, parameters by node, go before the file."""
+    """A parameter file and its goals; ``overrides``, parameters by node, go before the file.
+
+    ``goal`` is of the base, ``end_effector_goal`` of the end-effector; ``commanders`` are the nodes
+    that fly there.
+    """
 
     name: str
     path: Path
     description: str
     goal: Goal
+    end_effector_goal: Goal | None
+    commanders: tuple[str, ...]
     published: tuple[Published, ...]
     overrides: Mapping[str, Mapping[str, Any]]
 
@@ -93,7 +107,13 @@ def load_scenario(name: str) -> Scenario:
         name=path.stem,
         path=path.resolve(),
         description=str(values.get("description", "")),
-        goal=_goal(values, path),
+        goal=_goal("goal", values, path),
+        end_effector_goal=(
+            _goal("end_effector_goal", values, path)
+            if any(key.startswith("end_effector_goal") for key in values)
+            else None
+        ),
+        commanders=tuple(name for name in COMMANDERS if name in content) or ("planner",),
         published=_published(values.get("published", {}), path),
         overrides={},
     )
@@ -151,11 +171,12 @@ def _published(rows: Any, path: Path) -> tuple[Published, ...]:
         ) from error
 
 
-def _goal(values: Mapping[str, Any], path: Path) -> Goal:
+def _goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
     try:
-        position = values.get("goal_position", [0.0, 0.0, 0.0])
-        if "goal_rotvec" in values:
-            return goal_from_rotvec(position, values["goal_rotvec"])
-        return Goal.checked(position, values.get("goal_orientation", [0.0, 0.0, 0.0, 1.0]))
+        position = values.get(f"{name}_position", [0.0, 0.0, 0.0])
+        if f"{name}_rotvec" in values:
+            return goal_from_rotvec(position, values[f"{name}_rotvec"])
+        orientation = values.get(f"{name}_orientation", [0.0, 0.0, 0.0, 1.0])
+        return Goal.checked(position, orientation)
     except (PlanningError, ValueError, TypeError) as error:
         raise ParameterError(f"The goal of the scenario file {path} is refused: {error}") from error

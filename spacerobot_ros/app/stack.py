@@ -20,7 +20,13 @@ from rclpy.parameter import Parameter
 
 from spacerobot_ros.app.scenario import NODES, Scenario
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.nodes import FlightNode, PlannerNode, PlantNode, RecorderNode
+from spacerobot_ros.nodes import (
+    CoordinatedControlNode,
+    FlightNode,
+    PlannerNode,
+    PlantNode,
+    RecorderNode,
+)
 from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, spin_until
 from spacerobot_ros.nodes.recorder import parameters_of
 from spacerobot_ros.planning import Goal
@@ -28,10 +34,12 @@ from spacerobot_ros.planning import Goal
 _CLASSES: dict[str, type[FlightNode]] = {
     "plant": PlantNode,
     "planner": PlannerNode,
+    "coordinated_control": CoordinatedControlNode,
     "recorder": RecorderNode,
 }
 _DISCOVERY_TIMEOUT = 10.0
 _LOOK_PERIOD = 0.2
+_STATUS = {"planner": "planner/status", "coordinated_control": "controller/status"}
 _ENDED = ("reached", "failed", "refused", "aborted")
 
 
@@ -71,20 +79,27 @@ class FlightStack:
         overrides["plant"].setdefault("time_mode", "lockstep")
         if bag is not None:
             overrides["recorder"]["bag"] = str(bag)
-        wanted = [name for name in NODES if name != "recorder" or bag is not None]
+        wanted = ["plant", *scenario.commanders, *(["recorder"] if bag is not None else [])]
         try:
             nodes = {name: self._make(name, overrides[name], context) for name in wanted}
             self.plant: PlantNode = nodes["plant"]
-            self.planner: PlannerNode = nodes["planner"]
+            self.commanders: list[FlightNode] = [nodes[name] for name in scenario.commanders]
+            self.planner: PlannerNode | None = nodes.get("planner")
+            self.controller: CoordinatedControlNode | None = nodes.get("coordinated_control")
             self.recorder: RecorderNode | None = nodes.get("recorder")
-            # Its warnings are its status, which whoever runs the stack is told anyway.
-            self.planner.get_logger().set_level(LoggingSeverity.ERROR)
+            for node in self.commanders:
+                # Their warnings are their status, which whoever runs the stack is told anyway.
+                node.get_logger().set_level(LoggingSeverity.ERROR)
             self.operator = rclpy.create_node("operator", context=context)
             self._nodes.append(self.operator)
             self._goal_topic = self.operator.create_publisher(PoseStamped, "goal_pose", STREAM)
-            self.operator.create_subscription(
-                DiagnosticStatus, "planner/status", self._on_status, LATCHED
-            )
+            if scenario.end_effector_goal is not None:
+                self._end_effector_topic = self.operator.create_publisher(
+                    PoseStamped, "end_effector/goal_pose", STREAM
+                )
+            # Whoever plans decides; a controller alone decides for itself.
+            decider = _STATUS[scenario.commanders[0]]
+            self.operator.create_subscription(DiagnosticStatus, decider, self._on_status, LATCHED)
             for name in wanted:
                 if name != "recorder":
                     nodes[name].require(nodes[name].trigger_configure)
@@ -110,21 +125,27 @@ class FlightStack:
             self.operator.destroy_timer(timer)
             if self.recorder is not None:
                 self.recorder.trigger_activate()
-            self.planner.trigger_activate()
-            self.send(goal)
+            for node in reversed(self.commanders):
+                node.trigger_activate()
+            self.send(goal, self.scenario.end_effector_goal)
             self.plant.trigger_activate()
 
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         timer = self.operator.create_timer(0.001, launch, clock=steady)
 
-    def send(self, goal: Goal) -> None:
-        """Publish a goal pose."""
+    def send(self, goal: Goal, end_effector: Goal | None = None) -> None:
+        """Publish goal poses of the base and, where there is one, of the end-effector."""
+        self._goal_topic.publish(self._pose(goal))
+        if end_effector is not None:
+            self._end_effector_topic.publish(self._pose(end_effector))
+
+    def _pose(self, goal: Goal) -> PoseStamped:
         message = PoseStamped()
-        message.header.frame_id = str(self.planner.parameters["world_frame"])
+        message.header.frame_id = str(self.commanders[0].parameters["world_frame"])
         p, o = message.pose.position, message.pose.orientation
         p.x, p.y, p.z = goal.position.tolist()
         o.x, o.y, o.z, o.w = goal.quaternion.tolist()
-        self._goal_topic.publish(message)
+        return message
 
     def spin(self, look: Callable[[], bool]) -> None:
         """Run until the goal is decided, or until ``look``, called five times a second, is true.
@@ -152,7 +173,8 @@ class FlightStack:
         """
         if self.plant.is_active:
             self.plant.trigger_deactivate()
-        self.planner.trigger_deactivate()
+        for node in self.commanders:
+            node.trigger_deactivate()
         if self.recorder is None:
             return
         quiet = 0
@@ -212,6 +234,7 @@ class FlightStack:
                 "description": self.scenario.description,
                 "goal_position": " ".join(repr(x) for x in goal.position.tolist()),
                 "goal_orientation": " ".join(repr(x) for x in goal.quaternion.tolist()),
+                **self._end_effector_record(),
                 "published": json.dumps([asdict(row) for row in self.scenario.published]),
             },
         )
@@ -220,6 +243,15 @@ class FlightStack:
                 self.recorder.describe(f"parameters/{name}", parameters_of(nodes[name]))
         urdf = self.plant.plant.robot.description.urdf
         self.recorder.attach("robot_description.urdf", urdf.encode(), "application/xml")
+
+    def _end_effector_record(self) -> dict[str, str]:
+        goal = self.scenario.end_effector_goal
+        if goal is None:
+            return {}
+        return {
+            "end_effector_goal_position": " ".join(repr(x) for x in goal.position.tolist()),
+            "end_effector_goal_orientation": " ".join(repr(x) for x in goal.quaternion.tolist()),
+        }
 
     def _connect(self) -> None:
         """Wait until every subscription in this process has met its publisher."""

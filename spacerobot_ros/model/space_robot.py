@@ -18,9 +18,11 @@ import numpy.typing as npt
 from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.barycentric import barycentric_inertia, point_jacobian
 from spacerobot_ros.model.compilation import BufferedFunction, compiled, dense_function
+from spacerobot_ros.model.composite_rigid_body import composite_dynamics
 from spacerobot_ros.model.connection import connection, curvature
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.dynamics import bias, forward_dynamics, generalised_forces
+from spacerobot_ros.model.free_flight import runge_kutta_step, shape_equations, state_rate
 from spacerobot_ros.model.kinematics import tree_kinematics
 from spacerobot_ros.model.momentum import base_twist, momentum_of_bodies, rotation_from_quaternion
 from spacerobot_ros.model.reconstruction import attitude_step
@@ -214,6 +216,10 @@ class SpaceRobot:
             "inertia_matrix": lambda: self._shape_function("inertia_matrix", self._inertia.H_plus),
             "bias": self._bias,
             "forward_dynamics": self._forward_dynamics,
+            "dynamics": self._dynamics,
+            "shape_equations": lambda: shape_equations(self._kin),
+            "flight_step": lambda: runge_kutta_step(state_rate(self._kin)),
+            "holding_step": lambda: runge_kutta_step(state_rate(self._kin, holding=True)),
             "jacobian": self._jacobian,
             "connection": lambda: self._shape_function("connection", self._A),
             "curvature": self._curvature,
@@ -261,6 +267,17 @@ class SpaceRobot:
             "forward_dynamics",
             [self._kin.q, v, omega, qdot, wrench, tau],
             [acceleration],
+            (["q", "v_cm_B", "omega_WB_B", "qdot", "wrench_B", "tau"], ["z0ddot"]),
+        )
+
+    def _dynamics(self) -> ca.Function:
+        """The same function as ``forward_dynamics``, by fewer operations."""
+        v, omega, qdot = self._velocities()
+        wrench, tau = ca.SX.sym("wrench_B", 6), ca.SX.sym("tau", self.n)
+        return dense_function(
+            "dynamics",
+            [self._kin.q, v, omega, qdot, wrench, tau],
+            [composite_dynamics(self._kin, v, omega, qdot, wrench, tau)],
             (["q", "v_cm_B", "omega_WB_B", "qdot", "wrench_B", "tau"], ["z0ddot"]),
         )
 

@@ -11,15 +11,17 @@ from rclpy.clock import Clock, ClockType
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.nodes.actuation import ACTUATIONS
 from spacerobot_ros.nodes.cdr import NANOSECONDS
-from spacerobot_ros.nodes.command_channel import NEVER, CommandChannel, JointChannel
+from spacerobot_ros.nodes.command_channel import NEVER, CommandChannel
 from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
 from spacerobot_ros.nodes.parameters import ParameterSpec
 from spacerobot_ros.nodes.plant_report import PlantReport
 from spacerobot_ros.nodes.plant_topics import PlantTopics
 from spacerobot_ros.nodes.robot_source import ROBOT_SPECS, robot_of
-from spacerobot_ros.simulation import InitialState, VelocityPlant
+from spacerobot_ros.simulation import InitialState
+from spacerobot_ros.simulation.plant import Plant
 
 _LATE_JOINER_CHECK = 0.1
 """How often a waiting lockstep plant looks for new subscribers, wall s."""
@@ -42,7 +44,7 @@ class PlantNode(FlightNode):
     SPECS: ClassVar = (
         *ROBOT_SPECS,
         ParameterSpec(
-            "actuation", "velocity", "", "what joint_commands carry", choices=("velocity",)
+            "actuation", "velocity", "", "what joint_commands carry", choices=tuple(ACTUATIONS)
         ),
         ParameterSpec(
             "time_mode", "realtime", "", "who drives time", choices=("realtime", "lockstep")
@@ -52,7 +54,9 @@ class PlantNode(FlightNode):
         ParameterSpec(
             "command_timeout", 0.5, "s", "realtime: older commands stop the joints; 0: never", 0.0
         ),
-        ParameterSpec("integration_step", 0.01, "s", "longest step of the attitude", 1e-6),
+        ParameterSpec(
+            "integration_step", 0.0, "s", "longest step; 0: 0.01 (velocity), 0.001 (effort)", 0.0
+        ),
         ParameterSpec("world_frame", "world", "", "name of the inertial frame"),
         ParameterSpec(
             "end_effector_frame", "", "", "link of end_effector_pose; '': 'end_effector', if any"
@@ -67,6 +71,16 @@ class PlantNode(FlightNode):
         ),
         ParameterSpec(
             "initial_joint_positions", [], "m or rad", "by joint order of the URDF; []: zero"
+        ),
+        ParameterSpec(
+            "initial_joint_velocities", [], "m/s or rad/s", "likewise, under efforts; []: zero"
+        ),
+        ParameterSpec(
+            "initial_center_of_mass",
+            [],
+            "m",
+            "of the system in the world, instead of initial_position",
+            length=3,
         ),
         ParameterSpec("linear_momentum", [0.0, 0.0, 0.0], "kg m/s", "total, in world", length=3),
         ParameterSpec(
@@ -106,23 +120,21 @@ class PlantNode(FlightNode):
             )
         self._lockstep = values["time_mode"] == "lockstep"
         self._period_ns = round(NANOSECONDS / values["tick_rate"])
-        joints = values["initial_joint_positions"]
-        self.plant = VelocityPlant(
+        actuation = ACTUATIONS[values["actuation"]]
+        self.plant: Plant = actuation.plant(
             robot,
             self._period_ns / NANOSECONDS,
-            InitialState(
-                np.array(values["initial_position"]),
-                np.array(values["initial_orientation"]),
-                np.array(joints) if joints else None,
-                np.array(values["linear_momentum"]),
-                np.array(values["angular_momentum"]),
-            ),
-            values["integration_step"],
+            self._initial_state(),
+            values["integration_step"] or actuation.integration_step,
         )
         self._tick = 0
-        self._channels: list[CommandChannel] = [JointChannel(robot, "velocity")]
+        self._channels = actuation.channels(robot)
         self._topics = PlantTopics(
-            self, self.plant, values["world_frame"], values["end_effector_frame"]
+            self,
+            self.plant,
+            values["world_frame"],
+            values["end_effector_frame"],
+            thrusters=actuation.thrusters,
         )
         self._report = PlantReport(self, self.plant)
         self._marker_ticks = self._ticks(values["marker_period"])
@@ -138,6 +150,22 @@ class PlantNode(FlightNode):
             )
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
+
+    def _initial_state(self) -> InitialState:
+        values: dict[str, Any] = self.parameters
+
+        def optional(name: str) -> Any:
+            return np.array(values[name]) if values[name] else None
+
+        return InitialState(
+            position=np.array(values["initial_position"]),
+            quaternion=np.array(values["initial_orientation"]),
+            joint_positions=optional("initial_joint_positions"),
+            linear_momentum=np.array(values["linear_momentum"]),
+            angular_momentum=np.array(values["angular_momentum"]),
+            joint_velocities=optional("initial_joint_velocities"),
+            center_of_mass=optional("initial_center_of_mass"),
+        )
 
     def activate(self) -> None:
         """Publish the robot and its present state, and from now on step."""
@@ -168,7 +196,13 @@ class PlantNode(FlightNode):
     def _step(self) -> None:
         for channel in self._channels:
             channel.arrived = False
-        if self.plant.step(*(channel.command for channel in self._channels)):
+        try:
+            limited = self.plant.step(*(channel.command for channel in self._channels))
+        except SpaceRobotError as error:
+            self.get_logger().error(f"The plant stops at {self.time_ns / NANOSECONDS:g} s: {error}")
+            self.trigger_deactivate()
+            return
+        if limited:
             self._report.limited()
         self._tick += 1
         self._publish()

@@ -10,7 +10,7 @@ from rclpy.node import Node
 
 from spacerobot_ros.nodes.cdr import NANOSECONDS
 from spacerobot_ros.nodes.flight_node import STREAM
-from spacerobot_ros.simulation import VelocityPlant
+from spacerobot_ros.simulation.plant import Plant
 
 _LOG_PERIOD = 5.0
 """Wall s between two log lines of one kind."""
@@ -19,7 +19,7 @@ _LOG_PERIOD = 5.0
 class PlantReport:
     """Counters of one plant. Every refusal has a reason; the last one stays in the diagnostics."""
 
-    def __init__(self, node: Node, plant: VelocityPlant) -> None:
+    def __init__(self, node: Node, plant: Plant) -> None:
         self._node, self._plant = node, plant
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
         self.commands_refused = 0
@@ -46,7 +46,7 @@ class PlantReport:
         """Log that joints were held back in the last step."""
         plant = self._plant
         texts = []
-        for what, counts in (("rate", plant.velocity_limited), ("stroke", plant.stroke_limited)):
+        for what, counts in plant.limit_counts.items():
             names = [
                 name for name, count in zip(plant.robot.joint_names, counts, strict=True) if count
             ]
@@ -82,18 +82,15 @@ class PlantReport:
                 moved["limits"],
                 "limits of the URDF hold joints back" if moved["limits"] else "within limits",
                 {
-                    f"rate_limited.{j}": c
-                    for j, c in zip(joints, plant.velocity_limited, strict=True)
-                }
-                | {
-                    f"stroke_limited.{j}": c
-                    for j, c in zip(joints, plant.stroke_limited, strict=True)
+                    f"{what}_limited.{joint}": count
+                    for what, counts in plant.limit_counts.items()
+                    for joint, count in zip(joints, counts, strict=True)
                 },
             ),
             _status(
                 f"{name}: momentum",
                 False,
-                "total momentum without thrust",
+                "change that no thruster accounts for",
                 {
                     "linear_change": f"{self._drift(0):.3e}",
                     "angular_change": f"{self._drift(3):.3e}",
@@ -106,13 +103,15 @@ class PlantReport:
         plant = self._plant
         return {
             "commands": (self.commands_refused, self.command_timeouts, self.deadlines_missed),
-            "limits": (*plant.velocity_limited.tolist(), *plant.stroke_limited.tolist()),
+            "limits": tuple(int(n) for counts in plant.limit_counts.values() for n in counts),
         }
 
     def _drift(self, first: int) -> float:
-        start = self._plant.initial
-        initial = (start.linear_momentum, start.angular_momentum)[first // 3]
-        return float(np.linalg.norm(self._plant.momentum[first : first + 3] - initial))
+        """Change of the momentum that no thruster accounts for."""
+        part = slice(first, first + 3)
+        return float(
+            np.linalg.norm(self._plant.momentum[part] - self._plant.expected_momenta[part])
+        )
 
 
 def _status(name: str, warn: bool, message: str, values: Mapping[str, object]) -> DiagnosticStatus:

@@ -16,10 +16,13 @@ from spacerobot_ros.model.attitude import matrix_from_quaternion, quaternion_fro
 from spacerobot_ros.nodes.cdr import MessageTemplate, raw_publish, stamp_bytes
 from spacerobot_ros.nodes.flight_node import STREAM
 from spacerobot_ros.nodes.markers import LinkMarkers
-from spacerobot_ros.simulation import VelocityPlant
+from spacerobot_ros.simulation.plant import Plant
 
 MOMENTUM_LABEL = "linear_x linear_y linear_z angular_x angular_y angular_z kinetic_energy"
 """What the seven numbers of the momentum topic are (kg m/s, kg m^2/s, J; world components)."""
+
+EXPECTED_LABEL = " ".join(MOMENTUM_LABEL.split()[:6])
+"""What the six numbers of momentum_expected are: momenta at the start, and by the thrusters."""
 
 DEFAULT_END_EFFECTOR = "end_effector"
 
@@ -43,7 +46,13 @@ class PlantTopics:
     """
 
     def __init__(
-        self, node: Node, plant: VelocityPlant, world_frame: str, end_effector_frame: str
+        self,
+        node: Node,
+        plant: Plant,
+        world_frame: str,
+        end_effector_frame: str,
+        *,
+        thrusters: bool,
     ) -> None:
         self._plant = plant
         robot = plant.robot
@@ -61,9 +70,7 @@ class PlantTopics:
         )
         joints_message.header.frame_id = robot.base_link
         joints = MessageTemplate(joints_message)
-        momentum_message = Float64MultiArray(data=[0.0] * 7)
-        momentum_message.layout.dim = [MultiArrayDimension(label=MOMENTUM_LABEL, size=7, stride=7)]
-        momentum = MessageTemplate(momentum_message)
+        momentum = MessageTemplate(_labelled(MOMENTUM_LABEL))
 
         odom.feed("pose.pose.position.x", plant.pose)
         odom.feed("twist.twist.linear.x", plant.twist)
@@ -72,6 +79,7 @@ class PlantTopics:
         if n:
             joints.feed("position", plant.q)
             joints.feed("velocity", plant.qdot)
+            joints.feed("effort", plant.effort)
         # The clock first: whoever sees a state has seen its time.
         self._streams = [
             (node.create_publisher(kind, topic, STREAM), template)
@@ -83,6 +91,11 @@ class PlantTopics:
                 (JointState, "joint_states", joints),
             )
         ]
+        if thrusters:
+            expected = MessageTemplate(_labelled(EXPECTED_LABEL))
+            expected.feed("data", plant.expected_momenta)
+            publisher = node.create_publisher(Float64MultiArray, "momentum_expected", STREAM)
+            self._streams.insert(3, (publisher, expected))
         self._end_effector: tuple[int, Any] | None = None
         self._add_end_effector(node, world_frame, end_effector_frame, pose_message)
         self._sends = [(raw_publish(publisher), template) for publisher, template in self._streams]
@@ -128,3 +141,11 @@ class PlantTopics:
         # Before odom and joint_states, which set the commanders off.
         self._streams.insert(2, (publisher, template))
         self._end_effector = links.index(name), template.floats("pose.position.x", 7)
+
+
+def _labelled(label: str) -> Float64MultiArray:
+    """Return an array with one number for each word of its label."""
+    size = len(label.split())
+    message = Float64MultiArray(data=[0.0] * size)
+    message.layout.dim = [MultiArrayDimension(label=label, size=size, stride=size)]
+    return message

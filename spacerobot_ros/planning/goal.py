@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -11,16 +12,32 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model.attitude import attitude_error, unit_quaternion
 from spacerobot_ros.model.description import Array
 
+Controlled = Literal["position", "attitude", "shape"]
+"""A part of a goal: where the base is, how it is turned, how the joints stand."""
+
+POSE: frozenset[Controlled] = frozenset({"position", "attitude"})
+"""The parts of a goal that are the pose of the base."""
+
 
 @dataclass(frozen=True)
 class Goal:
-    """A pose of the base link in the world: ``position`` (3,) in m, ``quaternion`` (x, y, z, w)."""
+    """A pose of the base link in the world, and the shape to end in where it matters.
+
+    ``position`` (3,) in m, ``quaternion`` (x, y, z, w); ``joint_positions`` (n,) in m or rad, in
+    the order of the robot's joints, None: the shape is the method's to choose.
+    """
 
     position: Array
     quaternion: Array
+    joint_positions: Array | None = None
 
     @classmethod
-    def checked(cls, position: npt.ArrayLike, quaternion: npt.ArrayLike) -> Goal:
+    def checked(
+        cls,
+        position: npt.ArrayLike,
+        quaternion: npt.ArrayLike,
+        joint_positions: npt.ArrayLike | None = None,
+    ) -> Goal:
         """Return a goal with a unit quaternion.
 
         Raises
@@ -36,8 +53,13 @@ class Goal:
             raise PlanningError(f"The goal position {r.tolist()} is not finite.")
         if not np.all(np.isfinite(q)):
             raise PlanningError(f"The goal orientation {q.tolist()} is not finite.")
+        shape = None if joint_positions is None else np.asarray(joint_positions, dtype=float)
+        if shape is not None and (shape.ndim != 1 or not np.all(np.isfinite(shape))):
+            raise PlanningError(
+                f"The goal shape {shape.tolist()} is not a list of finite joint positions."
+            )
         try:
-            return cls(r, unit_quaternion(q))
+            return cls(r, unit_quaternion(q), shape)
         except ValueError:
             raise PlanningError(
                 f"The goal orientation {q.tolist()} is a zero quaternion, not a rotation; "
@@ -58,15 +80,25 @@ class RobotState:
 
 @dataclass(frozen=True)
 class PoseError:
-    """What is left to a goal: ``position`` (3,) in W, m, and ``rotvec`` (3,) in B, rad."""
+    """What is left to a goal: ``position`` (3,) in W, m, and ``rotvec`` (3,) in B, rad.
+
+    ``shape`` (n,) in m or rad is what the joints still have to go; empty where no shape is asked
+    for.
+    """
 
     position: Array
     rotvec: Array
+    shape: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def between(cls, position: Array, quaternion: Array, goal: Goal) -> PoseError:
-        """Return what is left from a pose to the goal."""
-        return cls(goal.position - position, attitude_error(quaternion, goal.quaternion))
+    def between(
+        cls, position: Array, quaternion: Array, goal: Goal, q: Array | None = None
+    ) -> PoseError:
+        """Return what is left from a pose, and from the shape ``q`` (n,) if given, to the goal."""
+        shape = np.zeros(0)
+        if q is not None and goal.joint_positions is not None:
+            shape = goal.joint_positions - q
+        return cls(goal.position - position, attitude_error(quaternion, goal.quaternion), shape)
 
     @property
     def distance(self) -> float:
@@ -78,14 +110,24 @@ class PoseError:
         """Angle of the attitude error, rad."""
         return float(np.linalg.norm(self.rotvec))
 
+    @property
+    def farthest_joint(self) -> float:
+        """Largest joint error, m or rad; zero where no shape is asked for."""
+        return float(np.abs(self.shape).max(initial=0.0))
+
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How near is there: ``position`` in m, ``attitude`` in rad."""
+    """How near is there: ``position`` in m, ``attitude`` in rad, ``shape`` in m or rad a joint."""
 
     position: float
     attitude: float
+    shape: float = 1e-3
 
-    def admits(self, error: PoseError) -> bool:
-        """Whether the goal is met."""
-        return error.distance <= self.position and error.angle <= self.attitude
+    def admits(self, error: PoseError, controls: frozenset[Controlled] = POSE) -> bool:
+        """Whether the goal is met, in the parts that are controlled."""
+        return (
+            ("position" not in controls or error.distance <= self.position)
+            and ("attitude" not in controls or error.angle <= self.attitude)
+            and ("shape" not in controls or error.farthest_joint <= self.shape)
+        )

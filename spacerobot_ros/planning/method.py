@@ -6,10 +6,16 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
+
+from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
-from spacerobot_ros.planning.goal import Goal, RobotState, Tolerance
+from spacerobot_ros.planning.goal import POSE, Controlled, Goal, RobotState, Tolerance
 from spacerobot_ros.planning.schedule import GaitSchedule
+
+_AT_REST = 1e-9
+"""Momenta below this times the mass count as zero, m/s and m^2/s."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +35,13 @@ class GaitMethod(ABC):
 
     A method is constructed once for a robot and plans many times. Its ``options`` become the
     parameters ``<name>.<option>`` of the planner node and arrive as keyword arguments.
+
+    ``controls`` names the parts of a goal that the method brings about and is judged by; the others
+    come out as they must.
     """
 
     name: ClassVar[str]
+    controls: ClassVar[frozenset[Controlled]] = POSE
     options: ClassVar[tuple[Option, ...]] = ()
 
     def __init__(
@@ -58,3 +68,13 @@ class GaitMethod(ABC):
         PlanningError
             The method cannot reach the goal; the sentence says why.
         """
+
+    def _require_rest(self, state: RobotState) -> None:
+        """Refuse a robot whose total momentum is not zero; for methods that plan without it."""
+        p, L = np.linalg.norm(state.linear_momentum), np.linalg.norm(state.angular_momentum)
+        if max(p, L) > _AT_REST * self.robot.total_mass:
+            raise PlanningError(
+                "The robot drifts: its total momentum is not zero "
+                f"({p:.3g} kg m/s, {L:.3g} kg m^2/s), and {self.name} plans for zero momentum; "
+                "shape changes cannot remove it."
+            )

@@ -7,32 +7,17 @@ linear and angular momenta are constants of the motion, zero unless the run star
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.attitude import matrix_from_quaternion, unit_quaternion
 from spacerobot_ros.model.compilation import BufferedFunction, compiled
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
-
-
-@dataclass(frozen=True)
-class InitialState:
-    """Where a run starts: base pose in W (m; quaternion x, y, z, w), shape, and total momenta in W.
-
-    ``joint_positions`` None means zero, or the nearest end of a stroke that excludes zero.
-    ``angular_momentum`` (kg m^2/s) is about the system's centre of mass.
-    """
-
-    position: Array = field(default_factory=lambda: np.zeros(3))
-    quaternion: Array = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0]))
-    joint_positions: Array | None = None
-    linear_momentum: Array = field(default_factory=lambda: np.zeros(3))
-    angular_momentum: Array = field(default_factory=lambda: np.zeros(3))
+from spacerobot_ros.simulation.initial_state import InitialState
 
 
 class VelocityPlant:
@@ -46,6 +31,8 @@ class VelocityPlant:
         (6,) ``v_WB_B`` in m/s and ``omega_WB_B`` in rad/s.
     ``q``, ``qdot``
         (n,) joint positions, and the velocities held up to now.
+    ``effort``
+        (n,) zero: what the servos need is not modelled.
     ``momentum``
         (7,) linear momentum (kg m/s), angular momentum about the system's centre of mass
         (kg m^2/s), both in W, and kinetic energy (J): summed body by body from the state above.
@@ -66,7 +53,8 @@ class VelocityPlant:
     Raises
     ------
     ParameterError
-        The initial shape has the wrong length or lies outside the strokes, or a number is bad.
+        The initial shape has the wrong length or lies outside the strokes, its joints move, or a
+        number is bad.
     """
 
     def __init__(
@@ -88,27 +76,33 @@ class VelocityPlant:
         self._next_state, self.pose, self.twist, self.qdot = outputs[:4]
         self.momentum, self.link_R, self.link_r, self._limited, self._next_r_cm = outputs[4:]
         self.q = self._next_state[: robot.n]
+        self.effort = np.zeros(robot.n)
         self.velocity_limited = np.zeros(robot.n, dtype=np.int64)
         self.stroke_limited = np.zeros(robot.n, dtype=np.int64)
         self.reset()
 
+    @property
+    def limit_counts(self) -> dict[str, npt.NDArray[np.int64]]:
+        """Ticks in which each joint (n,) was limited, by what limited it."""
+        return {"rate": self.velocity_limited, "stroke": self.stroke_limited}
+
+    @property
+    def expected_momenta(self) -> Array:
+        """Linear over angular momentum (6,) in W: what the run began with."""
+        return self._momenta
+
     def reset(self) -> None:
         """Return to the initial state, at rest; the limit counters go on."""
-        start = self.initial
-        q = self._initial_shape()
-        try:
-            quaternion = unit_quaternion(start.quaternion)
-        except ValueError as error:
-            raise ParameterError(f"The initial orientation is refused: {error}.") from None
-        momenta = np.concatenate([start.linear_momentum, start.angular_momentum])
-        if not np.all(np.isfinite(np.concatenate([start.position, momenta]))):
-            raise ParameterError("The initial position and momenta must be finite.")
-        self._state[: self.robot.n] = q
-        self._state[self.robot.n :] = quaternion
-        self._momenta[:] = momenta
-        self._r_cm[:] = start.position + matrix_from_quaternion(
-            quaternion
-        ) @ self.robot.center_of_mass(q)
+        start, robot = self.initial, self.robot
+        if np.any(start.rates(robot)):
+            raise ParameterError(
+                "Joints under velocity commands start at rest: leave the initial joint velocities "
+                "out, or command them."
+            )
+        self._state[: robot.n] = start.shape(robot)
+        self._state[robot.n :] = start.attitude()
+        self._momenta[:] = start.momenta()
+        self._r_cm[:] = start.system_position(robot)
         # A step of zero duration at zero rates fills every output.
         self._command[:] = 0.0
         self._h[:] = 0.0
@@ -131,26 +125,6 @@ class VelocityPlant:
         self.velocity_limited += (self._limited[1 : 1 + self.robot.n] != 0.0).astype(np.int64)
         self.stroke_limited += (self._limited[1 + self.robot.n :] != 0.0).astype(np.int64)
         return True
-
-    def _initial_shape(self) -> Array:
-        robot, given = self.robot, self.initial.joint_positions
-        if given is None:
-            return np.clip(np.zeros(robot.n), robot.lower, robot.upper)
-        q = np.asarray(given, dtype=float)
-        if q.shape != (robot.n,):
-            raise ParameterError(
-                f"The initial joint positions are {q.size} numbers; robot "
-                f"'{robot.description.name}' has {robot.n} joints: {', '.join(robot.joint_names)}."
-            )
-        for name, value, lower, upper in zip(
-            robot.joint_names, q, robot.lower, robot.upper, strict=True
-        ):
-            if not (lower <= value <= upper):
-                raise ParameterError(
-                    f"The initial position of joint '{name}', {value}, is outside its stroke "
-                    f"[{lower}, {upper}]."
-                )
-        return q
 
 
 def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:

@@ -53,7 +53,7 @@ TEXTS = ("", "a", "base_link", "µ", "slider_1 ", "Δq > 1 m")
 few = settings(
     derandomize=True,
     deadline=None,
-    max_examples=40,
+    max_examples=25,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 
@@ -264,7 +264,7 @@ joint_states = st.builds(
 )
 
 
-@settings(few, max_examples=150)
+@settings(few, max_examples=80)
 @given(st.lists(joint_states, min_size=1, max_size=12))
 def test_a_reader_reads_what_rclpy_reads_whatever_comes(sent: list[JointState]) -> None:
     reader = TemplateReader(JointState, spans)
@@ -377,7 +377,7 @@ def check_trajectory(message: Any, schedule: GaitSchedule, stamp_ns: int, frame:
 THREE = schedule_of(("slider_1", "slider_2", "slider_3"), np.arange(12.0).reshape(4, 3), 0.05)
 
 
-@settings(few, max_examples=150)
+@settings(few, max_examples=80)
 @given(schedules(), st.integers(0, 2**31 * 10**9 - 1), st.text("lmnop", max_size=9))
 @example(THREE, 0, "base_link")
 @example(THREE, 3, "base")

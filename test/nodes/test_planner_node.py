@@ -68,7 +68,7 @@ TOPICS = {
 
 HERE = ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 NEAR = ([0.05, -0.03, 0.02], [0.0, 0.0, 0.0])
-TURNED = ([0.02, -0.03, 0.01], [0.02, -0.01, 0.03])
+TURNED = ([0.02, -0.03, 0.01], [0.01, -0.005, 0.015])
 Place = tuple[Sequence[float], Sequence[float]]
 
 
@@ -142,7 +142,7 @@ class Flight:
             lambda: self.probe.count("joint_states") >= wanted, f"{count} more ticks"
         )
 
-    def fly(self, place: Place) -> DiagnosticStatus:
+    def decide(self, place: Place | PoseStamped) -> DiagnosticStatus:
         """Send a goal and wait until it is decided; the status that decides it."""
         before = self.probe.count("planner/status")
         self.send(place)
@@ -166,7 +166,7 @@ class Flight:
 
 def test_a_goal_is_met_within_tolerance(harness: Harness) -> None:
     flight = Flight(harness, {"position_tolerance": 2e-3, "attitude_tolerance": 3e-4})
-    status = flight.fly(TURNED)
+    status = flight.decide(TURNED)
     assert flight.states == ["idle", "executing", "reached"]
     distance, angle = flight.error_to(TURNED)
     assert distance <= 2e-3
@@ -187,7 +187,7 @@ def test_a_goal_is_met_within_tolerance(harness: Harness) -> None:
 
 def test_every_state_is_answered_with_one_command_of_its_stamp(harness: Harness) -> None:
     flight = Flight(harness)
-    flight.fly(NEAR)
+    flight.decide(NEAR)
     flight.ticks(5)
     states = [stamp_of(m) for m in flight.probe.messages["joint_states"]]
     commands = [stamp_of(m) for m in flight.probe.messages["joint_commands"]]
@@ -202,7 +202,7 @@ def test_every_state_is_answered_with_one_command_of_its_stamp(harness: Harness)
 def test_goals_are_flown_one_after_the_other(harness: Harness) -> None:
     flight = Flight(harness)
     for place in (NEAR, TURNED, HERE):
-        assert values_of(flight.fly(place))["state"] == "reached"
+        assert values_of(flight.decide(place))["state"] == "reached"
         distance, angle = flight.error_to(place)
         assert distance <= 1e-3
         assert angle <= 1e-3
@@ -210,7 +210,7 @@ def test_goals_are_flown_one_after_the_other(harness: Harness) -> None:
 
 def test_the_pose_that_is_already_there_is_reached(harness: Harness) -> None:
     flight = Flight(harness)
-    status = flight.fly(HERE)
+    status = flight.decide(HERE)
     assert flight.states[-1] == "reached"
     assert_one_sentence(status.message, "met")
     (schedule,) = flight.probe.messages["gait_schedule"]
@@ -262,21 +262,19 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize(("goal", "mentions"), REFUSED.values(), ids=REFUSED)
-def test_what_cannot_be_done_is_refused_and_the_next_goal_flies(
-    harness: Harness, goal: PoseStamped, mentions: tuple[str, ...]
-) -> None:
+def test_what_cannot_be_done_is_refused_and_the_next_goal_flies(harness: Harness) -> None:
     flight = Flight(harness)
     flight.start()
-    flight.send(goal)
-    status = flight.wait("refused")
-    assert status.level == DiagnosticStatus.ERROR
-    assert_one_sentence(status.message, *mentions)
+    for goal, mentions in REFUSED.values():
+        status = flight.decide(goal)
+        assert flight.states[-1] == "refused"
+        assert status.level == DiagnosticStatus.ERROR
+        assert_one_sentence(status.message, *mentions)
     flight.ticks(3)
     assert not any(any(m.velocity) for m in flight.probe.messages["joint_states"])
     assert not flight.probe.messages["gait_schedule"]
-    flight.fly(NEAR)
-    assert flight.states == ["idle", "refused", "executing", "reached"]
+    flight.decide(NEAR)
+    assert flight.states == ["idle", *["refused"] * len(REFUSED), "executing", "reached"]
     assert max(flight.error_to(NEAR)) <= 1e-3
 
 
@@ -297,21 +295,21 @@ def test_a_refused_goal_does_not_disturb_the_one_that_is_flown(harness: Harness,
 
 def test_a_drifting_robot_is_refused_with_the_true_reason(harness: Harness) -> None:
     flight = Flight(harness, plant={"linear_momentum": [0.3, -0.4, 0.0]})
-    status = flight.fly(NEAR)
+    status = flight.decide(NEAR)
     assert flight.states == ["idle", "refused"]
     assert_one_sentence(status.message, "drifts", "momentum", "0.5 kg m/s")
 
 
 def test_a_turning_robot_is_refused_with_the_true_reason(harness: Harness) -> None:
     flight = Flight(harness, plant={"angular_momentum": [0.0, 0.0, 0.25]})
-    status = flight.fly(NEAR)
+    status = flight.decide(NEAR)
     assert flight.states == ["idle", "refused"]
     assert_one_sentence(status.message, "momentum", "0.25 kg m^2/s")
 
 
 def test_a_robot_that_the_method_cannot_steer_is_refused(harness: Harness) -> None:
     flight = Flight(harness, {"robot": "planar_chain"}, {"robot": "planar_chain"})
-    status = flight.fly(TURNED)
+    status = flight.decide(TURNED)
     assert flight.states == ["idle", "refused"]
     assert_one_sentence(status.message, "three sliders", "planar_chain")
 
@@ -326,7 +324,7 @@ def test_a_new_goal_replaces_the_one_that_is_flown(harness: Harness) -> None:
     flight.wait("executing")
     flight.ticks(15)
     assert any(flight.probe.last("joint_states").velocity), "the first goal is being flown"
-    flight.fly(TURNED)
+    flight.decide(TURNED)
     assert flight.states == ["idle", "executing", "executing", "reached"]
     distance, angle = flight.error_to(TURNED)
     assert max(distance, angle) <= 1e-3
@@ -362,7 +360,7 @@ def test_abortion_brings_the_joints_to_rest(harness: Harness) -> None:
     answer = harness.call(client, Trigger.Request())
     assert not answer.success
     assert answer.message
-    flight.fly(NEAR)
+    flight.decide(NEAR)
     assert flight.states[-1] == "reached"
     assert max(flight.error_to(NEAR)) <= 1e-3
 
@@ -404,7 +402,7 @@ def flown(harness: Harness) -> Flight:
             "initial_joint_positions": [0.2, -0.1, 0.15],
         },
     )
-    status = flight.fly(([1.01, -0.52, 0.26], [0.42, -0.32, 0.23]))
+    status = flight.decide(([1.01, -0.52, 0.26], [0.41, -0.31, 0.215]))
     assert values_of(status)["state"] == "reached", status.message
     return flight
 
@@ -474,7 +472,7 @@ def test_markers_show_the_goal_and_the_path(harness: Harness) -> None:
     flight = Flight(harness)
     flight.probe.watch("markers", MarkerArray)
     harness.connect()
-    flight.fly(NEAR)
+    flight.decide(NEAR)
     (array,) = flight.probe.messages["markers"]
     ghosts = [m for m in array.markers if m.ns == "goal"]
     assert ghosts
@@ -544,28 +542,27 @@ def test_a_goal_that_is_missed_fails_with_a_sentence(harness: Harness) -> None:
     assert list(flight.probe.last("joint_states").velocity) == [0.0] * 3
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "mentions"),
-    [
-        ("position_tolerance", -1.0, ("position_tolerance",)),
-        ("max_corrections", -1, ("max_corrections",)),
-        # What follows rclpy itself refuses.
-        ("attitude_tolerance", "small", ("DOUBLE",)),
-        ("max_corrections", 2.5, ("INTEGER",)),
-        ("tick_rate", 50.0, ("tick_rate",)),
-    ],
-)
-def test_a_bad_change_in_flight_is_refused(
-    harness: Harness, name: str, value: Any, mentions: tuple[str, ...]
-) -> None:
+def test_a_bad_change_in_flight_is_refused(harness: Harness) -> None:
     flight = Flight(harness)
-    before = flight.planner.get_parameter(name).value
-    (result,) = flight.planner.set_parameters([Parameter(name, value=value)])
-    assert not result.successful
-    for mention in mentions:
+    flight.send(NEAR)
+    flight.start()
+    flight.wait("executing")
+    cases: list[tuple[str, Any, str]] = [
+        ("position_tolerance", -1.0, "position_tolerance"),
+        ("max_corrections", -1, "max_corrections"),
+        # What follows rclpy itself refuses.
+        ("attitude_tolerance", "small", "DOUBLE"),
+        ("max_corrections", 2.5, "INTEGER"),
+        ("tick_rate", 50.0, "tick_rate"),
+    ]
+    for name, value, mention in cases:
+        before = flight.planner.get_parameter(name).value
+        (result,) = flight.planner.set_parameters([Parameter(name, value=value)])
+        assert not result.successful
         assert mention in result.reason
-    assert flight.planner.get_parameter(name).value == before
-    assert values_of(flight.fly(NEAR))["state"] == "reached"
+        assert flight.planner.get_parameter(name).value == before
+    flight.wait("reached")
+    assert max(flight.error_to(NEAR)) <= 1e-3
 
 
 # -- where the robot comes from ---------------------------------------------------------------
@@ -734,12 +731,12 @@ def test_a_deactivated_planner_is_silent_and_goes_on_when_activated(harness: Har
     flight.planner.trigger_activate()
     flight.ticks(5)
     assert list(flight.probe.last("joint_states").velocity) == [0.0] * 3, "the goal was given up"
-    assert values_of(flight.fly(NEAR))["state"] == "reached"
+    assert values_of(flight.decide(NEAR))["state"] == "reached"
 
 
 def test_a_planner_is_cleaned_up_and_configured_again(harness: Harness) -> None:
     flight = Flight(harness)
-    flight.fly(NEAR)
+    flight.decide(NEAR)
     flight.plant.trigger_deactivate()
     for name in ("deactivate", "cleanup"):
         getattr(flight.planner, f"trigger_{name}")()
@@ -751,7 +748,7 @@ def test_a_planner_is_cleaned_up_and_configured_again(harness: Harness) -> None:
     assert flight.planner.trigger_configure() is TransitionCallbackReturn.SUCCESS
     harness.connect()
     assert flight.planner.trigger_activate() is TransitionCallbackReturn.SUCCESS
-    assert values_of(flight.fly(TURNED))["state"] == "reached"
+    assert values_of(flight.decide(TURNED))["state"] == "reached"
 
 
 # -- parameters -------------------------------------------------------------------------------

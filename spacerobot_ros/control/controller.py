@@ -1,0 +1,226 @@
+"""The controller without its topics: goals, reference, law, limits, loss of measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from spacerobot_ros.control.computed_torque import ComputedTorqueLaw
+from spacerobot_ros.control.estimator import DeadReckoning
+from spacerobot_ros.control.gains import Gains
+from spacerobot_ros.control.law import ControlLaw
+from spacerobot_ros.control.reference import MotionLimits, ReferenceProfile, StepReference
+from spacerobot_ros.control.saturation import ActuatorLimits, Saturated
+from spacerobot_ros.control.state import (
+    Actuation,
+    ControlState,
+    JointReference,
+    PoseReference,
+    Reference,
+)
+from spacerobot_ros.model.description import Array
+
+_BRAKE_RATE = 2.0
+"""Rate at which joints are brought to rest when the base is no longer known, 1/s."""
+
+
+class Mode(str, Enum):
+    """How the controller knows the state of the base."""
+
+    MEASURED = "measured"
+    ESTIMATED = "estimated"
+    STOPPED = "stopped"
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What the outputs are off their goals: worst position (m), attitude (rad) and joint error."""
+
+    position: float
+    attitude: float
+    joints: float
+
+
+class CoordinatedController:
+    """Flies spacecraft and arm together, a command for every state.
+
+    Until a goal is given the robot holds the pose it has at its first state. A goal starts a new
+    reference profile from the present reference, for the base and the end-effector together.
+
+    Parameters
+    ----------
+    law
+        The control law, with its outputs.
+    limits
+        Of thrusters and joints; what a command loses to them is reported.
+    profile, motion
+        How references move to goals.
+    tick_period
+        s.
+    estimation_time
+        For how long the base may be estimated by integration when its measurements stop (paper 4,
+        section IV), s. After that the thrusters are off and the joints are brought to rest.
+    """
+
+    def __init__(
+        self,
+        law: ControlLaw,
+        limits: ActuatorLimits,
+        profile: type[ReferenceProfile],
+        motion: MotionLimits,
+        tick_period: float,
+        estimation_time: float,
+    ) -> None:
+        self.law = law
+        self._limits, self._profile_type, self._motion = limits, profile, motion
+        self._tick_period, self._estimation_time = tick_period, estimation_time
+        self.mode = Mode.MEASURED
+        self._profile: ReferenceProfile | None = None
+        self._began = 0.0
+        self._goal = Reference()
+        self._sent: Actuation | None = None
+        self._estimator: DeadReckoning | None = None
+        self._known = False
+        self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
+
+    def set_gains(self, gains: Gains) -> None:
+        """Change the gains from the next command on."""
+        self.law.set_gains(gains)
+
+    def set_goals(
+        self,
+        time: float,
+        state: ControlState,
+        *,
+        base: PoseReference | None = None,
+        end_effector: PoseReference | None = None,
+        joints: Array | None = None,
+    ) -> None:
+        """Start towards new goals; what is not given keeps its earlier goal."""
+        start = self._present(time, state)
+        goal = start if self._profile is None else self._profile.goal
+        if base is not None:
+            goal = replace(goal, base=base)
+        if end_effector is not None:
+            goal = replace(goal, end_effector=end_effector)
+        if joints is not None:
+            goal = replace(goal, joints=JointReference.at_rest(joints))
+        self._profile = self._profile_type(start, goal, self._motion)
+        self._began = time
+
+    def follow(self, reference: Reference) -> None:
+        """Take this instant's reference from outside; what it lacks is held by the profile."""
+        self._goal = reference
+
+    def command(
+        self, time: float, measured: ControlState | None, q: Array, qdot: Array
+    ) -> Saturated:
+        """Return the actuation at ``time`` (s), within limits.
+
+        ``measured`` is the state, None where the base was not measured; ``q`` and ``qdot`` (n,) are
+        the joints, which are always.
+
+        Raises
+        ------
+        NotFiniteError
+            A measurement is not finite.
+        """
+        state = self._state(measured, q, qdot)
+        if state is None:
+            commanded = self._stopping(q, qdot)
+        else:
+            if self._profile is None:
+                self._profile = StepReference(
+                    self._present(time, state), self._present(time, state), self._motion
+                )
+                self._began = time
+            commanded = self.law.command(state, self._reference(time))
+        result = self._limits.apply(commanded)
+        self._sent = result.realised
+        return result
+
+    @property
+    def estimated_for(self) -> float:
+        """Time since the base was measured last, s."""
+        return self._estimator.elapsed if self._estimator is not None else 0.0
+
+    @property
+    def has_goal(self) -> bool:
+        """Whether a goal was given."""
+        return self._profile is not None and self._profile.goal is not self._profile.start
+
+    def arrived(self, time: float) -> bool:
+        """Whether the reference has come to its goal."""
+        return self._profile is not None and time - self._began >= self._profile.duration
+
+    def errors(self) -> Errors:
+        """Return the errors of the last command's outputs from the reference."""
+        worst = {"position": 0.0, "attitude": 0.0, "joints": 0.0}
+        for label, error in zip(self.law.outputs.labels, self.law.error, strict=True):
+            group, _, axis = label.partition(".")
+            kind = "joints" if group == "joint" else "attitude" if axis[0] == "r" else "position"
+            worst[kind] = max(worst[kind], abs(float(error)))
+        return Errors(**worst)
+
+    def labelled_errors(self) -> Mapping[str, float]:
+        """Return the error of each output by its label."""
+        return dict(zip(self.law.outputs.labels, self.law.error.tolist(), strict=True))
+
+    # -- parts --------------------------------------------------------------------------------
+
+    def _present(self, time: float, state: ControlState) -> Reference:
+        """Where the reference is now; at first, where the robot is."""
+        if self._profile is not None:
+            return self._profile.at(time - self._began)
+        link = self.law.outputs.selection.end_effector_link
+        return Reference.present(self.law.robot, state, link)
+
+    def _reference(self, time: float) -> Reference:
+        assert self._profile is not None
+        own, given = self._profile.at(time - self._began), self._goal
+        if given.base is None and given.joints is None and given.end_effector is None:
+            return own
+        return Reference(
+            given.base or own.base,
+            given.end_effector or own.end_effector,
+            given.joints or own.joints,
+        )
+
+    def _state(self, measured: ControlState | None, q: Array, qdot: Array) -> ControlState | None:
+        """Return the measured state, its estimate, or None when it is not known any more."""
+        if measured is not None:
+            if self._estimator is not None:
+                self._estimator.reset(measured)
+            self._last = measured
+            self._known = True
+            self.mode, self._brake = Mode.MEASURED, None
+            return measured
+        if not self._known or self._sent is None or self.mode is Mode.STOPPED:
+            self.mode = Mode.STOPPED
+            return None
+        if self._estimator is None:
+            self._estimator = DeadReckoning(self.law.robot, self._tick_period)
+            self._estimator.reset(self._last)
+        if self._estimator.elapsed + self._tick_period > self._estimation_time + 1e-9:
+            self.mode = Mode.STOPPED
+            return None
+        self.mode = Mode.ESTIMATED
+        return self._estimator.step(self._sent, q, qdot)
+
+    def _stopping(self, q: Array, qdot: Array) -> Actuation:
+        """Thrusters off, joints to rest: what can be done without knowing where the base is."""
+        robot = self.law.robot
+        if self._brake is None:
+            outputs = ComputedTorqueLaw.default_outputs(robot, "")
+            gains = Gains.uniform(_BRAKE_RATE**2, 2 * _BRAKE_RATE)
+            # The joints stop where a smooth deceleration from their present rates ends.
+            reference = Reference(joints=JointReference.at_rest(q + qdot / _BRAKE_RATE))
+            self._brake = ComputedTorqueLaw(robot, outputs, gains), reference
+        law, reference = self._brake
+        rest = np.zeros(3)
+        # Forces between base and arm depend on the base's rotation alone; taken as none.
+        state = ControlState(rest, np.array([0.0, 0.0, 0.0, 1.0]), rest, rest, q, qdot)
+        return law.command(state, reference)

@@ -1,0 +1,197 @@
+"""From where things are to where they are to be: references over time.
+
+The paper sets the goal at once (:class:`StepReference`): simple, with the largest demand on the
+actuators at the first instant. :class:`QuinticReference` moves the reference there smoothly.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+import numpy as np
+
+from spacerobot_ros.control.errors import TargetNotSetError
+from spacerobot_ros.control.state import JointReference, PoseReference, Reference
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model.attitude import (
+    attitude_error,
+    matrix_from_quaternion,
+    quaternion_multiply,
+)
+from spacerobot_ros.model.description import Array
+
+_PEAK_RATE = 15 / 8
+"""Largest ds/dt of the quintic over one second."""
+
+_PEAK_ACCELERATION = 10 / math.sqrt(3)
+"""Largest d2s/dt2 of the quintic over one second."""
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """The fastest a reference moves: speeds and accelerations of poses and of joints.
+
+    ``joint_speed`` and ``joint_acceleration`` hold for every joint (m or rad, s).
+
+    Raises
+    ------
+    ParameterError
+        A limit is not positive; the sentence names it.
+    """
+
+    speed: float = 0.1
+    acceleration: float = 0.02
+    angular_speed: float = 0.1
+    angular_acceleration: float = 0.02
+    joint_speed: float = 0.1
+    joint_acceleration: float = 0.02
+
+    def __post_init__(self) -> None:
+        for limit in fields(self):
+            value = getattr(self, limit.name)
+            if not value > 0:
+                raise ParameterError(f"The limit '{limit.name}' is {value}; it must be positive.")
+
+
+class ReferenceProfile(ABC):
+    """A reference over time, from ``start`` to ``goal``, at rest at both ends.
+
+    Parameters
+    ----------
+    start
+        Where the controlled things are; its velocities are not used.
+    goal
+        Where they are to be; what it lacks is not controlled.
+    limits
+        How fast it may go.
+
+    Raises
+    ------
+    TargetNotSetError
+        The goal has a group that the start lacks.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, start: Reference, goal: Reference, limits: MotionLimits) -> None:
+        for group in fields(goal):
+            wanted = getattr(goal, group.name) is not None
+            if wanted and getattr(start, group.name) is None:
+                what = group.name.replace("_", "-")
+                raise TargetNotSetError(f"The {what} has a goal and no start to go there from.")
+        self.start = start
+        self.goal = goal
+        self.limits = limits
+        self.duration = 0.0
+        """Time after which the reference is the goal, s."""
+
+    @abstractmethod
+    def at(self, time: float) -> Reference:
+        """Return the reference ``time`` s after its start."""
+
+
+class StepReference(ReferenceProfile):
+    """The goal at once, as in paper 4, section V."""
+
+    name: ClassVar[str] = "step"
+
+    def at(self, time: float) -> Reference:
+        """Return the goal."""
+        return self.goal
+
+
+class QuinticReference(ReferenceProfile):
+    """Positions along straight lines, attitudes along geodesics (one fixed axis), in W.
+
+    All share one profile, ``s = 10 u^3 - 15 u^4 + 6 u^5`` of ``u = t / T``: rest to rest, without
+    a jump in acceleration. T is the shortest time in which nothing exceeds its limits, so that the
+    one that needs longest sets the pace and all arrive together.
+    """
+
+    name: ClassVar[str] = "quintic"
+
+    def __init__(self, start: Reference, goal: Reference, limits: MotionLimits) -> None:
+        super().__init__(start, goal, limits)
+        self._base = _PoseLine.between(start.base, goal.base)
+        self._end_effector = _PoseLine.between(start.end_effector, goal.end_effector)
+        self._joints = np.zeros(0)
+        if goal.joints is not None and start.joints is not None:
+            self._joints = goal.joints.q - start.joints.q
+        needs = [
+            _shortest(float(abs(d)), limits.joint_speed, limits.joint_acceleration)
+            for d in self._joints
+        ]
+        for line in (self._base, self._end_effector):
+            if line is not None:
+                needs.append(_shortest(line.length, limits.speed, limits.acceleration))
+                needs.append(
+                    _shortest(line.angle, limits.angular_speed, limits.angular_acceleration)
+                )
+        self.duration = max(needs, default=0.0)
+
+    def at(self, time: float) -> Reference:
+        """Return the reference ``time`` s after its start; before it, that at the start."""
+        if time >= self.duration:
+            return self.goal
+        T = self.duration
+        u = max(time, 0.0) / T
+        s = u**3 * (10 + u * (6 * u - 15))
+        rate = 30 * u**2 * (1 - u) ** 2 / T
+        acceleration = 60 * u * (1 - u) * (1 - 2 * u) / T**2
+        joints = None
+        if self.start.joints is not None and self.goal.joints is not None:
+            d = self._joints
+            joints = JointReference(self.start.joints.q + s * d, rate * d, acceleration * d)
+        return Reference(
+            None if self._base is None else self._base.at(s, rate, acceleration),
+            None if self._end_effector is None else self._end_effector.at(s, rate, acceleration),
+            joints,
+        )
+
+
+PROFILES: dict[str, type[ReferenceProfile]] = {
+    StepReference.name: StepReference,
+    QuinticReference.name: QuinticReference,
+}
+"""The profiles by name."""
+
+
+class _PoseLine:
+    """A straight line and a geodesic; ``d`` (3,) in m and ``rotvec`` (3,) in rad, both in W."""
+
+    def __init__(self, start: PoseReference, goal: PoseReference) -> None:
+        self._start = start
+        self._d = goal.position - start.position
+        turn_B = attitude_error(start.quaternion, goal.quaternion)
+        # The axis of the turn is fixed in the body and in W alike.
+        self._turn_W: Array = matrix_from_quaternion(start.quaternion) @ turn_B
+        self.length = float(np.linalg.norm(self._d))
+        self.angle = float(np.linalg.norm(turn_B))
+        # The quaternion of a turn by phi is linear in sin(phi/2) and cos(phi/2).
+        axis = self._turn_W / self.angle if self.angle > 0 else np.zeros(3)
+        self._half_turn = quaternion_multiply(np.append(axis, 0.0), start.quaternion)
+
+    @classmethod
+    def between(cls, start: PoseReference | None, goal: PoseReference | None) -> _PoseLine | None:
+        return None if start is None or goal is None else cls(start, goal)
+
+    def at(self, s: float, rate: float, acceleration: float) -> PoseReference:
+        half = s * self.angle / 2
+        return PoseReference(
+            self._start.position + s * self._d,
+            math.sin(half) * self._half_turn + math.cos(half) * self._start.quaternion,
+            rate * self._d,
+            rate * self._turn_W,
+            acceleration * self._d,
+            acceleration * self._turn_W,
+        )
+
+
+def _shortest(distance: float, speed: float, acceleration: float) -> float:
+    """Return the shortest duration (s) of a quintic over a distance within its limits."""
+    return max(
+        _PEAK_RATE * distance / speed, math.sqrt(_PEAK_ACCELERATION * distance / acceleration)
+    )

@@ -1,0 +1,124 @@
+"""What a control law is given and what it returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from spacerobot_ros.model.attitude import matrix_from_quaternion, quaternion_from_matrix
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.space_robot import SpaceRobot
+
+_ZERO = np.zeros(3)
+_ZERO.flags.writeable = False
+
+
+def _zero() -> Array:
+    return _ZERO
+
+
+@dataclass(frozen=True)
+class ControlState:
+    """The measured (or estimated) state of a robot.
+
+    ``r_WB`` (3,) position of the base link's origin in W, m; ``quaternion_WB`` (4,) its attitude
+    (x, y, z, w), a unit quaternion; ``v_WB_B`` (3,) in m/s and ``omega_WB_B`` (3,) in rad/s, its
+    twist in base components; ``q``, ``qdot`` (n,) joint positions and velocities (m or rad, /s).
+    """
+
+    r_WB: Array
+    quaternion_WB: Array
+    v_WB_B: Array
+    omega_WB_B: Array
+    q: Array
+    qdot: Array
+
+    @classmethod
+    def at_rest(cls, r_WB: Array, quaternion_WB: Array, q: Array) -> ControlState:
+        """Return a state without velocities."""
+        return cls(r_WB, quaternion_WB, np.zeros(3), np.zeros(3), q, np.zeros(len(q)))
+
+    def stack(self, memory: Array) -> None:
+        """Write the six parts one after the other into ``memory`` (13 + 2 n,).
+
+        Raises
+        ------
+        ValueError
+            A part has the wrong length.
+        """
+        parts = self.r_WB, self.quaternion_WB, self.v_WB_B, self.omega_WB_B, self.q, self.qdot
+        np.concatenate(parts, out=memory)
+
+    @classmethod
+    def unstack(cls, memory: Array) -> ControlState:
+        """Return a copy of what :meth:`stack` has written."""
+        x = memory.copy()
+        joints = 13 + (len(x) - 13) // 2
+        return cls(x[:3], x[3:7], x[7:10], x[10:13], x[13:joints], x[joints:])
+
+
+@dataclass(frozen=True)
+class PoseReference:
+    """Where a frame is to be, in W: position (m), attitude (unit quaternion x, y, z, w), and their
+    velocities and accelerations (m, rad, s), all in world components; zero unless given.
+    """
+
+    position: Array
+    quaternion: Array
+    velocity: Array = field(default_factory=_zero)
+    angular_velocity: Array = field(default_factory=_zero)
+    acceleration: Array = field(default_factory=_zero)
+    angular_acceleration: Array = field(default_factory=_zero)
+
+
+@dataclass(frozen=True)
+class JointReference:
+    """Positions, velocities and accelerations (n,) of all joints, in the order of the model."""
+
+    q: Array
+    qdot: Array
+    qddot: Array
+
+    @classmethod
+    def at_rest(cls, q: Array) -> JointReference:
+        """Return a shape to hold."""
+        return cls(q, np.zeros(len(q)), np.zeros(len(q)))
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What the outputs are to follow; None where nothing of the kind is controlled."""
+
+    base: PoseReference | None = None
+    end_effector: PoseReference | None = None
+    joints: JointReference | None = None
+
+    @classmethod
+    def present(cls, robot: SpaceRobot, state: ControlState, end_effector: str = "") -> Reference:
+        """Return the reference that keeps everything where it is, at rest.
+
+        ``end_effector`` names the link of the end-effector; empty: the robot has none.
+
+        Raises
+        ------
+        KeyError
+            There is no such link.
+        """
+        pose = None
+        if end_effector:
+            R_WB = matrix_from_quaternion(state.quaternion_WB)
+            R_BE, r_BE_B = robot.link_pose(end_effector, state.q)
+            pose = PoseReference(state.r_WB + R_WB @ r_BE_B, quaternion_from_matrix(R_WB @ R_BE))
+        base = PoseReference(state.r_WB, state.quaternion_WB)
+        return cls(base, pose, JointReference.at_rest(state.q))
+
+
+@dataclass(frozen=True)
+class Actuation:
+    """``wrench_B`` (6,): thruster force (N) over torque (N m) at the origin of the base link, base
+    components; ``tau`` (n,): joint efforts (N m or N).
+    """
+
+    wrench_B: Array
+    tau: Array

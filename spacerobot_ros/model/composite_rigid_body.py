@@ -1,0 +1,267 @@
+"""Fast forward dynamics: composite rigid bodies, the base eliminated by hand.
+
+The same ``z0ddot`` as :func:`spacerobot_ros.model.dynamics.forward_dynamics` (paper 4, eq. 19) at
+less than half the operations. Spatial vectors as in Featherstone, Rigid Body Dynamics Algorithms
+(2008), angular part first: motions ``[omega; v]`` and forces ``[n; f]``. All are in base components
+at one common point, the system's centre of mass, so that no body needs a transform and the
+inertia of the whole system is ``diag(D, M 1)``.
+
+Because that inertia is block-diagonal, the base drops out joint by joint. A unit rate of joint j
+gives its composite (all bodies that it carries) the momentum ``P_j = I^c_j S_j``; to cancel it the
+whole system moves by ``-B_j``, ``B_j = diag(D, M 1)^-1 P_j``. So ``S_j - B_j`` is how the bodies
+beyond joint j really move when the base is free, and
+
+* ``K_ij = (S_i - B_i)' P_j``: inertia matrix of the shape alone, momentum given (i carries j;
+  without the ``S_i`` term if neither carries the other);
+* ``omega = D^-1 L - sum_j B_j qdot_j`` (angular parts): the base's rate at angular momentum L;
+* ``K qddot = Q``, ``Q_j = tau_j - S_j' f_j + B_j' (f_0 - f_external)``, where ``f_j`` is the force
+  that the motion alone, at ``qddot = 0``, demands of composite j.
+
+For chains of up to about nine joints this takes fewer operations than the articulated-body
+algorithm, whose cost grows only linearly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.model.kinematics import TreeKinematics
+
+
+@dataclass(frozen=True)
+class SpatialInertia:
+    """Inertia at the system's centre of mass: ``mass`` (kg), ``h`` (3,) first moment of mass
+    (kg m), ``J`` (3, 3) second moment of mass (kg m^2; the rotational inertia is ``tr(J) 1 - J``).
+    """
+
+    mass: float
+    h: ca.SX
+    J: ca.SX
+
+    def __add__(self, other: SpatialInertia) -> SpatialInertia:
+        """Take two bodies as one."""
+        return SpatialInertia(self.mass + other.mass, self.h + other.h, self.J + other.J)
+
+    def __matmul__(self, motion: ca.SX) -> ca.SX:
+        """Return the momentum (6,) of a motion (6,) (Featherstone, eq. 2.61)."""
+        omega, v = motion[:3], motion[3:]
+        return ca.vertcat(
+            ca.cross(self.h, v) + _rotational(self.J) @ omega,
+            self.mass * v + ca.cross(omega, self.h),
+        )
+
+
+class Factor:
+    """``L D L'`` of a symmetric positive definite matrix, to solve with."""
+
+    def __init__(self, matrix: ca.SX) -> None:
+        n = self._n = matrix.shape[0]
+        rest = [[matrix[i, j] for j in range(n)] for i in range(n)]
+        self._L: list[list[ca.SX]] = [[None] * n for _ in range(n)]
+        self._inverse: list[ca.SX] = []
+        for j in range(n):
+            # CasADi rewrites x * (1/d) as x/d, and there are many x; it leaves |1/d| as it is,
+            # which is the same because pivots are positive.
+            self._inverse.append(ca.fabs(1 / rest[j][j]))
+            for i in range(j + 1, n):
+                self._L[i][j] = rest[i][j] * self._inverse[j]
+                for k in range(j + 1, i + 1):
+                    rest[i][k] = rest[i][k] - self._L[i][j] * rest[k][j]
+
+    def solve(self, right: ca.SX) -> ca.SX:
+        """Return x (n,) of ``matrix x = right``."""
+        x = [right[i] for i in range(self._n)]
+        for i in range(self._n):
+            for j in range(i):
+                x[i] = x[i] - self._L[i][j] * x[j]
+        x = [a * b for a, b in zip(x, self._inverse, strict=True)]
+        for i in reversed(range(self._n)):
+            for j in range(i + 1, self._n):
+                x[i] = x[i] - self._L[j][i] * x[j]
+        return ca.vertcat(*x)
+
+
+@dataclass(frozen=True)
+class ShapeSystem:
+    """What the free base leaves of the inertia: see the module for the symbols.
+
+    ``J[k]`` (3, 3) is the second moment of mass of body k about its own centre; ``S[j]``, ``B[j]``
+    (6,) belong to the joint that carries body j (None for the base); ``D`` is the factor of the
+    system's rotational inertia, ``K`` (n, n) the shape's inertia matrix.
+    """
+
+    kin: TreeKinematics
+    J: tuple[ca.SX, ...]
+    S: tuple[ca.SX | None, ...]
+    B: tuple[ca.SX | None, ...]
+    D: Factor
+    K: ca.SX
+
+    def base_rate(self, L_B: ca.SX, qdot: ca.SX) -> ca.SX:
+        """Return ``omega_WB_B`` (3,) at the angular momentum ``L_B`` and the rates ``qdot``."""
+        return self.D.solve(L_B) - self._reaction(qdot)
+
+    def base_acceleration(self, moment: ca.SX, qddot: ca.SX) -> ca.SX:
+        """Return the rate (3,) of ``omega_WB_B`` under a moment (3,) and ``qddot``."""
+        return self.D.solve(moment) - self._reaction(qddot)
+
+    def _reaction(self, rates: ca.SX) -> ca.SX:
+        terms = (B[:3] * rates[j] for j, B in enumerate(self.B[1:]))
+        return sum(terms, ca.SX(3, 1))
+
+
+def shape_system(kin: TreeKinematics) -> ShapeSystem:
+    """Build the composites inward (Featherstone, table 6.2) and eliminate the base."""
+    n, c = kin.n, kin.r_BC_B
+    J = tuple(_second_moment(kin, k) for k in range(n + 1))
+    composite = []
+    for k in range(n + 1):
+        rho = kin.com[k] - c
+        h = kin.mass(k) * rho
+        composite.append(SpatialInertia(kin.mass(k), h, J[k] + _symmetric(h @ rho.T)))
+    S: list[ca.SX | None] = [None] * (n + 1)
+    P: list[ca.SX | None] = [None] * (n + 1)
+    for k in range(n, 0, -1):
+        S[k] = _joint_motion(kin, k)
+        P[k] = composite[k] @ S[k]
+        composite[kin.parent(k)] += composite[k]
+    D = Factor(_rotational(composite[0].J))
+    B = [None] + [ca.vertcat(D.solve(p[:3]), p[3:] * (1 / kin.robot.total_mass)) for p in P[1:]]
+    K = ca.SX(n, n)
+    for j in range(1, n + 1):
+        carriers = kin.ancestors(j)
+        for i in range(1, j + 1):
+            motion = S[i] - B[i] if i in carriers else -B[i]
+            K[i - 1, j - 1] = K[j - 1, i - 1] = ca.dot(motion, P[j])
+    return ShapeSystem(kin, J, tuple(S), tuple(B), D, K)
+
+
+def motion_forces(system: ShapeSystem, omega: ca.SX, qdot: ca.SX) -> tuple[ca.SX, ...]:
+    """Return ``f_k`` (6,) for every composite k: the force that its motion at the rates
+    ``omega_WB_B`` (3,) and ``qdot`` (n,) demands while ``omega`` and ``qdot`` stay as they are.
+
+    Recursive Newton-Euler (Featherstone, table 5.1). What turns with body k at ``omega_k`` and
+    ``alpha_k`` accelerates by ``A_k x``, ``A_k = hat(alpha_k) + hat(omega_k)^2``, relative to the
+    body's origin. The base's origin is taken as unaccelerated: a common acceleration has no part in
+    ``S_j - B_j``.
+    """
+    kin = system.kin
+    omegas, alphas = [omega], [ca.SX(3, 1)]
+    A, accelerations = [_turning(omega, ca.SX(3, 1))], [ca.SX(3, 1)]
+    for k in range(1, kin.n + 1):
+        i = kin.parent(k)
+        rate = kin.axis[k] * qdot[k - 1]
+        # Not the difference of two origins: that would neither cancel nor be shared.
+        arm = kin.R[i] @ _constant(kin.robot.bodies[k].origin.r)
+        if kin.is_revolute(k):
+            accelerations.append(accelerations[i] + A[i] @ arm)
+            omegas.append(omegas[i] + rate)
+            alphas.append(alphas[i] + ca.cross(omegas[i], rate))
+            A.append(_turning(omegas[k], alphas[k]))
+        else:
+            arm = arm + kin.axis[k] * kin.q[k - 1]
+            accelerations.append(accelerations[i] + A[i] @ arm + 2 * ca.cross(omegas[i], rate))
+            omegas.append(omegas[i])
+            alphas.append(alphas[i])
+            A.append(A[i])
+
+    forces = []
+    for k in range(kin.n + 1):
+        arm = kin.R[k] @ _constant(kin.robot.bodies[k].inertia.com)
+        force = kin.mass(k) * (accelerations[k] + A[k] @ arm)
+        # The moment is the integral of rho x A rho over the body: the axial vector of A J.
+        AJ = A[k] @ system.J[k]
+        spin = ca.vertcat(AJ[2, 1] - AJ[1, 2], AJ[0, 2] - AJ[2, 0], AJ[1, 0] - AJ[0, 1])
+        forces.append(ca.vertcat(ca.cross(kin.com[k] - kin.r_BC_B, force) + spin, force))
+    for k in range(kin.n, 0, -1):
+        forces[kin.parent(k)] += forces[k]
+    return tuple(forces)
+
+
+def shape_forces(
+    system: ShapeSystem, omega: ca.SX, qdot: ca.SX, external: ca.SX, tau: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """Return ``Q`` (n,) of ``K qddot = Q`` and the moment (3,) that is left to turn the base.
+
+    ``external`` (6,) is the moment (N m) over the force (N) from outside, base components, about
+    the system's centre of mass; ``tau`` (n,) are the joint efforts (N or N m).
+    """
+    f = motion_forces(system, omega, qdot)
+    excess = f[0] - external
+    Q = [
+        tau[k - 1] - ca.dot(system.S[k], f[k]) + ca.dot(system.B[k], excess)
+        for k in range(1, system.kin.n + 1)
+    ]
+    return ca.vertcat(*Q), -excess[:3]
+
+
+def external_force(kin: TreeKinematics, wrench_B: ca.SX) -> ca.SX:
+    """Return moment over force (6,) about the system's centre of mass of a wrench on the base.
+
+    ``wrench_B`` is force (N) over torque (N m) at the origin of the base link.
+    """
+    force, torque = wrench_B[:3], wrench_B[3:]
+    return ca.vertcat(torque - ca.cross(kin.r_BC_B, force), force)
+
+
+def composite_dynamics(
+    kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX, wrench_B: ca.SX, tau: ca.SX
+) -> ca.SX:
+    """Return ``z0ddot = [v_cm_dot; omega_dot; qddot]`` (6 + n,), base components (eq. 19)."""
+    system = shape_system(kin)
+    external = external_force(kin, wrench_B)
+    Q, moment = shape_forces(system, omega, qdot, external, tau)
+    qddot = Factor(system.K).solve(Q)
+    return ca.vertcat(
+        external[3:] / kin.robot.total_mass - ca.cross(omega, v_cm),
+        system.base_acceleration(moment, qddot),
+        qddot,
+    )
+
+
+def _joint_motion(kin: TreeKinematics, k: int) -> ca.SX:
+    """Return the motion (6,) of unit rate of joint k, as seen at the system's centre of mass."""
+    if kin.is_revolute(k):
+        return ca.vertcat(kin.axis[k], ca.cross(kin.p[k] - kin.r_BC_B, kin.axis[k]))
+    return ca.vertcat(ca.SX(3, 1), kin.axis[k])
+
+
+def _second_moment(kin: TreeKinematics, k: int) -> ca.SX:
+    """Return the second moment of mass (3, 3) of body k about its centre, base components.
+
+    Along principal axes ``u``: ``J = lambda 1 + sum (lambda_u - lambda) u u'``. The middle
+    moment serves as ``lambda``: a body with an axis of symmetry is left with that axis alone.
+    """
+    about = kin.robot.bodies[k].inertia.about_com
+    moments, axes = np.linalg.eigh(np.trace(about) / 2 * np.eye(3) - about)
+    J = moments[1] * ca.SX.eye(3)
+    for moment, axis in ((moments[0], axes[:, 0]), (moments[2], axes[:, 2])):
+        u = kin.R[k] @ _constant(axis)
+        J = J + _symmetric(((moment - moments[1]) * u) @ u.T)
+    return J
+
+
+def _rotational(J: ca.SX) -> ca.SX:
+    """Return the rotational inertia ``tr(J) 1 - J`` of a second moment of mass."""
+    inertia = -J
+    for i in range(3):
+        inertia[i, i] = J[i - 2, i - 2] + J[i - 1, i - 1]
+    return inertia
+
+
+def _turning(omega: ca.SX, alpha: ca.SX) -> ca.SX:
+    """Return ``hat(alpha) + hat(omega)^2`` (3, 3)."""
+    squares = _symmetric(omega @ omega.T)
+    return ca.skew(alpha) - _rotational(squares)
+
+
+def _symmetric(matrix: ca.SX) -> ca.SX:
+    """Return a symmetric matrix with one expression, not two equal ones, for each pair."""
+    return ca.tril2symm(ca.tril(matrix))
+
+
+def _constant(vector: np.ndarray) -> ca.DM:
+    return ca.sparsify(ca.DM(vector))

@@ -1,0 +1,138 @@
+"""Motion under joint efforts and a base wrench, with the total momenta among the states.
+
+The state is ``x = [q; quaternion_WB; qdot; p_W; L_W; r_WC_W]``, (2 n + 13,): shape, attitude
+(x, y, z, w), joint rates, total linear momentum (kg m/s), total angular momentum about the system's
+centre of mass (kg m^2/s), and position of that centre (m), the last three in W. The base's
+twist is no state: it follows from the momenta and the joint rates. What no thruster changes is
+therefore constant to the last bit, whatever the step:
+
+* ``p_W_dot = R_WB f``, ``L_W_dot = R_WB (n + (r_origin - c) x f)``, ``r_WC_W_dot = p_W / M``;
+* ``K qddot = Q`` at the ``omega_WB_B`` that the momenta imply
+  (:mod:`spacerobot_ros.model.composite_rigid_body`).
+
+The command is ``[tau; f; n]``, (n + 6,): joint efforts (N or N m), force (N) and torque (N m) at the
+origin of the base link, base components. The attitude is integrated in R^4 and normalised after
+each Runge-Kutta step.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from spacerobot_ros.model.compilation import dense_function
+from spacerobot_ros.model.composite_rigid_body import (
+    Factor,
+    ShapeSystem,
+    external_force,
+    shape_forces,
+    shape_system,
+)
+from spacerobot_ros.model.kinematics import TreeKinematics
+from spacerobot_ros.model.momentum import rotation_from_quaternion
+from spacerobot_ros.model.reconstruction import quaternion_rate
+
+
+def state_slices(n: int) -> tuple[slice, ...]:
+    """Return where ``q, quaternion_WB, qdot, p_W, L_W, r_WC_W`` are in the state."""
+    ends = [n, n + 4, 2 * n + 4, 2 * n + 7, 2 * n + 10, 2 * n + 13]
+    return tuple(slice(a, b) for a, b in zip([0, *ends], ends, strict=False))
+
+
+def shape_equations(kin: TreeKinematics) -> ca.Function:
+    """Return the function ``(x, command) -> (K, Q)`` of ``K qddot = Q``."""
+    x, command = _symbols(kin)
+    system, _, _, Q = _equations(kin, x, command)
+    names = (["x", "command"], ["K", "Q"])
+    return dense_function("shape_equations", [x, command], [system.K, Q], names)
+
+
+def state_rate(kin: TreeKinematics, *, holding: bool = False) -> ca.Function:
+    """Return the function ``(x, command) -> x_dot``.
+
+    With ``holding`` it takes a third argument ``free`` (n,): 1 for a joint that moves, 0 for one
+    that something holds at the rate it has.
+    """
+    x, command = _symbols(kin)
+    free = ca.SX.sym("free", kin.n) if holding else ca.DM.ones(kin.n)
+    _, quaternion, qdot, p_W, _, _ = (x[part] for part in state_slices(kin.n))
+    system, omega, external, Q = _equations(kin, x, command)
+    # A held joint takes no part in the others' equations, and its own says that qddot is zero.
+    K = system.K * (free @ free.T)
+    for j in range(kin.n):
+        K[j, j] = system.K[j, j]
+    R_WB = rotation_from_quaternion(quaternion)
+    x_dot = ca.vertcat(
+        qdot,
+        quaternion_rate(quaternion, omega),
+        Factor(K).solve(Q * free),
+        R_WB @ external[3:],
+        R_WB @ external[:3],
+        p_W / kin.robot.total_mass,
+    )
+    if holding:
+        names = ["x", "command", "free"]
+        return dense_function("holding_rate", [x, command, free], [x_dot], (names, ["x_dot"]))
+    return dense_function("flight_rate", [x, command], [x_dot], (["x", "command"], ["x_dot"]))
+
+
+def runge_kutta_step(rate: ca.Function) -> ca.Function:
+    """Return one step ``(x, held arguments of rate, h) -> x`` of Runge-Kutta 4.
+
+    The four stages call one piece of code: written out four times, it would leave the processor's
+    instruction cache and take six times as long to compile.
+    """
+    x, held = _arguments(rate)
+    h = ca.MX.sym("h")
+    k1 = rate(x, *held)
+    k2 = rate(x + h / 2 * k1, *held)
+    k3 = rate(x + h / 2 * k2, *held)
+    k4 = rate(x + h * k3, *held)
+    x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    attitude = state_slices((x.shape[0] - 13) // 2)[1]
+    x_next[attitude] = x_next[attitude] / ca.norm_2(x_next[attitude])
+    return ca.Function(rate.name().replace("rate", "step"), [x, *held, h], [x_next])
+
+
+def repeated(step: ca.Function, count: int) -> ca.Function:
+    """Return ``step`` applied ``count`` times to its first argument, the others held.
+
+    Each half is one function called twice, so that the code grows with the logarithm of ``count``.
+    """
+    if count == 1:
+        return step
+    x, held = _arguments(step)
+    half = repeated(step, count // 2)
+    x_next = half(half(x, *held), *held)
+    if count % 2:
+        x_next = step(x_next, *held)
+    return ca.Function(f"{step.name()}_{count}", [x, *held], [x_next])
+
+
+def _arguments(function: ca.Function) -> tuple[ca.MX, list[ca.MX]]:
+    x, *held = (
+        ca.MX.sym(function.name_in(i), function.size1_in(i)) for i in range(function.n_in())
+    )
+    return x, held
+
+
+def _symbols(kin: TreeKinematics) -> tuple[ca.SX, ca.SX]:
+    parts = [
+        kin.q if name == "q" else ca.SX.sym(name, part.stop - part.start)
+        for name, part in zip(
+            ("q", "quaternion", "qdot", "p_W", "L_W", "r_WC_W"), state_slices(kin.n), strict=True
+        )
+    ]
+    return ca.vertcat(*parts), ca.SX.sym("command", kin.n + 6)
+
+
+def _equations(
+    kin: TreeKinematics, x: ca.SX, command: ca.SX
+) -> tuple[ShapeSystem, ca.SX, ca.SX, ca.SX]:
+    """Return the shape's system, ``omega_WB_B``, the external moment over force, and ``Q``."""
+    _, quaternion, qdot, _, L_W, _ = (x[part] for part in state_slices(kin.n))
+    tau, wrench_B = command[: kin.n], command[kin.n :]
+    system = shape_system(kin)
+    external = external_force(kin, wrench_B)
+    omega = system.base_rate(rotation_from_quaternion(quaternion).T @ L_W, qdot)
+    Q, _ = shape_forces(system, omega, qdot, external, tau)
+    return system, omega, external, Q

@@ -1,0 +1,150 @@
+"""What coordinated control says of itself: one latched status."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+from spacerobot_ros.control import Saturated
+from spacerobot_ros.control.controller import CoordinatedController, Mode
+from spacerobot_ros.nodes.flight_node import LATCHED, FlightNode
+
+
+class ControllerState(str, Enum):
+    """The value of ``state`` in controller/status."""
+
+    HOLDING = "holding"
+    TRACKING = "tracking"
+    REACHED = "reached"
+    FAILED = "failed"
+    REFUSED = "refused"
+    ABORTED = "aborted"
+    ESTIMATING = "estimating"
+    STOPPED = "stopped"
+
+
+_LEVELS = {
+    ControllerState.FAILED: DiagnosticStatus.ERROR,
+    ControllerState.STOPPED: DiagnosticStatus.ERROR,
+    ControllerState.REFUSED: DiagnosticStatus.ERROR,
+    ControllerState.ABORTED: DiagnosticStatus.WARN,
+    ControllerState.ESTIMATING: DiagnosticStatus.WARN,
+}
+
+
+class ControllerStatus:
+    """Publishes controller/status when something changes, and every ``status_period``."""
+
+    def __init__(self, node: FlightNode) -> None:
+        self._node = node
+        self._publisher = node.create_publisher(DiagnosticStatus, "controller/status", LATCHED)
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget earlier goals."""
+        self._state = ControllerState.HOLDING
+        self._started = self._within_since = self._next = -1.0
+        self._limited = False
+        self._values: dict[str, str] = {}
+
+    def refused(self, sentence: str) -> None:
+        """Say that a goal is refused; the earlier one goes on."""
+        self._publish(ControllerState.REFUSED, sentence)
+
+    def started(self, now: float) -> None:
+        """Begin to judge a new goal."""
+        self._started, self._within_since, self._next = now, -1.0, now
+        self._state = ControllerState.TRACKING
+
+    def state(self, state: ControllerState, sentence: str) -> None:
+        """Take a state that was decided elsewhere."""
+        self._state = state
+        self._publish(state, sentence)
+
+    def update(self, now: float, controller: CoordinatedController, result: Saturated) -> None:
+        """Judge the errors after a command, and publish what is due."""
+        if controller.mode is Mode.MEASURED:
+            self._judge(now, controller)
+        before = self._state
+        if controller.mode is Mode.ESTIMATED:
+            self._state = ControllerState.ESTIMATING
+        elif controller.mode is Mode.STOPPED:
+            self._state = ControllerState.STOPPED
+        elif self._state in (ControllerState.ESTIMATING, ControllerState.STOPPED):
+            self._state = ControllerState.TRACKING
+        period = float(self._node.parameters["status_period"])  # type: ignore[arg-type]
+        if self._state is before and result.limited == self._limited and now < self._next:
+            return
+        self._next = now + period
+        self._limited = result.limited
+        self._values = self._describe(controller, result)
+        self._publish(self._state, self._sentence(controller))
+
+    def _judge(self, now: float, controller: CoordinatedController) -> None:
+        if self._state is not ControllerState.TRACKING or self._started < 0:
+            return
+        values = self._node.parameters
+        errors = controller.errors()
+        within = controller.arrived(now) and (
+            errors.position <= float(values["position_tolerance"])  # type: ignore[arg-type]
+            and errors.attitude <= float(values["attitude_tolerance"])  # type: ignore[arg-type]
+            and errors.joints <= float(values["joint_tolerance"])  # type: ignore[arg-type]
+        )
+        if not within:
+            self._within_since = -1.0
+        elif self._within_since < 0:
+            self._within_since = now
+        limit = float(values["time_limit"])  # type: ignore[arg-type]
+        settle = float(values["settle_time"])  # type: ignore[arg-type]
+        if within and now - self._within_since >= settle - 1e-9:
+            self._state, self._next = ControllerState.REACHED, now
+        elif limit and now - self._started >= limit:
+            self._state, self._next = ControllerState.FAILED, now
+
+    def _sentence(self, controller: CoordinatedController) -> str:
+        errors = controller.errors()
+        left = f"{errors.position:.3g} m, {errors.attitude:.3g} rad"
+        return {
+            ControllerState.HOLDING: f"Holding; off by {left}.",
+            ControllerState.TRACKING: f"Flying to the goal; {left} from the reference.",
+            ControllerState.REACHED: f"The goal is met: {left} from it.",
+            ControllerState.FAILED: f"The goal is not met in time: {left} from it.",
+            ControllerState.ESTIMATING: (
+                f"The base is not measured; it is estimated since {controller.estimated_for:.3g} s."
+            ),
+            ControllerState.STOPPED: (
+                "The base is not measured any more: thrusters off, joints brought to rest."
+            ),
+        }.get(self._state, "")
+
+    def _describe(self, controller: CoordinatedController, result: Saturated) -> dict[str, str]:
+        status = controller.law.status
+        force, torque = result.loss.wrench_B[:3], result.loss.wrench_B[3:]
+        values = {
+            "law": controller.law.name,
+            "singular": str(status.singular).lower(),
+            "smallest_singular_value": f"{status.smallest_singular_value:.6g}",
+            "damping": f"{status.damping:.6g}",
+            "lost_force_N": f"{np.linalg.norm(force):.6g}",
+            "lost_torque_Nm": f"{np.linalg.norm(torque):.6g}",
+            "lost_effort": f"{np.abs(result.loss.tau).max(initial=0.0):.6g}",
+        }
+        for label, error in controller.labelled_errors().items():
+            values[f"error.{label}"] = f"{error:.6g}"
+        return values
+
+    def _publish(self, state: ControllerState, sentence: str) -> None:
+        level = _LEVELS.get(state, DiagnosticStatus.OK)
+        values = {"state": state.value, **self._values}
+        self._publisher.publish(
+            DiagnosticStatus(
+                level=level,
+                name=self._node.get_fully_qualified_name(),
+                message=sentence,
+                values=[KeyValue(key=key, value=value) for key, value in values.items()],
+            )
+        )
+        if level != DiagnosticStatus.OK:
+            self._node.get_logger().warning(sentence, throttle_duration_sec=5.0)

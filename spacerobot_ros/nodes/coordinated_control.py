@@ -1,0 +1,382 @@
+"""The coordinated-control node: goal poses and references in, thruster wrench and efforts out."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any, ClassVar
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from spacerobot_ros.control import (
+    LAWS,
+    PROFILES,
+    ActuatorLimits,
+    ControlState,
+    GainPair,
+    Gains,
+    JointReference,
+    MotionLimits,
+    OutputSelection,
+    PoseReference,
+    Reference,
+)
+from spacerobot_ros.control.controller import CoordinatedController
+from spacerobot_ros.control.errors import NotFiniteError
+from spacerobot_ros.errors import CommandError, PlanningError, RobotDescriptionError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.nodes.cdr import (
+    NANOSECONDS,
+    MessageTemplate,
+    TemplateReader,
+    raw_publish,
+    stamp_bytes,
+)
+from spacerobot_ros.nodes.controller_status import ControllerState, ControllerStatus
+from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
+from spacerobot_ros.nodes.joint_command import JointReader
+from spacerobot_ros.nodes.parameters import ParameterSpec, option_specs
+from spacerobot_ros.nodes.plant_topics import DEFAULT_END_EFFECTOR
+from spacerobot_ros.nodes.robot_source import ROBOT_SPECS, robot_of
+from spacerobot_ros.planning import Goal
+
+_GROUPS = (
+    ("base_position", 30.0, 60.0),
+    ("base_attitude", 30.0, 60.0),
+    ("end_effector_position", 30.0, 60.0),
+    ("end_effector_attitude", 30.0, 60.0),
+    ("joints", 4.0, 4.0),
+)
+_SMALLEST_GAIN = 1e-9
+
+_GAIN_SPECS = tuple(
+    ParameterSpec(
+        f"gains.{group}.{name}",
+        default,
+        "of the law",
+        f"{meaning} gain of the {group.replace('_', ' ')}",
+        _SMALLEST_GAIN,
+        live=True,
+    )
+    for group, kp, kd in _GROUPS
+    for name, meaning, default in (("kp", "proportional", kp), ("kd", "derivative", kd))
+)
+
+
+class CoordinatedControlNode(FlightNode):
+    """Closes the loop over spacecraft and arm (paper 4): one command for every measured state.
+
+    ``goal_pose`` is where the base is to be, ``end_effector/goal_pose`` where the end-effector is.
+    Where a planner publishes ``joint_reference`` (or ``base_reference``), those are tracked. Until
+    there is a goal, the robot holds the pose of its first state.
+    """
+
+    SPECS: ClassVar = (
+        *ROBOT_SPECS,
+        ParameterSpec("law", "transposed_jacobian", "", "control law", choices=tuple(LAWS)),
+        ParameterSpec("tick_rate", 100.0, "Hz", "commands a second; the plant's", 1e-3, 1e5),
+        ParameterSpec("world_frame", "world", "", "frame that goals must be given in"),
+        ParameterSpec(
+            "end_effector_frame", "", "", "link that is controlled; '': 'end_effector', if any"
+        ),
+        ParameterSpec("base_outputs", "", "", "axes of the base: x y z rx ry rz; '': by the robot"),
+        ParameterSpec("end_effector_outputs", "", "", "axes of the end-effector; '': by the robot"),
+        ParameterSpec("joint_outputs", "", "", "joints that are outputs; '': by the robot"),
+        ParameterSpec(
+            "profile", "step", "", "how references move to goals", choices=tuple(PROFILES)
+        ),
+        ParameterSpec("motion.speed", 0.1, "m/s", "fastest reference", 1e-6),
+        ParameterSpec("motion.acceleration", 0.02, "m/s^2", "of the reference", 1e-6),
+        ParameterSpec("motion.angular_speed", 0.1, "rad/s", "fastest reference", 1e-6),
+        ParameterSpec("motion.angular_acceleration", 0.02, "rad/s^2", "of the reference", 1e-6),
+        ParameterSpec("max_force", 0.0, "N", "of the thrusters; 0: no limit", 0.0),
+        ParameterSpec("max_torque", 0.0, "N m", "of the thrusters; 0: no limit", 0.0),
+        ParameterSpec(
+            "estimation_time", 1.0, "s", "without odom the base is estimated this long", 0.0
+        ),
+        ParameterSpec("position_tolerance", 1e-3, "m", "a goal is met within", 0.0, live=True),
+        ParameterSpec("attitude_tolerance", 1e-3, "rad", "a goal is met within", 0.0, live=True),
+        ParameterSpec("joint_tolerance", 1e-3, "m or rad", "a goal is met within", 0.0, live=True),
+        ParameterSpec("settle_time", 1.0, "s", "... for this long", 0.0, live=True),
+        ParameterSpec(
+            "time_limit", 0.0, "s", "a goal not met after this long has failed; 0: never", 0.0
+        ),
+        ParameterSpec("status_period", 1.0, "s", "simulated time between status messages", 0.01),
+        *_GAIN_SPECS,
+        *option_specs(LAWS),
+    )
+
+    def __init__(self, name: str = "coordinated_control", **kwargs: Any) -> None:
+        self._running = False
+        self._robot: SpaceRobot | None = None
+        super().__init__(name, **kwargs)
+
+    # -- life ---------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Create the topics; without a robot of its own the node waits for robot_description."""
+        self._odom_raw = self._joints_raw = self._reference_raw = b""
+        self._odom_fresh = self._joints_fresh = self._hold = False
+        self._goals: dict[str, PoseReference] = {}
+        self._odom = TemplateReader(
+            Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
+        )
+        self._send_joints = raw_publish(self.create_publisher(JointState, "joint_commands", STREAM))
+        self._send_wrench = raw_publish(self.create_publisher(WrenchStamped, "base_wrench", STREAM))
+        self._status = ControllerStatus(self)
+        robot = robot_of(self.parameters)
+        if robot is None:
+            self.create_subscription(String, "robot_description", self._on_description, LATCHED)
+        else:
+            self._use(robot)
+        self.create_subscription(PoseStamped, "goal_pose", self._on_base_goal, STREAM)
+        self.create_subscription(
+            PoseStamped, "end_effector/goal_pose", self._on_end_effector_goal, STREAM
+        )
+        self.create_subscription(Odometry, "odom", self._on_odom, STREAM, raw=True)
+        self.create_subscription(JointState, "joint_states", self._on_joints, STREAM, raw=True)
+        self.create_subscription(
+            JointState, "joint_reference", self._on_reference, STREAM, raw=True
+        )
+        self.create_service(Trigger, "~/abort", self._on_abort)
+
+    def activate(self) -> None:
+        """Answer states with commands from now on."""
+        self._running = True
+        self._planner_drives = self.count_publishers("joint_reference") > 0
+        self._status.begin()
+        # A lockstep plant may have been waiting for an answer since before.
+        self._on_part()
+
+    def deactivate(self) -> None:
+        """Command nothing any more; goals are forgotten."""
+        self._running = False
+        self._goals = {}
+
+    def _use(self, robot: SpaceRobot) -> None:
+        self._robot = robot
+        values: dict[str, Any] = self.parameters
+        law_type = LAWS[values["law"]]
+        link = values["end_effector_frame"]
+        if not link and DEFAULT_END_EFFECTOR in robot.link_names:
+            link = DEFAULT_END_EFFECTOR
+        outputs = law_type.default_outputs(robot, link)
+        chosen = {
+            group: tuple(values[f"{key}_outputs"].split())
+            for group, key in (
+                ("base", "base"),
+                ("end_effector", "end_effector"),
+                ("joints", "joint"),
+            )
+        }
+        if any(chosen.values()):
+            outputs = OutputSelection(**chosen, end_effector_link=link)
+        options = {o.name: values[f"{law_type.name}.{o.name}"] for o in law_type.options}
+        law = law_type(robot, outputs, self._gains(), **options)
+        self._period = round(NANOSECONDS / values["tick_rate"]) / NANOSECONDS
+        motion = {
+            name: values[f"motion.{name}"]
+            for name in ("speed", "acceleration", "angular_speed", "angular_acceleration")
+        }
+        self.controller = CoordinatedController(
+            law,
+            ActuatorLimits(
+                values["max_force"] or math.inf,
+                values["max_torque"] or math.inf,
+                robot.effort_limit,
+            ),
+            PROFILES[values["profile"]],
+            MotionLimits(**motion),
+            self._period,
+            values["estimation_time"],
+        )
+        n = robot.n
+        self._joints = JointReader(robot.joint_names, ["position", "velocity"])
+        self._references = JointReader(robot.joint_names, ["position", "velocity"])
+        self._reference_rate: Any = None
+        self._effort, self._wrench = np.zeros(n), np.zeros(6)
+        names = list(robot.joint_names)
+        zeros = [0.0] * n
+        self._joint_message = MessageTemplate(
+            JointState(name=names, position=zeros, velocity=zeros, effort=zeros)
+        )
+        if n:
+            self._joint_message.feed("effort", self._effort)
+        wrench = WrenchStamped()
+        wrench.header.frame_id = robot.base_link
+        self._wrench_message = MessageTemplate(wrench)
+        self._wrench_message.feed("wrench.force.x", self._wrench)
+
+    def _gains(self) -> Gains:
+        values: dict[str, Any] = self.parameters
+        pairs = {
+            group: GainPair(values[f"gains.{group}.kp"], values[f"gains.{group}.kd"])
+            for group, _, _ in _GROUPS
+        }
+        return Gains(**pairs)
+
+    def parameters_changed(self) -> None:
+        """Take over new gains."""
+        if self._robot is not None:
+            self.controller.set_gains(self._gains())
+
+    # -- topics -------------------------------------------------------------------------------
+
+    def _on_description(self, message: String) -> None:
+        if self._robot is None:
+            try:
+                self._use(SpaceRobot.from_urdf(message.data))
+            except RobotDescriptionError as error:
+                self.get_logger().error(f"robot_description: {error}")
+                return
+            self._on_part()
+
+    def _on_base_goal(self, message: PoseStamped) -> None:
+        self._on_goal("base", message)
+
+    def _on_end_effector_goal(self, message: PoseStamped) -> None:
+        self._on_goal("end_effector", message)
+
+    def _on_goal(self, group: str, message: PoseStamped) -> None:
+        if not self._running:
+            return
+        frame = str(self.parameters["world_frame"])
+        p, o = message.pose.position, message.pose.orientation
+        try:
+            if message.header.frame_id not in ("", frame):
+                raise PlanningError(
+                    f"The goal of the {group.replace('_', '-')} is in frame "
+                    f"'{message.header.frame_id}'; goals are taken in '{frame}'."
+                )
+            goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w])
+            if self._robot is not None and not getattr(
+                self.controller.law.outputs.selection, group
+            ):
+                raise PlanningError(
+                    f"The law '{self.controller.law.name}' does not control the "
+                    f"{group.replace('_', '-')} of this robot; its outputs are "
+                    f"{', '.join(self.controller.law.outputs.labels)}."
+                )
+        except PlanningError as error:
+            self._status.refused(str(error))
+            return
+        self._goals[group] = PoseReference(goal.position, goal.quaternion)
+
+    def _on_odom(self, raw: bytes) -> None:
+        self._odom_raw = raw
+        self._odom_fresh = True
+        self._on_part()
+
+    def _on_joints(self, raw: bytes) -> None:
+        if self._joints_fresh and self._running and self._robot is not None:
+            # The joints of the tick before have not met their odom: the base was not measured.
+            self._on_state(measured=False)
+        self._joints_raw = raw
+        self._joints_fresh = True
+        self._on_part()
+
+    def _on_reference(self, raw: bytes) -> None:
+        self._reference_raw = raw
+        self._planner_drives = True
+        self._on_part()
+
+    def _on_part(self) -> None:
+        """Answer a state once, as soon as all its messages are there and the node is."""
+        stamp = self._joints_raw[4:12]
+        if (
+            self._running
+            and self._odom_fresh
+            and self._joints_fresh
+            and self._robot is not None
+            and stamp == self._odom_raw[4:12]
+            and (not self._planner_drives or stamp == self._reference_raw[4:12])
+        ):
+            self._odom_fresh = self._joints_fresh = False
+            self._on_state(measured=True)
+
+    def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = self._running and self._robot is not None
+        response.message = "The robot holds where it is."
+        if response.success:
+            self._hold = True
+        return response
+
+    # -- flying -------------------------------------------------------------------------------
+
+    def _on_state(self, *, measured: bool) -> None:
+        """Answer one state with one command of the same stamp."""
+        try:
+            stamp = self._joints.accept(self._joints_raw)
+            q, qdot = self._joints.values["position"], self._joints.values["velocity"]
+            now = stamp / NANOSECONDS
+            state = self._measured(q, qdot) if measured else None
+            if state is not None:
+                self._take_goals(now, state)
+            if self._planner_drives and self._reference_raw:
+                self.controller.follow(self._given_reference())
+            result = self.controller.command(now, state, q, qdot)
+        except (CommandError, NotFiniteError) as error:
+            self.get_logger().error(f"The state is refused: {error}", throttle_duration_sec=5.0)
+            return
+        self._effort[:] = result.realised.tau
+        self._wrench[:] = result.realised.wrench_B
+        stamped = stamp_bytes(stamp)
+        self._send_wrench(self._wrench_message.serialised(stamped))
+        self._send_joints(self._joint_message.serialised(stamped))
+        self._joints_fresh = False
+        self._status.update(now, self.controller, result)
+
+    def _measured(self, q: Any, qdot: Any) -> ControlState:
+        self._odom.accept(self._odom_raw)
+        pose = self._odom.floats("pose.pose.position.x")
+        twist = self._odom.floats("twist.twist.linear.x")
+        return ControlState(pose[:3], pose[3:], twist[:3], twist[3:], q, qdot)
+
+    def _take_goals(self, now: float, state: ControlState) -> None:
+        if self._hold:
+            self._hold = False
+            self._goals = {}
+            link = self.controller.law.outputs.selection.end_effector_link
+            assert self._robot is not None
+            here = Reference.present(self._robot, state, link)
+            self.controller.set_goals(
+                now, state, base=here.base, end_effector=here.end_effector, joints=state.q.copy()
+            )
+            self._status.state(ControllerState.ABORTED, "Aborted on request; the robot holds.")
+        if self._goals:
+            self.controller.set_goals(
+                now,
+                state,
+                base=self._goals.get("base"),
+                end_effector=self._goals.get("end_effector"),
+            )
+            self._goals = {}
+            self._status.started(now)
+
+    def _given_reference(self) -> Reference:
+        """Return the planner's reference of this tick, whose velocities are held over it."""
+        self._references.accept(self._reference_raw)
+        held = self._references.values["velocity"].copy()
+        before = self._reference_rate if self._reference_rate is not None else held
+        self._reference_rate = held
+        return Reference(
+            joints=JointReference(
+                self._references.values["position"].copy(),
+                (before + held) / 2,
+                (held - before) / self._period,
+            )
+        )
+
+
+def main() -> None:
+    """Run coordinated control until SIGINT or SIGTERM."""
+    sys.exit(run_node(CoordinatedControlNode))
+
+
+if __name__ == "__main__":
+    main()

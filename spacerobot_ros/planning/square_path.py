@@ -1,0 +1,252 @@
+"""Planar chains, square paths in shape space: the reorientation of paper 3, section III.
+
+Step 1 brings the shape to the wanted one, ``psi_e``. Step 2 goes to the corner of a square that is
+nearest to it, step 3 goes round the square, step 4 comes back by the path of step 2. The square is
+such that its geometric phase is the turn of the base that is missing after step 1; steps 2 and 4
+cancel.
+
+Every leg is a straight line of the shape from rest to rest. The plant holds each velocity for a
+tick: the shape then moves along the same straight lines with other speeds within a tick, and the
+geometric phase, which depends on the path alone, is that of the smooth motion exactly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.attitude import quaternion_inverse, quaternion_multiply
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.planning.goal import Controlled, Goal, PoseError, RobotState, Tolerance
+from spacerobot_ros.planning.method import GaitMethod, Option
+from spacerobot_ros.planning.planar import PlanarPhase
+from spacerobot_ros.planning.prediction import BasePrediction
+from spacerobot_ros.planning.schedule import BasePath, GaitSchedule
+from spacerobot_ros.planning.square_loop import SquareLoop, SquareSearch
+
+_WORTHWHILE = 0.1
+"""A missing turn below this share of the tolerance is left as it is."""
+
+_NO_ROTATION = 1e-9
+_NO_MOTION = 1e-9
+_BEYOND = 1e-9
+"""Rounding that a goal shape may be beyond a limit by, rad."""
+
+_KNOTS = 400
+"""About how many poses of the base a predicted path has."""
+
+
+class SquarePathGait(GaitMethod):
+    """Attitude and shape of planar trees of three or more links with joints that turn.
+
+    The base's position follows from both (the centre of mass rests) and cannot be chosen.
+    """
+
+    name: ClassVar[str] = "square_path"
+    controls: ClassVar[frozenset[Controlled]] = frozenset({"attitude", "shape"})
+    options: ClassVar[tuple[Option, ...]] = (
+        Option("t1", 8.0, "s", "end of step 1, the motion to the final shape", 1e-3),
+        Option("t2", 12.0, "s", "end of step 2, the motion to the square", 1e-3),
+        Option("t3", 20.0, "s", "end of step 3, one loop; more loops take as long each", 1e-3),
+        Option("t4", 24.0, "s", "end of step 4, the motion back", 1e-3),
+        Option("most_loops", 20, "", "loops that a turn may take", 1, 1_000_000),
+        Option("given_centre", 0, "", "1: squares round (centre_1, centre_2); 0: the best", 0, 1),
+        Option("centre_1", 0.0, "rad", "first coordinate of a given centre", -1e3, 1e3),
+        Option("centre_2", 0.0, "rad", "second coordinate of a given centre", -1e3, 1e3),
+        Option("check_position", 0, "", "1: refuse goals that are not where the base ends", 0, 1),
+        Option("longest", 3600.0, "s", "longest manoeuvre that is still planned", 1.0),
+    )
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        tick_period: float,
+        tolerance: Tolerance,
+        integration_step: float = DEFAULT_INTEGRATION_STEP,
+        *,
+        t1: float = 8.0,
+        t2: float = 12.0,
+        t3: float = 20.0,
+        t4: float = 24.0,
+        most_loops: int = 20,
+        given_centre: int = 0,
+        centre_1: float = 0.0,
+        centre_2: float = 0.0,
+        check_position: int = 0,
+        longest: float = 3600.0,
+    ) -> None:
+        super().__init__(robot, tick_period, tolerance, integration_step)
+        instants = (0.0, t1, t2, t3, t4)
+        if not np.all(np.diff(instants) > 0):
+            raise ParameterError(
+                f"The times t1 to t4 of square_path are {t1:g}, {t2:g}, {t3:g} and {t4:g} s; "
+                "each must be later than the one before."
+            )
+        self._durations = tuple(float(x) for x in np.diff(instants))
+        self._check_position = bool(check_position)
+        self._longest = longest
+        self._refusal: PlanningError | None = None
+        try:
+            self._phase = PlanarPhase(robot)
+        except PlanningError as refusal:
+            # Planners exist before goals: the robot is refused with the first one.
+            self._refusal = refusal
+            return
+        centre = np.array([centre_1, centre_2]) if given_centre else None
+        self._search = SquareSearch(robot, self._phase, most_loops, centre)
+        self._prediction = BasePrediction(robot, tick_period, integration_step)
+
+    def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
+        """Plan steps 1 to 4; see :meth:`GaitMethod.plan`."""
+        if self._refusal is not None:
+            raise PlanningError(str(self._refusal))
+        self._require_rest(state)
+        turn = self._turn(state, goal)
+        psi_e = self._final_shape(state, goal)
+        step_1 = float(self._phase.legs(state.q[np.newaxis], psi_e[np.newaxis])[0])
+        # Whole turns are no matter: the smaller of the two ways round.
+        wanted = math.remainder(turn - step_1, 2 * math.pi)
+        loop = None
+        if abs(wanted) > max(_NO_ROTATION, _WORTHWHILE * self.tolerance.attitude):
+            loop = self._search.loop(psi_e, wanted)
+        positions = self._motion(state.q, self._legs(psi_e, loop))
+        path = self._path(state, positions)
+        left = PoseError.between(path.position[-1], path.quaternion[-1], goal)
+        if self._check_position and left.distance > self.tolerance.position:
+            raise PlanningError(
+                f"The base will be at {np.round(path.position[-1], 4).tolist()} m, "
+                f"{left.distance:.3g} m from the goal position: without thrust, attitude and shape "
+                "decide where the base is; with check_position 0 the goal position is ignored."
+            )
+        return GaitSchedule(
+            method=self.name,
+            joint_names=self.robot.joint_names,
+            tick_period=self.tick_period,
+            positions=positions,
+            path=path,
+            goal=goal,
+            notes={
+                "psi_e": psi_e.tolist(),
+                "turn_of_step_1": step_1,
+                "wanted_phase": wanted,
+                **self._loop_notes(loop),
+                "final_position": path.position[-1].tolist(),
+                "predicted_attitude_error": left.angle,
+            },
+        )
+
+    def _turn(self, state: RobotState, goal: Goal) -> float:
+        """Return the angle in [-pi, pi] about the robot's axis from the present attitude."""
+        axis = self._phase.axis
+        x, y, z, w = quaternion_multiply(quaternion_inverse(state.quaternion), goal.quaternion)
+        vector = np.array([x, y, z])
+        # Swing after twist: what the twist about the axis leaves is a tilt out of the plane.
+        about = float(axis @ vector)
+        across = float(np.linalg.norm(vector - about * axis))
+        tilt = 2 * math.atan2(across, math.hypot(about, float(w)))
+        if tilt > max(self.tolerance.attitude, _NO_ROTATION):
+            raise PlanningError(
+                f"The goal attitude is {tilt:.4g} rad off any rotation about the axis "
+                f"{np.round(axis, 6).tolist()} of {self.robot.base_link}: planar robot "
+                f"'{self.robot.description.name}' turns about no other."
+            )
+        return math.remainder(2 * math.atan2(about, float(w)), 2 * math.pi)
+
+    def _final_shape(self, state: RobotState, goal: Goal) -> Array:
+        """Return ``psi_e`` (n,): the goal's shape, or the present one."""
+        robot = self.robot
+        if goal.joint_positions is None:
+            return np.clip(state.q, robot.lower, robot.upper)
+        psi_e = goal.joint_positions
+        if len(psi_e) != robot.n:
+            raise PlanningError(
+                f"The goal shape has {len(psi_e)} joint position(s); robot "
+                f"'{robot.description.name}' has {robot.n} joints."
+            )
+        beyond = np.maximum(robot.lower - psi_e, psi_e - robot.upper)
+        worst = int(np.argmax(beyond))
+        if beyond[worst] > _BEYOND:
+            raise PlanningError(
+                f"The goal shape is beyond limits: joint '{robot.joint_names[worst]}' at "
+                f"{psi_e[worst]:.4g} rad, and its limits are "
+                f"[{robot.lower[worst]:.4g}, {robot.upper[worst]:.4g}] rad."
+            )
+        return np.clip(psi_e, robot.lower, robot.upper)
+
+    def _legs(self, psi_e: Array, loop: SquareLoop | None) -> list[tuple[Array, float]]:
+        """Return the ends (n,) of the straight legs, and how long each is to take, s."""
+        step_1, step_2, step_3, step_4 = self._durations
+        legs = [(psi_e, step_1)]
+        if loop is not None:
+            legs.append((loop.corners[0], step_2))
+            around = [(corner, step_3 / 4) for corner in np.roll(loop.corners, -1, axis=0)]
+            legs += loop.loops * around
+            legs.append((psi_e, step_4))
+        return legs
+
+    def _motion(self, start: Array, legs: Sequence[tuple[Array, float]]) -> Array:
+        """Return the shapes (N + 1, n) at the ticks, each leg from rest to rest.
+
+        Under ``u = (2 pi D / T^2) sin(2 pi t / T)``, eqs (12) to (18), a leg D is travelled as
+        ``D (t/T - sin(2 pi t/T) / (2 pi))``.
+
+        Raises
+        ------
+        PlanningError
+            The manoeuvre takes longer than ``longest``.
+        """
+        starts = [start, *(end for end, _ in legs)]
+        moves = [(a, b, self._duration(b - a, T)) for a, (b, T) in zip(starts, legs, strict=False)]
+        total = sum(duration for _, _, duration in moves)
+        if total > self._longest:
+            slowest = int(np.argmin(self.robot.velocity_limit))
+            raise PlanningError(
+                f"The manoeuvre of {len(legs)} straight legs would take {total:.4g} s, more than "
+                f"longest = {self._longest:.6g} s; the slowest joint, "
+                f"'{self.robot.joint_names[slowest]}', has "
+                f"{self.robot.velocity_limit[slowest]:.3g} rad/s."
+            )
+        pieces = [start[np.newaxis]]
+        for a, b, duration in moves:
+            tau = np.linspace(0.0, 1.0, 1 + math.ceil(duration / self.tick_period - 1e-9))[1:]
+            progress = tau - np.sin(2 * math.pi * tau) / (2 * math.pi)
+            pieces.append(a + progress[:, np.newaxis] * (b - a))
+            pieces[-1][-1:] = b
+        return np.vstack(pieces)
+
+    def _duration(self, move: Array, wanted: float) -> float:
+        """Return how long a leg takes, s: not at all without a move, longer with slow joints."""
+        active = np.abs(move) > _NO_MOTION
+        if not active.any():
+            return 0.0
+        # The peak speed is twice the mean. A joint without speed takes for ever.
+        with np.errstate(divide="ignore"):
+            slowest = np.max(2 * np.abs(move[active]) / self.robot.velocity_limit[active])
+        return max(wanted, float(slowest))
+
+    def _path(self, state: RobotState, positions: Array) -> BasePath:
+        """Return the base path, integrated as the plant does, at about 400 of the ticks."""
+        attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
+        last = len(positions) - 1
+        chosen = np.unique(np.append(np.arange(0, last, max(1, last // _KNOTS)), last))
+        time, quaternions = chosen * self.tick_period, attitudes[chosen]
+        positions_W = self._prediction.positions(state, time, positions[chosen], quaternions)
+        return BasePath(time, positions_W, quaternions)
+
+    def _loop_notes(self, loop: SquareLoop | None) -> dict[str, list[float] | float | str]:
+        if loop is None:
+            return {"loops": 0.0}
+        return {
+            "joints": ", ".join(self.robot.joint_names[i] for i in loop.pair),
+            "psi_star": loop.centre.tolist(),
+            "z_star": loop.side,
+            "loops": float(loop.loops),
+            "direction": "clockwise" if loop.clockwise else "counter-clockwise",
+            "corner": loop.corners[0].tolist(),
+        }

@@ -1,0 +1,228 @@
+"""The plant under efforts: joint efforts and thrusters drive the full free-flying dynamics.
+
+One tick is one compiled function: limits, integration, and every quantity that is published. The
+total momenta are integrated as such (:mod:`spacerobot_ros.model.free_flight`): without thrust they
+do not change by a single bit. Ticks in which a joint touches the end of its stroke are taken again
+with its stop (:mod:`spacerobot_ros.simulation.joint_stops`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import BufferedFunction, compiled
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.free_flight import repeated, state_slices
+from spacerobot_ros.simulation.initial_state import InitialState
+from spacerobot_ros.simulation.joint_stops import JointStops
+
+DEFAULT_INTEGRATION_STEP = 0.001
+"""Longest Runge-Kutta step, s."""
+
+_DIVERGED = 1e100
+"""No quantity of a state is as large (SI units)."""
+
+
+class EffortPlant:
+    """A free-flying robot under held joint efforts and a held wrench on its base.
+
+    After :meth:`step`, the attributes are the state that a robot would report:
+
+    ``pose``
+        (7,) position ``r_WB`` in m and quaternion ``R_WB`` (x, y, z, w) of the base link.
+    ``twist``
+        (6,) ``v_WB_B`` in m/s and ``omega_WB_B`` in rad/s.
+    ``q``, ``qdot``
+        (n,) joint positions and velocities.
+    ``effort``, ``wrench``
+        (n,) efforts of the joints' actuators (N or N m), without those of stops, and (6,) force (N)
+        over torque (N m) at the origin of the base link, base components, as realised up to now.
+    ``momentum``
+        (7,) linear momentum (kg m/s), angular momentum about the system's centre of mass
+        (kg m^2/s), both in W, and kinetic energy (J): summed body by body from the state above.
+    ``link_R``, ``link_r``
+        (3, 3 L) and (3, L): pose in B of every link, in the order of ``robot.link_names``.
+
+    Parameters
+    ----------
+    robot
+        The model; its efforts are clipped to the limits of its description.
+    tick_period
+        Duration of a tick, s.
+    initial
+        Where to start.
+    integration_step
+        Longest Runge-Kutta step within a tick, s.
+
+    Raises
+    ------
+    ParameterError
+        The initial shape has the wrong length or lies outside the strokes, or a number is bad.
+    """
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        tick_period: float,
+        initial: InitialState | None = None,
+        integration_step: float = DEFAULT_INTEGRATION_STEP,
+    ) -> None:
+        for name, value in (("tick period", tick_period), ("integration step", integration_step)):
+            if not (math.isfinite(value) and value > 0):
+                raise ParameterError(f"The {name} must be positive, not {value} s.")
+        self.robot = robot
+        self.tick_period = tick_period
+        self.initial = initial or InitialState()
+        n = robot.n
+        substeps = max(1, math.ceil(tick_period / integration_step - 1e-9))
+        self._stops = JointStops(robot, tick_period / substeps)
+        self._advance = BufferedFunction(compiled(_tick_function(robot, substeps)))
+        self._state, self._command, self._h = self._advance.inputs
+        self._next_state, self.pose, self.twist, self._realised = self._advance.outputs[:4]
+        self.momentum, self.link_R, self.link_r, self._limited = self._advance.outputs[4:]
+        shape, _, rates, *_ = state_slices(n)
+        self.q, self.qdot = self._next_state[shape], self._next_state[rates]
+        self.effort, self.wrench = self._realised[:n], self._realised[n:]
+        self.effort_limited = np.zeros(n, dtype=np.int64)
+        self.stroke_limited = np.zeros(n, dtype=np.int64)
+        self.reset()
+
+    @property
+    def limit_counts(self) -> dict[str, npt.NDArray[np.int64]]:
+        """Ticks in which each joint (n,) was limited, by what limited it."""
+        return {"effort": self.effort_limited, "stroke": self.stroke_limited}
+
+    @property
+    def expected_momenta(self) -> Array:
+        """Linear over angular momentum (6,) in W: from the beginning and by the thrusters."""
+        _, _, _, p_W, L_W, _ = state_slices(self.robot.n)
+        return self._next_state[p_W.start : L_W.stop]
+
+    def reset(self) -> None:
+        """Return to the initial state, nothing actuated; the limit counters go on."""
+        start, robot = self.initial, self.robot
+        self._state[:] = np.concatenate(
+            [
+                start.shape(robot),
+                start.attitude(),
+                start.rates(robot),
+                start.momenta(),
+                start.system_position(robot),
+            ]
+        )
+        self._command[:] = 0.0
+        self._report()
+
+    def step(self, effort: npt.ArrayLike, wrench: npt.ArrayLike = 0.0) -> bool:
+        """Advance one tick under joint efforts (n,), clipped to their limits, and a base wrench.
+
+        ``wrench`` (6,) is force (N) over torque (N m) at the origin of the base link, in base
+        components; it turns with the base during the tick. A joint that reaches the end of its
+        stroke stops there without rebound and is held while something pushes it outwards. Returns
+        whether any joint was limited; ``effort_limited`` and ``stroke_limited`` count the ticks by
+        joint.
+
+        Raises
+        ------
+        CommandError
+            A command is not finite; the tick is not taken.
+        SpaceRobotError
+            The motion is no longer finite; the tick is not taken.
+        """
+        n = self.robot.n
+        self._state[:] = self._next_state
+        self._command[:n] = effort
+        self._command[n:] = wrench
+        self._advance.evaluate()
+        return self._limited[0] != 0.0 and self._apply_limits()
+
+    def _apply_limits(self) -> bool:
+        """Count what was clipped, and take the tick again if a joint touched a stop."""
+        n = self.robot.n
+        clipped, touched = self._limited[1 : 1 + n] != 0.0, self._limited[1 + n] != 0.0
+        stopped = np.zeros(n, dtype=np.bool_)
+        try:
+            if not np.all(np.isfinite(self._command)):
+                raise CommandError(f"A command is not finite: {self._command.tolist()}.")
+            if touched:
+                self._state[:], stopped = self._stops.advance(
+                    self._state, self._realised, self.tick_period
+                )
+                self._report()
+        except SpaceRobotError:
+            # The state before the tick remains.
+            self._command[:] = 0.0
+            self._report()
+            raise
+        self.effort_limited += clipped
+        self.stroke_limited += stopped
+        return bool(clipped.any() or stopped.any())
+
+    def _report(self) -> None:
+        """Fill every output at ``_state``: a tick of zero duration."""
+        self._h[:] = 0.0
+        self._advance.evaluate()
+        self._h[:] = self.tick_period
+
+
+def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
+    """Compose the tick from the model's functions; see :class:`EffortPlant` for its results."""
+    n = robot.n
+    parts = state_slices(n)
+    state, command = ca.MX.sym("state", parts[-1].stop), ca.MX.sym("command", n + 6)
+    h = ca.MX.sym("h")
+    effort = ca.fmin(ca.fmax(command[:n], -robot.effort_limit), robot.effort_limit)
+    realised = ca.vertcat(effort, command[n:])
+    march = repeated(_watched_step(robot), substeps)
+    marched = march(ca.vertcat(state, _touching(robot, state)), realised, h / substeps)
+    next_state = marched[:-1]
+
+    q, quaternion, qdot, p_W, L_W, r_WC_W = (next_state[part] for part in parts)
+    v, omega = robot.function("base_twist", compile=False)(quaternion, q, qdot, p_W, L_W)
+    center = robot.function("center_of_mass", compile=False)(q)
+    r_WB_W = r_WC_W - robot.function("rotate", compile=False)(quaternion, center)
+    ledger = robot.function("momentum", compile=False)(quaternion, q, v, omega, qdot)
+    link_R, link_r = robot.function("link_poses", compile=False)(q)
+    clipped = command[:n] != effort
+    # Comparisons with what is not a number are false.
+    diverged = parts[-1].stop - ca.sum1(ca.fabs(next_state) < _DIVERGED)
+    touched = marched[-1] + diverged
+    return ca.Function(
+        f"effort_tick_{substeps}",
+        [state, command, h],
+        [
+            next_state,
+            ca.vertcat(r_WB_W, quaternion),
+            ca.vertcat(v, omega),
+            realised,
+            ca.vertcat(*ledger),
+            link_R,
+            link_r,
+            ca.densify(ca.vertcat(ca.sum1(clipped) + touched, clipped, touched)),
+        ],
+    )
+
+
+def _watched_step(robot: SpaceRobot) -> ca.Function:
+    """Return the step that also counts, in one more entry of the state, joints on or beyond stops.
+
+    It looks at the end of each step: a joint cannot swing out of its stroke and back within one.
+    """
+    step = robot.function("flight_step", compile=False)
+    watched = ca.MX.sym("x", step.size1_in(0) + 1)
+    command, h = ca.MX.sym("command", robot.n + 6), ca.MX.sym("h")
+    x = step(watched[:-1], command, h)
+    counted = ca.vertcat(x, watched[-1] + _touching(robot, x))
+    return ca.Function("watched_step", [watched, command, h], [counted])
+
+
+def _touching(robot: SpaceRobot, state: ca.MX) -> ca.MX:
+    """Return how many joints are not strictly inside their strokes."""
+    q = state[: robot.n]
+    return robot.n - ca.sum1(ca.logic_and(q > robot.lower, q < robot.upper))

@@ -1,0 +1,190 @@
+"""Robots, goals and closed loops that several tests fly."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from control.pinocchio_plant import PinocchioPlant
+from scipy.spatial.transform import Rotation
+
+from spacerobot_ros.control import (
+    LAWS,
+    Actuation,
+    ActuatorLimits,
+    ControlLaw,
+    ControlState,
+    GainPair,
+    Gains,
+    LawStatus,
+    MotionLimits,
+    PoseReference,
+    Reference,
+)
+from spacerobot_ros.model import SpaceRobot
+
+Array = npt.NDArray[np.float64]
+
+URDF = Path(__file__).parents[2] / "urdf"
+END_EFFECTOR = "end_effector"
+INVERTIBLE = ("transposed_jacobian", "model_based")
+
+
+@cache
+def load(name: str) -> SpaceRobot:
+    return SpaceRobot.from_file(URDF / f"{name}.urdf")
+
+
+def pose(position: npt.ArrayLike, rotvec: npt.ArrayLike = (0, 0, 0)) -> PoseReference:
+    """Return a pose to hold; rotvec in rad."""
+    return PoseReference(np.array(position, float), Rotation.from_rotvec(rotvec).as_quat())
+
+
+def random_state(rng: np.random.Generator, joints: int) -> ControlState:
+    """Return a state of order one in everything."""
+    return ControlState(
+        rng.uniform(-2, 2, 3),
+        Rotation.random(rng=rng).as_quat(),
+        rng.uniform(-1, 1, 3),
+        rng.uniform(-1, 1, 3),
+        rng.uniform(-1.2, 1.2, joints),
+        rng.uniform(-1, 1, joints),
+    )
+
+
+def random_pose_reference(rng: np.random.Generator) -> PoseReference:
+    return PoseReference(
+        rng.uniform(-2, 2, 3), Rotation.random(rng=rng).as_quat(), *rng.uniform(-1, 1, (4, 3))
+    )
+
+
+def scaled_robot(robot: SpaceRobot, factor: Callable[[], float]) -> SpaceRobot:
+    """Return the robot with every mass and every inertia entry times a factor of its own."""
+    root = ET.fromstring(robot.description.urdf)
+    for inertial in root.iter("inertial"):
+        for name in ("mass", "inertia"):
+            element = inertial.find(name)
+            assert element is not None
+            by = factor()
+            for key, value in element.attrib.items():
+                element.set(key, repr(float(value) * by))
+    return SpaceRobot.from_urdf(ET.tostring(root, encoding="unicode"))
+
+
+# -- the paper's example ----------------------------------------------------------------------
+
+
+def planar_start() -> ControlState:
+    """Return paper 4's start: at rest, the system's centre of mass at the origin of W."""
+    q = np.radians([-58.0, 60.3])
+    attitude = Rotation.from_euler("z", 21.0, degrees=True)
+    r = -attitude.apply(load("planar_manipulator").center_of_mass(q))
+    return ControlState.at_rest(r, attitude.as_quat(), q)
+
+
+PLANAR_GOAL = Reference(pose([0.5, 0.5, 0.0], [0.0, 0.0, np.radians(15.0)]), pose([1.5, 1.5, 0.0]))
+PLANAR_GAINS = Gains.uniform(30.0, 60.0)
+
+
+# -- the servicer -----------------------------------------------------------------------------
+
+SERVICER_SHAPE = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])
+SERVICER_GOAL = Reference(
+    pose([1.0, 0.4, -0.2], [0.1, -0.2, 0.5]), pose([2.28, 1.85, 0.79], [-0.56, 0.95, 1.05])
+)
+SERVICER_GAINS = {
+    "transposed_jacobian": Gains(
+        base_position=GainPair(400.0, 900.0),
+        base_attitude=GainPair(200.0, 400.0),
+        end_effector_position=GainPair(200.0, 200.0),
+        end_effector_attitude=GainPair(3.0, 2.0),
+        joints=GainPair(1.0, 1.0),
+    ),
+    "model_based": Gains.uniform(1.0, 2.0),
+}
+SERVICER_PACE = MotionLimits(
+    speed=0.15, acceleration=0.02, angular_speed=0.15, angular_acceleration=0.02
+)
+# Within a tenth of the thrust and torque that the pace above takes.
+SERVICER_SLOW_PACE = MotionLimits(
+    speed=0.15, acceleration=0.0015, angular_speed=0.15, angular_acceleration=0.0015
+)
+
+
+def servicer_start() -> ControlState:
+    return ControlState.at_rest(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), SERVICER_SHAPE)
+
+
+# -- closed loop ------------------------------------------------------------------------------
+
+
+def law_of(name: str, robot: SpaceRobot, gains: Gains, **options: float) -> ControlLaw:
+    law = LAWS[name]
+    return law(robot, law.default_outputs(robot, END_EFFECTOR), gains, **options)
+
+
+@dataclass
+class Flight:
+    """What a closed loop did, sampled at ticks."""
+
+    times: list[float] = field(default_factory=list)
+    states: list[ControlState] = field(default_factory=list)
+    errors: list[Array] = field(default_factory=list)
+    """Of the law's outputs against the reference of the tick."""
+    actuations: list[Actuation] = field(default_factory=list)
+    """As realised."""
+    statuses: list[LawStatus] = field(default_factory=list)
+    end_effector: list[Array] = field(default_factory=list)
+    """Position of the end-effector, from the plant."""
+    limited: int = 0
+    """Ticks in which something was limited."""
+
+    def at(self, time: float) -> int:
+        """Return the index of a time."""
+        return int(np.argmin(np.abs(np.array(self.times) - time)))
+
+    @property
+    def peak_force(self) -> float:
+        return max(float(np.linalg.norm(a.wrench_B[:3])) for a in self.actuations)
+
+    @property
+    def peak_torque(self) -> float:
+        return max(float(np.linalg.norm(a.wrench_B[3:])) for a in self.actuations)
+
+
+def fly(
+    plant: PinocchioPlant,
+    law: ControlLaw,
+    reference: Callable[[float], Reference],
+    duration: float,
+    rate: float = 100.0,
+    limits: ActuatorLimits | None = None,
+    every: int = 1,
+) -> Flight:
+    """Close the loop over a plant: commands are held for a tick; every so many are sampled."""
+    flight = Flight()
+    for tick in range(round(duration * rate) + 1):
+        time = tick / rate
+        actuation = law.command(plant.state, reference(time))
+        if limits is not None:
+            saturated = limits.apply(actuation)
+            flight.limited += saturated.limited
+            actuation = saturated.realised
+        if tick % every == 0:
+            flight.times.append(time)
+            flight.states.append(plant.state)
+            flight.errors.append(law.error)
+            flight.actuations.append(actuation)
+            flight.statuses.append(law.status)
+            flight.end_effector.append(plant.frame(END_EFFECTOR)[0])
+        plant.step(actuation, 1 / rate)
+    return flight
+
+
+def plant_of(robot: SpaceRobot, start: ControlState, longest_step: float = 0.01) -> PinocchioPlant:
+    return PinocchioPlant(robot.description.urdf, robot.joint_names, start, longest_step)

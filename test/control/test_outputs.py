@@ -1,0 +1,241 @@
+"""The output vector: its Jacobian, its bias and its error, against Pinocchio and SciPy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from control.flights import (
+    END_EFFECTOR,
+    Array,
+    load,
+    random_pose_reference,
+    random_state,
+)
+from scipy.spatial.transform import Rotation
+from support.random_robots import random_robot_urdf
+
+from spacerobot_ros.control import (
+    ControlState,
+    JointReference,
+    NotFiniteError,
+    OutputSelection,
+    PoseReference,
+    Reference,
+    TargetNotSetError,
+)
+from spacerobot_ros.control.outputs import OutputVector
+from spacerobot_ros.control.selection import AXES
+from spacerobot_ros.model import SpaceRobot
+
+STEP = 1e-6
+
+
+@dataclass
+class Outputs:
+    """The expressions of an output vector, evaluated."""
+
+    vector: OutputVector
+
+    def __post_init__(self) -> None:
+        z1 = self.vector
+        results = [z1.J_z, z1.bias, z1.z0dot, z1.error, z1.error_rate, z1.acceleration]
+        self._function = ca.Function("outputs", [z1.state, z1.reference], results)
+
+    def __call__(self, state: ControlState, reference: Reference) -> list[Array]:
+        z1 = self.vector
+        x, r = np.zeros(z1.state.numel()), np.zeros(z1.reference.numel())
+        z1.pack_state(state, x)
+        z1.pack_reference(reference, r)
+        J_z, *vectors = (np.array(result) for result in self._function(x, r))
+        return [J_z, *(vector.ravel() for vector in vectors)]
+
+
+class Frames:
+    """Where Pinocchio has the frames of a robot after a short time at constant velocities."""
+
+    def __init__(self, robot: SpaceRobot, links: tuple[str, str]) -> None:
+        self.model = pin.buildModelFromXML(robot.description.urdf, pin.JointModelFreeFlyer())
+        self.data = self.model.createData()
+        joints = [self.model.joints[self.model.getJointId(name)] for name in robot.joint_names]
+        self._joints = joints
+        self._ids = [self.model.getFrameId(link, pin.FrameType.BODY) for link in links]
+
+    def after(self, state: ControlState, time: float) -> list[tuple[Array, Rotation]]:
+        q, u = pin.neutral(self.model), np.zeros(self.model.nv)
+        q[:3], q[3:7], u[:3], u[3:6] = (
+            state.r_WB,
+            state.quaternion_WB,
+            state.v_WB_B,
+            state.omega_WB_B,
+        )
+        for joint, value, rate in zip(self._joints, state.q, state.qdot, strict=True):
+            own = (value,) if joint.nq == 1 else (np.cos(value), np.sin(value))
+            q[joint.idx_q : joint.idx_q + joint.nq] = own
+            u[joint.idx_v] = rate
+        pin.framesForwardKinematics(self.model, self.data, pin.integrate(self.model, q, time * u))
+        placements = [self.data.oMf[index] for index in self._ids]
+        return [(np.array(M.translation), Rotation.from_matrix(M.rotation)) for M in placements]
+
+
+def random_case(seed: int) -> tuple[SpaceRobot, OutputSelection, np.random.Generator]:
+    """Return a random robot with everything selected that its degrees of freedom allow."""
+    rng = np.random.default_rng(seed)
+    robot = SpaceRobot.from_urdf(random_robot_urdf(rng, joints=6 + seed % 2))
+    return robot, OutputSelection(AXES, AXES, (), "tool_frame"), rng
+
+
+def with_all(rng: np.random.Generator, joints: int) -> Reference:
+    return Reference(
+        random_pose_reference(rng),
+        random_pose_reference(rng),
+        JointReference(*rng.uniform(-1, 1, (3, joints))),
+    )
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_jacobian_against_finite_differences(seed: int) -> None:
+    robot, selection, rng = random_case(seed)
+    outputs, frames = (
+        Outputs(OutputVector(robot, selection)),
+        Frames(robot, (robot.base_link, "tool_frame")),
+    )
+    state = random_state(rng, robot.n)
+    J_z, _, z0dot, *_ = outputs(state, with_all(rng, robot.n))
+    expected = []
+    for before, after in zip(frames.after(state, -STEP), frames.after(state, STEP), strict=True):
+        expected.append((after[0] - before[0]) / (2 * STEP))
+        expected.append((after[1] * before[1].inv()).as_rotvec() / (2 * STEP))
+    np.testing.assert_allclose(J_z @ z0dot, np.concatenate(expected), atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bias_against_finite_differences(seed: int) -> None:
+    robot, selection, rng = random_case(seed)
+    outputs = Outputs(OutputVector(robot, selection))
+    state, reference = random_state(rng, robot.n), with_all(rng, robot.n)
+    _, bias, z0dot, *_ = outputs(state, reference)
+
+    def J_z_after(time: float) -> Array:
+        turn = Rotation.from_quat(state.quaternion_WB) * Rotation.from_rotvec(
+            time * state.omega_WB_B
+        )
+        moved = replace(state, quaternion_WB=turn.as_quat(), q=state.q + time * state.qdot)
+        return outputs(moved, reference)[0]
+
+    expected = (J_z_after(STEP) - J_z_after(-STEP)) / (2 * STEP) @ z0dot
+    np.testing.assert_allclose(bias, expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_error_and_its_rate(seed: int) -> None:
+    robot, selection, rng = random_case(seed)
+    outputs, frames = (
+        Outputs(OutputVector(robot, selection)),
+        Frames(robot, (robot.base_link, "tool_frame")),
+    )
+    state, reference = random_state(rng, robot.n), with_all(rng, robot.n)
+    J_z, _, z0dot, error, error_rate, acceleration = outputs(state, reference)
+    expected, velocity, wanted = [], [], []
+    poses = reference.base, reference.end_effector
+    for pose, (position, attitude) in zip(poses, frames.after(state, 0.0), strict=True):
+        assert pose is not None
+        turn = Rotation.from_quat(pose.quaternion) * attitude.inv()
+        expected += [pose.position - position, turn.as_rotvec()]
+        velocity += [pose.velocity, pose.angular_velocity]
+        wanted += [pose.acceleration, pose.angular_acceleration]
+    np.testing.assert_allclose(error, np.concatenate(expected), atol=1e-12)
+    np.testing.assert_allclose(error_rate, np.concatenate(velocity) - J_z @ z0dot, atol=1e-12)
+    np.testing.assert_array_equal(acceleration, np.concatenate(wanted))
+
+
+def test_error_rate_is_the_derivative_of_the_error_about_one_axis() -> None:
+    robot = load("planar_manipulator")
+    outputs = Outputs(OutputVector(robot, OutputSelection(base=("rz",))))
+    turned = Rotation.from_euler("z", 0.4).as_quat()
+    still = ControlState.at_rest(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(2))
+    state = replace(still, omega_WB_B=np.array([0.0, 0.0, 0.7]))
+
+    def error_after(time: float) -> Array:
+        attitude = Rotation.from_euler("z", 0.7 * time).as_quat()
+        target = Reference(PoseReference(np.zeros(3), turned))
+        return outputs(replace(state, quaternion_WB=attitude), target)[3]
+
+    rate = (error_after(STEP) - error_after(-STEP)) / (2 * STEP)
+    np.testing.assert_allclose(rate, [-0.7], atol=1e-9)
+
+
+def test_joints_and_axes_are_selected_in_order() -> None:
+    robot = load("servicer")
+    selection = OutputSelection(("z", "rx"), ("y",), ("elbow_pitch", "shoulder_yaw"), END_EFFECTOR)
+    vector = OutputVector(robot, selection)
+    assert vector.labels == (
+        "base.z",
+        "base.rx",
+        "end_effector.y",
+        "joint.elbow_pitch",
+        "joint.shoulder_yaw",
+    )
+    rng = np.random.default_rng(7)
+    state, reference = random_state(rng, 6), with_all(rng, 6)
+    assert reference.joints is not None
+    full = OutputSelection(AXES, AXES, (), END_EFFECTOR)
+    whole = Outputs(OutputVector(robot, full))(state, reference)
+    part = Outputs(vector)(state, reference)
+    for everything, chosen in zip(whole, part, strict=True):
+        if len(everything) == 12 and everything is not whole[2]:
+            np.testing.assert_array_equal(chosen[:3], everything[[2, 3, 7]])
+    _, bias, _, error, error_rate, acceleration = part
+    np.testing.assert_array_equal(part[0][3:, 6:], np.eye(6)[[2, 0]])
+    np.testing.assert_array_equal(bias[3:], 0.0)
+    np.testing.assert_array_equal(error[3:], (reference.joints.q - state.q)[[2, 0]])
+    np.testing.assert_array_equal(error_rate[3:], (reference.joints.qdot - state.qdot)[[2, 0]])
+    np.testing.assert_array_equal(acceleration[3:], reference.joints.qddot[[2, 0]])
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("degrees", [0.0, 1e-9, 90.0, 179.999, 180.0, 180.001, 270.0, 360.0])
+def test_attitude_error_takes_the_shorter_way(degrees: float, sign: float) -> None:
+    robot = load("planar_manipulator")
+    outputs = Outputs(OutputVector(robot, OutputSelection(base=("rx", "ry", "rz"))))
+    axis = np.array([2.0, -3.0, 6.0]) / 7.0
+    rng = np.random.default_rng(11)
+    present = Rotation.random(rng=rng)
+    half = np.radians(degrees) / 2
+    turn = np.append(np.sin(half) * axis, np.cos(half))
+    target = sign * (Rotation.from_quat(turn) * present).as_quat()
+    state = ControlState.at_rest(np.zeros(3), present.as_quat(), np.zeros(2))
+    error = outputs(state, Reference(PoseReference(np.zeros(3), target)))[3]
+    shorter = degrees if degrees <= 180.0 else degrees - 360.0
+    if degrees == 180.0:
+        # Both ways are as short: either will do.
+        error = error * np.sign(error @ axis)
+    np.testing.assert_allclose(error, np.radians(shorter) * axis, atol=1e-7)
+
+
+def test_state_and_reference_that_are_refused() -> None:
+    robot = load("planar_manipulator")
+    vector = OutputVector(robot, OutputSelection(("x",), ("x",), ("elbow",), END_EFFECTOR))
+    x, r = np.zeros(vector.state.numel()), np.zeros(vector.reference.numel())
+    rng = np.random.default_rng(3)
+    state, reference = random_state(rng, 2), with_all(rng, 2)
+    vector.pack_state(state, x)
+    vector.pack_reference(reference, r)
+    for bad in (np.nan, np.inf, -np.inf):
+        with pytest.raises(NotFiniteError, match="state"):
+            vector.pack_state(replace(state, qdot=np.array([0.0, bad])), x)
+        joints = JointReference.at_rest(np.array([bad, 0.0]))
+        with pytest.raises(NotFiniteError, match="reference"):
+            vector.pack_reference(replace(reference, joints=joints), r)
+    with pytest.raises(ValueError, match="shape"):
+        vector.pack_state(random_state(rng, 3), x)
+    for group, named in (
+        ("base", "the base"),
+        ("end_effector", "the end-effector"),
+        ("joints", "the joints"),
+    ):
+        with pytest.raises(TargetNotSetError, match=named):
+            vector.pack_reference(replace(reference, **{group: None}), r)

@@ -1,0 +1,811 @@
+"""Square paths of planar robots: the numbers of paper 3, goals met by another integration."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.integrate import dblquad, quad, solve_ivp
+from scipy.spatial.transform import Rotation
+
+from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.attitude import quaternion_from_rotvec
+from spacerobot_ros.planning import (
+    METHODS,
+    GaitMethod,
+    GaitSchedule,
+    Goal,
+    PoseError,
+    RobotState,
+    Tolerance,
+)
+from spacerobot_ros.planning.planar import PlanarPhase, planar_axis
+
+Array = npt.NDArray[np.float64]
+
+URDF = Path(__file__).parents[2] / "urdf" / "planar_chain.urdf"
+PERIOD = 0.05
+TIGHT = Tolerance(1e-6, 1e-6)
+
+FOLDED, DEPLOYED = np.array([np.pi, -np.pi]), np.zeros(2)
+"""Paper 3, section IV: the shapes before and after."""
+
+RIGHT = {"given_centre": 1, "centre_1": 5 * np.pi / 6, "centre_2": 2 * np.pi / 3}
+SWAPPED = {"given_centre": 1, "centre_1": 2 * np.pi / 3, "centre_2": 5 * np.pi / 6}
+"""Centres of the square: the printed coordinates in the right order, and in the printed one."""
+
+
+# -- other ways to the same numbers -----------------------------------------------------------
+
+
+def closed_forms(psi: Array) -> Array:
+    """Return ``s = (N_1, N_2) / D`` (..., 2) of shapes (..., 2): section IV as printed."""
+    one, two, both = np.cos(psi[..., 0]), np.cos(psi[..., 1]), np.cos(psi.sum(axis=-1))
+    N_1 = 17.5 + 7.5 * one + 10.5 * two + 2.5 * both
+    N_2 = 3.75 + 5.25 * two + 2.5 * both
+    D = 32.5 + 15 * one + 10.5 * two + 5 * both
+    return np.stack([N_1, N_2], axis=-1) / D[..., np.newaxis]
+
+
+def phase_density(psi: npt.ArrayLike) -> Array:
+    """Return ``H = ds_2/dpsi_1 - ds_1/dpsi_2`` (...) of the printed functions at shapes (..., 2),
+    by central differences.
+    """
+    psi, h = np.asarray(psi), 1e-5 * np.eye(2)
+    slope = [(closed_forms(psi + step) - closed_forms(psi - step)) / 2e-5 for step in h]
+    return np.asarray(slope[0][..., 1] - slope[1][..., 0])
+
+
+@dataclass(frozen=True)
+class Part:
+    """A link in the plane: parent, joint in the parent's frame, mass centre in its own, limits."""
+
+    parent: int
+    joint: Array
+    com: Array
+    mass: float
+    inertia: float
+    limits: tuple[float, float] | None = None
+    rate: float = 2.0
+
+
+@dataclass(frozen=True)
+class PlanarTree:
+    """A planar robot from its angular momentum; ``plane`` (3, 3) turns plane vectors into B."""
+
+    parts: tuple[Part, ...]
+    plane: Array
+
+    @property
+    def urdf(self) -> str:
+        """The robot as URDF: joints ``j1``, ``j2``, ... about the third axis of ``plane``."""
+        text = []
+        for k, part in enumerate(self.parts):
+            moments = self.plane @ np.diag([0.3, 0.4, 0.7]) @ self.plane.T * part.inertia / 0.7
+            text.append(link(f"l{k}", part.mass, moments, self.plane[:, :2] @ part.com))
+            if k:
+                text.append(
+                    joint(k, part.parent, self.plane[:, :2] @ part.joint, self.plane[:, 2], part)
+                )
+        return f'<robot name="tree">{"".join(text)}</robot>'
+
+    def positions(self, psi: Array) -> tuple[Array, Array]:
+        """Return joints and mass centres (..., N, 2) of shapes (..., N - 1), base components."""
+        angle = [np.zeros(psi.shape[:-1])]
+        origin = [np.zeros((*psi.shape[:-1], 2))]
+        for k, part in enumerate(self.parts[1:], start=1):
+            origin.append(origin[part.parent] + turned(angle[part.parent], part.joint))
+            angle.append(angle[part.parent] + psi[..., k - 1])
+        com = [
+            p + turned(a, part.com) for p, a, part in zip(origin, angle, self.parts, strict=True)
+        ]
+        return np.stack(origin, axis=-2), np.stack(com, axis=-2)
+
+    def center_of_mass(self, psi: Array) -> Array:
+        """Return the mass centre (..., 2) of shapes (..., N - 1), base components."""
+        mass = np.array([part.mass for part in self.parts])
+        return np.tensordot(self.positions(psi)[1], mass / mass.sum(), axes=([-2], [0]))
+
+    def s(self, psi: Array) -> Array:
+        """Return s (..., N - 1) of ``theta_dot = -s' psi_dot``: the angular momentum about the mass
+        centre of the whole is ``D theta_dot + sum N_i psi_dot_i = 0``.
+        """
+        origin, com = self.positions(psi)
+        d = com - self.center_of_mass(psi)[..., np.newaxis, :]
+        mass = np.array([part.mass for part in self.parts])
+        inertia = np.array([part.inertia for part in self.parts])
+        D = inertia.sum() + (mass * (d * d).sum(axis=-1)).sum(axis=-1)
+        N = []
+        for i in range(1, len(self.parts)):
+            carried = [k for k in range(len(self.parts)) if self.carries(i, k)]
+            arm = com[..., carried, :] - origin[..., i : i + 1, :]
+            moment = mass[carried] * (d[..., carried, :] * arm).sum(axis=-1)
+            N.append(inertia[carried].sum() + moment.sum(axis=-1))
+        return np.stack(N, axis=-1) / D[..., np.newaxis]
+
+    def carries(self, i: int, k: int) -> bool:
+        while k > i:
+            k = self.parts[k].parent
+        return k == i
+
+
+def turned(angle: Array, vector: Array) -> Array:
+    """Return plane vectors (..., 2): a vector (2,) turned by angles (...)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]], axis=-1)
+
+
+def link(name: str, mass: float, moments: Array, com: Array) -> str:
+    values = " ".join(
+        f'i{"xyz"[i]}{"xyz"[j]}="{moments[i, j]:.17g}"' for i in range(3) for j in range(i, 3)
+    )
+    return (
+        f'<link name="{name}"><inertial><origin xyz="{numbers(com)}"/><mass value="{mass!r}"/>'
+        f"<inertia {values}/></inertial></link>"
+    )
+
+
+def joint(k: int, parent: int, origin: Array, axis: Array, part: Part) -> str:
+    kind, stops = "continuous", ""
+    if part.limits is not None:
+        kind, stops = "revolute", f'lower="{part.limits[0]!r}" upper="{part.limits[1]!r}" '
+    # The sense of an axis is the URDF's choice.
+    return (
+        f'<joint name="j{k}" type="{kind}"><parent link="l{parent}"/><child link="l{k}"/>'
+        f'<origin xyz="{numbers(origin)}"/><axis xyz="{numbers(axis)}"/>'
+        f'<limit {stops}velocity="{part.rate!r}" effort="50"/></joint>'
+    )
+
+
+def numbers(values: npt.ArrayLike) -> str:
+    return " ".join(f"{value:.17g}" for value in np.asarray(values))
+
+
+def random_tree(rng: np.random.Generator, links: int, *, branched: bool = False) -> PlanarTree:
+    """Return a heavy base with links of about a metre, in any plane of the base's frame."""
+    parts = [Part(-1, np.zeros(2), rng.uniform(-0.2, 0.2, 2), 60.0, float(rng.uniform(4, 12)))]
+    # Parents in ascending order, as the model orders the joints of a tree.
+    parents = sorted(int(rng.integers(k)) if branched else k - 1 for k in range(1, links))
+    for parent in parents:
+        reach = rng.uniform([0.4, -0.2], [1.0, 0.2])
+        com, mass = rng.uniform([0.2, -0.1], [0.6, 0.1]), float(rng.uniform(5, 15))
+        parts.append(Part(parent, reach, com, mass, float(rng.uniform(0.3, 2.0))))
+    return PlanarTree(tuple(parts), Rotation.from_rotvec(rng.normal(size=3)).as_matrix())
+
+
+def turns(s: Any, shapes: Array) -> Array:
+    """Return the turns (N,) of the base between the ticks of ``shapes`` (N + 1, n), velocities
+    held in between: ``theta_dot = -s' psi_dot`` by DOP853, all ticks side by side.
+    """
+    rates = np.diff(shapes, axis=0) / PERIOD
+
+    def derivative(t: float, _: Array) -> Array:
+        return -np.sum(s(shapes[:-1] + t * rates) * rates, axis=1)
+
+    solution = solve_ivp(
+        derivative,
+        (0.0, PERIOD),
+        np.zeros(len(rates)),
+        "DOP853",
+        first_step=PERIOD / 2,
+        rtol=1e-11,
+        atol=1e-13,
+    )
+    return np.asarray(solution.y[:, -1])
+
+
+# -- planning ---------------------------------------------------------------------------------
+
+
+def planner(robot: SpaceRobot, tolerance: Tolerance = TIGHT, **options: Any) -> GaitMethod:
+    return METHODS["square_path"](robot, PERIOD, tolerance, **options)
+
+
+def at_rest(q: Array, attitude: Rotation | None = None) -> RobotState:
+    quaternion = (attitude or Rotation.identity()).as_quat()
+    return RobotState(np.array([0.3, -0.2, 0.5]), quaternion, np.asarray(q, dtype=float))
+
+
+def goal_of(attitude: Rotation, shape: npt.ArrayLike | None = None) -> Goal:
+    return Goal.checked([0.0, 0.0, 0.0], attitude.as_quat(), shape)
+
+
+def about_z(angle: float) -> Rotation:
+    return Rotation.from_rotvec([0.0, 0.0, angle])
+
+
+def wrapped(angle: float) -> float:
+    return float(np.remainder(angle + np.pi, 2 * np.pi) - np.pi)
+
+
+@pytest.fixture(scope="module")
+def chain() -> SpaceRobot:
+    return SpaceRobot.from_file(URDF)
+
+
+def paper_gait(chain: SpaceRobot, **options: Any) -> GaitSchedule:
+    """From (0, pi, -pi) to (pi/2, 0, 0)."""
+    goal = goal_of(about_z(np.pi / 2), DEPLOYED)
+    return planner(chain, **options).plan(at_rest(FOLDED), goal)
+
+
+# -- the numbers of paper 3 -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("centre", "printed"),
+    [((5 * np.pi / 6, 2 * np.pi / 3), -0.464153), ((2 * np.pi / 3, 5 * np.pi / 6), -0.276306)],
+)
+def test_phase_of_a_unit_square(
+    chain: SpaceRobot, centre: tuple[float, float], printed: float
+) -> None:
+    corners = np.array(centre) + np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    phase = float(PlanarPhase(chain).legs(corners, np.roll(corners, -1, axis=0)).sum())
+    assert phase == pytest.approx(printed, abs=5e-7)
+    # Eq. (11) with the printed functions, and Stokes' surface integral.
+    along = sum(
+        quad(lambda t, a=a, b=b: -closed_forms(a + t * (b - a)) @ (b - a), 0, 1, epsabs=1e-13)[0]
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    )
+    assert phase == pytest.approx(along, abs=1e-12)
+    (left, low), (right, high) = corners[0], corners[2]
+    over = dblquad(lambda y, x: float(phase_density([x, y])), left, right, low, high, epsabs=1e-6)[
+        0
+    ]
+    assert phase == pytest.approx(-over, abs=1e-6)
+
+
+def test_step_1_of_the_paper_turns_the_base_by_one_radian(chain: SpaceRobot) -> None:
+    phase = PlanarPhase(chain).legs(FOLDED[np.newaxis], DEPLOYED[np.newaxis])
+    assert phase[0] == pytest.approx(0.999503, abs=5e-7)
+    gait = paper_gait(chain)
+    assert gait.notes["turn_of_step_1"] == pytest.approx(0.999503, abs=5e-7)
+    assert gait.notes["wanted_phase"] == pytest.approx(0.571293, abs=5e-7)
+
+
+@pytest.mark.parametrize(("options", "side"), [(RIGHT, 1.130702), (SWAPPED, 1.525774)])
+def test_the_square_of_the_paper(chain: SpaceRobot, options: dict[str, float], side: float) -> None:
+    gait = paper_gait(chain, **options)
+    assert gait.notes["z_star"] == pytest.approx(side, abs=5e-7)
+    assert gait.notes["psi_star"] == [options["centre_1"], options["centre_2"]]
+    assert gait.notes["direction"] == "clockwise"
+    assert gait.notes["joints"] == "pin_1, pin_2"
+    assert gait.notes["loops"] == 1
+    # The corner nearest to (0, 0), and the four sides clockwise from it: t = 8, 12, 14, .. 20, 24.
+    low, high = np.array(gait.notes["psi_star"]) + side * np.array([[-0.5], [0.5]])
+    assert gait.duration == pytest.approx(24.0)
+    ends = [low, [low[0], high[1]], high, [high[0], low[1]], low, DEPLOYED]
+    ticks = np.round(np.array([12, 14, 16, 18, 20, 24]) / PERIOD).astype(int)
+    np.testing.assert_allclose(gait.positions[ticks], ends, atol=1e-6)
+    np.testing.assert_allclose(gait.positions[160], DEPLOYED, atol=1e-12)
+    np.testing.assert_allclose(gait.notes["corner"], low, atol=1e-6)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("options", [RIGHT, SWAPPED, {}])
+def test_the_manoeuvre_of_the_paper_ends_on_its_goal(
+    chain: SpaceRobot, options: dict[str, float]
+) -> None:
+    gait = paper_gait(chain, **options)
+    theta = turns(closed_forms, gait.positions)
+    assert theta.sum() == pytest.approx(np.pi / 2, abs=1e-9)
+    np.testing.assert_allclose(gait.positions[-1], DEPLOYED, atol=1e-12)
+    # Steps 2 and 4 cancel; the square makes the phase.
+    step_1, step_2, step_3, step_4 = (
+        theta[a:b].sum() for a, b in itertools.pairwise([0, 160, 240, 400, 480])
+    )
+    assert step_1 == pytest.approx(0.999503, abs=5e-7)
+    assert step_2 == pytest.approx(-step_4, abs=1e-12)
+    assert step_3 == pytest.approx(0.571293, abs=5e-7)
+
+
+def test_the_centre_is_where_the_phase_density_is_largest(chain: SpaceRobot) -> None:
+    grid = np.radians(np.arange(-180.0, 180.0, 1.0))
+    heights = np.abs(phase_density(np.stack(np.meshgrid(grid, grid), axis=-1)))
+    centre = np.array(paper_gait(chain).notes["psi_star"])
+    np.testing.assert_allclose(np.degrees(np.abs(centre)), [153, 121], atol=0.6)
+    assert centre[0] * centre[1] > 0
+    top = abs(phase_density(centre))
+    assert top == pytest.approx(0.5376, abs=5e-5)
+    assert top >= heights.max() - 1e-6
+    curvature = PlanarPhase(chain).curvature(centre[np.newaxis], 0, 1)
+    assert curvature[0] == pytest.approx(-phase_density(centre), abs=1e-8)
+    np.testing.assert_allclose(chain.curvature(centre)[5, 0, 1], curvature[0], atol=1e-12)
+
+
+def test_the_nearer_of_two_equal_centres_is_taken(chain: SpaceRobot) -> None:
+    for sign in (1, -1):
+        shape = sign * np.array([2.0, 1.5])
+        gait = planner(chain).plan(at_rest(shape), goal_of(about_z(0.3)))
+        centre = np.array(gait.notes["psi_star"])
+        np.testing.assert_allclose(sign * np.degrees(centre), [153, 121], atol=0.6)
+    # A turn further it is the image a turn further.
+    shape = np.array([2.0 + 2 * np.pi, 1.5])
+    gait = planner(chain).plan(at_rest(shape), goal_of(about_z(0.3)))
+    np.testing.assert_allclose(np.degrees(gait.notes["psi_star"]), [513, 121], atol=0.6)
+
+
+def test_velocities_are_the_mean_of_the_papers_over_each_tick(chain: SpaceRobot) -> None:
+    gait = paper_gait(chain, **RIGHT)
+    T, D = 4.0, np.array(gait.notes["corner"]) - DEPLOYED
+
+    def speed(t: float) -> float:
+        # The integral of u = (2 pi D / T^2) sin(2 pi t / T), for D = 1.
+        return quad(lambda tau: 2 * np.pi / T**2 * np.sin(2 * np.pi * tau / T), 0, t)[0]
+
+    for k in (0, 1, 39, 40, 60, 79):
+        mean = quad(speed, k * PERIOD, (k + 1) * PERIOD)[0] / PERIOD
+        np.testing.assert_allclose(gait.velocities[160 + k], mean * D, atol=1e-9)
+
+
+# -- any planar robot -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot somewhere, a goal it can reach, and the robot in formulas."""
+
+    tree: PlanarTree
+    robot: SpaceRobot
+    state: RobotState
+    goal: Goal
+    angle: float
+
+
+def random_case(seed: int, links: int, angle: float | None = None, **kind: bool) -> Case:
+    rng = np.random.default_rng(seed)
+    tree = random_tree(rng, links, **kind)
+    angle = float(rng.uniform(-np.pi, np.pi)) if angle is None else angle
+    attitude = Rotation.from_rotvec(rng.normal(size=3))
+    state = at_rest(rng.uniform(-2, 2, links - 1), attitude)
+    # About the axis in the base, which is the same in the world.
+    goal_attitude = attitude * Rotation.from_rotvec(angle * tree.plane[:, 2])
+    goal = goal_of(goal_attitude, rng.uniform(-2, 2, links - 1))
+    return Case(tree, SpaceRobot.from_urdf(tree.urdf), state, goal, angle)
+
+
+def check_flight(case: Case, gait: GaitSchedule) -> None:
+    """Check end, rest, predicted path and notes against the formulas of the robot."""
+    assert gait.joint_names == tuple(f"j{k}" for k in range(1, len(case.tree.parts)))
+    np.testing.assert_array_equal(gait.positions[0], case.state.q)
+    theta = np.append(0.0, np.cumsum(turns(case.tree.s, gait.positions)))
+    assert wrapped(theta[-1] - case.angle) == pytest.approx(0.0, abs=1e-7)
+    shape = case.state.q if case.goal.joint_positions is None else case.goal.joint_positions
+    np.testing.assert_allclose(gait.positions[-1], shape, atol=1e-12)
+    # The path: the base turns by theta about its axis, and the mass centre stays.
+    ticks = np.round(gait.path.time / PERIOD).astype(int)
+    np.testing.assert_allclose(ticks * PERIOD, gait.path.time, atol=1e-9)
+    assert (ticks[0], ticks[-1]) == (0, gait.ticks)
+    start = Rotation.from_quat(case.state.quaternion)
+    axis = case.tree.plane[:, 2]
+    c = case.tree.center_of_mass(gait.positions) @ case.tree.plane[:, :2].T
+    r_cm = case.state.position + start.apply(c[0])
+    attitudes = start * Rotation.from_rotvec(np.multiply.outer(theta[ticks], axis))
+    left = attitudes.inv() * Rotation.from_quat(gait.path.quaternion)
+    assert left.magnitude().max() < 1e-6
+    np.testing.assert_allclose(gait.path.position, r_cm - attitudes.apply(c[ticks]), atol=1e-6)
+    np.testing.assert_array_equal(gait.notes["final_position"], gait.path.position[-1])
+    assert float(gait.notes["predicted_attitude_error"]) < 1e-6  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("seed", "links", "branched"),
+    [(1, 3, False), (2, 3, True), (3, 4, False), (4, 4, True), (5, 5, True), (6, 6, True)],
+)
+def test_random_goals_of_random_robots(seed: int, links: int, branched: bool) -> None:
+    case = random_case(seed, links, branched=branched)
+    check_flight(case, planner(case.robot).plan(case.state, case.goal))
+
+
+@pytest.mark.parametrize("degrees", [-170.0, 170.0, 15.0])
+def test_a_chain_of_five_links(degrees: float) -> None:
+    case = random_case(11, 5, float(np.radians(degrees)))
+    gait = planner(case.robot).plan(case.state, case.goal)
+    check_flight(case, gait)
+    # Two joints go round; the others wait in their final position.
+    names = str(gait.notes["joints"]).split(", ")
+    others = [k for k, name in enumerate(gait.joint_names) if name not in names]
+    assert (len(names), len(others)) == (2, 2)
+    waiting = gait.positions[round(8.0 / PERIOD) :, others]
+    assert case.goal.joint_positions is not None
+    np.testing.assert_allclose(
+        waiting, np.tile(case.goal.joint_positions[others], (len(waiting), 1)), atol=1e-12
+    )
+
+
+def test_the_paper_chain_turns_by_minus_170_degrees(chain: SpaceRobot) -> None:
+    goal = goal_of(about_z(np.radians(-170)), DEPLOYED)
+    gait = planner(chain).plan(at_rest(FOLDED), goal)
+    theta = turns(closed_forms, gait.positions).sum()
+    # -170 deg less the 57 of step 1 are -227: it goes on by 133 instead.
+    assert gait.notes["wanted_phase"] == pytest.approx(np.radians(190) - 0.999503, abs=1e-6)
+    assert theta == pytest.approx(np.radians(190), abs=1e-9)
+    assert gait.notes["loops"] == 2
+
+
+def test_all_loops_are_the_same_square(chain: SpaceRobot) -> None:
+    method = planner(chain, t3=24.0, t4=28.0)
+    gait = method.plan(at_rest(DEPLOYED), goal_of(about_z(np.radians(-170))))
+    assert gait.notes["loops"] == 2
+    assert gait.notes["direction"] == "counter-clockwise"
+    # 4 s there, 12 s a loop and 4 s back; nothing for step 1.
+    assert gait.duration == pytest.approx(32.0)
+    first, second = gait.positions[80:320], gait.positions[320:560]
+    np.testing.assert_allclose(first, second, atol=1e-12)
+    np.testing.assert_allclose(gait.positions[:81], gait.positions[560:][::-1], atol=1e-12)
+    theta = turns(closed_forms, gait.positions)
+    assert theta.sum() == pytest.approx(np.radians(-170), abs=1e-9)
+    assert theta[80:320].sum() == pytest.approx(np.radians(-85), abs=1e-9)
+
+
+def test_the_phase_does_not_depend_on_the_ticks(chain: SpaceRobot) -> None:
+    goal = goal_of(about_z(np.pi / 2), DEPLOYED)
+    coarse = METHODS["square_path"](chain, 0.7, TIGHT).plan(at_rest(FOLDED), goal)
+    fine = paper_gait(chain)
+    assert coarse.notes["z_star"] == fine.notes["z_star"]
+    assert turns(closed_forms, coarse.positions).sum() == pytest.approx(np.pi / 2, abs=1e-9)
+
+
+def test_the_pair_with_the_smallest_square_goes_round() -> None:
+    case = random_case(21, 4, 0.8)
+    best = planner(case.robot).plan(case.state, case.goal).notes
+    found = {}
+    for pair in itertools.combinations(range(1, 4), 2):
+        # Joints without speed go round no square; they are where they are to be.
+        parts = tuple(
+            replace(part, rate=2.0 if k in pair else 0.0) for k, part in enumerate(case.tree.parts)
+        )
+        robot = SpaceRobot.from_urdf(replace(case.tree, parts=parts).urdf)
+        assert case.goal.joint_positions is not None
+        state = at_rest(case.goal.joint_positions, Rotation.from_quat(case.state.quaternion))
+        axis = case.tree.plane[:, 2]
+        turn = Rotation.from_rotvec(float(best["wanted_phase"]) * axis)  # type: ignore[arg-type]
+        goal = goal_of(Rotation.from_quat(case.state.quaternion) * turn)
+        notes = planner(robot).plan(state, goal).notes
+        found[f"j{pair[0]}, j{pair[1]}"] = (notes["loops"], notes["z_star"])
+    winner = min(found, key=lambda names: found[names])
+    assert best["joints"] == winner
+    assert best["z_star"] == pytest.approx(found[winner][1], abs=1e-6)
+
+
+def test_the_sense_of_the_axes_is_no_matter(chain: SpaceRobot) -> None:
+    text = URDF.read_text().replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 -1"/>')
+    mirrored = SpaceRobot.from_urdf(text)
+    np.testing.assert_allclose(planar_axis(mirrored), [0, 0, 1], atol=1e-15)
+    goal = goal_of(about_z(np.pi / 2), DEPLOYED)
+    gait = planner(mirrored).plan(at_rest(-FOLDED), goal)
+    assert gait.notes["wanted_phase"] == pytest.approx(0.571293, abs=5e-7)
+    assert turns(closed_forms, -gait.positions).sum() == pytest.approx(np.pi / 2, abs=1e-9)
+
+
+def test_without_a_shape_the_present_one_is_kept() -> None:
+    case = random_case(31, 3, 1.0)
+    case = replace(case, goal=replace(case.goal, joint_positions=None))
+    gait = planner(case.robot).plan(case.state, case.goal)
+    check_flight(case, gait)
+    assert gait.notes["psi_e"] == case.state.q.tolist()
+
+
+def test_a_goal_that_is_met_takes_no_time(chain: SpaceRobot) -> None:
+    gait = planner(chain).plan(at_rest(FOLDED), goal_of(Rotation.identity()), correction=True)
+    assert (gait.ticks, gait.duration, gait.notes["loops"]) == (0, 0.0, 0.0)
+    np.testing.assert_array_equal(gait.positions, [FOLDED])
+    np.testing.assert_array_equal(gait.path.position, [at_rest(FOLDED).position])
+
+
+def test_a_turn_well_within_the_tolerance_is_left_as_it_is(chain: SpaceRobot) -> None:
+    method = planner(chain, Tolerance(1e-3, 1e-3))
+    assert method.plan(at_rest(FOLDED), goal_of(about_z(9e-5))).ticks == 0
+    gait = method.plan(at_rest(FOLDED), goal_of(about_z(2e-4)), correction=True)
+    assert turns(closed_forms, gait.positions).sum() == pytest.approx(2e-4, abs=1e-10)
+
+
+# -- limits -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_limits_are_kept_or_the_goal_is_refused_with_the_reason(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    case = random_case(seed, 3 + seed % 2)
+    middle, width = rng.uniform(-1, 1, 4), rng.uniform(0.5, 6.0, 4)
+    parts = [case.tree.parts[0]]
+    for k, part in enumerate(case.tree.parts[1:]):
+        limits = float(middle[k] - width[k] / 2), float(middle[k] + width[k] / 2)
+        parts.append(replace(part, limits=limits, rate=float(rng.uniform(0.1, 2.0))))
+    tree = replace(case.tree, parts=tuple(parts))
+    robot = SpaceRobot.from_urdf(tree.urdf)
+    state = replace(case.state, q=rng.uniform(robot.lower, robot.upper))
+    goal = replace(case.goal, joint_positions=rng.uniform(robot.lower, robot.upper))
+    case = Case(tree, robot, state, goal, case.angle)
+    try:
+        gait = planner(robot, most_loops=5).plan(state, goal)
+    except PlanningError as refusal:
+        reason = str(refusal)
+    else:
+        reason = ""
+        check_flight(case, gait)
+        assert np.all(gait.positions >= robot.lower - 1e-12)
+        assert np.all(gait.positions <= robot.upper + 1e-12)
+        assert np.all(np.abs(gait.velocities) <= robot.velocity_limit * (1 + 1e-9))
+        assert float(gait.notes["loops"]) <= 5  # type: ignore[arg-type]
+    if reason:
+        assert "more than most_loops = 5" in reason
+        assert too_small(case, 5)
+
+
+def too_small(case: Case, loops: int) -> bool:
+    """Whether no square among many within the limits turns the base far enough in some loops."""
+    psi_e = case.goal.joint_positions
+    assert psi_e is not None
+    squares = []
+    for i, j in itertools.combinations(range(case.robot.n), 2):
+        lower, upper = case.robot.lower[[i, j]], case.robot.upper[[i, j]]
+        for share in (0.4, 0.7, 1.0):
+            side = share * float((upper - lower).min())
+            axes = [np.linspace(lower[k], upper[k] - side, 5) for k in range(2)]
+            for low in itertools.product(*axes):
+                corners = np.tile(psi_e, (4, 1))
+                corners[:, [i, j]] = low + side * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+                squares.append(corners)
+    starts = np.array(squares)
+    phases = gauss_turns(case.tree, starts, np.roll(starts, -1, axis=1)).sum(axis=1)
+    step_1 = float(gauss_turns(case.tree, case.state.q, psi_e))
+    return abs(wrapped(case.angle - step_1)) > 0.97 * loops * float(np.abs(phases).max())
+
+
+def gauss_turns(tree: PlanarTree, starts: Array, ends: Array) -> Array:
+    """Return the turns (...) along straight legs of the shape, starts and ends (..., n)."""
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    moves = ends - starts
+    rates = [np.sum(tree.s(starts + (x + 1) / 2 * moves) * moves, axis=-1) for x in nodes]
+    return -np.tensordot(weights / 2, np.array(rates), axes=1)
+
+
+def test_slow_joints_take_longer(chain: SpaceRobot) -> None:
+    text = URDF.read_text().replace('velocity="2"', 'velocity="0.1"')
+    gait = paper_gait(SpaceRobot.from_urdf(text))
+    side = float(gait.notes["z_star"])  # type: ignore[arg-type]
+    corner = float(np.max(np.abs(gait.notes["corner"])))
+    # The peak speed is twice the mean, on each leg.
+    expected = [2 * np.pi / 0.1, 2 * corner / 0.1, *[2 * side / 0.1] * 4, 2 * corner / 0.1]
+    ticks = np.ceil(np.array(expected) / PERIOD).sum()
+    assert gait.ticks == ticks
+    assert np.abs(gait.velocities).max() == pytest.approx(0.1, rel=1e-3)
+    assert np.abs(gait.velocities).max() <= 0.1
+    assert gait.notes["z_star"] == pytest.approx(paper_gait(chain).notes["z_star"], abs=1e-9)
+
+
+def test_a_wide_range_is_used_round_the_shape(chain: SpaceRobot) -> None:
+    # Three turns of room; the shape is near one end of it.
+    kind = 'type="revolute"'
+    text = URDF.read_text().replace('type="continuous"', kind)
+    text = text.replace("<limit velocity", '<limit lower="-9.5" upper="9.5" velocity')
+    robot = SpaceRobot.from_urdf(text)
+    gait = planner(robot).plan(at_rest(np.array([9.3, 9.0])), goal_of(about_z(1.0)))
+    assert np.abs(gait.positions).max() <= 9.5
+    assert turns(closed_forms, gait.positions).sum() == pytest.approx(1.0, abs=1e-9)
+    free = planner(chain).plan(at_rest(np.array([9.3, 9.0])), goal_of(about_z(1.0)))
+    # The same square up to whole turns and the mirror image.
+    assert gait.notes["z_star"] == pytest.approx(free.notes["z_star"], abs=1e-3)
+
+
+# -- refusals ---------------------------------------------------------------------------------
+
+
+def refusal_of(robot: SpaceRobot, state: RobotState, goal: Goal, **options: Any) -> str:
+    with pytest.raises(PlanningError) as refusal:
+        planner(robot, **options).plan(state, goal)
+    text = str(refusal.value)
+    assert text.endswith(".")
+    assert "\n" not in text
+    return text
+
+
+NEAR = goal_of(about_z(0.2))
+
+
+@pytest.mark.parametrize("links", [1, 2])
+def test_fewer_than_three_links_are_refused(links: int) -> None:
+    tree = random_tree(np.random.default_rng(5), links)
+    tree = replace(tree, plane=np.eye(3))
+    text = refusal_of(SpaceRobot.from_urdf(tree.urdf), at_rest(np.zeros(links - 1)), NEAR)
+    assert f"has {links} link(s)" in text
+    assert "fewer than three" in text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "mention"),
+    [
+        ('"pin_2" type="continuous"', '"pin_2" type="prismatic"', "joint 'pin_2' slides"),
+        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0.02 1"/>', "axis of joint 'pin_2' is not parallel"),
+        (
+            '<origin xyz="0.5 0 0"/>\n      <mass',
+            '<origin xyz="0.5 0 0.05"/>\n      <mass',
+            "plane",
+        ),
+        ('ixz="0" iyy="1"', 'ixz="0.05" iyy="1"', "products of inertia"),
+        ('<origin xyz="1 0 0"/>', '<origin xyz="1 0 0.1"/>', "outside of one plane"),
+    ],
+)
+def test_what_is_not_planar_is_refused(old: str, new: str, mention: str) -> None:
+    before, last, after = URDF.read_text().rpartition(old)
+    assert last
+    text = f"{before}{new}{after}".replace(
+        "<limit velocity", '<limit lower="-1" upper="1" velocity'
+    )
+    reason = refusal_of(SpaceRobot.from_urdf(text), at_rest(np.zeros(2)), NEAR)
+    assert "not planar" in reason
+    assert mention in reason
+
+
+def test_angles_written_with_six_digits_are_planar() -> None:
+    text = URDF.read_text()
+    # The whole chain turned about x, the joint's frame by 1.5708.
+    text = text.replace(
+        '<origin xyz="0.5 0 0"/>\n    <axis', '<origin xyz="0.5 0 0" rpy="1.5708 0 0"/>\n    <axis'
+    )
+    text = text.replace('iyy="10" iyz="0" izz="10"', 'iyy="10" iyz="0" izz="9"')
+    axis = planar_axis(SpaceRobot.from_urdf(text))
+    np.testing.assert_allclose(np.abs(axis), [0, 1, 0], atol=1e-5)
+
+
+@pytest.mark.parametrize("tilt", [0.3, 0.01])
+def test_a_goal_out_of_the_plane_is_refused(chain: SpaceRobot, tilt: float) -> None:
+    goal = goal_of(about_z(1.0) * Rotation.from_rotvec([0.6 * tilt, 0.8 * tilt, 0.0]))
+    text = refusal_of(chain, at_rest(FOLDED), goal)
+    assert f"{tilt:.4g} rad off any rotation about the axis [0.0, 0.0, 1.0]" in text
+    assert "base_link" in text
+    # Within the tolerance it is as good as in the plane.
+    gait = planner(chain, Tolerance(1e-3, 1.01 * tilt)).plan(at_rest(FOLDED), goal)
+    assert turns(closed_forms, gait.positions).sum() == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("shape", "mention"),
+    [
+        ([0.0], "1 joint position(s); robot 'planar_chain' has 2 joints"),
+        ([0.0, 1.2], "joint 'pin_2' at 1.2 rad, and its limits are [-1, 1] rad"),
+        ([-1.001, 0.0], "joint 'pin_1' at -1.001 rad"),
+    ],
+)
+def test_a_shape_that_the_robot_cannot_take_is_refused(shape: list[float], mention: str) -> None:
+    robot = limited(1.0)
+    assert mention in refusal_of(robot, at_rest(np.zeros(2)), goal_of(about_z(0.1), shape))
+
+
+def limited(reach: float, middle: float = 0.0) -> SpaceRobot:
+    """Return the paper's chain with joints that go so far to either side of the middle, rad."""
+    text = URDF.read_text().replace('type="continuous"', 'type="revolute"')
+    limit = f'<limit lower="{middle - reach!r}" upper="{middle + reach!r}" velocity'
+    return SpaceRobot.from_urdf(text.replace("<limit velocity", limit))
+
+
+def test_limits_too_narrow_for_a_square_are_refused() -> None:
+    text = refusal_of(limited(0.01, 1.5), at_rest(np.full(2, 1.5)), NEAR)
+    assert "more than most_loops = 20" in text
+    assert "sides of up to 0.02 rad within the joint limits" in text
+    assert "'pin_1' and 'pin_2'" in text
+    # The curvature times the largest square, and how many of those.
+    phase = 0.02**2 * abs(phase_density([1.5, 1.5]))
+    loops = int(text.split(" loops, more")[0].rsplit(" ", 1)[1])
+    assert loops == pytest.approx(0.2 / phase, rel=0.05)
+
+
+@pytest.mark.parametrize("centre", [(2.0, 0.0), (0.0, -1.0)])
+def test_a_given_centre_beyond_the_limits_is_refused(centre: tuple[float, float]) -> None:
+    options: dict[str, Any] = {"given_centre": 1, "centre_1": centre[0], "centre_2": centre[1]}
+    text = refusal_of(limited(1.0), at_rest(np.zeros(2)), NEAR, **options)
+    assert "given centre" in text
+    assert "joint limits" in text
+
+
+def test_wheels_on_their_mass_centres_turn_the_base_by_no_loop() -> None:
+    base = Part(-1, np.zeros(2), np.zeros(2), 50.0, 5.0)
+    wheels = [Part(0, np.array([x, 0.0]), np.zeros(2), 5.0, 1.0) for x in (0.5, -0.5)]
+    tree = PlanarTree((base, *wheels), np.eye(3))
+    text = refusal_of(SpaceRobot.from_urdf(tree.urdf), at_rest(np.zeros(2)), NEAR)
+    assert "cannot be turned" in text
+    assert "joint limits" not in text
+
+
+def test_joints_without_speed_are_refused(chain: SpaceRobot) -> None:
+    head, tail = URDF.read_text().rsplit('velocity="2"', 1)
+    robot = SpaceRobot.from_urdf(f'{head}velocity="0"{tail}')
+    assert "velocity limit above zero" in refusal_of(robot, at_rest(DEPLOYED), NEAR)
+    # No loop is needed here, and step 1 takes for ever.
+    shape = np.array([np.pi, 0.0])
+    turn = float(PlanarPhase(chain).legs(FOLDED[np.newaxis], shape[np.newaxis])[0])
+    text = refusal_of(robot, at_rest(FOLDED), goal_of(about_z(turn), shape))
+    assert "'pin_2'" in text
+    assert "inf s" in text
+
+
+def test_a_manoeuvre_that_takes_too_long_is_refused(chain: SpaceRobot) -> None:
+    text = refusal_of(chain, at_rest(FOLDED), goal_of(about_z(1.0), DEPLOYED), longest=20.0)
+    assert "24 s" in text
+    assert "longest = 20 s" in text
+
+
+@pytest.mark.parametrize(
+    ("momentum", "shown"),
+    [
+        ({"linear_momentum": np.array([0.0, 3e-3, 4e-3])}, "0.005 kg m/s"),
+        ({"angular_momentum": np.array([0.0, 0.0, -2e-3])}, "0.002 kg m^2/s"),
+    ],
+)
+def test_a_drifting_robot_is_refused(
+    chain: SpaceRobot, momentum: dict[str, Array], shown: str
+) -> None:
+    text = refusal_of(chain, replace(at_rest(FOLDED), **momentum), NEAR)
+    assert "drifts" in text
+    assert shown in text
+
+
+def test_the_goal_position_is_checked_on_request(chain: SpaceRobot) -> None:
+    end = np.array(paper_gait(chain).notes["final_position"])
+    attitude = about_z(np.pi / 2).as_quat()
+    reached = Goal.checked(end + np.array([0, 0, 9e-7]), attitude, DEPLOYED)
+    assert planner(chain, check_position=1).plan(at_rest(FOLDED), reached).ticks == 480
+    missed = Goal.checked(end + np.array([0, 0.01, 0]), attitude, DEPLOYED)
+    text = refusal_of(chain, at_rest(FOLDED), missed, check_position=1)
+    assert "0.01 m from the goal position" in text
+    assert str(np.round(end, 4).tolist()) in text
+    assert planner(chain).plan(at_rest(FOLDED), missed).ticks == 480
+
+
+@pytest.mark.parametrize("times", [{"t2": 8.0}, {"t3": 11.0}, {"t1": 30.0}, {"t4": 20.0}])
+def test_times_that_do_not_follow_each_other_are_refused(
+    chain: SpaceRobot, times: dict[str, Any]
+) -> None:
+    with pytest.raises(ParameterError, match="t1 to t4") as refusal:
+        planner(chain, **times)
+    assert f"{next(iter(times.values())):g}" in str(refusal.value)
+
+
+def test_times_are_the_options(chain: SpaceRobot) -> None:
+    gait = paper_gait(chain, t1=10.0, t2=16.0, t3=36.0, t4=40.0)
+    assert gait.duration == pytest.approx(40.0)
+    corner = np.array(gait.notes["corner"])
+    for seconds, shape in ((10, DEPLOYED), (16, corner), (36, corner), (40, DEPLOYED)):
+        np.testing.assert_allclose(gait.positions[round(seconds / PERIOD)], shape, atol=1e-9)
+
+
+# -- goals ------------------------------------------------------------------------------------
+
+
+def test_methods_say_what_they_control() -> None:
+    assert METHODS["square_path"].controls == {"attitude", "shape"}
+    assert METHODS["lie_bracket"].controls == {"position", "attitude"}
+
+
+def test_a_goal_is_judged_by_what_is_controlled() -> None:
+    goal = Goal.checked([1, 0, 0], quaternion_from_rotvec([0, 0, 0.2]), [0.5, -0.5])
+    here = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+    error = PoseError.between(*here, goal, np.array([0.5, -0.4]))
+    assert error.distance == 1.0
+    assert error.angle == pytest.approx(0.2)
+    assert error.farthest_joint == pytest.approx(0.1)
+    for parts in itertools.chain.from_iterable(
+        itertools.combinations(("position", "attitude", "shape"), k) for k in range(4)
+    ):
+        controls: Any = frozenset(parts)
+        loose = {"position": 1.1, "attitude": 0.21, "shape": 0.11}
+        assert Tolerance(**loose).admits(error, controls)
+        for part in parts:
+            assert not Tolerance(**{**loose, part: 0.05}).admits(error, controls)
+    # Without a shape in the goal, or measured, no joint is wrong.
+    assert PoseError.between(*here, goal).farthest_joint == 0.0
+    unshaped = replace(goal, joint_positions=None)
+    assert PoseError.between(*here, unshaped, np.ones(2)).farthest_joint == 0.0
+    assert not Tolerance(0.5, 0.21).admits(error)
+
+
+@pytest.mark.parametrize("shape", [[0.0, np.nan], [[0.0, 1.0]], 0.5])
+def test_what_is_no_shape_is_refused(shape: npt.ArrayLike) -> None:
+    with pytest.raises(PlanningError, match="goal shape"):
+        Goal.checked([0, 0, 0], [0, 0, 0, 1], shape)

@@ -1,0 +1,393 @@
+"""The plant under held joint velocities: conservation, another integration, limits, refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+from support.oracles import PinocchioOracle
+from support.random_robots import random_robot_urdf
+
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import c_compiler
+from spacerobot_ros.simulation import InitialState, VelocityPlant
+
+Array = npt.NDArray[np.float64]
+
+URDF = Path(__file__).parents[2] / "urdf"
+TICK = 0.05
+RATE, STROKE = 2.0, 3.0  # of the joints of random robots
+
+
+class Case:
+    """A random robot in a random state, and the engine that watches it."""
+
+    def __init__(self, seed: int, *, momentum: bool) -> None:
+        self.rng = rng = np.random.default_rng(seed)
+        self.urdf = random_robot_urdf(rng, int(rng.integers(3, 7)))
+        self.robot = SpaceRobot.from_urdf(self.urdf)
+        self.oracle = PinocchioOracle(self.urdf, self.robot.joint_names)
+        n = self.robot.n
+        quaternion = rng.normal(size=4)
+        self.initial = InitialState(
+            position=rng.uniform(-2.0, 2.0, 3),
+            quaternion=quaternion / np.linalg.norm(quaternion),
+            # Not far from the ends of the strokes.
+            joint_positions=rng.uniform(2.0, 2.9, n) * rng.choice([-1.0, 1.0], n),
+            linear_momentum=rng.normal(size=3) if momentum else np.zeros(3),
+            angular_momentum=rng.normal(size=3) if momentum else np.zeros(3),
+        )
+
+    def plant(self, **options: Any) -> VelocityPlant:
+        return VelocityPlant(self.robot, TICK, self.initial, **options)
+
+    def command(self) -> Array:
+        """Return random rates, many of them more than a joint can do."""
+        return self.rng.uniform(-1.3 * RATE, 1.3 * RATE, self.robot.n)
+
+    def body_momenta(self, plant: VelocityPlant) -> tuple[Array, Array]:
+        """Return linear and angular momentum of every body (L, 3), world, the latter about the
+        system's centre of mass.
+        """
+        oracle = self.oracle
+        oracle.set_configuration(plant.q, plant.pose[3:], plant.pose[:3])
+        u = oracle.base_velocities(plant.twist) + oracle.joint_velocities(plant.qdot)
+        pin.forwardKinematics(oracle.model, oracle.data, oracle.q, u)
+        r_cm = oracle.center_of_mass_W()
+        linear, angular = [], []
+        for index in range(1, oracle.model.njoints):
+            own = oracle.model.inertias[index] * oracle.data.v[index]
+            about_origin = oracle.data.oMi[index].act(own)
+            linear.append(np.array(about_origin.linear))
+            angular.append(about_origin.angular - np.cross(r_cm, about_origin.linear))
+        return np.array(linear), np.array(angular)
+
+
+SEEDS = range(4)
+
+
+# -- conservation -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("momentum", [False, True], ids=["at rest", "drifting"])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_momentum_is_conserved_and_the_centre_of_mass_goes_straight(
+    seed: int, momentum: bool
+) -> None:
+    case = Case(seed, momentum=momentum)
+    plant = case.plant()
+    start = case.initial
+    case.oracle.set_configuration(plant.q, plant.pose[3:], plant.pose[:3])
+    r_cm = case.oracle.center_of_mass_W()
+    ledger, watched = [], []
+    largest_p = largest_L = 0.0
+    command = case.command()
+    for tick in range(1, 121):
+        if tick % 10 == 0:
+            command = case.command()
+        plant.step(command)
+        linear, angular = case.body_momenta(plant)
+        largest_p = max(largest_p, float(np.linalg.norm(linear, axis=1).sum()))
+        largest_L = max(largest_L, float(np.linalg.norm(angular, axis=1).sum()))
+        ledger.append(plant.momentum.copy())
+        watched.append(np.concatenate([linear.sum(axis=0), angular.sum(axis=0)]))
+        expected = r_cm + tick * TICK * start.linear_momentum / case.robot.total_mass
+        np.testing.assert_allclose(case.oracle.center_of_mass_W(), expected, atol=1e-12)
+    assert plant.velocity_limited.sum() > 0
+    assert plant.stroke_limited.sum() > 0
+    for series in (np.array(ledger), np.array(watched)):
+        drift_p = np.linalg.norm(series[:, :3] - start.linear_momentum, axis=1)
+        drift_L = np.linalg.norm(series[:, 3:6] - start.angular_momentum, axis=1)
+        assert drift_p.max() <= 1e-12 * largest_p
+        assert drift_L.max() <= 1e-12 * largest_L
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_energy_twist_and_link_poses_are_those_of_pinocchio(seed: int) -> None:
+    case = Case(seed, momentum=True)
+    plant, oracle = case.plant(), case.oracle
+    for _ in range(5):
+        plant.step(case.command())
+        oracle.set_configuration(plant.q, plant.pose[3:], plant.pose[:3])
+        momenta = np.concatenate([case.initial.linear_momentum, case.initial.angular_momentum])
+        twist = oracle.base_twist(plant.q, plant.qdot, plant.pose[3:], momenta)
+        np.testing.assert_allclose(plant.twist, twist, atol=1e-11)
+        oracle.set_configuration(plant.q, plant.pose[3:], plant.pose[:3])
+        oracle.move(oracle.base_velocities(plant.twist) + oracle.joint_velocities(plant.qdot))
+        assert plant.momentum[6] == pytest.approx(oracle.momentum_W()[2], rel=1e-11)
+        R_WB = Rotation.from_quat(plant.pose[3:]).as_matrix()
+        for index, link in enumerate(case.robot.link_names):
+            R_WL, r_WL = oracle.frame_W(link)
+            R_BL, r_BL = plant.link_R[:, 3 * index : 3 * index + 3], plant.link_r[:, index]
+            np.testing.assert_allclose(R_WB @ R_BL, R_WL, atol=1e-13)
+            np.testing.assert_allclose(plant.pose[:3] + R_WB @ r_BL, r_WL, atol=1e-13)
+
+
+# -- another integration ----------------------------------------------------------------------
+
+
+def integrated(
+    case: Case, commands: list[Array], tick: float = TICK
+) -> tuple[Array, Rotation, Array]:
+    """Return pose and shape after held rates: base twist by Pinocchio, integrated by DOP853."""
+    start, oracle = case.initial, case.oracle
+    assert start.joint_positions is not None
+    q = start.joint_positions.copy()
+    state = np.concatenate([start.position, start.quaternion])
+    momenta = np.concatenate([start.linear_momentum, start.angular_momentum])
+    kinds = [j.kind.value for j in case.robot.description.movable_joints]
+    bounded = np.array([kind != "continuous" for kind in kinds])
+    for command in commands:
+        rates = np.clip(command, -RATE, RATE)
+        lower = np.where(bounded, (-STROKE - q) / tick, -np.inf)
+        upper = np.where(bounded, (STROKE - q) / tick, np.inf)
+        rates = np.clip(rates, lower, upper)
+
+        def derivative(t: float, y: Array, q: Array = q, rates: Array = rates) -> Array:
+            quaternion = y[3:] / np.linalg.norm(y[3:])
+            twist = oracle.base_twist(q + t * rates, rates, quaternion, momenta)
+            turn = Rotation.from_quat(quaternion)
+            x, w = y[3:6], y[6]
+            rate = 0.5 * np.append(w * twist[3:] + np.cross(x, twist[3:]), -x @ twist[3:])
+            return np.concatenate([turn.apply(twist[:3]), rate])
+
+        solution = solve_ivp(
+            derivative, (0.0, tick), state, method="DOP853", rtol=1e-12, atol=1e-13
+        )
+        state = solution.y[:, -1]
+        q = q + tick * rates
+    return state[:3], Rotation.from_quat(state[3:]), q
+
+
+def deviation(plant: VelocityPlant, position: Array, attitude: Rotation) -> float:
+    turned = (Rotation.from_quat(plant.pose[3:]).inv() * attitude).magnitude()
+    return float(max(np.abs(plant.pose[:3] - position).max(), turned))
+
+
+@pytest.mark.parametrize("momentum", [False, True], ids=["at rest", "drifting"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_motion_is_that_of_another_integration(seed: int, momentum: bool) -> None:
+    case = Case(seed, momentum=momentum)
+    plant = case.plant(integration_step=0.002)
+    commands = [case.command() for _ in range(15)]
+    for command in commands:
+        plant.step(command)
+    position, attitude, q = integrated(case, commands)
+    np.testing.assert_allclose(plant.q, q, atol=1e-13)
+    assert deviation(plant, position, attitude) < 1e-9
+
+
+def test_the_attitude_is_integrated_to_fourth_order() -> None:
+    case, tick = Case(3, momentum=True), 0.4
+    commands = [case.command() for _ in range(4)]
+    position, attitude, _ = integrated(case, commands, tick)
+    errors = []
+    for step in (tick / 2, tick / 4):
+        plant = VelocityPlant(case.robot, tick, case.initial, step)
+        for command in commands:
+            plant.step(command)
+        errors.append(deviation(plant, position, attitude))
+    assert errors[1] > 1e-9, "nothing to compare"
+    assert errors[0] / errors[1] == pytest.approx(16.0, rel=0.5)
+
+
+def test_a_body_without_joints_tumbles_as_euler_says() -> None:
+    moments = np.array([1.0, 2.0, 2.5])
+    urdf = (
+        '<robot name="brick"><link name="brick"><inertial><mass value="4"/><inertia ixx="1" '
+        'iyy="2" izz="2.5" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
+    )
+    L = np.array([0.3, 1.0, -0.4])
+    initial = InitialState(linear_momentum=np.array([4.0, 0.0, -2.0]), angular_momentum=L)
+    plant = VelocityPlant(SpaceRobot.from_urdf(urdf), TICK, initial)
+
+    def euler(_: float, omega: Array) -> Array:
+        return np.asarray(-np.cross(omega, moments * omega) / moments)
+
+    solution = solve_ivp(
+        euler, (0.0, 5.0), L / moments, method="DOP853", rtol=1e-12, atol=1e-12, dense_output=True
+    )
+    energy = float(np.sum(L**2 / moments)) / 2 + float(np.sum([16.0, 4.0])) / 8
+    for tick in range(1, 101):
+        plant.step(np.zeros(0))
+        np.testing.assert_allclose(plant.twist[3:], solution.sol(tick * TICK), atol=1e-8)
+        np.testing.assert_allclose(
+            plant.pose[:3], tick * TICK * np.array([1.0, 0.0, -0.5]), atol=1e-12
+        )
+        assert plant.momentum[6] == pytest.approx(energy, rel=1e-8)
+
+
+# -- limits -----------------------------------------------------------------------------------
+
+
+def sliding_masses(**initial: Any) -> VelocityPlant:
+    """Return three sliders of 0.7 m/s and 2.5 m either way."""
+    robot = SpaceRobot.from_file(URDF / "sliding_masses.urdf")
+    return VelocityPlant(robot, TICK, InitialState(**initial))
+
+
+def test_a_rate_is_clipped_and_counted_once_a_tick() -> None:
+    plant = sliding_masses()
+    assert plant.step(np.array([0.70001, -0.7, 5.0]))
+    np.testing.assert_array_equal(plant.qdot, [0.7, -0.7, 0.7])
+    np.testing.assert_allclose(plant.q, [0.035, -0.035, 0.035])
+    assert not plant.step(np.array([0.7, 0.0, -0.7]))
+    assert plant.step(np.array([0.0, 0.0, -np.inf]))
+    np.testing.assert_array_equal(plant.velocity_limited, [1, 0, 2])
+    np.testing.assert_array_equal(plant.stroke_limited, [0, 0, 0])
+
+
+def test_a_joint_stops_at_the_end_of_its_stroke_and_comes_back() -> None:
+    plant = sliding_masses(joint_positions=np.array([2.49, -2.5, 0.0]))
+    assert plant.step(np.array([0.7, -0.3, 0.7]))
+    np.testing.assert_allclose(plant.qdot, [0.2, 0.0, 0.7], atol=1e-12)
+    np.testing.assert_allclose(plant.q, [2.5, -2.5, 0.035], rtol=1e-15)
+    np.testing.assert_array_equal(plant.stroke_limited, [1, 1, 0])
+    np.testing.assert_array_equal(plant.velocity_limited, [0, 0, 0])
+    # Too fast and too far at once counts as both.
+    assert plant.step(np.array([1.0, 0.3, 0.0]))
+    np.testing.assert_array_equal(plant.stroke_limited, [2, 1, 0])
+    np.testing.assert_array_equal(plant.velocity_limited, [1, 0, 0])
+    assert plant.qdot[0] == pytest.approx(0.0, abs=1e-12)
+    assert not plant.step(np.array([-0.7, 0.3, 0.0]))
+    np.testing.assert_allclose(plant.q, [2.465, -2.47, 0.035], rtol=1e-14)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_joint_ever_leaves_its_limits(seed: int) -> None:
+    case = Case(seed, momentum=False)
+    plant = case.plant()
+    kinds = [j.kind.value for j in case.robot.description.movable_joints]
+    free = np.array([kind == "continuous" for kind in kinds])
+    push = RATE * np.sign(case.command())
+    for tick in range(200):
+        before = plant.q.copy()
+        plant.step(1.2 * push if tick % 2 else push)
+        assert np.all(np.abs(plant.qdot) <= RATE)
+        assert np.all((np.abs(plant.q) <= STROKE + 1e-14) | free)
+        np.testing.assert_allclose(plant.q, before + TICK * plant.qdot, atol=1e-12)
+    np.testing.assert_allclose(plant.q[~free], (STROKE * np.sign(push))[~free], atol=1e-12)
+    assert np.all(np.abs(plant.q[free]) > STROKE)
+    np.testing.assert_array_equal(plant.velocity_limited, 100)
+    assert np.all(plant.stroke_limited[~free] > 0)
+    assert np.all(plant.stroke_limited[free] == 0)
+
+
+# -- start and reset --------------------------------------------------------------------------
+
+
+def test_it_starts_at_rest_where_it_is_told() -> None:
+    case = Case(4, momentum=False)
+    plant = case.plant()
+    np.testing.assert_array_equal(plant.q, case.initial.joint_positions)
+    np.testing.assert_allclose(plant.pose[:3], case.initial.position, atol=1e-14)
+    np.testing.assert_allclose(plant.pose[3:], case.initial.quaternion, atol=1e-15)
+    np.testing.assert_array_equal(plant.qdot, np.zeros(case.robot.n))
+    np.testing.assert_allclose(plant.twist, np.zeros(6), atol=1e-15)
+    np.testing.assert_allclose(plant.momentum, np.zeros(7), atol=1e-15)
+
+
+def test_a_quaternion_of_any_length_is_taken() -> None:
+    plant = sliding_masses(quaternion=np.array([0.0, 0.0, -3.0, 4.0]))
+    np.testing.assert_allclose(plant.pose[3:], [0.0, 0.0, -0.6, 0.8])
+
+
+def test_a_stroke_without_zero_starts_at_its_nearest_end() -> None:
+    text = (URDF / "sliding_masses.urdf").read_text("utf-8")
+    text = text.replace('lower="-2.5"', 'lower="0.5"', 1)
+    plant = VelocityPlant(SpaceRobot.from_urdf(text), TICK)
+    np.testing.assert_array_equal(plant.q, [0.5, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("momentum", [False, True])
+def test_a_reset_is_a_new_start_to_the_last_bit(momentum: bool) -> None:
+    case = Case(5, momentum=momentum)
+    commands = [case.command() for _ in range(20)]
+    plant, first = case.plant(), []
+    begin = [x.copy() for x in (plant.pose, plant.twist, plant.q, plant.qdot, plant.momentum)]
+    for command in commands:
+        plant.step(command)
+        first.append(plant.pose.copy())
+    counted = plant.velocity_limited.copy()
+    plant.reset()
+    for now, then in zip(
+        (plant.pose, plant.twist, plant.q, plant.qdot, plant.momentum), begin, strict=True
+    ):
+        np.testing.assert_array_equal(now, then)
+    np.testing.assert_array_equal(plant.velocity_limited, counted)
+    for command, pose in zip(commands, first, strict=True):
+        plant.step(command)
+        np.testing.assert_array_equal(plant.pose, pose)
+
+
+def test_two_plants_of_one_robot_do_not_share_anything() -> None:
+    case = Case(1, momentum=True)
+    one, two = case.plant(), case.plant()
+    before = two.pose.copy()
+    for _ in range(5):
+        one.step(case.command())
+    np.testing.assert_array_equal(two.pose, before)
+
+
+def test_compiled_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(6)
+    momenta = {"linear_momentum": rng.normal(size=3), "angular_momentum": rng.normal(size=3)}
+    interpreted = sliding_masses(**momenta)
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
+    if c_compiler() is None:
+        pytest.skip("no C compiler")
+    compiled = sliding_masses(**momenta)
+    for _ in range(50):
+        command = rng.uniform(-1.0, 1.0, 3)
+        interpreted.step(command)
+        compiled.step(command)
+        for one, other in (
+            (interpreted.pose, compiled.pose),
+            (interpreted.twist, compiled.twist),
+            (interpreted.momentum, compiled.momentum),
+        ):
+            np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+
+
+# -- refusals ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("period", [0.0, -0.05, np.nan, np.inf])
+def test_a_bad_tick_period_is_refused(period: float) -> None:
+    robot = SpaceRobot.from_file(URDF / "sliding_masses.urdf")
+    with pytest.raises(ParameterError, match="tick period"):
+        VelocityPlant(robot, period)
+
+
+@pytest.mark.parametrize(
+    ("initial", "mentions"),
+    [
+        ({"joint_positions": [0.0, 0.0]}, ["2 numbers", "slider_1, slider_2, slider_3"]),
+        ({"joint_positions": [0.0] * 4}, ["4 numbers", "3 joints"]),
+        ({"joint_positions": [0.0, 2.6, 0.0]}, ["'slider_2'", "2.6", "[-2.5, 2.5]"]),
+        ({"joint_positions": [0.0, 0.0, -2.51]}, ["'slider_3'", "-2.51"]),
+        ({"joint_positions": [np.nan, 0.0, 0.0]}, ["joint positions", "nan"]),
+        ({"quaternion": [0.0] * 4}, ["orientation"]),
+        ({"quaternion": [0.0, np.nan, 0.0, 1.0]}, ["orientation"]),
+        ({"position": [0.0, np.inf, 0.0]}, ["position"]),
+        ({"linear_momentum": [np.nan, 0.0, 0.0]}, ["moment"]),
+        ({"angular_momentum": [0.0, 0.0, np.inf]}, ["moment"]),
+    ],
+)
+def test_a_bad_initial_state_is_refused(
+    initial: dict[str, list[float]], mentions: list[str]
+) -> None:
+    with pytest.raises(ParameterError) as refusal:
+        sliding_masses(**{name: np.array(value) for name, value in initial.items()})
+    text = str(refusal.value)
+    assert text.endswith(".")
+    assert "\n" not in text
+    for mention in mentions:
+        assert mention in text
