@@ -173,10 +173,14 @@ def _chosen(
     scenario = load_scenario(name)
     # Published figures belong to the published goal.
     if goal is not None:
-        scenario = replace(scenario, goal=Goal.checked(goal[:3], goal[3:]), published=())
+        given = Goal.checked(goal[:3], goal[3:])
+        pose = replace(scenario.goal, position=given.position, quaternion=given.quaternion)
+        scenario = replace(scenario, goal=pose, published=())
     if goal_rotvec is not None:
         position = scenario.goal.position.tolist()
-        scenario = replace(scenario, goal=goal_from_rotvec(position, goal_rotvec), published=())
+        given = goal_from_rotvec(position, goal_rotvec)
+        pose = replace(scenario.goal, quaternion=given.quaternion)
+        scenario = replace(scenario, goal=pose, published=())
     for text in settings:
         node, parameter, value = parse_setting(text)
         scenario = scenario.with_overrides(node, {parameter: value})

@@ -12,6 +12,7 @@ import yaml
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model.attitude import quaternion_from_rotvec
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import resource_names, share_directory
 
@@ -25,6 +26,7 @@ _GOALS = ("goal", "end_effector_goal")
 _KEYS = (
     "description",
     "published",
+    "goal_joint_positions",
     *(f"{goal}_{part}" for goal in _GOALS for part in ("position", "orientation", "rotvec")),
 )
 
@@ -107,7 +109,7 @@ def load_scenario(name: str) -> Scenario:
         name=path.stem,
         path=path.resolve(),
         description=str(values.get("description", "")),
-        goal=_goal("goal", values, path),
+        goal=replace(_goal("goal", values, path), joint_positions=_shape(values, path)),
         end_effector_goal=(
             _goal("end_effector_goal", values, path)
             if any(key.startswith("end_effector_goal") for key in values)
@@ -180,3 +182,14 @@ def _goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
         return Goal.checked(position, orientation)
     except (PlanningError, ValueError, TypeError) as error:
         raise ParameterError(f"The goal of the scenario file {path} is refused: {error}") from error
+
+
+def _shape(values: Mapping[str, Any], path: Path) -> Array | None:
+    if "goal_joint_positions" not in values:
+        return None
+    try:
+        return np.array([float(x) for x in values["goal_joint_positions"]])
+    except (TypeError, ValueError) as error:
+        raise ParameterError(
+            f"'goal_joint_positions' of the scenario file {path} is not a list of numbers."
+        ) from error

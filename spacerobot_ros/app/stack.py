@@ -17,6 +17,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
 
 from spacerobot_ros.app.scenario import NODES, Scenario
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
@@ -93,6 +94,10 @@ class FlightStack:
             self.operator = rclpy.create_node("operator", context=context)
             self._nodes.append(self.operator)
             self._goal_topic = self.operator.create_publisher(PoseStamped, "goal_pose", STREAM)
+            if scenario.goal.joint_positions is not None:
+                self._shape_topic = self.operator.create_publisher(
+                    JointState, "goal_joint_states", STREAM
+                )
             if scenario.end_effector_goal is not None:
                 self._end_effector_topic = self.operator.create_publisher(
                     PoseStamped, "end_effector/goal_pose", STREAM
@@ -135,6 +140,11 @@ class FlightStack:
 
     def send(self, goal: Goal, end_effector: Goal | None = None) -> None:
         """Publish goal poses of the base and, where there is one, of the end-effector."""
+        if goal.joint_positions is not None:
+            names = self.plant.plant.robot.joint_names
+            self._shape_topic.publish(
+                JointState(name=list(names), position=goal.joint_positions.tolist())
+            )
         self._goal_topic.publish(self._pose(goal))
         if end_effector is not None:
             self._end_effector_topic.publish(self._pose(end_effector))

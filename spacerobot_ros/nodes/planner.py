@@ -17,6 +17,7 @@ from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.errors import CommandError, PlanningError, RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.cdr import (
     NANOSECONDS,
     MessageTemplate,
@@ -54,6 +55,14 @@ class PlannerNode(FlightNode):
         ParameterSpec("world_frame", "world", "", "frame that goals must be given in"),
         ParameterSpec("position_tolerance", 1e-3, "m", "a goal is met within", 0.0, live=True),
         ParameterSpec("attitude_tolerance", 1e-3, "rad", "a goal is met within", 0.0, live=True),
+        ParameterSpec("joint_tolerance", 1e-3, "m or rad", "a shape is met within", 0.0, live=True),
+        ParameterSpec(
+            "output",
+            "commands",
+            "",
+            "joint_commands (velocities) for the plant, or joint_reference for a controller",
+            choices=("commands", "reference"),
+        ),
         ParameterSpec("max_corrections", 3, "", "new plans after the first", 0, 1000, live=True),
         ParameterSpec("shape_gain", 2.0, "1/s", "feedback on the shape while flying", 0.0, 1e3),
         *option_specs(METHODS),
@@ -75,6 +84,8 @@ class PlannerNode(FlightNode):
     def configure(self) -> None:
         """Create the topics; without a robot of its own the planner waits for robot_description."""
         self._goal: Goal | None = None
+        self._goal_shape: Array | None = None
+        self._held: Array | None = None
         self._pending = False
         self._corrections = 0
         self._follower: GaitFollower | None = None
@@ -85,9 +96,9 @@ class PlannerNode(FlightNode):
         self._odom = TemplateReader(
             Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
         )
-        self._send_command = raw_publish(
-            self.create_publisher(JointState, "joint_commands", STREAM)
-        )
+        self._commands_plant = self.parameters["output"] == "commands"
+        topic = "joint_commands" if self._commands_plant else "joint_reference"
+        self._send_command = raw_publish(self.create_publisher(JointState, topic, STREAM))
         self._schedule_topic = self.create_publisher(JointTrajectory, "gait_schedule", LATCHED)
         self._path_topic = self.create_publisher(Path, "planned_path", LATCHED)
         self._marker_topic = self.create_publisher(MarkerArray, "markers", STREAM)
@@ -98,6 +109,7 @@ class PlannerNode(FlightNode):
         else:
             self._use(robot)
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal, STREAM)
+        self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
         self.create_subscription(Odometry, "odom", self._on_odom, STREAM, raw=True)
         self.create_subscription(JointState, "joint_states", self._on_joints, STREAM, raw=True)
         self.create_service(Trigger, "~/abort", self._on_abort)
@@ -113,7 +125,7 @@ class PlannerNode(FlightNode):
         """Give up the present goal and command nothing any more."""
         self._running = False
         self._follower = None
-        self._goal = None
+        self._goal = self._held = None
 
     def _use(self, robot: SpaceRobot) -> None:
         self._robot = robot
@@ -146,7 +158,9 @@ class PlannerNode(FlightNode):
 
     def _tolerance(self) -> Tolerance:
         values: dict[str, Any] = self.parameters
-        return Tolerance(values["position_tolerance"], values["attitude_tolerance"])
+        return Tolerance(
+            values["position_tolerance"], values["attitude_tolerance"], values["joint_tolerance"]
+        )
 
     def parameters_changed(self) -> None:
         """Plan and judge with the new tolerances."""
@@ -175,7 +189,7 @@ class PlannerNode(FlightNode):
                     f"The goal pose is in frame '{message.header.frame_id}'; goals are taken in "
                     f"'{frame}'."
                 )
-            goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w])
+            goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w], self._goal_shape)
         except PlanningError as error:
             self._status.publish(PlannerState.REFUSED, str(error))
             return
@@ -185,6 +199,18 @@ class PlannerNode(FlightNode):
             self._status.publish(
                 PlannerState.PLANNING, "The goal waits for a robot on robot_description."
             )
+
+    def _on_goal_shape(self, message: JointState) -> None:
+        """Keep the shape that goals from now on are to end in, for methods that take one."""
+        if self._robot is None:
+            return
+        missing = set(self._robot.joint_names) - set(message.name)
+        values = dict(zip(message.name, message.position, strict=False))
+        if missing or not np.all(np.isfinite(list(values.values()))):
+            what = f"joint '{min(missing)}' is missing" if missing else "a position is not finite"
+            self._status.publish(PlannerState.REFUSED, f"The goal shape is refused: {what}.")
+            return
+        self._goal_shape = np.array([values[name] for name in self._robot.joint_names])
 
     def _on_odom(self, raw: bytes) -> None:
         self._odom_raw = raw
@@ -236,8 +262,12 @@ class PlannerNode(FlightNode):
             self._judge(stamp)
         if self._follower is not None:
             self._follower.command(stamp, q, self._command_position, self._command_velocity)
+            self._held = None
         else:
-            self._command_position[:] = q
+            # A reference must stay where it is; what the plant makes of rest is its affair.
+            if self._held is None or self._commands_plant:
+                self._held = q.copy()
+            self._command_position[:] = self._held
             self._command_velocity[:] = 0.0
         self._send_command(self._command.serialised(stamp_bytes(stamp)))
 
@@ -273,7 +303,8 @@ class PlannerNode(FlightNode):
             self.plan_time += time.perf_counter() - began
 
     def _fly(self, schedule: GaitSchedule, stamp: int) -> None:
-        gain = float(self.parameters["shape_gain"])  # type: ignore[arg-type]
+        # A controller closes its own loop round the reference.
+        gain = float(self.parameters["shape_gain"]) if self._commands_plant else 0.0  # type: ignore[arg-type]
         self._follower = GaitFollower(schedule, stamp, gain)
         self.flown_time += schedule.duration
         self.ends_at = stamp / NANOSECONDS + schedule.duration
@@ -316,15 +347,23 @@ class PlannerNode(FlightNode):
         """Compare the measured pose with the goal; plan what is left, or be done."""
         assert self._goal is not None
         state = self._measured()
-        error = PoseError.between(state.position, state.quaternion, self._goal)
+        error = PoseError.between(state.position, state.quaternion, self._goal, state.q)
+        self._held = self._follower.schedule.positions[-1] if self._follower else None
         self._follower = None
         result: dict[str, Any] = {
             "goal": self._goal,
             "error": error,
             "corrections": self._corrections,
         }
-        left = f"{error.distance:.3g} m and {error.angle:.3g} rad from the goal"
-        if self._tolerance().admits(error):
+        controls = self._method.controls
+        parts = {
+            "position": f"{error.distance:.3g} m",
+            "attitude": f"{error.angle:.3g} rad",
+            "shape": f"{error.farthest_joint:.3g} at the joints",
+        }
+        left = " and ".join(text for part, text in parts.items() if part in controls)
+        left = f"{left} from the goal"
+        if self._tolerance().admits(error, controls):
             self._status.publish(PlannerState.REACHED, f"The goal is met: {left}.", **result)
             return
         if self._corrections >= int(self.parameters["max_corrections"]):  # type: ignore[arg-type]

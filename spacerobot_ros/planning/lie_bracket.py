@@ -39,7 +39,6 @@ _WORST_CONDITION = 1e6
 _MOST_REFINEMENTS = 20
 _NO_ROTATION = 1e-9
 _NO_MOTION = 1e-9
-_AT_REST = 1e-9
 
 
 class LieBracketGait(GaitMethod):
@@ -345,15 +344,6 @@ class LieBracketGait(GaitMethod):
         return BasePath(
             time, self._prediction.positions(state, time, shapes, quaternions), quaternions
         )
-
-    def _require_rest(self, state: RobotState) -> None:
-        p, L = np.linalg.norm(state.linear_momentum), np.linalg.norm(state.angular_momentum)
-        if p > _AT_REST * self.robot.total_mass or L > _AT_REST * self.robot.total_mass:
-            raise PlanningError(
-                "The robot drifts: its total momentum is not zero "
-                f"({p:.3g} kg m/s, {L:.3g} kg m^2/s), and lie_bracket plans for zero momentum "
-                "(paper 1); shape changes cannot remove it."
-            )
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,17 @@
 """Joints that run into the ends of their strokes: inelastic stops.
 
 A stop acts between the two links of its joint, along the joint's coordinate: an internal force,
-which changes neither total momentum. It does two things, both by one principle: with ``K`` the
-inertia matrix of the shape (:mod:`spacerobot_ros.model.composite_rigid_body`), of all that does
-not lead out of a stroke, what happens is nearest to what would happen without stops, in the metric
-of K. The other joints and the base take their share.
+which changes neither total momentum; the other joints and the base take their share. With ``K`` the
+inertia matrix of the shape (:mod:`spacerobot_ros.model.composite_rigid_body`), stops do two things:
 
-* Arrival: ``qdot+ = nearest(qdot-)``, by impulses of the stops that are touched. The joint does not
-  rebound; the energy ``(qdot+ - qdot-)' K (qdot+ - qdot-) / 2`` is lost (Carnot).
-* Holding: ``qddot = nearest(K^-1 Q)`` for joints at rest on a stop (Gauss's principle of least
-  constraint). A joint is held while effort and motion push it outwards, and leaves when they do
-  not, to within one integration step.
+* Arrival: of all rates that lead out of no stroke, ``qdot+`` is the nearest to ``qdot-`` in the
+  metric of K. The joint does not rebound; ``(qdot+ - qdot-)' K (qdot+ - qdot-) / 2`` of energy is
+  lost (Carnot). The time of arrival is found to rounding.
+* Holding: a joint on its stop stays there through an integration step if it is pushed outwards,
+  that is, if the nearest to ``qdot + h K^-1 Q`` that leads out of no stroke has it at rest (Gauss's
+  principle of least constraint over a step, Moreau's time stepping). So it leaves with a delay of
+  at most one step, and the endless shorter and shorter hops of joints that knock each
+  other off their stops end.
 """
 
 from __future__ import annotations
@@ -64,16 +65,32 @@ class JointStops:
         x, left = state.copy(), duration
         stopped = np.zeros(self._lower.size, dtype=np.bool_)
         while left > 1e-12 * duration:
+            held, arrived = self._rest(x, command)
+            stopped |= held | arrived
             step = min(self._integration_step, left)
-            held = self._held(x, command)
             after = self._move(x, command, held, step)
-            hit = np.zeros_like(held)
             if self._outside(after):
                 step = self._arrival(x, command, held, step)
-                after, hit = self._stop(self._move(x, command, held, step), command)
-            stopped |= held | hit
+                after = self._move(x, command, held, step)
+                after[self._q] = np.clip(after[self._q], self._lower, self._upper)
             x, left = after, left - step
-        return x, stopped
+        # Whatever has arrived at the very end.
+        held, arrived = self._rest(x, command)
+        return x, stopped | held | arrived
+
+    def _rest(self, x: Array, command: Array) -> tuple[Flags, Flags]:
+        """Bring joints on their stops to rest, in ``x``; return those held so, and arrivals."""
+        q = x[self._q]
+        inward = np.where(q <= self._lower, 1.0, np.where(q >= self._upper, -1.0, 0.0))
+        if not inward.any():
+            return inward != 0.0, inward != 0.0
+        K, Q = self._equations(x, command)
+        compliance = np.linalg.inv(K)
+        arrived = pushed_out(compliance, x[self._qdot], inward)
+        qdot, _ = at_rest(compliance, x[self._qdot], arrived)
+        held = pushed_out(compliance, qdot + self._integration_step * (compliance @ Q), inward)
+        x[self._qdot], _ = at_rest(compliance, qdot, held)
+        return held, arrived
 
     def _move(self, x: Array, command: Array, held: Flags, step: float) -> Array:
         after = self._step(x, command, np.where(held, 0.0, 1.0), step)[0]
@@ -99,42 +116,31 @@ class JointStops:
                 early = middle
         return late
 
-    def _stop(self, x: Array, command: Array) -> tuple[Array, Flags]:
-        x[self._q] = np.clip(x[self._q], self._lower, self._upper)
-        K, _ = self._equations(x, command)
-        x[self._qdot], stopped = nearest(K, x[self._qdot], self._inward(x))
-        return x, stopped
 
-    def _held(self, x: Array, command: Array) -> Flags:
-        inward = np.where(x[self._qdot] == 0.0, self._inward(x), 0.0)
-        if not inward.any():
-            return np.zeros(inward.size, dtype=np.bool_)
-        K, Q = self._equations(x, command)
-        return nearest(K, np.linalg.solve(K, Q), inward)[1]
+def at_rest(compliance: Array, rates: Array, joints: Flags) -> tuple[Array, Array]:
+    """Return the rates (n,) after the impulses (n,) that bring some joints to rest, and these.
 
-    def _inward(self, x: Array) -> Array:
-        """Return the direction into the stroke of each joint (n,): 1, -1, or 0 away from stops."""
-        q = x[self._q]
-        return np.where(q <= self._lower, 1.0, np.where(q >= self._upper, -1.0, 0.0))
-
-
-def nearest(K: Array, unhindered: Array, inward: Array) -> tuple[Array, Flags]:
-    """Return the x (n,) nearest to ``unhindered`` in the metric of K (n, n) with
-    ``inward * x >= 0``, and which joints it stops: those with ``x = 0`` that pull at the others.
-
-    The linear complementarity problem of this projection is solved by Murty's least-index pivoting,
-    which ends for every positive definite K.
+    ``compliance`` (n, n) is the inverse of K.
     """
-    stopped = np.zeros(unhindered.size, dtype=np.bool_)
-    compliance = np.linalg.inv(K)
+    after, impulses = rates.copy(), np.zeros_like(rates)
+    if joints.any():
+        impulses[joints] = np.linalg.solve(compliance[np.ix_(joints, joints)], -rates[joints])
+        after += compliance @ impulses
+        after[joints] = 0.0
+    return after, impulses
+
+
+def pushed_out(compliance: Array, rates: Array, inward: Array) -> Flags:
+    """Return which joints (n,) their stops bring to rest, so that ``inward * rates >= 0`` for all.
+
+    ``inward`` is 1 or -1 on a stop and 0 elsewhere. These joints make the rates after the impulses
+    the nearest to those before in the metric of K. The linear complementarity problem is solved
+    by Murty's least-index pivoting, which ends for every positive definite K.
+    """
+    joints = np.zeros(rates.size, dtype=np.bool_)
     while True:
-        x, impulse = unhindered.copy(), np.zeros_like(unhindered)
-        if stopped.any():
-            block = compliance[np.ix_(stopped, stopped)]
-            impulse[stopped] = np.linalg.solve(block, -unhindered[stopped])
-            x += compliance @ impulse
-            x[stopped] = 0.0
-        wrong = np.flatnonzero(inward * np.where(stopped, impulse, x) < 0.0)
+        after, impulses = at_rest(compliance, rates, joints)
+        wrong = np.flatnonzero(inward * np.where(joints, impulses, after) < 0.0)
         if not wrong.size:
-            return x, stopped
-        stopped[wrong[0]] = ~stopped[wrong[0]]
+            return joints
+        joints[wrong[0]] = ~joints[wrong[0]]

@@ -885,7 +885,7 @@ REFUSED: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "actuation": ({"actuation": "magnets"}, ("'actuation'", "magnets", "velocity")),
     "real time factor": ({"real_time_factor": 0.0}, ("'real time factor'",)),
     "negative timeout": ({"command_timeout": -1.0}, ("'command timeout'", "s")),
-    "integration step": ({"integration_step": 0.0}, ("'integration step'",)),
+    "integration step": ({"integration_step": -0.01}, ("'integration step'", "s")),
     "world frame is a number": ({"world_frame": 7}, ("'world frame'",)),
     "two coordinates": ({"initial_position": [1.0, 2.0]}, ("'initial position'", "3 numbers")),
     "zero quaternion": ({"initial_orientation": [0.0] * 4}, ("initial orientation",)),
