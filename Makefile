@@ -39,7 +39,7 @@ test: $(STAMP)/test ## check style and types, run the tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python3 -m pytest
+	$(BIN)/python3 -m pytest -n 2
 
 .PHONY: test-slow
 test-slow: $(STAMP)/test ## run the slow tests: long flights, builds with pip and colcon

@@ -79,6 +79,7 @@ setup(
             "mypy",
             "pin",
             "pytest>=8",
+            "pytest-xdist",
             "ruff",
             "setuptools",
             "types-PyYAML",

@@ -1,9 +1,10 @@
-"""Plant, planner and recorder, each its own process."""
+"""The nodes of a scenario and the recorder, each its own process."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import yaml
 from ament_index_python.packages import get_package_share_directory
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
@@ -25,20 +26,24 @@ def nodes(context: LaunchContext) -> list[Node]:
         "namespace": LaunchConfiguration("namespace"),
         "output": "screen",
     }
+    parameter_file = Path(chosen) if chosen else share / "config" / f"{scenario}.yaml"
     parameters = [
-        chosen or str(share / "config" / f"{scenario}.yaml"),
+        str(parameter_file),
         {"use_sim_time": LaunchConfiguration("use_sim_time")},
     ]
+    # The file has a section for each node that its scenario needs.
+    sections = yaml.safe_load(parameter_file.read_text(encoding="utf-8"))
+    wanted = [name for name in ("plant", "planner", "coordinated_control") if name in sections]
+    recorder = Node(
+        executable="recorder",
+        name="recorder",
+        parameters=parameters,
+        condition=IfCondition(LaunchConfiguration("record")),
+        **common,
+    )
     return [
-        Node(executable="plant", name="plant", parameters=parameters, **common),
-        Node(executable="planner", name="planner", parameters=parameters, **common),
-        Node(
-            executable="recorder",
-            name="recorder",
-            parameters=parameters,
-            condition=IfCondition(LaunchConfiguration("record")),
-            **common,
-        ),
+        *(Node(executable=name, name=name, parameters=parameters, **common) for name in wanted),
+        recorder,
     ]
 
 

@@ -12,7 +12,6 @@ import yaml
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model.attitude import quaternion_from_rotvec
-from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import resource_names, share_directory
 
@@ -109,7 +108,7 @@ def load_scenario(name: str) -> Scenario:
         name=path.stem,
         path=path.resolve(),
         description=str(values.get("description", "")),
-        goal=replace(_goal("goal", values, path), joint_positions=_shape(values, path)),
+        goal=_goal("goal", values, path),
         end_effector_goal=(
             _goal("end_effector_goal", values, path)
             if any(key.startswith("end_effector_goal") for key in values)
@@ -176,20 +175,9 @@ def _published(rows: Any, path: Path) -> tuple[Published, ...]:
 def _goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
     try:
         position = values.get(f"{name}_position", [0.0, 0.0, 0.0])
-        if f"{name}_rotvec" in values:
-            return goal_from_rotvec(position, values[f"{name}_rotvec"])
         orientation = values.get(f"{name}_orientation", [0.0, 0.0, 0.0, 1.0])
-        return Goal.checked(position, orientation)
+        if f"{name}_rotvec" in values:
+            orientation = goal_from_rotvec(position, values[f"{name}_rotvec"]).quaternion
+        return Goal.checked(position, orientation, values.get(f"{name}_joint_positions"))
     except (PlanningError, ValueError, TypeError) as error:
         raise ParameterError(f"The goal of the scenario file {path} is refused: {error}") from error
-
-
-def _shape(values: Mapping[str, Any], path: Path) -> Array | None:
-    if "goal_joint_positions" not in values:
-        return None
-    try:
-        return np.array([float(x) for x in values["goal_joint_positions"]])
-    except (TypeError, ValueError) as error:
-        raise ParameterError(
-            f"'goal_joint_positions' of the scenario file {path} is not a list of numbers."
-        ) from error

@@ -28,7 +28,7 @@ from spacerobot_ros.control import (
 )
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.errors import NotFiniteError
-from spacerobot_ros.errors import CommandError, PlanningError, RobotDescriptionError
+from spacerobot_ros.errors import CommandError, PlanningError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.cdr import (
     NANOSECONDS,
@@ -231,7 +231,7 @@ class CoordinatedControlNode(FlightNode):
         if self._robot is None:
             try:
                 self._use(SpaceRobot.from_urdf(message.data))
-            except RobotDescriptionError as error:
+            except SpaceRobotError as error:
                 self.get_logger().error(f"robot_description: {error}")
                 return
             self._on_part()

@@ -226,7 +226,11 @@ def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = No
     standard error).
     """
     use_loopback_discovery()
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # The middleware's errors: arguments, parameter files.
+        print(f"ROS 2 does not start: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
     stop = rclpy.task.Future()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set_result(None))

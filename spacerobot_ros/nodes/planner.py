@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from spacerobot_ros.errors import CommandError, PlanningError, RobotDescriptionError
+from spacerobot_ros.errors import CommandError, PlanningError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.cdr import (
@@ -173,7 +173,7 @@ class PlannerNode(FlightNode):
         if self._robot is None:
             try:
                 self._use(SpaceRobot.from_urdf(message.data))
-            except RobotDescriptionError as error:
+            except SpaceRobotError as error:
                 self.get_logger().error(f"robot_description: {error}")
                 return
             self._on_part()

@@ -1,7 +1,7 @@
 """Where in the plane of two joints the curvature is largest (paper 3, remark 2).
 
 Small loops turn the base most there. Boxes (2, 2) are lower over upper bounds of the two joints,
-rad; the other joints stay where they are in a shape ``psi`` (n,).
+rad.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.planar import PlanarPhase
+from spacerobot_ros.planning.geometric_phase import PhasePlane
 
 _GRID_STEP = math.radians(15.0)
 _REFINEMENTS = 8
@@ -39,20 +39,15 @@ def centre_box(at: Array, lower: Array, upper: Array) -> Array:
     return np.stack([start, start + width])
 
 
-def curvature_grid(phase: PlanarPhase, psi: Array, pair: tuple[int, int], box: Array) -> Array:
-    """Return |curvature| (A, B), 1/rad, on a grid over a box."""
-    return _heights(phase, psi, pair, _grid(box))
-
-
-def curvature_peaks(phase: PlanarPhase, psi: Array, pair: tuple[int, int], boxes: Array) -> Array:
+def curvature_peaks(plane: PhasePlane, at: Array, boxes: Array) -> Array:
     """Return the points (R, 2) of the largest |curvature| in boxes (R, 2, 2).
 
-    Of equally good points it is the one that is nearest to ``psi``.
+    Of equally good points it is the one that is nearest to ``at`` (2,).
     """
     # Joints without limits have the same box for squares of all sizes.
     flat, row = np.unique(boxes.reshape(-1, 4), axis=0, return_inverse=True)
     boxes = flat.reshape(-1, 2, 2)
-    tops = [_tops(phase, psi, pair, box) for box in boxes]
+    tops = [_tops(plane, box) for box in boxes]
     points = np.vstack(tops)
     owner = np.repeat(np.arange(len(boxes)), [len(found) for found in tops])
     lower, upper = boxes[owner, :1], boxes[owner, 1:]
@@ -60,10 +55,10 @@ def curvature_peaks(phase: PlanarPhase, psi: Array, pair: tuple[int, int], boxes
     for _ in range(_REFINEMENTS):
         step /= 2
         near = np.clip(points[:, np.newaxis] + step * _AROUND, lower, upper)
-        around = _heights(phase, psi, pair, near)
+        around = np.abs(plane.curvature(near))
         points = near[np.arange(len(points)), np.argmax(around, axis=1)]
     heights = around.max(axis=1)
-    distances = np.linalg.norm(points - psi[list(pair)], axis=1)
+    distances = np.linalg.norm(points - at, axis=1)
     chosen = []
     for k in range(len(boxes)):
         mine = np.flatnonzero(owner == k)
@@ -74,23 +69,11 @@ def curvature_peaks(phase: PlanarPhase, psi: Array, pair: tuple[int, int], boxes
     return np.array(chosen)[row.ravel()]
 
 
-def _tops(phase: PlanarPhase, psi: Array, pair: tuple[int, int], box: Array) -> Array:
+def _tops(plane: PhasePlane, box: Array) -> Array:
     """Return the highest local maxima (P, 2) of |curvature| on a grid over a box."""
-    grid = _grid(box)
-    heights = _heights(phase, psi, pair, grid)
+    axes = [np.linspace(low, high, 1 + math.ceil((high - low) / _GRID_STEP)) for low, high in box.T]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    heights = np.abs(plane.curvature(grid))
     tops = np.flatnonzero(heights == maximum_filter(heights, size=3, mode="nearest"))
     order = np.argsort(-heights.ravel()[tops], kind="stable")
     return grid.reshape(-1, 2)[tops[order[:_MOST_PEAKS]]]
-
-
-def _grid(box: Array) -> Array:
-    """Return points (A, B, 2) at most a grid step apart over a box."""
-    axes = [np.linspace(low, high, 1 + math.ceil((high - low) / _GRID_STEP)) for low, high in box.T]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-
-
-def _heights(phase: PlanarPhase, psi: Array, pair: tuple[int, int], points: Array) -> Array:
-    """Return |curvature| at points (..., 2) of the plane of a pair."""
-    shapes = np.tile(psi, (points.size // 2, 1))
-    shapes[:, pair] = points.reshape(-1, 2)
-    return np.abs(phase.curvature(shapes, *pair)).reshape(points.shape[:-1])

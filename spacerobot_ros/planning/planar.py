@@ -1,17 +1,9 @@
-"""Planar robots, and how far a path of shapes turns their base: the geometric phase of paper 3.
-
-All joints turn about parallel axes and nothing couples to other axes. The attitude is then one
-angle theta about that axis, and at zero angular momentum ``theta_dot = -s(psi)' psi_dot`` (eq. 3):
-``s`` is the component about the axis of the mechanical connection. The turn along a path of shapes
-is the line integral of ``-s``, eq. (11): it depends on the path and not on the speed.
-"""
+"""What a planar robot is: all its joints turn about parallel axes, and nothing tilts the base."""
 
 from __future__ import annotations
 
-import itertools
 import math
 
-import casadi as ca
 import numpy as np
 
 from spacerobot_ros.errors import PlanningError
@@ -24,12 +16,6 @@ as much as angles written with six digits leave."""
 
 _SAMPLES = 8
 """Shapes at which a robot is asked whether it stays in its plane."""
-
-_PANEL = 0.5
-"""Longest piece of a leg that one Gauss rule integrates, rad."""
-
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
-_NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
 
 def planar_axis(robot: SpaceRobot) -> Array:
@@ -85,56 +71,3 @@ def _require_turn_about(robot: SpaceRobot, axis: Array) -> None:
             f"by up to {tilts[worst]:.2g} rad a rad; mass centres outside of one plane or products "
             "of inertia do that."
         )
-
-
-class PlanarPhase:
-    """Turns of the base of a planar robot about its axis, rad, by paths of the shape.
-
-    Parameters
-    ----------
-    robot
-        The model.
-
-    Raises
-    ------
-    PlanningError
-        The robot is not planar; see :func:`planar_axis`.
-    """
-
-    def __init__(self, robot: SpaceRobot) -> None:
-        self.axis = planar_axis(robot)
-        """Unit vector (3,) that positive angles turn about, base components."""
-        psi = ca.SX.sym("psi", robot.n)
-        D, D_q = robot.function("locked_inertia", compile=False)(psi)
-        axis = ca.DM(self.axis)
-        # A = D^-1 D_q, where nothing couples the axis to the others: s_i = N_i / D, as printed.
-        s = (axis.T @ D_q).T / (axis.T @ D @ axis)
-        slope = ca.jacobian(s, psi)
-        self._s = ca.Function("s", [psi], [ca.densify(s)])
-        # Rotations about one axis commute: the curvature is the curl alone.
-        self._curl = {
-            (i, j): ca.Function("curl", [psi], [ca.densify(slope[i, j] - slope[j, i])])
-            for i, j in itertools.combinations(range(robot.n), 2)
-        }
-
-    def curvature(self, shapes: Array, i: int, j: int) -> Array:
-        """Return the turn of the base an area of small loops in (psi_i, psi_j), 1/rad, (K,).
-
-        ``shapes`` (K, n), i < j, loops counter-clockwise. It is ``-H``,
-        ``H = ds_j/dpsi_i - ds_i/dpsi_j`` (eq. 10).
-        """
-        curl: Array = self._curl[i, j](shapes.T).full()
-        return curl[0]
-
-    def legs(self, starts: Array, ends: Array) -> Array:
-        """Return the turns (L,) along straight legs of the shape, ``starts`` and ``ends`` (L, n).
-
-        Gauss-Legendre quadrature of ``-s' dpsi`` in pieces of at most half a radian.
-        """
-        moves = ends - starts
-        count = max(1, math.ceil(np.abs(moves).max(initial=0.0) / _PANEL))
-        along = ((np.arange(count)[:, np.newaxis] + _NODES) / count).ravel()
-        weights = np.tile(_WEIGHTS, count) / count
-        shapes = starts[:, np.newaxis] + along[:, np.newaxis] * moves[:, np.newaxis]
-        s = self._s(shapes.reshape(-1, starts.shape[1]).T).full().T.reshape(shapes.shape)
-        return np.asarray(-np.einsum("p,lpn,ln->l", weights, s, moves))

@@ -16,8 +16,8 @@ from scipy.optimize import brentq
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.curvature_peak import centre_box, curvature_grid, curvature_peaks
-from spacerobot_ros.planning.planar import PlanarPhase
+from spacerobot_ros.planning.curvature_peak import centre_box, curvature_peaks
+from spacerobot_ros.planning.geometric_phase import PhasePlane, PlanarPhase, square_corners
 
 _LARGEST_SIDE = math.pi
 """rad. Over a whole turn of both joints the curvature has mean zero: beyond about half a turn a
@@ -29,13 +29,7 @@ _SIDES = 8
 _LARGEST_WITHIN = 1.0 - 1e-9
 """Share of the room that the largest square takes: rounding must not put a corner beyond it."""
 
-_MARGIN = 1.1
-"""What |curvature| on a grid is raised by to bound it between the points."""
-
 _NO_TURN = 1e-9
-
-_CORNERS = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-"""Corners of the unit square, counter-clockwise."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +65,7 @@ class _Candidates:
     """Growing squares of one pair: centres (R, 2), sides (R,), phases (R,) counter-clockwise."""
 
     pair: tuple[int, int]
+    plane: PhasePlane
     centres: Array
     sides: Array
     phases: Array
@@ -79,25 +74,6 @@ class _Candidates:
     def largest(self) -> float:
         """The largest turn of the base by one loop, rad."""
         return float(np.abs(self.phases).max())
-
-
-@dataclass(frozen=True)
-class _Plane:
-    """A pair of joints, its limits (2,), the largest side that fits, and bounds on the curvature
-    and on the phase of any square in it.
-    """
-
-    pair: tuple[int, int]
-    lower: Array
-    upper: Array
-    side: float
-    steepest: float
-    largest: float
-
-    def at_best(self, wanted: float) -> tuple[int, float]:
-        """Return the fewest loops that may turn the base by ``wanted``, rad, and their side."""
-        loops = math.ceil(wanted / max(self.largest, _NO_TURN))
-        return loops, math.sqrt(wanted / loops / max(self.steepest, _NO_TURN))
 
 
 class SquareSearch:
@@ -135,23 +111,32 @@ class SquareSearch:
         PlanningError
             No square within the joint limits turns the base far enough.
         """
-        best: SquareLoop | None = None
-        largest: _Candidates | None = None
-        for plane in sorted(self._planes(psi_e), key=lambda plane: -plane.steepest):
-            # What cannot be better need not be looked at closely.
-            if best is not None and plane.at_best(abs(wanted)) > (best.loops, best.side):
-                continue
-            candidates = self._candidates(psi_e, plane)
-            if largest is None or candidates.largest > largest.largest:
-                largest = candidates
-            loops = math.ceil(abs(wanted) / max(candidates.largest, _NO_TURN))
-            if loops <= self._most_loops:
-                found = self._solve(psi_e, candidates, wanted, loops)
-                if best is None or (loops, found.side) < (best.loops, best.side):
-                    best = found
-        if best is None:
+        pairs = itertools.combinations(self._movable, 2)
+        found = [candidates for pair in pairs if (candidates := self._candidates(psi_e, pair))]
+        largest = max(found, key=lambda candidates: candidates.largest, default=None)
+        if largest is None or largest.largest * self._most_loops < abs(wanted):
             raise PlanningError(self._why_not(wanted, largest))
-        return best
+        loops = math.ceil(abs(wanted) / largest.largest)
+        target = abs(wanted) / loops
+        solved = [
+            (candidates, *_solve(candidates, target))
+            for candidates in found
+            if candidates is largest or candidates.largest >= target
+        ]
+        candidates, row, side = min(solved, key=lambda square: square[2])
+        clockwise = candidates.phases[row] * wanted < 0
+        corners = np.tile(psi_e, (4, 1))
+        corners[:, candidates.pair] = square_corners(candidates.centres[[row]], np.array([side]))[0]
+        corners = corners[::-1] if clockwise else corners
+        nearest = int(np.argmin(np.linalg.norm(corners - psi_e, axis=1)))
+        return SquareLoop(
+            candidates.pair,
+            candidates.centres[row],
+            side,
+            loops,
+            clockwise,
+            np.roll(corners, -nearest, axis=0),
+        )
 
     def _why_not(self, wanted: float, largest: _Candidates | None) -> str:
         """Return why no loop will do; ``largest`` is the best there is."""
@@ -181,68 +166,39 @@ class SquareSearch:
             f"{self._most_loops}: {most}."
         )
 
-    def _planes(self, psi_e: Array) -> list[_Plane]:
-        """Return the planes of all pairs of joints that have room for a square."""
-        planes = []
-        for i, j in itertools.combinations(self._movable, 2):
-            lower, upper = self._robot.lower[[i, j]], self._robot.upper[[i, j]]
-            room = float(np.min(upper - lower))
-            if self._centre is not None:
-                room = 2 * float(np.minimum(self._centre - lower, upper - self._centre).min())
-            if room > 0:
-                box = centre_box(psi_e[[i, j]], lower, upper)
-                heights = _MARGIN * curvature_grid(self._phase, psi_e, (i, j), box)
-                side = min(room, _LARGEST_SIDE) * _LARGEST_WITHIN
-                steepest, total = heights.max(), heights.mean() * np.prod(box[1] - box[0])
-                bound = float(min(steepest * side**2, total))
-                planes.append(_Plane((i, j), lower, upper, side, float(steepest), bound))
-        return planes
-
-    def _candidates(self, psi_e: Array, plane: _Plane) -> _Candidates:
-        """Return squares of growing side within the limits."""
-        sides = np.linspace(0.0, plane.side, _SIDES + 1)[1:]
+    def _candidates(self, psi_e: Array, pair: tuple[int, int]) -> _Candidates | None:
+        """Return squares of growing side within the limits; None if there is no room."""
+        at, lower, upper = (x[list(pair)] for x in (psi_e, self._robot.lower, self._robot.upper))
+        room = float(np.min(upper - lower))
+        if self._centre is not None:
+            room = 2 * float(np.minimum(self._centre - lower, upper - self._centre).min())
+        if room <= 0:
+            return None
+        plane = self._phase.plane(psi_e, *pair)
+        sides = np.linspace(0.0, min(room, _LARGEST_SIDE) * _LARGEST_WITHIN, _SIDES + 1)[1:]
         if self._centre is not None:
             centres = np.tile(self._centre, (_SIDES, 1))
         else:
-            psi = psi_e[list(plane.pair)]
-            boxes = [centre_box(psi, plane.lower + z / 2, plane.upper - z / 2) for z in sides]
-            centres = curvature_peaks(self._phase, psi_e, plane.pair, np.array(boxes))
-        phases = self._phases(psi_e, plane.pair, centres, sides)
-        return _Candidates(plane.pair, centres, sides, phases)
+            boxes = [centre_box(at, lower + side / 2, upper - side / 2) for side in sides]
+            centres = curvature_peaks(plane, at, np.array(boxes))
+        return _Candidates(pair, plane, centres, sides, plane.squares(centres, sides))
 
-    def _solve(
-        self, psi_e: Array, candidates: _Candidates, wanted: float, loops: int
-    ) -> SquareLoop:
-        """Return the loop round the smallest candidate that is large enough, with its ``z*``."""
-        target = abs(wanted) / loops
-        # Rounding of the division must not leave the largest out.
-        enough = np.abs(candidates.phases) >= min(target, candidates.largest)
-        pair, row = candidates.pair, int(np.argmax(enough))
-        centre, side = candidates.centres[row], float(candidates.sides[row])
-        sign = math.copysign(1.0, candidates.phases[row])
 
-        def excess(z: float) -> float:
-            return sign * float(self._phases(psi_e, pair, centre, np.array([z]))[0]) - target
+def _solve(candidates: _Candidates, wanted: float) -> tuple[int, float]:
+    """Return the row of the smallest candidate that turns far enough, and ``z*`` round its centre.
 
-        # The last digit of the phase depends on how many legs are integrated together.
-        if excess(side) > 0:
-            side = float(brentq(excess, 0.0, side, xtol=1e-13, rtol=1e-14))
-        clockwise = sign * wanted < 0
-        corners = self._corners(psi_e, pair, centre, np.array([side]))[0]
-        corners = corners[::-1] if clockwise else corners
-        nearest = int(np.argmin(np.linalg.norm(corners - psi_e, axis=1)))
-        return SquareLoop(pair, centre, side, loops, clockwise, np.roll(corners, -nearest, axis=0))
+    ``wanted`` is the turn of one loop in either sense, rad, at most the largest there is.
+    """
+    # Rounding must not leave the largest out.
+    enough = np.abs(candidates.phases) >= min(wanted, candidates.largest)
+    row = int(np.argmax(enough))
+    centre, side = candidates.centres[[row]], float(candidates.sides[row])
+    sign = math.copysign(1.0, candidates.phases[row])
 
-    def _phases(self, psi_e: Array, pair: tuple[int, int], centres: Array, sides: Array) -> Array:
-        """Return the turns (R,) of the base by squares gone round counter-clockwise."""
-        corners = self._corners(psi_e, pair, centres, sides)
-        n = len(psi_e)
-        legs = self._phase.legs(corners.reshape(-1, n), np.roll(corners, -1, axis=1).reshape(-1, n))
-        return legs.reshape(-1, 4).sum(axis=1)
+    def excess(z: float) -> float:
+        return sign * float(candidates.plane.squares(centre, np.array([z]))[0]) - wanted
 
-    @staticmethod
-    def _corners(psi_e: Array, pair: tuple[int, int], centres: Array, sides: Array) -> Array:
-        """Return the corners (R, 4, n) of squares, counter-clockwise."""
-        corners = np.tile(psi_e, (len(sides), 4, 1))
-        corners[:, :, pair] = np.reshape(centres, (-1, 1, 2)) + np.multiply.outer(sides, _CORNERS)
-        return corners
+    # The last digit of a phase depends on how many legs are integrated together.
+    if excess(side) <= 0:
+        return row, side
+    return row, float(brentq(excess, 0.0, side, xtol=1e-13, rtol=1e-14))

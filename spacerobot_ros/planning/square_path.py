@@ -23,9 +23,9 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.attitude import quaternion_inverse, quaternion_multiply
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.planning.geometric_phase import PlanarPhase
 from spacerobot_ros.planning.goal import Controlled, Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.method import GaitMethod, Option
-from spacerobot_ros.planning.planar import PlanarPhase
 from spacerobot_ros.planning.prediction import BasePrediction
 from spacerobot_ros.planning.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.square_loop import SquareLoop, SquareSearch
@@ -38,8 +38,8 @@ _NO_MOTION = 1e-9
 _BEYOND = 1e-9
 """Rounding that a goal shape may be beyond a limit by, rad."""
 
-_KNOTS = 400
-"""About how many poses of the base a predicted path has."""
+_KNOTS = 200
+"""A predicted path has this many poses of the base, or up to twice as many."""
 
 
 class SquarePathGait(GaitMethod):
@@ -231,7 +231,7 @@ class SquarePathGait(GaitMethod):
         return max(wanted, float(slowest))
 
     def _path(self, state: RobotState, positions: Array) -> BasePath:
-        """Return the base path, integrated as the plant does, at about 400 of the ticks."""
+        """Return the base path, integrated as the plant does, at some of the ticks."""
         attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
         last = len(positions) - 1
         chosen = np.unique(np.append(np.arange(0, last, max(1, last // _KNOTS)), last))

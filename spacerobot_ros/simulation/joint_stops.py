@@ -63,10 +63,8 @@ class JointStops:
             The motion is no longer finite.
         """
         x, left = state.copy(), duration
-        stopped = np.zeros(self._lower.size, dtype=np.bool_)
+        held, stopped = self._rest(x, command, np.zeros(self._lower.size, dtype=np.bool_))
         while left > 1e-12 * duration:
-            held, arrived = self._rest(x, command)
-            stopped |= held | arrived
             step = min(self._integration_step, left)
             after = self._move(x, command, held, step)
             if self._outside(after):
@@ -74,23 +72,29 @@ class JointStops:
                 after = self._move(x, command, held, step)
                 after[self._q] = np.clip(after[self._q], self._lower, self._upper)
             x, left = after, left - step
-        # Whatever has arrived at the very end.
-        held, arrived = self._rest(x, command)
-        return x, stopped | held | arrived
+            held, touched = self._rest(x, command, held)
+            stopped |= touched
+        return x, stopped
 
-    def _rest(self, x: Array, command: Array) -> tuple[Flags, Flags]:
-        """Bring joints on their stops to rest, in ``x``; return those held so, and arrivals."""
-        q = x[self._q]
+    def _rest(self, x: Array, command: Array, held: Flags) -> tuple[Flags, Flags]:
+        """Bring joints on their stops to rest, in ``x``; return those that stay so through the next
+        step, and these with those that have arrived. ``held`` are the joints held until now.
+        """
+        q, qdot = x[self._q], x[self._qdot]
         inward = np.where(q <= self._lower, 1.0, np.where(q >= self._upper, -1.0, 0.0))
+        touched = np.zeros(q.size, dtype=np.bool_)
         if not inward.any():
-            return inward != 0.0, inward != 0.0
+            return touched, touched
         K, Q = self._equations(x, command)
         compliance = np.linalg.inv(K)
-        arrived = pushed_out(compliance, x[self._qdot], inward)
-        qdot, _ = at_rest(compliance, x[self._qdot], arrived)
-        held = pushed_out(compliance, qdot + self._integration_step * (compliance @ Q), inward)
-        x[self._qdot], _ = at_rest(compliance, qdot, held)
-        return held, arrived
+        if np.any(inward * qdot < 0.0):
+            touched = pushed_out(compliance, qdot, inward, touched)
+            qdot[:], _ = at_rest(compliance, qdot, touched)
+        pushed = qdot + self._integration_step * (compliance @ Q)
+        held = pushed_out(compliance, pushed, inward, held)
+        if qdot[held].any():
+            qdot[:], _ = at_rest(compliance, qdot, held)
+        return held, held | touched
 
     def _move(self, x: Array, command: Array, held: Flags, step: float) -> Array:
         after = self._step(x, command, np.where(held, 0.0, 1.0), step)[0]
@@ -130,14 +134,14 @@ def at_rest(compliance: Array, rates: Array, joints: Flags) -> tuple[Array, Arra
     return after, impulses
 
 
-def pushed_out(compliance: Array, rates: Array, inward: Array) -> Flags:
+def pushed_out(compliance: Array, rates: Array, inward: Array, guess: Flags) -> Flags:
     """Return which joints (n,) their stops bring to rest, so that ``inward * rates >= 0`` for all.
 
     ``inward`` is 1 or -1 on a stop and 0 elsewhere. These joints make the rates after the impulses
     the nearest to those before in the metric of K. The linear complementarity problem is solved
-    by Murty's least-index pivoting, which ends for every positive definite K.
+    by Murty's least-index pivoting, which ends for every positive definite K from every ``guess``.
     """
-    joints = np.zeros(rates.size, dtype=np.bool_)
+    joints = guess.copy()
     while True:
         after, impulses = at_rest(compliance, rates, joints)
         wrong = np.flatnonzero(inward * np.where(joints, impulses, after) < 0.0)

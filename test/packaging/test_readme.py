@@ -6,7 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from spacerobot_ros.nodes import FlightNode, PlannerNode, PlantNode, RecorderNode
+from spacerobot_ros.nodes import (
+    CoordinatedControlNode,
+    FlightNode,
+    PlannerNode,
+    PlantNode,
+    RecorderNode,
+)
 from spacerobot_ros.nodes.flight_node import AUTOSTART
 
 README = Path(__file__).resolve().parents[2] / "README.md"
@@ -14,7 +20,12 @@ README = Path(__file__).resolve().parents[2] / "README.md"
 
 @pytest.mark.parametrize(
     ("heading", "node"),
-    [("plant", PlantNode), ("planner", PlannerNode), ("recorder", RecorderNode)],
+    [
+        ("plant", PlantNode),
+        ("planner", PlannerNode),
+        ("coordinated_control", CoordinatedControlNode),
+        ("recorder", RecorderNode),
+    ],
 )
 def test_parameters_are_documented_with_their_defaults(
     heading: str, node: type[FlightNode]

@@ -25,7 +25,8 @@ from spacerobot_ros.planning import (
     RobotState,
     Tolerance,
 )
-from spacerobot_ros.planning.planar import PlanarPhase, planar_axis
+from spacerobot_ros.planning.geometric_phase import PlanarPhase
+from spacerobot_ros.planning.planar import planar_axis
 
 Array = npt.NDArray[np.float64]
 
@@ -155,7 +156,6 @@ def joint(k: int, parent: int, origin: Array, axis: Array, part: Part) -> str:
     kind, stops = "continuous", ""
     if part.limits is not None:
         kind, stops = "revolute", f'lower="{part.limits[0]!r}" upper="{part.limits[1]!r}" '
-    # The sense of an axis is the URDF's choice.
     return (
         f'<joint name="j{k}" type="{kind}"><parent link="l{parent}"/><child link="l{k}"/>'
         f'<origin xyz="{numbers(origin)}"/><axis xyz="{numbers(axis)}"/>'
@@ -313,9 +313,6 @@ def test_the_centre_is_where_the_phase_density_is_largest(chain: SpaceRobot) -> 
     top = abs(phase_density(centre))
     assert top == pytest.approx(0.5376, abs=5e-5)
     assert top >= heights.max() - 1e-6
-    curvature = PlanarPhase(chain).curvature(centre[np.newaxis], 0, 1)
-    assert curvature[0] == pytest.approx(-phase_density(centre), abs=1e-8)
-    np.testing.assert_allclose(chain.curvature(centre)[5, 0, 1], curvature[0], atol=1e-12)
 
 
 def test_the_nearer_of_two_equal_centres_is_taken(chain: SpaceRobot) -> None:
@@ -341,6 +338,24 @@ def test_velocities_are_the_mean_of_the_papers_over_each_tick(chain: SpaceRobot)
     for k in (0, 1, 39, 40, 60, 79):
         mean = quad(speed, k * PERIOD, (k + 1) * PERIOD)[0] / PERIOD
         np.testing.assert_allclose(gait.velocities[160 + k], mean * D, atol=1e-9)
+
+
+@pytest.mark.parametrize("branched", [False, True])
+def test_the_curvature_in_the_plane_of_two_joints(branched: bool) -> None:
+    rng = np.random.default_rng(8)
+    tree = random_tree(rng, 5, branched=branched)
+    robot = SpaceRobot.from_urdf(tree.urdf)
+    phase, h = PlanarPhase(robot), 1e-5 * np.eye(4)
+    for i, j in itertools.combinations(range(4), 2):
+        psi = rng.uniform(-np.pi, np.pi, 4)
+        curl = (tree.s(psi + h[i]) - tree.s(psi - h[i]))[j]
+        curl -= (tree.s(psi + h[j]) - tree.s(psi - h[j]))[i]
+        # The plane knows where the other joints are, and not where these two were.
+        plane = phase.plane(np.where(np.isin(np.arange(4), [i, j]), 9.0, psi), i, j)
+        K = plane.curvature(psi[[i, j]]) * phase.axis
+        np.testing.assert_allclose(K, -curl / 2e-5 * tree.plane[:, 2], atol=1e-8)
+        # The model's is one of three dimensions: here it has no more than this.
+        np.testing.assert_allclose(K, robot.curvature(psi)[3:, i, j], atol=1e-11)
 
 
 # -- any planar robot -------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +27,19 @@ TICK = 0.05
 RATE, STROKE = 2.0, 3.0  # of the joints of random robots
 
 
+@cache
+def robot_of(urdf: str) -> SpaceRobot:
+    """Return the model of a robot, built once: that takes longer than a flight."""
+    return SpaceRobot.from_urdf(urdf)
+
+
 class Case:
     """A random robot in a random state, and the engine that watches it."""
 
     def __init__(self, seed: int, *, momentum: bool) -> None:
         self.rng = rng = np.random.default_rng(seed)
         self.urdf = random_robot_urdf(rng, int(rng.integers(3, 7)))
-        self.robot = SpaceRobot.from_urdf(self.urdf)
+        self.robot = robot_of(self.urdf)
         self.oracle = PinocchioOracle(self.urdf, self.robot.joint_names)
         n = self.robot.n
         quaternion = rng.normal(size=4)
@@ -229,7 +236,7 @@ def test_a_body_without_joints_tumbles_as_euler_says() -> None:
 
 def sliding_masses(**initial: Any) -> VelocityPlant:
     """Return three sliders of 0.7 m/s and 2.5 m either way."""
-    robot = SpaceRobot.from_file(URDF / "sliding_masses.urdf")
+    robot = robot_of((URDF / "sliding_masses.urdf").read_text("utf-8"))
     return VelocityPlant(robot, TICK, InitialState(**initial))
 
 
@@ -343,7 +350,8 @@ def test_compiled_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
     if c_compiler() is None:
         pytest.skip("no C compiler")
-    compiled = sliding_masses(**momenta)
+    robot = SpaceRobot.from_file(URDF / "sliding_masses.urdf")
+    compiled = VelocityPlant(robot, TICK, interpreted.initial)
     for _ in range(50):
         command = rng.uniform(-1.0, 1.0, 3)
         interpreted.step(command)
@@ -361,7 +369,7 @@ def test_compiled_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("period", [0.0, -0.05, np.nan, np.inf])
 def test_a_bad_tick_period_is_refused(period: float) -> None:
-    robot = SpaceRobot.from_file(URDF / "sliding_masses.urdf")
+    robot = robot_of((URDF / "sliding_masses.urdf").read_text("utf-8"))
     with pytest.raises(ParameterError, match="tick period"):
         VelocityPlant(robot, period)
 

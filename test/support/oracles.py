@@ -353,12 +353,16 @@ class PinocchioOracle(Oracle):
 class MujocoOracle(Oracle):
     """MuJoCo: u has the base velocity in world and its rate in base components."""
 
-    def load(self, urdf: str) -> None:
+    def describe(self, urdf: str) -> mujoco.MjSpec:
+        """Return the description that is compiled."""
         spec = mujoco.MjSpec.from_string(urdf)
         # Left alone, links on fixed joints lose their names and the root is welded to the world.
         spec.compiler.fusestatic = False
         spec.worldbody.first_body().add_freejoint()
-        self.model = spec.compile()
+        return spec
+
+    def load(self, urdf: str) -> None:
+        self.model = self.describe(urdf).compile()
         self.model.opt.gravity[:] = 0.0
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
         assert not self.model.dof_armature.any()

@@ -1,0 +1,118 @@
+"""The fast dynamics against the paper's, Pinocchio and MuJoCo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.oracles import ENGINES, Array, Motion, assert_agrees, random_motion, relative_deviation
+from support.random_robots import random_chain_urdf, random_robot_urdf
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.attitude import matrix_from_quaternion
+from spacerobot_ros.model.compilation import BufferedFunction
+from spacerobot_ros.model.free_flight import state_slices
+from spacerobot_ros.resources import share_directory
+
+SEEDS = range(10)
+SERVICER = share_directory() / "urdf" / "servicer.urdf"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot in a random state, with forces on it."""
+
+    urdf: str
+    robot: SpaceRobot
+    motion: Motion
+    wrench_B: Array
+    tau: Array
+
+    def arguments(self) -> tuple[Array, ...]:
+        m = self.motion
+        return m.q, m.v_cm_B, m.omega_WB_B, m.qdot, self.wrench_B, self.tau
+
+    def dynamics(self) -> Array:
+        return self.robot.buffered("dynamics")(*self.arguments())[0]
+
+
+def case_of(urdf: str, rng: np.random.Generator) -> Case:
+    robot = SpaceRobot.from_urdf(urdf)
+    motion = random_motion(rng, robot.n)
+    return Case(urdf, robot, motion, rng.uniform(-10, 10, 6), rng.uniform(-5, 5, robot.n))
+
+
+@cache
+def random_case(seed: int) -> Case:
+    rng = np.random.default_rng(seed)
+    return case_of(random_robot_urdf(rng, joints=3 + seed % 4), rng)
+
+
+@pytest.fixture(params=SEEDS, ids=lambda seed: f"robot{seed}")
+def case(request: pytest.FixtureRequest) -> Case:
+    return random_case(request.param)
+
+
+def test_same_as_the_paper(case: Case) -> None:
+    assert_agrees(case.dynamics(), case.robot.forward_dynamics(*case.arguments()), 1e-12)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_same_as_the_engines(case: Case, engine: type) -> None:
+    oracle = engine(case.urdf, case.robot.joint_names)
+    assert_agrees(case.dynamics(), oracle.forward_dynamics(case.motion, case.wrench_B, case.tau))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_bodies_with_axes_of_symmetry(engine: type) -> None:
+    """They are built from fewer directions than others."""
+    case = case_of(SERVICER.read_text(encoding="utf-8"), np.random.default_rng(21))
+    oracle = engine(case.urdf, case.robot.joint_names)
+    assert_agrees(case.dynamics(), oracle.forward_dynamics(case.motion, case.wrench_B, case.tau))
+
+
+@pytest.mark.parametrize("joints", [0, 1, 2, 12])
+def test_chains(joints: int) -> None:
+    rng = np.random.default_rng(100 + joints)
+    case = case_of(random_chain_urdf(rng, joints), rng)
+    assert_agrees(case.dynamics(), case.robot.forward_dynamics(*case.arguments()), 1e-12)
+
+
+def test_shape_equations_are_the_schur_complement(case: Case) -> None:
+    """Of the paper's ``H+`` with respect to the base, at momenta that do not matter."""
+    robot, n = case.robot, case.robot.n
+    x = np.zeros(2 * n + 13)
+    shape, attitude, rates, *_ = state_slices(n)
+    x[shape], x[attitude], x[rates] = case.motion.q, case.motion.quaternion_WB, case.motion.qdot
+    K, _ = robot.buffered("shape_equations")(x, np.zeros(n + 6))
+    H = robot.inertia_matrix(case.motion.q)
+    assert_agrees(K, H[6:, 6:] - H[6:, :6] @ np.linalg.solve(H[:6, :6], H[:6, 6:]), 1e-12)
+    assert_agrees(K, K.T, 0.0)
+
+
+def test_shape_forces_from_the_papers_acceleration(case: Case) -> None:
+    """``K qddot`` at the momenta of the state is ``Q``."""
+    robot, m = case.robot, case.motion
+    L_W = matrix_from_quaternion(m.quaternion_WB) @ robot.inertia_matrix(m.q)[3:6] @ m.z0dot
+    x = np.concatenate([m.q, m.quaternion_WB, m.qdot, np.zeros(3), L_W, np.zeros(3)])
+    K, Q = robot.buffered("shape_equations")(x, np.concatenate([case.tau, case.wrench_B]))
+    assert_agrees(K @ robot.forward_dynamics(*case.arguments())[6:], Q, 1e-12)
+
+
+def test_costs_less_than_half_of_the_papers() -> None:
+    robot = SpaceRobot.from_file(SERVICER)
+    fast, slow = (robot.function(name, compile=False) for name in ("dynamics", "forward_dynamics"))
+    assert fast.n_nodes() < 0.45 * slow.n_nodes()
+
+
+def test_compiled_numbers(compiled_code: Path) -> None:
+    interpreted = random_case(0)
+    robot = SpaceRobot(interpreted.robot.description)
+    function = robot.function("dynamics")
+    assert function.class_name() == "External"
+    (compiled,) = BufferedFunction(function)(*interpreted.arguments())
+    expected = interpreted.robot.forward_dynamics(*interpreted.arguments())
+    assert relative_deviation(compiled, expected) < 1e-12
