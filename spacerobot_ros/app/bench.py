@@ -27,6 +27,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from spacerobot_ros.app.bench_dynamics import dynamics_benchmark
 from spacerobot_ros.app.run import ros
 from spacerobot_ros.app.scenario import load_scenario
 from spacerobot_ros.app.stack import FlightStack
@@ -63,7 +64,7 @@ def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
             )
     stack_rate, peer_rate = statistics.median(stack_rates), statistics.median(peer_rates)
     tick = _plant_tick()
-    figures = {
+    figures: dict[str, float | str] = {
         "ticks_per_s": stack_rate,
         "bare_ticks_per_s": peer_rate,
         "ratio_to_bare": stack_rate / peer_rate,
@@ -74,9 +75,27 @@ def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
     yield f"bare ping-pong with as many topics and a raw recorder: {peer_rate:.0f} ticks/s"
     yield f"ratio: {100 * stack_rate / peer_rate:.0f} %"
     yield f"one plant tick alone: {1e6 * tick:.1f} us (compiler: {figures['compiler']})"
+    dynamics = dynamics_benchmark()
+    figures |= dynamics
+    yield from _dynamics_lines(dynamics)
     if json_file is not None:
         json_file.parent.mkdir(parents=True, exist_ok=True)
         json_file.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+
+
+def _dynamics_lines(figures: dict[str, float | str]) -> Iterator[str]:
+    """Say how the dynamics of the six-joint robot compare with MuJoCo's."""
+    if "step_us" in figures:
+        yield f"one RK4 step of the servicer's dynamics: {figures['step_us']:.1f} us"
+    yield f"... in the virtual machine: {figures['step_without_compiler_us']:.1f} us"
+    if "mujoco_step_us" not in figures:
+        yield f"MuJoCo: {figures['mujoco']}"
+        return
+    yield f"MuJoCo {figures['mujoco']}, mj_step with RK4: {figures['mujoco_step_us']:.1f} us"
+    if "ratio_to_mujoco" in figures:
+        yield f"times faster than MuJoCo: {figures['ratio_to_mujoco']:.1f}"
+    without = figures["ratio_to_mujoco_without_compiler"]
+    yield f"... without a compiler: {without:.2f}"
 
 
 def _stack_rate(ticks: int, bag: Path) -> float:

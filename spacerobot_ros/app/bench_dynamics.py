@@ -32,9 +32,9 @@ def dynamics_benchmark() -> dict[str, float | str]:
     Each engine takes a thousand steps in one call, which loops in compiled code: one tick of
     :class:`EffortPlant` and ``mujoco.mj_step(model, data, nstep=1000)``. All start from the same
     drifting motion, without force and away from the strokes' ends. The plant integrates position,
-    momenta and limits besides; MuJoCo is spared what this robot does not need (constraints, contacts,
-    sensors, its own check of the state). They take turns, and medians are compared: what else
-    the machine does then falls on all.
+    momenta and limits besides; MuJoCo is spared what this robot does not need (constraints,
+    contacts, sensors, its own check of the state). They take turns, and medians are compared: what
+    else the machine does then falls on all.
 
     ``step_us``, ``step_without_compiler_us`` (CasADi's virtual machine) and ``mujoco_step_us`` are
     times, ``ratio_to_mujoco`` and ``ratio_to_mujoco_without_compiler`` say how many times faster

@@ -18,8 +18,6 @@ from spacerobot_ros.control import (
     PROFILES,
     ActuatorLimits,
     ControlState,
-    GainPair,
-    Gains,
     JointReference,
     MotionLimits,
     OutputSelection,
@@ -30,6 +28,7 @@ from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.errors import NotFiniteError
 from spacerobot_ros.errors import CommandError, PlanningError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.attitude import matrix_from_quaternion
 from spacerobot_ros.nodes.cdr import (
     NANOSECONDS,
     MessageTemplate,
@@ -37,35 +36,13 @@ from spacerobot_ros.nodes.cdr import (
     raw_publish,
     stamp_bytes,
 )
+from spacerobot_ros.nodes.control_parameters import CONTROL_SPECS, gains_of
 from spacerobot_ros.nodes.controller_status import ControllerState, ControllerStatus
 from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
 from spacerobot_ros.nodes.joint_command import JointReader
-from spacerobot_ros.nodes.parameters import ParameterSpec, option_specs
 from spacerobot_ros.nodes.plant_topics import DEFAULT_END_EFFECTOR
-from spacerobot_ros.nodes.robot_source import ROBOT_SPECS, robot_of
+from spacerobot_ros.nodes.robot_source import robot_of
 from spacerobot_ros.planning import Goal
-
-_GROUPS = (
-    ("base_position", 30.0, 60.0),
-    ("base_attitude", 30.0, 60.0),
-    ("end_effector_position", 30.0, 60.0),
-    ("end_effector_attitude", 30.0, 60.0),
-    ("joints", 4.0, 4.0),
-)
-_SMALLEST_GAIN = 1e-9
-
-_GAIN_SPECS = tuple(
-    ParameterSpec(
-        f"gains.{group}.{name}",
-        default,
-        "of the law",
-        f"{meaning} gain of the {group.replace('_', ' ')}",
-        _SMALLEST_GAIN,
-        live=True,
-    )
-    for group, kp, kd in _GROUPS
-    for name, meaning, default in (("kp", "proportional", kp), ("kd", "derivative", kd))
-)
 
 
 class CoordinatedControlNode(FlightNode):
@@ -76,40 +53,7 @@ class CoordinatedControlNode(FlightNode):
     there is a goal, the robot holds the pose of its first state.
     """
 
-    SPECS: ClassVar = (
-        *ROBOT_SPECS,
-        ParameterSpec("law", "transposed_jacobian", "", "control law", choices=tuple(LAWS)),
-        ParameterSpec("tick_rate", 100.0, "Hz", "commands a second; the plant's", 1e-3, 1e5),
-        ParameterSpec("world_frame", "world", "", "frame that goals must be given in"),
-        ParameterSpec(
-            "end_effector_frame", "", "", "link that is controlled; '': 'end_effector', if any"
-        ),
-        ParameterSpec("base_outputs", "", "", "axes of the base: x y z rx ry rz; '': by the robot"),
-        ParameterSpec("end_effector_outputs", "", "", "axes of the end-effector; '': by the robot"),
-        ParameterSpec("joint_outputs", "", "", "joints that are outputs; '': by the robot"),
-        ParameterSpec(
-            "profile", "step", "", "how references move to goals", choices=tuple(PROFILES)
-        ),
-        ParameterSpec("motion.speed", 0.1, "m/s", "fastest reference", 1e-6),
-        ParameterSpec("motion.acceleration", 0.02, "m/s^2", "of the reference", 1e-6),
-        ParameterSpec("motion.angular_speed", 0.1, "rad/s", "fastest reference", 1e-6),
-        ParameterSpec("motion.angular_acceleration", 0.02, "rad/s^2", "of the reference", 1e-6),
-        ParameterSpec("max_force", 0.0, "N", "of the thrusters; 0: no limit", 0.0),
-        ParameterSpec("max_torque", 0.0, "N m", "of the thrusters; 0: no limit", 0.0),
-        ParameterSpec(
-            "estimation_time", 1.0, "s", "without odom the base is estimated this long", 0.0
-        ),
-        ParameterSpec("position_tolerance", 1e-3, "m", "a goal is met within", 0.0, live=True),
-        ParameterSpec("attitude_tolerance", 1e-3, "rad", "a goal is met within", 0.0, live=True),
-        ParameterSpec("joint_tolerance", 1e-3, "m or rad", "a goal is met within", 0.0, live=True),
-        ParameterSpec("settle_time", 1.0, "s", "... for this long", 0.0, live=True),
-        ParameterSpec(
-            "time_limit", 0.0, "s", "a goal not met after this long has failed; 0: never", 0.0
-        ),
-        ParameterSpec("status_period", 1.0, "s", "simulated time between status messages", 0.01),
-        *_GAIN_SPECS,
-        *option_specs(LAWS),
-    )
+    SPECS: ClassVar = CONTROL_SPECS
 
     def __init__(self, name: str = "coordinated_control", **kwargs: Any) -> None:
         self._running = False
@@ -120,10 +64,14 @@ class CoordinatedControlNode(FlightNode):
 
     def configure(self) -> None:
         """Create the topics; without a robot of its own the node waits for robot_description."""
-        self._odom_raw = self._joints_raw = self._reference_raw = b""
+        self._odom_raw = self._joints_raw = b""
+        self._reference_raw = self._base_reference_raw = b""
         self._odom_fresh = self._joints_fresh = self._hold = False
         self._goals: dict[str, PoseReference] = {}
         self._odom = TemplateReader(
+            Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
+        )
+        self._base_reference = TemplateReader(
             Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
         )
         self._send_joints = raw_publish(self.create_publisher(JointState, "joint_commands", STREAM))
@@ -143,12 +91,16 @@ class CoordinatedControlNode(FlightNode):
         self.create_subscription(
             JointState, "joint_reference", self._on_reference, STREAM, raw=True
         )
+        self.create_subscription(
+            Odometry, "base_reference", self._on_base_reference, STREAM, raw=True
+        )
         self.create_service(Trigger, "~/abort", self._on_abort)
 
     def activate(self) -> None:
         """Answer states with commands from now on."""
         self._running = True
-        self._planner_drives = self.count_publishers("joint_reference") > 0
+        self._joints_driven = self.count_publishers("joint_reference") > 0
+        self._base_driven = self.count_publishers("base_reference") > 0
         self._status.begin()
         # A lockstep plant may have been waiting for an answer since before.
         self._on_part()
@@ -177,7 +129,7 @@ class CoordinatedControlNode(FlightNode):
         if any(chosen.values()):
             outputs = OutputSelection(**chosen, end_effector_link=link)
         options = {o.name: values[f"{law_type.name}.{o.name}"] for o in law_type.options}
-        law = law_type(robot, outputs, self._gains(), **options)
+        law = law_type(robot, outputs, gains_of(self.parameters), **options)
         self._period = round(NANOSECONDS / values["tick_rate"]) / NANOSECONDS
         motion = {
             name: values[f"motion.{name}"]
@@ -212,18 +164,10 @@ class CoordinatedControlNode(FlightNode):
         self._wrench_message = MessageTemplate(wrench)
         self._wrench_message.feed("wrench.force.x", self._wrench)
 
-    def _gains(self) -> Gains:
-        values: dict[str, Any] = self.parameters
-        pairs = {
-            group: GainPair(values[f"gains.{group}.kp"], values[f"gains.{group}.kd"])
-            for group, _, _ in _GROUPS
-        }
-        return Gains(**pairs)
-
     def parameters_changed(self) -> None:
         """Take over new gains."""
         if self._robot is not None:
-            self.controller.set_gains(self._gains())
+            self.controller.set_gains(gains_of(self.parameters))
 
     # -- topics -------------------------------------------------------------------------------
 
@@ -282,7 +226,12 @@ class CoordinatedControlNode(FlightNode):
 
     def _on_reference(self, raw: bytes) -> None:
         self._reference_raw = raw
-        self._planner_drives = True
+        self._joints_driven = True
+        self._on_part()
+
+    def _on_base_reference(self, raw: bytes) -> None:
+        self._base_reference_raw = raw
+        self._base_driven = True
         self._on_part()
 
     def _on_part(self) -> None:
@@ -294,7 +243,8 @@ class CoordinatedControlNode(FlightNode):
             and self._joints_fresh
             and self._robot is not None
             and stamp == self._odom_raw[4:12]
-            and (not self._planner_drives or stamp == self._reference_raw[4:12])
+            and (not self._joints_driven or stamp == self._reference_raw[4:12])
+            and (not self._base_driven or stamp == self._base_reference_raw[4:12])
         ):
             self._odom_fresh = self._joints_fresh = False
             self._on_state(measured=True)
@@ -317,8 +267,10 @@ class CoordinatedControlNode(FlightNode):
             state = self._measured(q, qdot) if measured else None
             if state is not None:
                 self._take_goals(now, state)
-            if self._planner_drives and self._reference_raw:
-                self.controller.follow(self._given_reference())
+            if self._joints_driven or self._base_driven:
+                self.controller.follow(
+                    Reference(base=self._given_base(), joints=self._given_joints())
+                )
             result = self.controller.command(now, state, q, qdot)
         except (CommandError, NotFiniteError) as error:
             self.get_logger().error(f"The state is refused: {error}", throttle_duration_sec=5.0)
@@ -358,19 +310,29 @@ class CoordinatedControlNode(FlightNode):
             self._goals = {}
             self._status.started(now)
 
-    def _given_reference(self) -> Reference:
-        """Return the planner's reference of this tick, whose velocities are held over it."""
+    def _given_joints(self) -> JointReference | None:
+        """Return the joint reference of this tick, whose velocities are held over it."""
+        if not self._reference_raw:
+            return None
         self._references.accept(self._reference_raw)
         held = self._references.values["velocity"].copy()
         before = self._reference_rate if self._reference_rate is not None else held
         self._reference_rate = held
-        return Reference(
-            joints=JointReference(
-                self._references.values["position"].copy(),
-                (before + held) / 2,
-                (held - before) / self._period,
-            )
+        return JointReference(
+            self._references.values["position"].copy(),
+            (before + held) / 2,
+            (held - before) / self._period,
         )
+
+    def _given_base(self) -> PoseReference | None:
+        """Return the base reference of this tick; an Odometry's twist is in the base."""
+        if not self._base_reference_raw:
+            return None
+        self._base_reference.accept(self._base_reference_raw)
+        pose = self._base_reference.floats("pose.pose.position.x")
+        twist = self._base_reference.floats("twist.twist.linear.x")
+        R_WB = matrix_from_quaternion(pose[3:])
+        return PoseReference(pose[:3], pose[3:], R_WB @ twist[:3], R_WB @ twist[3:])
 
 
 def main() -> None:

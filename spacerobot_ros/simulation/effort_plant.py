@@ -140,7 +140,9 @@ class EffortPlant:
         self._command[:n] = effort
         self._command[n:] = wrench
         self._advance.evaluate()
-        return self._limited[0] != 0.0 and self._apply_limits()
+        if self._limited[0] == 0.0:
+            return False
+        return self._apply_limits()
 
     def _apply_limits(self) -> bool:
         """Count what was clipped, and take the tick again if a joint touched a stop."""
@@ -225,4 +227,4 @@ def _watched_step(robot: SpaceRobot) -> ca.Function:
 def _touching(robot: SpaceRobot, state: ca.MX) -> ca.MX:
     """Return how many joints are not strictly inside their strokes."""
     q = state[: robot.n]
-    return robot.n - ca.sum1(ca.logic_and(q > robot.lower, q < robot.upper))
+    return robot.n - ca.sum1(ca.logic_and(q > ca.DM(robot.lower), q < ca.DM(robot.upper)))

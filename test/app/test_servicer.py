@@ -158,7 +158,12 @@ def test_momentum_is_what_the_thrusters_gave(unlimited: RunResult) -> None:
 def test_lost_thrust_is_reported(law: str, tmp_path: Path) -> None:
     """The goal at once demands more than small thrusters give: status says how much is lost."""
     force, torque = 2.0, 0.5
-    settings = {"profile": "step", "max_force": force, "max_torque": torque, "time_limit": 5.0}
+    settings: dict[str, Any] = {
+        "profile": "step",
+        "max_force": force,
+        "max_torque": torque,
+        "time_limit": 5.0,
+    }
     result = fly(tmp_path / "run.mcap", law, **settings)
     bag = read_bag(tmp_path / "run.mcap")
     given_force, given_torque = peaks(bag)
@@ -175,18 +180,18 @@ def test_both_poses_are_reached_with_a_tenth_of_the_thrust(
     unlimited: RunResult, law: str, tmp_path: Path
 ) -> None:
     force, torque = (peak / 10 for peak in peaks(read_bag(unlimited.summary["bag"])))
-    result = fly(
-        tmp_path / "run.mcap",
-        law,
-        max_force=force,
-        max_torque=torque,
-        time_limit=300.0,
-        **{"motion.acceleration": 0.0015, "motion.angular_acceleration": 0.0015},
-    )
+    settings: dict[str, Any] = {
+        "max_force": force,
+        "max_torque": torque,
+        "motion.acceleration": 0.0015,
+        "motion.angular_acceleration": 0.0015,
+        "time_limit": 300.0,
+    }
+    result = fly(tmp_path / "run.mcap", law, **settings)
     given_force, given_torque = peaks(assert_arrived(result))
     assert given_force <= force * (1 + 1e-12)
     assert given_torque <= torque * (1 + 1e-12)
-    assert result.summary["sim_time_s"] > 3 * unlimited.summary["sim_time_s"] / 1.2
+    assert result.summary["sim_time_s"] > 2.5 * unlimited.summary["sim_time_s"]
 
 
 def heavier() -> Callable[[], float]:

@@ -595,7 +595,9 @@ class FakePlant:
     def __init__(self, harness: Harness, parameters: dict[str, Any]) -> None:
         self.harness = harness
         self.planner = harness.make(PlannerNode, {**PLANNER, **parameters}, autostart=False)
-        self.probe: Probe = harness.probe({"joint_commands": JointState, "/rosout": Log})
+        topics = {"joint_commands": JointState, "planner/status": DiagnosticStatus, "/rosout": Log}
+        self.probe: Probe = harness.probe(topics)
+        self.goals = self.probe.create_publisher(PoseStamped, "goal_pose", 10)
         self.description = self.probe.create_publisher(String, "robot_description", LATCHED)
         self.odom = self.probe.create_publisher(Odometry, "odom", 10)
         self.joints = self.probe.create_publisher(JointState, "joint_states", 10)
@@ -606,15 +608,23 @@ class FakePlant:
         given = (URDF / "sliding_masses.urdf").read_text("utf-8") if text is None else text
         self.description.publish(String(data=given))
 
-    def show(self, tick: int = 0, joints_first: bool = False, **joints: float) -> None:
+    def show(
+        self,
+        tick: int = 0,
+        joints_first: bool = False,
+        rates: bool = True,
+        x: float = 0.0,
+        **joints: float,
+    ) -> None:
         odom = Odometry(child_frame_id="base_link")
+        odom.pose.pose.position.x = x
         odom.header.frame_id = "world"
         odom.pose.pose.orientation.w = 1.0
         places = joints or dict.fromkeys(SLIDERS, 0.0)
         state = JointState(
             name=list(places),
             position=list(places.values()),
-            velocity=[0.0] * len(places),
+            velocity=[0.0] * len(places) if rates else [],
             effort=[0.0] * len(places),
         )
         for message in (odom, state):
@@ -678,6 +688,57 @@ def test_joint_states_of_another_robot_are_refused_with_a_reason(harness: Harnes
     )
     fake.show(1)
     assert [stamp_of(m) for m in fake.answers(1)] == [TICK_NS]
+
+
+def test_joint_states_that_lack_a_joint_are_refused_with_a_reason(harness: Harness) -> None:
+    # Zero would be a guess, and the plan would start from it.
+    fake = FakePlant(harness, {})
+    fake.planner.trigger_activate()
+    fake.show(0, slider_1=0.1, slider_3=0.3)
+    harness.spin_until(
+        lambda: any("slider_2" in m.msg for m in fake.probe.messages["/rosout"]),
+        "a word on the joint that is missing",
+    )
+    fake.show(1)
+    assert [stamp_of(m) for m in fake.answers(1)] == [TICK_NS]
+
+
+def test_joint_states_without_velocities_do_not_end_the_planner(harness: Harness) -> None:
+    fake = FakePlant(harness, {})
+    fake.planner.trigger_activate()
+    fake.goals.publish(goal_at(NEAR))
+    harness.settle(fake.probe)
+    fake.show(0, rates=False)
+    # Flown as from rest, or refused with a reason.
+    harness.spin_until(
+        lambda: values_of(fake.probe.last("planner/status"))["state"] in ("executing", "refused"),
+        "the goal is decided",
+    )
+    count = fake.probe.count("joint_commands")
+    fake.show(1)
+    fake.answers(count + 1)
+
+
+@pytest.mark.parametrize("broken", [{"x": math.nan}, dict.fromkeys(SLIDERS, math.nan)])
+def test_a_state_that_is_not_finite_does_not_end_the_planner(
+    harness: Harness, broken: dict[str, float]
+) -> None:
+    fake = FakePlant(harness, {})
+    fake.planner.trigger_activate()
+    fake.goals.publish(goal_at(NEAR))
+    harness.settle(fake.probe)
+    fake.show(0, **broken)  # type: ignore[arg-type]
+    harness.settle(fake.probe)
+    assert values_of(fake.probe.last("planner/status"))["state"] != "executing"
+    fake.goals.publish(goal_at(NEAR))
+    harness.settle(fake.probe)
+    fake.show(1)
+    harness.spin_until(
+        lambda: values_of(fake.probe.last("planner/status"))["state"] == "executing",
+        "a plan from a state that is finite",
+    )
+    for command in fake.probe.messages["joint_commands"]:
+        assert np.all(np.isfinite(command.velocity))
 
 
 def test_a_broken_description_is_refused_and_the_next_is_taken(harness: Harness) -> None:
