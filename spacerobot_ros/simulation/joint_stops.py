@@ -86,7 +86,7 @@ class JointStops:
         if not inward.any():
             return touched, touched
         K, Q = self._equations(x, command)
-        compliance = np.linalg.inv(K)
+        compliance = np.linalg.inv(K.reshape(q.size, q.size))
         if np.any(inward * qdot < 0.0):
             touched = pushed_out(compliance, qdot, inward, touched)
             qdot[:], _ = at_rest(compliance, qdot, touched)

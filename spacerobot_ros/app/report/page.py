@@ -100,7 +100,10 @@ def _facts(flight: Flight) -> str:
 
 def _outcome(flight: Flight) -> str:
     if not flight.statuses:
-        return '<p class="outcome">The bag holds no word of a planner (planner/status).</p>'
+        return (
+            '<p class="outcome">The bag holds no word of a planner or a controller '
+            "(planner/status, controller/status).</p>"
+        )
     last = flight.statuses[-1]
     sentence = last.message
     if last.state == "executing":

@@ -20,7 +20,9 @@ _TYPES = {
     "odom": "nav_msgs/msg/Odometry",
     "joint_states": "sensor_msgs/msg/JointState",
     "momentum": "std_msgs/msg/Float64MultiArray",
+    "momentum_expected": "std_msgs/msg/Float64MultiArray",
     "planner/status": "diagnostic_msgs/msg/DiagnosticStatus",
+    "controller/status": "diagnostic_msgs/msg/DiagnosticStatus",
     "goal_pose": "geometry_msgs/msg/PoseStamped",
     "planned_path": "nav_msgs/msg/Path",
     "robot_description": "std_msgs/msg/String",
@@ -64,10 +66,11 @@ def read_flight(path: Path) -> Flight:
         attitude=attitude,
         shape=space.signal(joints, ["position"], len(names)),
         rates=space.signal(joints, ["velocity"], len(names)),
-        momentum=space.signal(space["momentum"], ["data"], 7),
+        momentum=_ledger(space),
         statuses=[
             Status(time, message.message, {pair.key: pair.value for pair in message.values})
             for time, message in space.messages("planner/status")
+            or space.messages("controller/status")
         ],
         sent=_goals(space, odom),
         planned=[
@@ -114,6 +117,17 @@ class _Namespace:
 
     def _times(self, series: TopicSeries) -> Array:
         return series.stamp if self._stamped else series.time
+
+
+def _ledger(space: _Namespace) -> Signal:
+    """Return momenta and energy (N, 7), without the momenta that thrusters have put in."""
+    ledger = space.signal(space["momentum"], ["data"], 7)
+    expected = space.signal(space["momentum_expected"], ["data"], 6)
+    if len(expected) != len(ledger) or not len(ledger):
+        return ledger
+    values = ledger.values.copy()
+    values[:, :6] -= expected.values - expected.values[0]
+    return Signal(ledger.time, values)
 
 
 def _column(values: Any, width: int) -> Array:
