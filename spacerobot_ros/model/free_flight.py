@@ -10,9 +10,9 @@ therefore constant to the last bit, whatever the step:
 * ``K qddot = Q`` at the ``omega_WB_B`` that the momenta imply
   (:mod:`spacerobot_ros.model.composite_rigid_body`).
 
-The command is ``[tau; f; n]``, (n + 6,): joint efforts (N or N m), force (N) and torque (N m) at the
-origin of the base link, base components. The attitude is integrated in R^4 and normalised after
-each Runge-Kutta step.
+The command is ``[tau; f; n]``, (n + 6,): joint efforts (N or N m), then force (N) and torque (N m)
+at the origin of the base link, base components. The attitude is integrated in R^4 and normalised
+after each Runge-Kutta step.
 """
 
 from __future__ import annotations

@@ -18,8 +18,8 @@ class InitialState:
 
     ``joint_positions`` None means zero, or the nearest end of a stroke that excludes zero.
     ``angular_momentum`` (kg m^2/s) is about the system's centre of mass. ``joint_velocities`` None
-    means zero; the base's twist follows from them and the momenta. ``center_of_mass`` (m, in W) puts
-    the system's centre of mass there instead of the base link at ``position``.
+    means zero; the base's twist follows from them and the momenta. ``center_of_mass`` (m, in W)
+    puts the system's centre of mass there instead of the base link at ``position``.
 
     Raises
     ------

@@ -128,12 +128,13 @@ def test_spin_keeps_the_slider_out_until_effort_draws_it_in() -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_stops_change_no_momentum_and_only_take_energy(seed: int) -> None:
     robot, rng = random_robot(seed), np.random.default_rng(200 + seed)
+    side = rng.choice([-1.0, 1.0], robot.n)
     start = InitialState(
         quaternion=rng.normal(size=4),
-        joint_positions=rng.uniform(2.0, 2.9, robot.n) * rng.choice([-1.0, 1.0], robot.n),
+        joint_positions=side * rng.uniform(2.5, 2.9, robot.n),
         linear_momentum=rng.uniform(-1.0, 1.0, 3),
         angular_momentum=rng.uniform(-1.0, 1.0, 3),
-        joint_velocities=rng.uniform(-1.5, 1.5, robot.n),
+        joint_velocities=side * rng.uniform(0.5, 1.5, robot.n),
     )
     plant = EffortPlant(robot, 0.02, start)
     before, hits = plant.momentum.copy(), 0
