@@ -98,11 +98,8 @@ def _mujoco_run(mujoco: Any, description: RobotDescription) -> Callable[[], None
     spec = mujoco.MjSpec.from_string(description.urdf)
     spec.worldbody.first_body().add_freejoint()
     model = spec.compile()
-    off = mujoco.mjtDisableBit
-    for flag in (off.mjDSBL_CONSTRAINT, off.mjDSBL_GRAVITY, off.mjDSBL_SENSOR):
-        model.opt.disableflags |= int(flag)
-    for flag in (off.mjDSBL_SPRING, off.mjDSBL_DAMPER, off.mjDSBL_ISLAND, off.mjDSBL_AUTORESET):
-        model.opt.disableflags |= int(flag)
+    for name in ("CONSTRAINT", "GRAVITY", "SENSOR", "SPRING", "DAMPER", "ISLAND", "AUTORESET"):
+        model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
     model.opt.timestep = _STEP
     data = mujoco.MjData(model)

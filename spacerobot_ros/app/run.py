@@ -107,6 +107,7 @@ class _Facts:
     manoeuvre_time: float
     corrections: int
     gait: dict[str, str]
+    end_effector_turns: bool
 
     @classmethod
     def of(cls, stack: FlightStack, wall_time: float, stopped: bool) -> _Facts:
@@ -127,6 +128,7 @@ class _Facts:
             ),
             corrections=int(stack.status.get("corrections", 0)),
             gait=stack.gait,
+            end_effector_turns=_controls_rotation(stack),
         )
 
 
@@ -134,6 +136,15 @@ def _method(stack: FlightStack) -> str:
     """Name the gait method, or the control law where nobody plans."""
     node, name = (stack.planner, "method") if stack.planner else (stack.controller, "law")
     return str(node.parameters[name]) if node is not None else ""
+
+
+def _controls_rotation(stack: FlightStack) -> bool:
+    """Whether the attitude of the end-effector is one of the outputs."""
+    if stack.controller is None:
+        return False
+    return any(
+        axis[0] == "r" for axis in stack.controller.controller.law.outputs.selection.end_effector
+    )
 
 
 def _ends_at(stack: FlightStack) -> float:
@@ -182,7 +193,8 @@ def _summarise(scenario: Scenario, path: Path, facts: _Facts) -> RunResult:
         end = PoseError.between(*measured.end_effector, scenario.end_effector_goal)
         summary["end_effector_final_position_m"] = measured.end_effector[0].tolist()
         summary["end_effector_position_error_m"] = end.distance
-        summary["end_effector_attitude_error_rad"] = end.angle
+        if facts.end_effector_turns:
+            summary["end_effector_attitude_error_rad"] = end.angle
     return RunResult(summary, facts.sentence, measured)
 
 

@@ -251,8 +251,6 @@ class FlightStack:
         for name in names:
             if name != "recorder":
                 self.recorder.describe(f"parameters/{name}", parameters_of(nodes[name]))
-        urdf = self.plant.plant.robot.description.urdf
-        self.recorder.attach("robot_description.urdf", urdf.encode(), "application/xml")
 
     def _end_effector_record(self) -> dict[str, str]:
         goal = self.scenario.end_effector_goal

@@ -86,6 +86,12 @@ class CoordinatedController:
         self._known = False
         self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
 
+    def forget(self) -> None:
+        """Forget goals and what was measured; the next state is the first."""
+        self._profile, self._goal = None, Reference()
+        self._sent = self._estimator = self._brake = None
+        self._known, self.mode = False, Mode.MEASURED
+
     def set_gains(self, gains: Gains) -> None:
         """Change the gains from the next command on."""
         self.law.set_gains(gains)

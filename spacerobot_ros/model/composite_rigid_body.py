@@ -17,7 +17,7 @@ beyond joint j really move when the base is free, and
 * ``K qddot = Q``, ``Q_j = tau_j - S_j' f_j + B_j' (f_0 - f_external)``, where ``f_j`` is the force
   that the motion alone, at ``qddot = 0``, demands of composite j.
 
-For chains of up to about nine joints this takes fewer operations than the articulated-body
+For chains of up to about eight joints this takes fewer operations than the articulated-body
 algorithm, whose cost grows only linearly.
 """
 
@@ -89,14 +89,14 @@ class ShapeSystem:
     """What the free base leaves of the inertia: see the module for the symbols.
 
     ``J[k]`` (3, 3) is the second moment of mass of body k about its own centre; ``S[j]``, ``B[j]``
-    (6,) belong to the joint that carries body j (None for the base); ``D`` is the factor of the
+    (6,) belong to the joint that carries body j (zero for the base); ``D`` is the factor of the
     system's rotational inertia, ``K`` (n, n) the shape's inertia matrix.
     """
 
     kin: TreeKinematics
     J: tuple[ca.SX, ...]
-    S: tuple[ca.SX | None, ...]
-    B: tuple[ca.SX | None, ...]
+    S: tuple[ca.SX, ...]
+    B: tuple[ca.SX, ...]
     D: Factor
     K: ca.SX
 
@@ -122,14 +122,13 @@ def shape_system(kin: TreeKinematics) -> ShapeSystem:
         rho = kin.com[k] - c
         h = kin.mass(k) * rho
         composite.append(SpatialInertia(kin.mass(k), h, J[k] + _symmetric(h @ rho.T)))
-    S: list[ca.SX | None] = [None] * (n + 1)
-    P: list[ca.SX | None] = [None] * (n + 1)
+    S, P = ([ca.SX(6, 1)] * (n + 1) for _ in range(2))
     for k in range(n, 0, -1):
         S[k] = _joint_motion(kin, k)
         P[k] = composite[k] @ S[k]
         composite[kin.parent(k)] += composite[k]
     D = Factor(_rotational(composite[0].J))
-    B = [None] + [ca.vertcat(D.solve(p[:3]), p[3:] * (1 / kin.robot.total_mass)) for p in P[1:]]
+    B = [ca.vertcat(D.solve(p[:3]), p[3:] * (1 / kin.robot.total_mass)) for p in P]
     K = ca.SX(n, n)
     for j in range(1, n + 1):
         carriers = kin.ancestors(j)
@@ -145,8 +144,8 @@ def motion_forces(system: ShapeSystem, omega: ca.SX, qdot: ca.SX) -> tuple[ca.SX
 
     Recursive Newton-Euler (Featherstone, table 5.1). What turns with body k at ``omega_k`` and
     ``alpha_k`` accelerates by ``A_k x``, ``A_k = hat(alpha_k) + hat(omega_k)^2``, relative to the
-    body's origin. The base's origin is taken as unaccelerated: a common acceleration has no part in
-    ``S_j - B_j``.
+    body's origin. The base's origin is taken as unaccelerated: what a common acceleration adds to
+    ``S_j' f_j``, ``B_j' f_0`` takes off in ``Q_j``.
     """
     kin = system.kin
     omegas, alphas = [omega], [ca.SX(3, 1)]
@@ -154,7 +153,7 @@ def motion_forces(system: ShapeSystem, omega: ca.SX, qdot: ca.SX) -> tuple[ca.SX
     for k in range(1, kin.n + 1):
         i = kin.parent(k)
         rate = kin.axis[k] * qdot[k - 1]
-        # Not the difference of two origins: that would neither cancel nor be shared.
+        # Not as a difference of origins, in which CasADi finds nothing to cancel or to share.
         arm = kin.R[i] @ _constant(kin.robot.bodies[k].origin.r)
         if kin.is_revolute(k):
             accelerations.append(accelerations[i] + A[i] @ arm)

@@ -22,7 +22,7 @@ from spacerobot_ros.model.composite_rigid_body import composite_dynamics
 from spacerobot_ros.model.connection import connection, curvature
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.dynamics import bias, forward_dynamics, generalised_forces
-from spacerobot_ros.model.free_flight import runge_kutta_step, shape_equations, state_rate
+from spacerobot_ros.model.free_flight import repeated, runge_kutta_step, shape_equations, state_rate
 from spacerobot_ros.model.kinematics import tree_kinematics
 from spacerobot_ros.model.momentum import base_twist, momentum_of_bodies, rotation_from_quaternion
 from spacerobot_ros.model.reconstruction import attitude_step
@@ -326,9 +326,7 @@ class SpaceRobot:
         step = attitude_step(self._locked_inertia())
         x0, qdot = ca.MX.sym("x", self.n + 4), ca.MX.sym("qdot", self.n)
         L_W, h = ca.MX.sym("L_W", 3), ca.MX.sym("h")
-        x = x0
-        for _ in range(count):
-            x = step(x, qdot, L_W, h / count)
+        x = repeated(step, count)(x0, qdot, L_W, h / count)
         names = ["x", "qdot", "L_W", "h"]
         return ca.Function(f"velocity_step_{count}", [x0, qdot, L_W, h], [x], names, ["x_next"])
 

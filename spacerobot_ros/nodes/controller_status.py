@@ -34,6 +34,10 @@ _LEVELS = {
 }
 
 
+_BLIND = (ControllerState.ESTIMATING, ControllerState.STOPPED)
+"""States in which the base is not measured."""
+
+
 class ControllerStatus:
     """Publishes controller/status when something changes, and every ``status_period``."""
 
@@ -44,7 +48,7 @@ class ControllerStatus:
 
     def begin(self) -> None:
         """Forget earlier goals."""
-        self._state = ControllerState.HOLDING
+        self._state = self._seen = ControllerState.HOLDING
         self._started = self._within_since = self._next = -1.0
         self._limited = False
         self._values: dict[str, str] = {}
@@ -59,21 +63,22 @@ class ControllerStatus:
         self._state = ControllerState.TRACKING
 
     def state(self, state: ControllerState, sentence: str) -> None:
-        """Take a state that was decided elsewhere."""
-        self._state = state
+        """Take a state that was decided elsewhere; the goal is not judged any more."""
+        self._state, self._started = state, -1.0
         self._publish(state, sentence)
 
     def update(self, now: float, controller: CoordinatedController, result: Saturated) -> None:
         """Judge the errors after a command, and publish what is due."""
-        if controller.mode is Mode.MEASURED:
-            self._judge(now, controller)
         before = self._state
-        if controller.mode is Mode.ESTIMATED:
-            self._state = ControllerState.ESTIMATING
-        elif controller.mode is Mode.STOPPED:
-            self._state = ControllerState.STOPPED
-        elif self._state in (ControllerState.ESTIMATING, ControllerState.STOPPED):
-            self._state = ControllerState.TRACKING
+        if before not in _BLIND:
+            self._seen = before
+        if controller.mode is Mode.MEASURED:
+            # After a gap in the measurements everything is as it was before.
+            self._state = self._seen
+            self._judge(now, controller)
+        else:
+            estimated = controller.mode is Mode.ESTIMATED
+            self._state = ControllerState.ESTIMATING if estimated else ControllerState.STOPPED
         period = float(self._node.parameters["status_period"])  # type: ignore[arg-type]
         if self._state is before and result.limited == self._limited and now < self._next:
             return
@@ -100,7 +105,7 @@ class ControllerStatus:
         settle = float(values["settle_time"])  # type: ignore[arg-type]
         if within and now - self._within_since >= settle - 1e-9:
             self._state, self._next = ControllerState.REACHED, now
-        elif limit and now - self._started >= limit:
+        elif limit and now - self._started >= limit - 1e-9:
             self._state, self._next = ControllerState.FAILED, now
 
     def _sentence(self, controller: CoordinatedController) -> str:

@@ -109,6 +109,8 @@ class CoordinatedControlNode(FlightNode):
         """Command nothing any more; goals are forgotten."""
         self._running = False
         self._goals = {}
+        if self._robot is not None:
+            self.controller.forget()
 
     def _use(self, robot: SpaceRobot) -> None:
         self._robot = robot
@@ -148,7 +150,7 @@ class CoordinatedControlNode(FlightNode):
             values["estimation_time"],
         )
         n = robot.n
-        self._joints = JointReader(robot.joint_names, ["position", "velocity"])
+        self._joints = JointReader(robot.joint_names, ["position", "velocity"], complete=True)
         self._references = JointReader(robot.joint_names, ["position", "velocity"])
         self._reference_rate: Any = None
         self._effort, self._wrench = np.zeros(n), np.zeros(6)
@@ -218,8 +220,9 @@ class CoordinatedControlNode(FlightNode):
 
     def _on_joints(self, raw: bytes) -> None:
         if self._joints_fresh and self._running and self._robot is not None:
-            # The joints of the tick before have not met their odom: the base was not measured.
-            self._on_state(measured=False)
+            # The tick before was not answered: its odom is missing, or whoever gives references
+            # is silent.
+            self._on_state(measured=self._odom_raw[4:12] == self._joints_raw[4:12])
         self._joints_raw = raw
         self._joints_fresh = True
         self._on_part()

@@ -26,9 +26,18 @@ class JointReader:
         The model's joints.
     quantities
         What to read; the first is required in every message.
+    complete
+        Whether every joint must be named, as in a measured state.
     """
 
-    def __init__(self, joint_names: Sequence[str], quantities: Sequence[Quantity]) -> None:
+    def __init__(
+        self,
+        joint_names: Sequence[str],
+        quantities: Sequence[Quantity],
+        *,
+        complete: bool = False,
+    ) -> None:
+        self._complete = complete
         self._index = {name: i for i, name in enumerate(joint_names)}
         self._robot_joints = ", ".join(joint_names)
         self._quantities = quantities
@@ -76,6 +85,9 @@ class JointReader:
             values[:] = 0.0
         if unknown:
             self._problem = f"joint '{unknown[0]}' is unknown; the robot has {self._robot_joints}"
+        elif self._complete and len(set(names)) < len(self._index):
+            missing = next(name for name in self._index if name not in names)
+            self._problem = f"joint '{missing}' is missing"
         elif len(set(names)) != len(names):
             self._problem = f"a joint is named twice in {names}"
         else:

@@ -141,8 +141,8 @@ class PlannerNode(FlightNode):
             },
         )
         n = robot.n
-        self._joints = JointReader(robot.joint_names, ["position"])
-        self._rates = JointReader(robot.joint_names, ["velocity"])
+        self._joints = JointReader(robot.joint_names, ["position"], complete=True)
+        self._motion = JointReader(robot.joint_names, ["position", "velocity"], complete=True)
         self._command = MessageTemplate(
             JointState(
                 name=list(robot.joint_names),
@@ -276,8 +276,10 @@ class PlannerNode(FlightNode):
         self._odom.accept(self._odom_raw)
         pose = self._odom.floats("pose.pose.position.x")
         twist = self._odom.floats("twist.twist.linear.x")
-        self._rates.accept(self._joints_raw)
-        q, qdot = self._joints.values["position"].copy(), self._rates.values["velocity"]
+        self._motion.accept(self._joints_raw)
+        q, qdot = self._motion.values["position"].copy(), self._motion.values["velocity"]
+        if not np.all(np.isfinite(np.concatenate([pose, twist, q, qdot]))):
+            raise PlanningError("The measured state is not finite; see odom and joint_states.")
         if np.abs(qdot).max(initial=0.0) <= _AT_REST:
             # While joints move, the momentum of a robot whose masses are not quite known is
             # uncertain; at rest the base alone shows it, and without thrust it stays.
@@ -346,7 +348,12 @@ class PlannerNode(FlightNode):
     def _judge(self, stamp: int) -> None:
         """Compare the measured pose with the goal; plan what is left, or be done."""
         assert self._goal is not None
-        state = self._measured()
+        try:
+            state = self._measured()
+        except PlanningError as reason:
+            self._follower = None
+            self._status.publish(PlannerState.FAILED, str(reason), goal=self._goal)
+            return
         error = PoseError.between(state.position, state.quaternion, self._goal, state.q)
         self._held = self._follower.schedule.positions[-1] if self._follower else None
         self._follower = None

@@ -26,6 +26,9 @@ from spacerobot_ros.simulation.plant import Plant
 _LATE_JOINER_CHECK = 0.1
 """How often a waiting lockstep plant looks for new subscribers, wall s."""
 
+_SHORTEST_STEP = 1e-5
+"""Shorter Runge-Kutta steps lose more to rounding than they gain, s."""
+
 _LONGEST_LAG = 10
 """Ticks that a real-time plant may be late and still make up; what is beyond is lost for good."""
 
@@ -121,6 +124,11 @@ class PlantNode(FlightNode):
         self._lockstep = values["time_mode"] == "lockstep"
         self._period_ns = round(NANOSECONDS / values["tick_rate"])
         actuation = ACTUATIONS[values["actuation"]]
+        if 0.0 < values["integration_step"] < _SHORTEST_STEP:
+            raise ParameterError(
+                f"Parameter 'integration_step' is {values['integration_step']}; it must be 0 (by "
+                f"the actuation) or at least {_SHORTEST_STEP:g} s."
+            )
         self.plant: Plant = actuation.plant(
             robot,
             self._period_ns / NANOSECONDS,
@@ -251,12 +259,17 @@ class PlantNode(FlightNode):
         self._look_round()
         if self._readers > before:
             self._topics.publish(self._tick * self._period_ns)
+        self._step_if_complete()
 
     def _look_round(self) -> None:
         """See who listens and who commands; the joints are waited for, a wrench if one comes."""
         self._readers = self._topics.readers()
         for channel in self._channels[1:]:
             channel.required = self.count_publishers(channel.topic) > 0
+            if not channel.required:
+                # Nobody is left who could turn the thrusters off.
+                channel.rest()
+                channel.arrived = False
 
     # -- commands -----------------------------------------------------------------------------
 

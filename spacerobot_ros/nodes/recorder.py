@@ -12,7 +12,9 @@ from typing import Any, ClassVar
 from rclpy.clock import Clock as RosClock
 from rclpy.clock import ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
 
 from spacerobot_ros import __version__
 from spacerobot_ros.errors import SpaceRobotError
@@ -69,6 +71,7 @@ class RecorderNode(FlightNode):
         }
         self._recorded: dict[str, int] = {}
         self._unknown: set[str] = set()
+        self._attached: set[str] = set()
         self._early: list[tuple[int, bytes, int, int]] | None = []
         self._wall = False
         self._now = 0
@@ -125,7 +128,7 @@ class RecorderNode(FlightNode):
             self._guarded(lambda writer: writer.add_metadata(name, values))
 
     def attach(self, name: str, data: bytes, media_type: str) -> None:
-        """Put a whole file into the bag (the URDF)."""
+        """Put a whole file into the bag; the URDF of a recorded robot_description is by itself."""
         self._guarded(lambda writer: writer.add_attachment(name, data, media_type, self._now))
 
     def scan(self) -> None:
@@ -204,8 +207,18 @@ class RecorderNode(FlightNode):
             now = raw[4:12] == self._now_stamp
             store(raw, 0 if now else _time_at(raw))
 
+        def on_description(raw: bytes) -> None:
+            if topic not in self._attached and self._active:
+                self._attached.add(topic)
+                urdf = deserialize_message(raw, String).data.encode()
+                name = f"{topic.strip('/').replace('/', '.')}.urdf"
+                self.attach(name, urdf, "application/xml")
+            store(raw, 0)
+
         if topic == "/clock":
             return on_clock
+        if topic.endswith("/robot_description"):
+            return on_description
         header = next(iter(_message_class(type_name).get_fields_and_field_types().values()), "")
         if header == "std_msgs/Header":
             return on_stamped

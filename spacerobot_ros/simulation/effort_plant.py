@@ -23,7 +23,11 @@ from spacerobot_ros.simulation.initial_state import InitialState
 from spacerobot_ros.simulation.joint_stops import JointStops
 
 DEFAULT_INTEGRATION_STEP = 0.001
-"""Longest Runge-Kutta step, s."""
+"""Longest Runge-Kutta step, s.
+
+With it the energy of a tumbling six-joint arm, its joints turning at several rad/s, drifts by about
+1e-12 in 100 s, relative; by 2e-10 with four times the step. A step takes some microseconds.
+"""
 
 _DIVERGED = 1e100
 """No quantity of a state is as large (SI units)."""

@@ -86,7 +86,7 @@ class JointStops:
         if not inward.any():
             return touched, touched
         K, Q = self._equations(x, command)
-        compliance = np.linalg.inv(K.reshape(q.size, q.size))
+        compliance: Array = np.asarray(np.linalg.inv(K.reshape(q.size, q.size)))
         if np.any(inward * qdot < 0.0):
             touched = pushed_out(compliance, qdot, inward, touched)
             qdot[:], _ = at_rest(compliance, qdot, touched)
@@ -142,9 +142,13 @@ def pushed_out(compliance: Array, rates: Array, inward: Array, guess: Flags) -> 
     by Murty's least-index pivoting, which ends for every positive definite K from every ``guess``.
     """
     joints = guess.copy()
-    while True:
+    tried: set[bytes] = set()
+    # What comes up again is a tie to rounding: either answer is right.
+    while joints.tobytes() not in tried:
+        tried.add(joints.tobytes())
         after, impulses = at_rest(compliance, rates, joints)
         wrong = np.flatnonzero(inward * np.where(joints, impulses, after) < 0.0)
         if not wrong.size:
-            return joints
+            break
         joints[wrong[0]] = ~joints[wrong[0]]
+    return joints

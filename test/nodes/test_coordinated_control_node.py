@@ -371,9 +371,6 @@ def test_without_odom_from_the_beginning_nothing_is_thrust(harness: Harness) -> 
     np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="after a gap in odom the state is tracking, whatever it was before"
-)
 def test_a_robot_that_held_still_holds_after_a_gap_in_odom(harness: Harness) -> None:
     loop = Loop(harness)
     loop.answer()
@@ -426,7 +423,6 @@ def test_an_inactive_node_commands_nothing_and_then_answers_the_waiting_state(
     np.testing.assert_allclose([*wrench, *effort], 0.0, atol=1e-12)
 
 
-@pytest.mark.xfail(strict=True, reason="after a gap in odom an aborted goal is judged again")
 def test_an_aborted_goal_is_not_reached_after_a_gap_in_odom(harness: Harness) -> None:
     loop = Loop(harness, settle_time=0.0)
     loop.aim(base=pose([1.0, 0.0, 0.0]))
@@ -444,7 +440,6 @@ def test_an_aborted_goal_is_not_reached_after_a_gap_in_odom(harness: Harness) ->
     assert loop.status["state"] == "aborted"
 
 
-@pytest.mark.xfail(strict=True, reason="after a gap in odom a goal long reached is out of time")
 def test_a_reached_goal_does_not_fail_after_a_gap_in_odom(harness: Harness) -> None:
     loop = Loop(harness, settle_time=0.01, time_limit=0.1)
     loop.aim(base=pose([0.0, 0.0, 0.0]))
@@ -465,7 +460,6 @@ def test_a_reached_goal_does_not_fail_after_a_gap_in_odom(harness: Harness) -> N
     assert loop.status["state"] == "reached"
 
 
-@pytest.mark.xfail(strict=True, reason="the controller keeps its earlier goal over a deactivation")
 def test_goals_are_forgotten_by_a_deactivation(harness: Harness) -> None:
     loop = Loop(harness)
     loop.aim(base=pose([1.0, 0.0, 0.0]))
@@ -590,9 +584,6 @@ def test_efforts_alone_do_where_nobody_gives_a_wrench(harness: Harness) -> None:
     assert list(rig.probe.last("joint_states").effort) == [1.0, -1.0]
 
 
-@pytest.mark.xfail(
-    strict=True, reason="a lockstep plant waits for ever for a wrench of a commander that is gone"
-)
 def test_a_lockstep_plant_does_not_wait_for_a_commander_that_is_gone(harness: Harness) -> None:
     rig = Effort(harness, wrench=True)
     rig.turn(1.0, 0.0)
@@ -601,7 +592,6 @@ def test_a_lockstep_plant_does_not_wait_for_a_commander_that_is_gone(harness: Ha
     harness.spin_until(lambda: rig.probe.count("joint_states") > 1, "a step", 3.0)
 
 
-@pytest.mark.xfail(strict=True, reason="the last wrench stays in force when nobody commands it")
 def test_thrusters_are_off_when_their_commander_is_gone(harness: Harness) -> None:
     rig = Effort(harness, wrench=True)
     rig.push(4.7)

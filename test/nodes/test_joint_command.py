@@ -18,7 +18,7 @@ from spacerobot_ros.errors import CommandError
 from spacerobot_ros.nodes.joint_command import JointReader
 
 JOINTS = ("slider_1", "elbow", "slider_3")
-few = settings(derandomize=True, deadline=None, max_examples=50)
+few = settings(derandomize=True, deadline=None, max_examples=30)
 numbers = st.floats(allow_nan=True)
 
 

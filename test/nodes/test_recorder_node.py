@@ -364,8 +364,8 @@ def test_without_a_clock_messages_carry_wall_time(harness: Harness, tmp_path: Pa
     assert content.log_times == sorted(content.log_times)
     for topic in ("/heard", "/stamped"):
         for entry, sent_ns in zip(content.by_topic[topic], sent, strict=True):
-            assert abs(entry.log_ns - sent_ns) < 100_000_000
-            assert abs(entry.publish_ns - sent_ns) < 100_000_000
+            assert abs(entry.log_ns - sent_ns) < 400_000_000
+            assert abs(entry.publish_ns - sent_ns) < 400_000_000
 
 
 def test_a_recorder_that_is_up_before_the_plant_keeps_one_time(

@@ -242,7 +242,7 @@ def test_stops_bring_the_rates_to_the_nearest_admissible(seed: int) -> None:
     inward = rng.choice([-1.0, 0.0, 1.0], size=n, p=[0.4, 0.2, 0.4])
     rates = rng.normal(size=n)
     guess = rng.uniform(size=n) < 0.5
-    compliance = np.linalg.inv(K)
+    compliance: Array = np.asarray(np.linalg.inv(K))
 
     best = math.inf
     for choice in itertools.product([False, True], repeat=n):
