@@ -137,6 +137,7 @@ class PlantNode(FlightNode):
         )
         self._tick = 0
         self._channels = actuation.channels(robot)
+        self._commands = [channel.command for channel in self._channels]
         self._topics = PlantTopics(
             self,
             self.plant,
@@ -205,7 +206,7 @@ class PlantNode(FlightNode):
         for channel in self._channels:
             channel.arrived = False
         try:
-            limited = self.plant.step(*(channel.command for channel in self._channels))
+            limited = self.plant.step(*self._commands)
         except SpaceRobotError as error:
             self.get_logger().error(f"The plant stops at {self.time_ns / NANOSECONDS:g} s: {error}")
             self.trigger_deactivate()
@@ -301,8 +302,11 @@ class PlantNode(FlightNode):
         self._step_if_complete()
 
     def _step_if_complete(self) -> None:
-        if self._paused or not all(c.arrived or not c.required for c in self._channels):
+        if self._paused:
             return
+        for channel in self._channels:
+            if channel.required and not channel.arrived:
+                return
         self._step()
 
     def _on_realtime_command(self, channel: CommandChannel, stamp: int, problem: str) -> None:

@@ -326,12 +326,12 @@ class LieBracketGait(GaitMethod):
     def _path(
         self, state: RobotState, slide: Array, attitudes: Array, cycle: Array, n: int
     ) -> BasePath:
-        """Base path: step 2 as it goes, step 3 at the ends of (at most 1000 of the) cycles."""
-        stride = max(1, len(slide) // 200)
+        """Base path: step 2 as it goes, step 3 at the ends of (about 400 of the) cycles."""
+        stride = max(1, len(slide) // 100)
         chosen = np.unique(np.append(np.arange(0, len(slide), stride), len(slide) - 1))
         time, shapes, quaternions = chosen * self.tick_period, slide[chosen], attitudes[chosen]
         if n:
-            done = np.unique(np.append(np.arange(0, n, max(1, n // 1000))[1:], n))
+            done = np.unique(np.append(np.arange(0, n, max(1, n // 400))[1:], n))
             rotation = self._rotation(cycle)
             turned = [
                 quaternion_multiply(attitudes[-1], quaternion_from_rotvec(k * rotation))
