@@ -195,6 +195,11 @@ def test_three_processes_fly_to_a_goal_and_record_it(
     plant = start("plant", FAST)
     await_nodes(harness, probe, [plant])
     harness.matched(goals)
+    harness.spin_until(
+        lambda: all(probe.count_subscribers(topic) >= 3 for topic in ("odom", "joint_states")),
+        "recorder, planner and probe listening to the plant",
+        timeout=START,
+    )
     goals.publish(goal(0.05))
     harness.spin_until(
         lambda: state_of(probe) in ("reached", "failed", "refused"), "the goal", timeout=START
