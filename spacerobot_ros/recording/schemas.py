@@ -107,7 +107,7 @@ def _share_folder(package: str) -> Path:
 
         return Path(get_package_share_directory(package))
     except (ImportError, LookupError, OSError, ValueError):
-        # The wheels from PyPI install into the environment's own prefix and set no search path.
+        # The wheels install into the environment's own prefix and set no search path.
         folder = Path(sys.prefix) / "share" / package
     if not folder.is_dir():
         raise RecordingError(
