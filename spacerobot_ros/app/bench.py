@@ -37,13 +37,14 @@ from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import VelocityPlant
 
 _ROUNDS = 3
-_TOPICS: tuple[tuple[str, type[Any], int], ...] = (
-    ("/clock", Clock, 0),
-    ("base_pose", PoseStamped, 0),
-    ("momentum", Float64MultiArray, 7),
-    ("odom", Odometry, 0),
-    ("joint_states", JointState, 3),
+_TOPICS: tuple[tuple[str, type[Any], int, int], ...] = (
+    ("/clock", Clock, 0, 1),
+    ("base_pose", PoseStamped, 0, 20),
+    ("momentum", Float64MultiArray, 7, 1),
+    ("odom", Odometry, 0, 1),
+    ("joint_states", JointState, 3, 1),
 )
+"""The plant's topics: name, type, length of its lists, and how many ticks from one to the next."""
 
 
 def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
@@ -128,14 +129,15 @@ def _peer_rate(ticks: int, path: Path) -> float:
     count = 0
     command = serialize_message(_filled(JointState, 3))
     publishers = [
-        (a.create_publisher(kind, topic, qos), serialize_message(_filled(kind, n)))
-        for topic, kind, n in _TOPICS
+        (a.create_publisher(kind, topic, qos), serialize_message(_filled(kind, n)), period)
+        for topic, kind, n, period in _TOPICS
     ]
     reply = b.create_publisher(JointState, "joint_commands", qos)
 
     def ping() -> None:
-        for publisher, raw in publishers:
-            publisher.publish(raw)
+        for publisher, raw, period in publishers:
+            if count % period == 0:
+                publisher.publish(raw)
 
     def on_command(_: bytes) -> None:
         nonlocal count
@@ -149,7 +151,7 @@ def _peer_rate(ticks: int, path: Path) -> float:
         writer = Writer(stream, chunk_size=65536, compression=CompressionType.ZSTD)
         writer.start()
         schema = writer.register_schema("bench", "ros2msg", b"")
-        for topic, kind, _ in (*_TOPICS, ("joint_commands", JointState, 3)):
+        for topic, kind, _, _ in (*_TOPICS, ("joint_commands", JointState, 3, 1)):
             channel = writer.register_channel(topic, "cdr", schema)
             recorder.create_subscription(kind, topic, _writing(writer, channel), qos, raw=True)
         a.create_subscription(JointState, "joint_commands", on_command, qos, raw=True)
@@ -158,7 +160,7 @@ def _peer_rate(ticks: int, path: Path) -> float:
         )
         for node in (a, b, recorder):
             executor.add_node(node)
-        while not all(p.get_subscription_count() for p in (*(p for p, _ in publishers), reply)):
+        while not all(p.get_subscription_count() for p in (*(p for p, *_ in publishers), reply)):
             executor.spin_once(timeout_sec=0.01)
         began = time.perf_counter()
         ping()

@@ -12,6 +12,7 @@ from spacerobot_ros.control.computed_torque import ComputedTorqueLaw
 from spacerobot_ros.control.estimator import DeadReckoning
 from spacerobot_ros.control.gains import Gains
 from spacerobot_ros.control.law import ControlLaw
+from spacerobot_ros.control.pacing import within_thrust
 from spacerobot_ros.control.reference import MotionLimits, ReferenceProfile, StepReference
 from spacerobot_ros.control.saturation import ActuatorLimits, Saturated
 from spacerobot_ros.control.state import (
@@ -57,7 +58,7 @@ class CoordinatedController:
     limits
         Of thrusters and joints; what a command loses to them is reported.
     profile, motion
-        How references move to goals.
+        How references move to goals; accelerations that the thrusters cannot give are lowered.
     tick_period
         s.
     estimation_time
@@ -114,7 +115,8 @@ class CoordinatedController:
             goal = replace(goal, end_effector=end_effector)
         if joints is not None:
             goal = replace(goal, joints=JointReference.at_rest(joints))
-        self._profile = self._profile_type(start, goal, self._motion)
+        motion = within_thrust(self._motion, self._limits, self.law.robot, state.q)
+        self._profile = self._profile_type(start, goal, motion)
         self._began = time
 
     def follow(self, reference: Reference) -> None:

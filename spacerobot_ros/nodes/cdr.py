@@ -144,6 +144,12 @@ def stamp_bytes(time_ns: int) -> bytes:
     return _TIME.pack(*divmod(time_ns, NANOSECONDS))
 
 
+def first_time_ns(raw: bytes) -> int:
+    """Return the time that a serialised message begins with, ns; 0 if it is before zero."""
+    seconds, nanoseconds = _TIME.unpack_from(raw, _ENCAPSULATION)
+    return max(seconds * NANOSECONDS + nanoseconds, 0)
+
+
 def raw_publish(publisher: Publisher) -> Callable[[bytes], None]:
     """Return the function that publishes serialised messages.
 
@@ -170,8 +176,8 @@ class TemplateReader(Generic[M]):
         self._type = message_type
         self._spans = spans
         self._size = -1
-        self._fixed: list[tuple[int, int, bytes]] = []
-        self._stretches: list[tuple[int, int, bytes]] = []
+        self._fixed: list[tuple[slice, bytes]] = []
+        self._stretches: list[tuple[slice, bytes]] = []
         self._reads: dict[str, tuple[int, int]] = {}
         self._stamp = 0
         self.prototype: M | None = None
@@ -187,14 +193,28 @@ class TemplateReader(Generic[M]):
         RuntimeError
             The bytes are not a message of the type.
         """
-        if len(raw) != self._size or not self._as_before(raw):
-            self._learn(raw)
         self._raw = raw
+        if len(raw) == self._size:
+            # One writer repeats its padding too: a few whole stretches are compared first.
+            for place, text in self._stretches:
+                if raw[place] != text:
+                    break
+            else:
+                return
+            if all(raw[place] == text for place, text in self._fixed):
+                self._remember_stretches(raw)
+                return
+        self._learn(raw)
 
     def floats(self, path: str) -> FloatArray:
         """Return a read-only view of the values at ``path``."""
         offset, count = self._reads[path]
         return np.frombuffer(self._raw, np.float64, count, offset)
+
+    def place(self, path: str) -> slice:
+        """Return where the bytes of the values at ``path`` are in messages of this layout."""
+        offset, count = self._reads[path]
+        return slice(offset, offset + 8 * count)
 
     def has(self, path: str) -> bool:
         """Whether the accepted message has values at ``path``."""
@@ -206,34 +226,21 @@ class TemplateReader(Generic[M]):
         seconds, nanoseconds = _TIME.unpack_from(self._raw, self._stamp)
         return int(seconds * NANOSECONDS + nanoseconds)
 
-    def _as_before(self, raw: bytes) -> bool:
-        # One writer repeats its padding too: a few whole stretches are compared first.
-        for a, b, text in self._stretches:
-            if raw[a:b] != text:
-                break
-        else:
-            return True
-        if any(raw[a:b] != text for a, b, text in self._fixed):
-            return False
-        self._remember_stretches(raw)
-        return True
-
     def _remember_stretches(self, raw: bytes) -> None:
         """Keep the fixed spans joined where only padding can lie between them."""
-        stretches: list[list[int]] = []
-        for a, b, _ in self._fixed:
-            if stretches and a - stretches[-1][1] < _LARGEST_ALIGNMENT:
-                stretches[-1][1] = b
-            else:
-                stretches.append([a, b])
-        self._stretches = [(a, b, raw[a:b]) for a, b in stretches]
+        stretches: list[slice] = []
+        for place, _ in self._fixed:
+            if stretches and place.start - stretches[-1].stop < _LARGEST_ALIGNMENT:
+                place = slice(stretches.pop().start, place.stop)
+            stretches.append(place)
+        self._stretches = [(place, raw[place]) for place in stretches]
 
     def _learn(self, raw: bytes) -> None:
         message = deserialize_message(raw, self._type)
         layout = Layout.of(message)
         self.prototype = message
         self._size = len(raw)
-        self._fixed = [(a, b, raw[a:b]) for a, b in layout.fixed]
+        self._fixed = [(slice(a, b), raw[a:b]) for a, b in layout.fixed]
         self._stamp = layout.offsets["header.stamp.sec"]
         self._reads = {
             path: (layout.offsets[path], count)

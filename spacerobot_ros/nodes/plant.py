@@ -64,6 +64,9 @@ class PlantNode(FlightNode):
         ParameterSpec(
             "end_effector_frame", "", "", "link of end_effector_pose; '': 'end_effector', if any"
         ),
+        ParameterSpec(
+            "base_pose_period", 0.0, "s", "simulated time between base_pose; 0: every tick", 0.0
+        ),
         ParameterSpec("marker_period", 0.5, "s", "simulated time between markers; 0: none", 0.0),
         ParameterSpec(
             "diagnostics_period", 1.0, "s", "simulated time between diagnostics; 0: none", 0.0
@@ -146,6 +149,7 @@ class PlantNode(FlightNode):
             thrusters=actuation.thrusters,
         )
         self._report = PlantReport(self, self.plant)
+        self._pose_ticks = self._ticks(values["base_pose_period"]) or 1
         self._marker_ticks = self._ticks(values["marker_period"])
         self._report_ticks = self._ticks(values["diagnostics_period"])
         self._description = self.create_publisher(String, "robot_description", LATCHED)
@@ -223,7 +227,7 @@ class PlantNode(FlightNode):
 
     def _publish(self) -> None:
         now = self._tick * self._period_ns
-        self._topics.publish(now)
+        self._topics.publish(now, with_pose=self._tick % self._pose_ticks == 0)
         if self._marker_ticks and self._tick % self._marker_ticks == 0:
             self._topics.publish_markers(now)
         if self._report_ticks and self._tick % self._report_ticks == 0:
@@ -259,7 +263,7 @@ class PlantNode(FlightNode):
         before = self._readers
         self._look_round()
         if self._readers > before:
-            self._topics.publish(self._tick * self._period_ns)
+            self._topics.publish(self.time_ns, with_pose=True)
         self._step_if_complete()
 
     def _look_round(self) -> None:

@@ -99,10 +99,11 @@ class PlantTopics:
         self._end_effector: tuple[int, Any] | None = None
         self._add_end_effector(node, world_frame, end_effector_frame, pose_message)
         self._sends = [(raw_publish(publisher), template) for publisher, template in self._streams]
+        self._sends_without_pose = [send for send in self._sends if send[1] is not base_pose]
         self._markers = LinkMarkers(node, robot.description, world_frame)
 
-    def publish(self, time_ns: int) -> None:
-        """Publish the plant's state, stamped ``time_ns``."""
+    def publish(self, time_ns: int, *, with_pose: bool) -> None:
+        """Publish the plant's state, stamped ``time_ns``; ``with_pose``: base_pose too."""
         if self._end_effector is not None:
             index, target = self._end_effector
             R_WB, r_WB = self._base()
@@ -110,7 +111,7 @@ class PlantTopics:
             R_WE = R_WB @ self._plant.link_R[:, 3 * index : 3 * index + 3]
             target[3:] = quaternion_from_matrix(R_WE)
         stamp = stamp_bytes(time_ns)
-        for send, template in self._sends:
+        for send, template in self._sends if with_pose else self._sends_without_pose:
             send(template.serialised(stamp))
 
     def publish_markers(self, time_ns: int) -> None:

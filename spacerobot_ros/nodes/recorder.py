@@ -18,7 +18,7 @@ from std_msgs.msg import String
 
 from spacerobot_ros import __version__
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.nodes.cdr import NANOSECONDS
+from spacerobot_ros.nodes.cdr import NANOSECONDS, first_time_ns
 from spacerobot_ros.nodes.flight_node import FlightNode, run_node
 from spacerobot_ros.nodes.parameters import ParameterSpec
 from spacerobot_ros.recording import BagWriter, QosProfile, RecordingError
@@ -76,7 +76,7 @@ class RecorderNode(FlightNode):
         self._wall = False
         self._now = 0
         self._now_stamp = b""
-        self._active = False
+        self._active = self._steady = False
         self.messages_recorded = 0
         self.failure: RecordingError | None = None
         steady = RosClock(clock_type=ClockType.STEADY_TIME)
@@ -92,10 +92,11 @@ class RecorderNode(FlightNode):
     def activate(self) -> None:
         """Record from now on."""
         self._active = True
+        self._settle()
 
     def deactivate(self) -> None:
         """Pause: what arrives is not recorded."""
-        self._active = False
+        self._active = self._steady = False
 
     def cleanup(self) -> None:
         """Complete the bag.
@@ -142,6 +143,10 @@ class RecorderNode(FlightNode):
 
     # -- recording ----------------------------------------------------------------------------
 
+    def _settle(self) -> None:
+        """Nothing but writing is left to do with a message once the time is known."""
+        self._steady = self._active and self._early is None and not self._wall
+
     def _record(self, topic: str, type_name: str) -> None:
         infos = self.get_publishers_info_by_topic(topic)
         if not infos:
@@ -185,12 +190,12 @@ class RecorderNode(FlightNode):
         write = self._writer.write
 
         def store(raw: bytes, published_ns: int) -> None:
-            if not self._active:
-                return
-            if self._early is not None:
-                self._early.append((channel, raw, published_ns, time.time_ns()))
-                return
-            if self._wall:
+            if not self._steady:
+                if not self._active:
+                    return
+                if self._early is not None:
+                    self._early.append((channel, raw, published_ns, time.time_ns()))
+                    return
                 self._now = time.time_ns()
             try:
                 write(channel, raw, self._now, published_ns or self._now)
@@ -204,8 +209,7 @@ class RecorderNode(FlightNode):
             store(raw, 0)
 
         def on_stamped(raw: bytes) -> None:
-            now = raw[4:12] == self._now_stamp
-            store(raw, 0 if now else _time_at(raw))
+            store(raw, 0 if raw[4:12] == self._now_stamp else first_time_ns(raw))
 
         def on_description(raw: bytes) -> None:
             if topic not in self._attached and self._active:
@@ -227,13 +231,14 @@ class RecorderNode(FlightNode):
     def _on_time(self, raw: bytes) -> None:
         if self._wall:
             return
-        self._now, self._now_stamp = _time_at(raw), raw[4:12]
+        self._now, self._now_stamp = first_time_ns(raw), raw[4:12]
         if self._early is not None and self._active:
             self._release_early(self._now)
 
     def _release_early(self, now_ns: int | None) -> None:
         """Write what came before the time was known; None: at the wall time that it came."""
         early, self._early = self._early or [], None
+        self._settle()
 
         def write_all(writer: BagWriter) -> None:
             for channel, raw, published_ns, arrival_ns in early:
@@ -262,7 +267,7 @@ class RecorderNode(FlightNode):
     def _fail(self, error: RecordingError) -> None:
         """The disk is full or gone: say so once, keep what is written, let the others fly on."""
         self.failure = error
-        self._active = False
+        self._active = self._steady = False
         self.get_logger().error(f"Recording has ended: {error}")
 
 
@@ -277,12 +282,6 @@ def _message_class(type_name: str) -> Any:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except (ImportError, AttributeError):
         raise SpaceRobotError(f"its type {type_name} is not installed here.") from None
-
-
-def _time_at(raw: bytes) -> int:
-    """Stamp in ns of a message that begins with a time or a header; 0 if it is before zero."""
-    seconds = int.from_bytes(raw[4:8], "little", signed=True)
-    return max(seconds * NANOSECONDS + int.from_bytes(raw[8:12], "little"), 0)
 
 
 def main() -> None:

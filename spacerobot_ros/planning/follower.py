@@ -31,17 +31,18 @@ class GaitFollower:
         self.schedule = schedule
         self._start_ns = start_ns
         self._period_ns = round(schedule.tick_period * 1e9)
+        self._last_tick = schedule.ticks
+        self._end_ns = start_ns + self._last_tick * self._period_ns
         self._gain = min(shape_gain, 1.0 / schedule.tick_period)
         self._positions = schedule.positions
-        # At rest after the last tick.
-        self._velocities = np.vstack([schedule.velocities, np.zeros(len(schedule.joint_names))])
-
-    def _tick(self, stamp_ns: int) -> int:
-        return min(max((stamp_ns - self._start_ns) // self._period_ns, 0), self.schedule.ticks)
+        # At rest after the last tick. The part of the feedback that is known beforehand is added
+        # here: qdot = qdot_k + gain (q_k - q), and q alone is measured.
+        velocities = np.vstack([schedule.velocities, np.zeros(len(schedule.joint_names))])
+        self._feedforward = velocities + self._gain * self._positions
 
     def ended(self, stamp_ns: int, q: Array) -> bool:
         """Whether the schedule is over and the shape ``q`` (n,) has arrived."""
-        late = stamp_ns - self._start_ns - self.schedule.ticks * self._period_ns
+        late = stamp_ns - self._end_ns
         if late < 0:
             return False
         far = np.abs(self._positions[-1] - q).max(initial=0.0) > _ARRIVED
@@ -49,8 +50,8 @@ class GaitFollower:
 
     def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
         """Write the wanted shape now (n,) and the velocities to hold from now (n,)."""
-        k = self._tick(stamp_ns)
+        k = (stamp_ns - self._start_ns) // self._period_ns
+        k = 0 if k < 0 else min(k, self._last_tick)
         position[:] = self._positions[k]
-        np.subtract(position, q, out=velocity)
-        velocity *= self._gain
-        velocity += self._velocities[k]
+        np.multiply(q, -self._gain, out=velocity)
+        velocity += self._feedforward[k]

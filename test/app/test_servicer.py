@@ -176,24 +176,15 @@ def test_lost_thrust_is_reported(law: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("acceleration", [0.0015, 0.0022])
 def test_both_poses_are_reached_with_a_tenth_of_the_thrust(
-    unlimited: RunResult, law: str, acceleration: float, tmp_path: Path
+    unlimited: RunResult, law: str, tmp_path: Path
 ) -> None:
-    """A reference slow enough for the thrusters, and one that asks a little more of them."""
+    """The scenario as it is, but for the thrusters: the reference becomes slower by itself."""
     force, torque = (peak / 10 for peak in peaks(read_bag(unlimited.summary["bag"])))
-    settings: dict[str, Any] = {
-        "max_force": force,
-        "max_torque": torque,
-        "motion.acceleration": acceleration,
-        "motion.angular_acceleration": acceleration,
-        "time_limit": 300.0,
-    }
-    result = fly(tmp_path / "run.mcap", law, **settings)
+    result = fly(tmp_path / "run.mcap", law, max_force=force, max_torque=torque)
     bag = assert_arrived(result)
     given_force, given_torque = peaks(bag)
-    assert any(status_values(bag, "lost_force_N")) == (acceleration > 0.002)
-    assert given_force <= force * (1 + 1e-12)
+    assert force / 4 < given_force <= force * (1 + 1e-12)
     assert given_torque <= torque * (1 + 1e-12)
     assert result.summary["sim_time_s"] > 2 * unlimited.summary["sim_time_s"]
 
