@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
@@ -14,16 +14,26 @@ from spacerobot_ros.errors import CommandError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.cdr import TemplateReader
-from spacerobot_ros.nodes.joint_command import JointReader, Quantity
+from spacerobot_ros.nodes.command_gate import Reason
+from spacerobot_ros.nodes.joint_command import JointReader
 
 NEVER = -math.inf
+
+Refused = tuple[Reason, str]
+"""Why a command is refused, as a word and as a clause."""
 
 
 class CommandChannel(ABC):
     """One command topic of a plant.
 
     ``command`` is what the actuators are to do now; ``stamp_ns`` is when the command in force was
-    stamped, :data:`NEVER` while there is none; ``arrived`` whether this tick's has come.
+    stamped, :data:`NEVER` while there is none; ``arrived`` whether this tick's has come;
+    ``resting`` whether the last was taken back, so that the joints are to come to rest.
+
+    Parameters
+    ----------
+    limits
+        (size,) largest magnitude of each value; beyond it the plant clips.
     """
 
     topic: ClassVar[str]
@@ -31,10 +41,15 @@ class CommandChannel(ABC):
     required: bool = True
     """Whether a lockstep plant waits for it."""
 
-    def __init__(self, size: int) -> None:
-        self.command: Array = np.zeros(size)
+    def __init__(self, limits: Array) -> None:
+        self.command: Array = np.zeros(len(limits))
         self.stamp_ns: float = NEVER
-        self.arrived = False
+        self.arrived = self.resting = False
+        self.refuses_beyond_limits = False
+        """Whether a command beyond the limits is refused as a whole instead of clipped."""
+        self.commanders = 1
+        """How many publish on the topic, as far as is known."""
+        self._limits = limits
 
     @abstractmethod
     def read(self, raw: bytes) -> tuple[int, Array]:
@@ -51,29 +66,33 @@ class CommandChannel(ABC):
     def read_stamp_ns(self) -> int:
         """Stamp of the message read last, ns."""
 
-    def check(self, raw: bytes) -> tuple[int, str]:
-        """Read a message; return its stamp (ns) and why it is refused, empty if it is not."""
+    def check(self, raw: bytes) -> tuple[int, Refused | None]:
+        """Read a message; return its stamp (ns), and why it is refused if it is."""
         try:
             stamp, values = self.read(raw)
         except CommandError as error:
-            return self.read_stamp_ns, str(error)
+            return self.read_stamp_ns, (Reason.MALFORMED, str(error))
         self._read = values
         # A sum is finite only if every term is; for a few numbers a list is summed fastest.
         if not math.isfinite(sum(values.tolist())):
-            return stamp, f"a value is not finite: {values.tolist()}"
-        return stamp, ""
+            return stamp, (Reason.NOT_FINITE, f"a value is not finite: {values.tolist()}")
+        if self.refuses_beyond_limits and np.any(np.abs(values) > self._limits):
+            limits = f"{values.tolist()} is beyond the limits {self._limits.tolist()}"
+            return stamp, (Reason.BEYOND_LIMITS, limits)
+        return stamp, None
 
     def take(self, stamp_ns: float) -> None:
         """Put the message that was checked last into force."""
         self.command[:] = self._read
         self.stamp_ns = stamp_ns
         self.arrived = True
+        self.resting = False
 
     def rest(self) -> None:
         """Command nothing from now on."""
         self.command[:] = 0.0
         self.stamp_ns = NEVER
-        self.arrived = True
+        self.arrived = self.resting = True
 
 
 class JointChannel(CommandChannel):
@@ -82,8 +101,9 @@ class JointChannel(CommandChannel):
     topic = "joint_commands"
     message_type = JointState
 
-    def __init__(self, robot: SpaceRobot, quantity: Quantity) -> None:
-        super().__init__(robot.n)
+    def __init__(self, robot: SpaceRobot, quantity: Literal["velocity", "effort"]) -> None:
+        limits = {"velocity": robot.velocity_limit, "effort": robot.effort_limit}
+        super().__init__(limits[quantity])
         self._reader = JointReader(robot.joint_names, [quantity])
         self._quantity = quantity
 
@@ -104,7 +124,7 @@ class WrenchChannel(CommandChannel):
     message_type = WrenchStamped
 
     def __init__(self, robot: SpaceRobot) -> None:
-        super().__init__(6)
+        super().__init__(np.full(6, np.inf))
         self._base_link = robot.base_link
         self._reader = TemplateReader(WrenchStamped, lambda _: {"wrench.force.x": 6})
 

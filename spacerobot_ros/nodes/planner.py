@@ -31,7 +31,7 @@ from spacerobot_ros.nodes.markers import goal_markers
 from spacerobot_ros.nodes.parameters import ParameterSpec, option_specs
 from spacerobot_ros.nodes.planner_status import PlannerState, PlannerStatus
 from spacerobot_ros.nodes.robot_source import ROBOT_SPECS, robot_of
-from spacerobot_ros.nodes.trajectory_message import serialised_trajectory
+from spacerobot_ros.nodes.trajectory_message import path_message, serialised_trajectory
 from spacerobot_ros.planning import METHODS, GaitSchedule, Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.follower import GaitFollower
 
@@ -44,7 +44,8 @@ class PlannerNode(FlightNode):
 
     A goal is planned from the next measured state. When its schedule has ended the measured pose
     is compared with the goal, and the rest is planned again until the tolerance is met or
-    ``max_corrections`` are used up. A new goal replaces the one that is being flown.
+    ``max_corrections`` are used up; the pieces of a gait that its method plans one by one (a
+    *partial* schedule) do not count. A new goal replaces the one that is being flown.
     """
 
     SPECS: ClassVar = (
@@ -289,13 +290,14 @@ class PlannerNode(FlightNode):
     def _plan_proposed(self, stamp: int) -> None:
         self.plan_time = self.flown_time = 0.0
         try:
-            self._fly(self._plan(self._proposed, correction=False), stamp)
+            schedule = self._plan(self._proposed, correction=False)
         except PlanningError as error:
             kept = " The earlier goal is still flown." if self._follower else ""
             self._status.publish(PlannerState.REFUSED, f"{error}{kept}", goal=self._proposed)
             return
         self._goal = self._proposed
         self._corrections = 0
+        self._fly(schedule, stamp)
 
     def _plan(self, goal: Goal, *, correction: bool) -> GaitSchedule:
         began = time.perf_counter()
@@ -304,7 +306,7 @@ class PlannerNode(FlightNode):
         finally:
             self.plan_time += time.perf_counter() - began
 
-    def _fly(self, schedule: GaitSchedule, stamp: int) -> None:
+    def _fly(self, schedule: GaitSchedule, stamp: int, error: PoseError | None = None) -> None:
         # A controller closes its own loop round the reference.
         gain = float(self.parameters["shape_gain"]) if self._commands_plant else 0.0  # type: ignore[arg-type]
         self._follower = GaitFollower(schedule, stamp, gain)
@@ -316,32 +318,13 @@ class PlannerNode(FlightNode):
             f"Flying a {schedule.method} gait of {schedule.duration:.6g} s.",
             goal=schedule.goal,
             schedule=schedule,
+            error=error,
+            corrections=self._corrections,
         )
         assert self._robot is not None
         base_link = self._robot.base_link
         self._schedule_topic.publish(serialised_trajectory(schedule, stamp, base_link))
-        path = Path()
-        path.header.frame_id = frame
-        path.header.stamp.sec, path.header.stamp.nanosec = divmod(stamp, NANOSECONDS)
-        seconds = (schedule.path.time * NANOSECONDS).round().astype(np.int64) + stamp
-        for instant, r, o in zip(
-            seconds.tolist(),
-            schedule.path.position.tolist(),
-            schedule.path.quaternion.tolist(),
-            strict=True,
-        ):
-            pose = PoseStamped()
-            pose.header.frame_id = frame
-            pose.header.stamp.sec, pose.header.stamp.nanosec = divmod(instant, NANOSECONDS)
-            pose.pose.position.x, pose.pose.position.y, pose.pose.position.z = r
-            (
-                pose.pose.orientation.x,
-                pose.pose.orientation.y,
-                pose.pose.orientation.z,
-                pose.pose.orientation.w,
-            ) = o
-            path.poses.append(pose)
-        self._path_topic.publish(path)
+        self._path_topic.publish(path_message(schedule.path, stamp, frame))
         shapes = self._robot.description.links[0].shapes
         self._marker_topic.publish(goal_markers(schedule.goal, schedule.path, shapes, frame))
 
@@ -355,8 +338,9 @@ class PlannerNode(FlightNode):
             self._status.publish(PlannerState.FAILED, str(reason), goal=self._goal)
             return
         error = PoseError.between(state.position, state.quaternion, self._goal, state.q)
-        self._held = self._follower.schedule.positions[-1] if self._follower else None
-        self._follower = None
+        assert self._follower is not None
+        flown, self._follower = self._follower.schedule, None
+        self._held = flown.positions[-1]
         result: dict[str, Any] = {
             "goal": self._goal,
             "error": error,
@@ -373,16 +357,16 @@ class PlannerNode(FlightNode):
         if self._tolerance().admits(error, controls):
             self._status.publish(PlannerState.REACHED, f"The goal is met: {left}.", **result)
             return
-        if self._corrections >= int(self.parameters["max_corrections"]):  # type: ignore[arg-type]
+        if not flown.partial and self._corrections >= int(self.parameters["max_corrections"]):  # type: ignore[arg-type]
             self._status.publish(
                 PlannerState.FAILED,
                 f"The goal is not met: {left} after {self._corrections} correction(s).",
                 **result,
             )
             return
-        self._corrections += 1
+        self._corrections += not flown.partial
         try:
-            self._fly(self._plan(self._goal, correction=True), stamp)
+            self._fly(self._plan(self._goal, correction=True), stamp, error)
         except PlanningError as reason:
             self._status.publish(
                 PlannerState.FAILED, f"The goal is not met: {left}, and {reason}", **result

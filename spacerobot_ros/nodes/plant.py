@@ -6,28 +6,26 @@ import sys
 from functools import partial
 from typing import Any, ClassVar
 
-import numpy as np
 from rclpy.clock import Clock, ClockType
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.nodes.actuation import ACTUATIONS
+from spacerobot_ros.nodes.actuation import CHANNELS
 from spacerobot_ros.nodes.cdr import NANOSECONDS
-from spacerobot_ros.nodes.command_channel import NEVER, CommandChannel
+from spacerobot_ros.nodes.command_channel import CommandChannel
+from spacerobot_ros.nodes.command_gate import CommandGate
+from spacerobot_ros.nodes.command_intake import CommandIntake
 from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
-from spacerobot_ros.nodes.parameters import ParameterSpec
+from spacerobot_ros.nodes.plant_parameters import PLANT_SPECS
 from spacerobot_ros.nodes.plant_report import PlantReport
 from spacerobot_ros.nodes.plant_topics import PlantTopics
-from spacerobot_ros.nodes.robot_source import ROBOT_SPECS, robot_of
-from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.plant import Plant
+from spacerobot_ros.nodes.robot_source import robot_of
+from spacerobot_ros.simulation.brakes import JointBrakes
+from spacerobot_ros.simulation.building import PLANTS, build_plant, period_ns
 
 _LATE_JOINER_CHECK = 0.1
 """How often a waiting lockstep plant looks for new subscribers, wall s."""
-
-_SHORTEST_STEP = 1e-5
-"""Shorter Runge-Kutta steps lose more to rounding than they gain, s."""
 
 _LONGEST_LAG = 10
 """Ticks that a real-time plant may be late and still make up; what is beyond is lost for good."""
@@ -44,59 +42,7 @@ class PlantNode(FlightNode):
     last command, and brings the joints to rest when that is older than ``command_timeout``.
     """
 
-    SPECS: ClassVar = (
-        *ROBOT_SPECS,
-        ParameterSpec(
-            "actuation", "velocity", "", "what joint_commands carry", choices=tuple(ACTUATIONS)
-        ),
-        ParameterSpec(
-            "time_mode", "realtime", "", "who drives time", choices=("realtime", "lockstep")
-        ),
-        ParameterSpec("tick_rate", 20.0, "Hz", "ticks a second of simulated time", 1e-3, 1e5),
-        ParameterSpec("real_time_factor", 1.0, "", "simulated over wall time", 1e-3, 1e3),
-        ParameterSpec(
-            "command_timeout", 0.5, "s", "realtime: older commands stop the joints; 0: never", 0.0
-        ),
-        ParameterSpec(
-            "integration_step", 0.0, "s", "longest step; 0: 0.01 (velocity), 0.001 (effort)", 0.0
-        ),
-        ParameterSpec("world_frame", "world", "", "name of the inertial frame"),
-        ParameterSpec(
-            "end_effector_frame", "", "", "link of end_effector_pose; '': 'end_effector', if any"
-        ),
-        ParameterSpec(
-            "base_pose_period", 0.0, "s", "simulated time between base_pose; 0: every tick", 0.0
-        ),
-        ParameterSpec("marker_period", 0.5, "s", "simulated time between markers; 0: none", 0.0),
-        ParameterSpec(
-            "diagnostics_period", 1.0, "s", "simulated time between diagnostics; 0: none", 0.0
-        ),
-        ParameterSpec("initial_position", [0.0, 0.0, 0.0], "m", "base link in the world", length=3),
-        ParameterSpec(
-            "initial_orientation", [0.0, 0.0, 0.0, 1.0], "", "quaternion x, y, z, w", length=4
-        ),
-        ParameterSpec(
-            "initial_joint_positions", [], "m or rad", "by joint order of the URDF; []: zero"
-        ),
-        ParameterSpec(
-            "initial_joint_velocities", [], "m/s or rad/s", "likewise, under efforts; []: zero"
-        ),
-        ParameterSpec(
-            "initial_center_of_mass",
-            [],
-            "m",
-            "of the system in the world, instead of initial_position",
-            length=3,
-        ),
-        ParameterSpec("linear_momentum", [0.0, 0.0, 0.0], "kg m/s", "total, in world", length=3),
-        ParameterSpec(
-            "angular_momentum",
-            [0.0, 0.0, 0.0],
-            "kg m^2/s",
-            "total, about the centre of mass, in world",
-            length=3,
-        ),
-    )
+    SPECS: ClassVar = PLANT_SPECS
 
     def __init__(self, name: str = "plant", **kwargs: Any) -> None:
         self._running = self._paused = False
@@ -125,35 +71,30 @@ class PlantNode(FlightNode):
                 "robot of this package, or 'robot_description' to a URDF text."
             )
         self._lockstep = values["time_mode"] == "lockstep"
-        self._period_ns = round(NANOSECONDS / values["tick_rate"])
-        actuation = ACTUATIONS[values["actuation"]]
-        if 0.0 < values["integration_step"] < _SHORTEST_STEP:
-            raise ParameterError(
-                f"Parameter 'integration_step' is {values['integration_step']}; it must be 0 (by "
-                f"the actuation) or at least {_SHORTEST_STEP:g} s."
-            )
-        self.plant: Plant = actuation.plant(
-            robot,
-            self._period_ns / NANOSECONDS,
-            self._initial_state(),
-            values["integration_step"] or actuation.integration_step,
-        )
+        self._period_ns = period_ns(values["tick_rate"])
+        self.plant = build_plant(robot, values)
         self._tick = 0
-        self._channels = actuation.channels(robot)
-        self._commands = [channel.command for channel in self._channels]
         self._topics = PlantTopics(
             self,
             self.plant,
             values["world_frame"],
             values["end_effector_frame"],
-            thrusters=actuation.thrusters,
+            thrusters=PLANTS[values["actuation"]].thrusters,
         )
-        self._report = PlantReport(self, self.plant)
+        self._gate = CommandGate(values["latched_faults"])
+        self._report = PlantReport(self, self.plant, self._gate)
+        self._intake = CommandIntake(
+            self, CHANNELS[values["actuation"]](robot), self._gate, self._report, values
+        )
+        # Velocity servos stop at once; motors have to be told how.
+        self._brakes = None
+        if values["actuation"] == "effort":
+            self._brakes = JointBrakes(self.plant, self._period_ns / NANOSECONDS)
         self._pose_ticks = self._ticks(values["base_pose_period"]) or 1
         self._marker_ticks = self._ticks(values["marker_period"])
         self._report_ticks = self._ticks(values["diagnostics_period"])
         self._description = self.create_publisher(String, "robot_description", LATCHED)
-        for channel in self._channels:
+        for channel in self._intake.channels:
             self.create_subscription(
                 channel.message_type,
                 channel.topic,
@@ -163,22 +104,8 @@ class PlantNode(FlightNode):
             )
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
-
-    def _initial_state(self) -> InitialState:
-        values: dict[str, Any] = self.parameters
-
-        def optional(name: str) -> Any:
-            return np.array(values[name]) if values[name] else None
-
-        return InitialState(
-            position=np.array(values["initial_position"]),
-            quaternion=np.array(values["initial_orientation"]),
-            joint_positions=optional("initial_joint_positions"),
-            linear_momentum=np.array(values["linear_momentum"]),
-            angular_momentum=np.array(values["angular_momentum"]),
-            joint_velocities=optional("initial_joint_velocities"),
-            center_of_mass=optional("initial_center_of_mass"),
-        )
+        self.create_service(Trigger, "~/abort", self._on_abort)
+        self.create_service(Trigger, "~/rearm", self._on_rearm)
 
     def activate(self) -> None:
         """Publish the robot and its present state, and from now on step."""
@@ -187,30 +114,35 @@ class PlantNode(FlightNode):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if self._lockstep:
             self._look_round()
-            self._timer = self.create_timer(
-                _LATE_JOINER_CHECK, self._on_late_joiner_check, clock=steady
-            )
+            self._own_timers = [
+                self.create_timer(_LATE_JOINER_CHECK, self._on_late_joiner_check, clock=steady)
+            ]
         else:
             pace = self._period_ns / float(self.parameters["real_time_factor"])  # type: ignore[arg-type]
             self._pace_ns, self._steady = pace, steady
             self._origin_ns = steady.now().nanoseconds - self._tick * pace
-            self._timer = self.create_timer(pace / NANOSECONDS, self._on_wall_tick, clock=steady)
+            self._own_timers = [
+                self.create_timer(pace / NANOSECONDS, self._on_wall_tick, clock=steady),
+                self.create_timer(_LATE_JOINER_CHECK, self._intake.count_commanders, clock=steady),
+            ]
         self._publish()
 
     def deactivate(self) -> None:
         """Stop time; nothing is commanded when it goes on."""
         if self._running:
-            self.destroy_timer(self._timer)
+            for timer in self._own_timers:
+                self.destroy_timer(timer)
         self._running = False
-        self._rest()
+        self._intake.rest()
 
     # -- time ---------------------------------------------------------------------------------
 
     def _step(self) -> None:
-        for channel in self._channels:
-            channel.arrived = False
+        commands = self._intake.begin_step()
+        if self._brakes is not None and self._intake.joints_rest:
+            commands[0][:] = self._brakes.efforts()
         try:
-            limited = self.plant.step(*self._commands)
+            limited = self.plant.step(*commands)
         except SpaceRobotError as error:
             self.get_logger().error(f"The plant stops at {self.time_ns / NANOSECONDS:g} s: {error}")
             self.trigger_deactivate()
@@ -219,11 +151,6 @@ class PlantNode(FlightNode):
             self._report.limited()
         self._tick += 1
         self._publish()
-
-    def _rest(self) -> None:
-        for channel in self._channels:
-            channel.rest()
-            channel.arrived = False
 
     def _publish(self) -> None:
         now = self._tick * self._period_ns
@@ -244,17 +171,8 @@ class PlantNode(FlightNode):
             self._report.deadlines_missed += due - _LONGEST_LAG
             self._origin_ns += (due - _LONGEST_LAG) * self._pace_ns
         for _ in range(min(due, _CATCH_UP)):
-            self._drop_old_commands()
+            self._intake.drop_old(self.time_ns)
             self._step()
-
-    def _drop_old_commands(self) -> None:
-        """Bring to rest what nobody has commanded for the timeout."""
-        timeout = float(self.parameters["command_timeout"])  # type: ignore[arg-type]
-        for channel in self._channels:
-            age = self._tick * self._period_ns - channel.stamp_ns
-            if timeout and NEVER != channel.stamp_ns and age > timeout * NANOSECONDS:
-                channel.rest()
-                self._report.timed_out(channel.topic, timeout)
 
     def _on_late_joiner_check(self) -> None:
         """A lockstep plant waits for ever if nobody saw its last state: show it to newcomers."""
@@ -267,73 +185,46 @@ class PlantNode(FlightNode):
         self._step_if_complete()
 
     def _look_round(self) -> None:
-        """See who listens and who commands; the joints are waited for, a wrench if one comes."""
+        """See who listens and who commands."""
         self._readers = self._topics.readers()
-        for channel in self._channels[1:]:
-            channel.required = self.count_publishers(channel.topic) > 0
-            if not channel.required:
-                # Nobody is left who could turn the thrusters off.
-                channel.rest()
-                channel.arrived = False
+        self._intake.look_round()
 
     # -- commands -----------------------------------------------------------------------------
 
     def _on_command(self, channel: CommandChannel, raw: bytes) -> None:
         if not self._running:
             return
-        stamp, problem = channel.check(raw)
-        if self._lockstep:
-            self._on_lockstep_command(channel, stamp, problem)
-        else:
-            self._on_realtime_command(channel, stamp, problem)
-
-    def _on_lockstep_command(self, channel: CommandChannel, stamp: int, problem: str) -> None:
-        now = self._tick * self._period_ns
-        if stamp != now or channel.arrived:
-            kind = "stale" if stamp <= now else "ahead of time"
-            self._report.refused(
-                channel.topic,
-                f"it is {kind}: stamped {stamp / NANOSECONDS:.9g} s, the plant is at "
-                f"{now / NANOSECONDS:.9g} s",
-            )
-            return
-        if problem:
-            # Time must go on for the others: a bad command is a tick at rest.
-            self._report.refused(channel.topic, problem)
-            channel.rest()
-        else:
-            channel.take(stamp)
-        self._step_if_complete()
+        if self._intake.accept(channel, raw, self.time_ns):
+            self._step_if_complete()
 
     def _step_if_complete(self) -> None:
-        if self._paused:
-            return
-        for channel in self._channels:
-            if channel.required and not channel.arrived:
-                return
-        self._step()
-
-    def _on_realtime_command(self, channel: CommandChannel, stamp: int, problem: str) -> None:
-        now = self._tick * self._period_ns
-        timeout = float(self.parameters["command_timeout"])  # type: ignore[arg-type]
-        stamp = stamp or now  # An unset stamp means now, as everywhere in ROS.
-        age = (now - stamp) / NANOSECONDS
-        if timeout and abs(age) > timeout:
-            problem = f"it is {abs(age):.3g} s {'old' if age > 0 else 'ahead of time'}"
-        if problem:
-            self._report.refused(channel.topic, problem)
-            return
-        channel.take(stamp)
+        if not self._paused and self._intake.complete:
+            self._step()
 
     # -- services -----------------------------------------------------------------------------
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.plant.reset()
-        self._rest()
+        self._intake.rest()
         response.success = True
         response.message = "The robot is back in its initial state; time goes on."
         if self._running:
             self._publish()
+        return response
+
+    def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._intake.latch("aborted on request")
+        response.success = True
+        response.message = "The joints come to rest; nothing moves until '~/rearm' is called."
+        return response
+
+    def _on_rearm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        fault = self._gate.fault
+        self._gate.rearm()
+        response.success = True
+        response.message = (
+            f"Commands pass again after: {fault}." if fault else "No fault was latched."
+        )
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:

@@ -9,8 +9,12 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from spacerobot_ros.nodes.cdr import NANOSECONDS
+from spacerobot_ros.nodes.command_gate import CommandGate
 from spacerobot_ros.nodes.flight_node import STREAM
 from spacerobot_ros.simulation.plant import Plant
+
+_ROUNDING = 1e-9
+"""Momenta that change by less than this times the mass only round, m/s and m^2/s."""
 
 _LOG_PERIOD = 5.0
 """Wall s between two log lines of one kind."""
@@ -19,18 +23,16 @@ _LOG_PERIOD = 5.0
 class PlantReport:
     """Counters of one plant. Every refusal has a reason; the last one stays in the diagnostics."""
 
-    def __init__(self, node: Node, plant: Plant) -> None:
-        self._node, self._plant = node, plant
+    def __init__(self, node: Node, plant: Plant, gate: CommandGate) -> None:
+        self._node, self._plant, self._gate = node, plant, gate
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
-        self.commands_refused = 0
         self.command_timeouts = 0
         self.deadlines_missed = 0
         self.last_refusal = ""
         self._reported = self._levels()
 
     def refused(self, topic: str, reason: str) -> None:
-        """Count a refused command."""
-        self.commands_refused += 1
+        """Log a refused command, which the gate has counted."""
         self.last_refusal = f"A command on '{topic}' was refused: {reason}."
         self._node.get_logger().warning(self.last_refusal, throttle_duration_sec=_LOG_PERIOD)
 
@@ -69,17 +71,19 @@ class PlantReport:
         array.status = [
             _status(
                 f"{name}: commands",
-                moved["commands"],
-                self.last_refusal if moved["commands"] and self.last_refusal else "commands arrive",
+                self._command_level(moved["commands"]),
+                self._command_sentence(moved["commands"]),
                 {
-                    "refused": self.commands_refused,
+                    "refused": self._gate.refused,
+                    **{f"refused.{reason.value}": n for reason, n in self._gate.counts.items()},
+                    "latched_fault": self._gate.fault,
                     "timeouts": self.command_timeouts,
                     "deadlines_missed": self.deadlines_missed,
                 },
             ),
             _status(
                 f"{name}: actuators",
-                moved["limits"],
+                DiagnosticStatus.WARN if moved["limits"] else DiagnosticStatus.OK,
                 "limits of the URDF hold joints back" if moved["limits"] else "within limits",
                 {
                     f"{what}_limited.{joint}": count
@@ -89,8 +93,10 @@ class PlantReport:
             ),
             _status(
                 f"{name}: momentum",
-                False,
-                "change that no thruster accounts for",
+                DiagnosticStatus.ERROR if self._leaks() else DiagnosticStatus.OK,
+                "momentum changes that no thruster accounts for"
+                if self._leaks()
+                else "momentum is accounted for",
                 {
                     "linear_change": f"{self._drift(0):.3e}",
                     "angular_change": f"{self._drift(3):.3e}",
@@ -102,9 +108,23 @@ class PlantReport:
     def _levels(self) -> dict[str, tuple[int, ...]]:
         plant = self._plant
         return {
-            "commands": (self.commands_refused, self.command_timeouts, self.deadlines_missed),
+            "commands": (self._gate.refused, self.command_timeouts, self.deadlines_missed),
             "limits": tuple(int(n) for counts in plant.limit_counts.values() for n in counts),
         }
+
+    def _command_level(self, moved: bool) -> bytes:
+        if self._gate.fault:
+            return bytes(DiagnosticStatus.ERROR)
+        return bytes(DiagnosticStatus.WARN if moved else DiagnosticStatus.OK)
+
+    def _command_sentence(self, moved: bool) -> str:
+        if self._gate.fault:
+            return f"Nothing moves until '~/rearm' is called: {self._gate.fault}."
+        return self.last_refusal if moved and self.last_refusal else "commands arrive"
+
+    def _leaks(self) -> bool:
+        """Whether momentum changes by more than rounding, for bodies that move at up to 1 m/s."""
+        return max(self._drift(0), self._drift(3)) > _ROUNDING * self._plant.robot.total_mass
 
     def _drift(self, first: int) -> float:
         """Change of the momentum that no thruster accounts for."""
@@ -114,9 +134,11 @@ class PlantReport:
         )
 
 
-def _status(name: str, warn: bool, message: str, values: Mapping[str, object]) -> DiagnosticStatus:
+def _status(
+    name: str, level: bytes, message: str, values: Mapping[str, object]
+) -> DiagnosticStatus:
     return DiagnosticStatus(
-        level=DiagnosticStatus.WARN if warn else DiagnosticStatus.OK,
+        level=level,
         name=name,
         message=message,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],

@@ -1,16 +1,38 @@
-"""A whole gait as one serialised JointTrajectory, without an object for each of its points."""
+"""A whole gait as messages: its schedule, and the base path that it predicts."""
 
 from __future__ import annotations
 
 import struct
 
 import numpy as np
-from builtin_interfaces.msg import Duration
+from builtin_interfaces.msg import Duration, Time
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from nav_msgs.msg import Path
 from rclpy.serialization import serialize_message
+from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from spacerobot_ros.nodes.cdr import NANOSECONDS, Layout
-from spacerobot_ros.planning import GaitSchedule
+from spacerobot_ros.planning import BasePath, GaitSchedule
+
+
+def path_message(path: BasePath, start_ns: int, frame: str) -> Path:
+    """Return a predicted base path that begins at ``start_ns`` as nav_msgs/Path."""
+
+    def header(time_ns: int) -> Header:
+        sec, nanosec = divmod(time_ns, NANOSECONDS)
+        return Header(frame_id=frame, stamp=Time(sec=sec, nanosec=nanosec))
+
+    instants = (path.time * NANOSECONDS).round().astype(np.int64) + start_ns
+    poses = []
+    for instant, r, o in zip(
+        instants.tolist(), path.position.tolist(), path.quaternion.tolist(), strict=True
+    ):
+        position = Point(x=r[0], y=r[1], z=r[2])
+        orientation = Quaternion(x=o[0], y=o[1], z=o[2], w=o[3])
+        pose = Pose(position=position, orientation=orientation)
+        poses.append(PoseStamped(header=header(instant), pose=pose))
+    return Path(header=header(start_ns), poses=poses)
 
 
 def serialised_trajectory(schedule: GaitSchedule, stamp_ns: int, frame: str) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +17,14 @@ from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import Log
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, String
-from std_srvs.srv import SetBool, Trigger
+from std_msgs.msg import String
 from support.oracles import PinocchioOracle
+from support.plant_rig import SLIDERS, STATE, TICK, TICK_NS, Rig
 from support.ros_harness import Harness, assert_one_sentence, construction, nanoseconds
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -36,129 +34,8 @@ from spacerobot_ros.nodes import PlantNode
 Array = npt.NDArray[np.float64]
 
 URDF = Path(__file__).parents[2] / "urdf"
-SLIDERS = ["slider_1", "slider_2", "slider_3"]
 MASS = 10 + 3 * 2.0
 RATE_LIMIT, STROKE = 0.7, 2.5  # of each slider, as its <limit> says
-TICK = 0.05
-TICK_NS = 50_000_000
-WARN = 30  # of rcl_interfaces/msg/Log
-
-STATE = {
-    "/clock": Clock,
-    "base_pose": PoseStamped,
-    "momentum": Float64MultiArray,
-    "odom": Odometry,
-    "joint_states": JointState,
-}
-TOPICS = {**STATE, "/diagnostics": DiagnosticArray, "/rosout": Log}
-
-
-class Rig:
-    """A plant, and a probe that commands it and hears all that it says."""
-
-    def __init__(
-        self,
-        harness: Harness,
-        parameters: dict[str, Any] | None = None,
-        *,
-        topics: dict[str, Any] | None = None,
-        activate: bool = True,
-    ) -> None:
-        self.harness = harness
-        defaults = {
-            "robot": "sliding_masses",
-            "time_mode": "lockstep",
-            "tick_rate": 1 / TICK,
-            "diagnostics_period": TICK,
-        }
-        self.plant = harness.make(
-            PlantNode, {**defaults, **(parameters or {})}, name="plant", autostart=False
-        )
-        self.probe = harness.probe({**TOPICS, **(topics or {})})
-        self.commands = self.probe.create_publisher(JointState, "joint_commands", 100)
-        assert self.plant.trigger_configure() is TransitionCallbackReturn.SUCCESS
-        harness.connect()
-        if activate:
-            self.activate()
-
-    def activate(self) -> None:
-        before = self.probe.count("joint_states")
-        assert self.plant.trigger_activate() is TransitionCallbackReturn.SUCCESS
-        self.wait("joint_states", before + 1)
-
-    def wait(self, topic: str, count: int) -> Any:
-        """Wait until ``count`` messages have come on a topic, and return the last of them."""
-        self.harness.spin_until(
-            lambda: self.probe.count(topic) >= count, f"message {count} on {topic}"
-        )
-        return self.probe.messages[topic][count - 1]
-
-    @property
-    def now_ns(self) -> int:
-        """Time of the last state."""
-        return nanoseconds(self.probe.last("joint_states").header.stamp)
-
-    def send(
-        self,
-        velocity: Sequence[float],
-        names: Sequence[str] = SLIDERS,
-        *,
-        stamp_ns: int | None = None,
-        **fields: Any,
-    ) -> None:
-        """Publish a command, stamped with the last state's time unless given."""
-        message = JointState(name=list(names), velocity=[float(x) for x in velocity], **fields)
-        stamp = self.now_ns if stamp_ns is None else stamp_ns
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
-        self.commands.publish(message)
-
-    def step(
-        self, velocity: Sequence[float], names: Sequence[str] = SLIDERS, **options: Any
-    ) -> JointState:
-        """Send a command, and return the joint states it leads to."""
-        before = self.probe.count("joint_states")
-        self.send(velocity, names, **options)
-        return self.wait("joint_states", before + 1)
-
-    def logged(self, part: str) -> bool:
-        """Whether the plant has logged a warning with this text."""
-        return any(
-            part in line.msg and line.name == "plant" and line.level == WARN
-            for line in self.probe.messages["/rosout"]
-        )
-
-    def wait_for_log(self, part: str) -> None:
-        self.harness.spin_until(lambda: self.logged(part), f"a warning with '{part}'")
-
-    def diagnosis(self, what: str) -> DiagnosticStatus:
-        """Return a status of the diagnostics of the last tick."""
-        self.harness.spin_until(
-            lambda: (
-                self.probe.count("/diagnostics")
-                and nanoseconds(self.probe.last("/diagnostics").header.stamp) == self.now_ns
-            ),
-            "diagnostics of the last tick",
-        )
-        (status,) = (
-            s for s in self.probe.last("/diagnostics").status if s.name == f"/plant: {what}"
-        )
-        return status
-
-    def diagnosed(self, what: str, key: str) -> float:
-        """Return one value of the diagnostics of the last tick."""
-        return float(next(p.value for p in self.diagnosis(what).values if p.key == key))
-
-    def wait_for_refusals(self, count: int) -> None:
-        self.harness.spin_until(
-            lambda: self.diagnosed("commands", "refused") == count, f"{count} refusal(s)"
-        )
-
-    def trigger(self, service: str) -> Any:
-        return self.harness.call(self.probe.create_client(Trigger, service), Trigger.Request())
-
-    def pause(self, on: bool) -> Any:
-        client = self.probe.create_client(SetBool, "plant/pause")
-        return self.harness.call(client, SetBool.Request(data=on))
 
 
 def pose_of(odom: Odometry) -> tuple[Array, Array]:
