@@ -11,8 +11,8 @@ PIP := $(BIN)/python3 -m pip -qq --disable-pip-version-check
 # What decides on the dependencies, and what is installed with the package. Directories are among
 # the latter because a deleted file changes nothing else.
 DECLARATION := setup.py setup.cfg
-SOURCES := package.xml LICENSE $(shell find $(wildcard bags config launch resource scripts \
-    spacerobot_ros urdf) -not -path '*/__pycache__*' -not -name '.*')
+SOURCES := package.xml LICENSE $(shell find $(wildcard bags config foxglove launch resource rviz \
+    scripts spacerobot_ros urdf) -not -path '*/__pycache__*' -not -name '.*')
 
 # The environment has a ROS 2 of its own, which one that the shell has sourced would be mixed with.
 ifdef AMENT_PREFIX_PATH
@@ -45,6 +45,27 @@ test: $(STAMP)/test ## check style and types, run the tests
 test-slow: $(STAMP)/test ## run the slow tests: long flights, builds with pip and colcon
 	$(BIN)/python3 -m pytest -m slow
 
+# Short flights, so that the bags of all scenarios stay small. A goal not met in time is no failure.
+REFERENCE := --set plant.marker_period=5 --set plant.diagnostics_period=5
+FLY = @fly() { echo "bags/$$1.mcap"; $(BIN)/spacerobot run "$$@" --bag "bags/$$1.mcap" $(REFERENCE) \
+    >/dev/null || [ $$? -eq 1 ]; }; fly
+
+.PHONY: bags
+bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed behaviour is wanted
+	$(FLY) sliding_masses --goal 0.05 -0.04 0.02 0 0 0 1 --goal-rotvec 0.04 -0.02 0.03 \
+	    --set plant.tick_rate=10 --set planner.tick_rate=10 --set planner.lie_bracket.t1=10 \
+	    --set planner.lie_bracket.cycle_period=4 --set planner.lie_bracket.cycles=0 \
+	    --set planner.attitude_tolerance=1e-4
+	$(FLY) arm_attitude --goal-rotvec 0.01 0.01 0.01 --set planner.attitude_tolerance=0.006 \
+	    --set plant.tick_rate=5 --set planner.tick_rate=5
+	$(FLY) planar_chain --set plant.tick_rate=25 --set planner.tick_rate=25 \
+	    --set coordinated_control.tick_rate=25
+	$(FLY) coordinated_control --set coordinated_control.settle_time=0.5 \
+	    --set coordinated_control.position_tolerance=0.02 \
+	    --set coordinated_control.attitude_tolerance=0.02
+	$(FLY) servicer --set coordinated_control.time_limit=8
+	$(FLY) servicer_thrusters --set coordinated_control.time_limit=5
+
 .PHONY: clean
 clean: ## remove .venv, caches, and the demo's bag and report
 	rm -rf $(VENV) build/lib build/bdist.* spacerobot_ros.egg-info
@@ -67,7 +88,7 @@ $(STAMP)/venv:
 	@mkdir -p $(STAMP)
 	@touch $@
 
-$(STAMP)/demo: EXTRAS := jazzy
+$(STAMP)/demo: EXTRAS := jazzy,viewer
 $(STAMP)/test: EXTRAS := jazzy,test
 
 # A changed declaration or a new stamp: the package with its dependencies. Changed sources: the

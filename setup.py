@@ -37,7 +37,7 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=find_packages(include=["spacerobot_ros*"]),
-    package_data={NAME: ["py.typed"]},
+    package_data={NAME: ["py.typed", "app/report/*.js"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -45,6 +45,8 @@ setup(
         *share("config"),
         *share("launch"),
         *share("bags"),
+        *share("foxglove"),
+        *share("rviz"),
         # The nodes are files and not console scripts because pip puts every console script into
         # bin/, where `ros2 run` does not look and a command called `plant` is out of place. As
         # files they are in lib/spacerobot_ros/ with pip and with colcon.
@@ -71,10 +73,13 @@ setup(
             "ros-jazzy-common-interfaces",
             "ros-jazzy-rclpy[fastrtps]",
         ],
+        # The 3D view of reports is MeshCat's. Only its script is used, but the package brings much.
+        "viewer": ["meshcat"],
         "test": [
             "catkin_pkg",
             "hypothesis",
             "mcap-ros2-support",
+            "meshcat",
             'mujoco>=4; python_version >= "3.11"',
             "mypy",
             "pin",

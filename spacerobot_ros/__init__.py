@@ -1,3 +1,21 @@
 """A ROS 2 flight stack for free-floating space robots."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from spacerobot_ros.recording import read_bag
+
 __version__ = "0.1.0"
+
+__all__ = ["__version__", "read_bag"]
+
+
+def __getattr__(name: str) -> Any:
+    # Imported when first asked for: the package itself is light.
+    if name == "read_bag":
+        from spacerobot_ros.recording import read_bag
+
+        return read_bag
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

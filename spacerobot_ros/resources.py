@@ -6,7 +6,7 @@ import sys
 from functools import lru_cache
 from pathlib import Path
 
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 
 _PACKAGE = "spacerobot_ros"
 
@@ -42,3 +42,23 @@ def share_directory() -> Path:
 def resource_names(folder: str, suffix: str) -> list[str]:
     """Return the names, without suffix, of the files of one kind (``urdf``, ``config``)."""
     return sorted(path.stem for path in (share_directory() / folder).glob(f"*{suffix}"))
+
+
+def robot_file(name: str) -> Path:
+    """Return the URDF file of a robot: a path, or the name of a robot of this package.
+
+    Raises
+    ------
+    ParameterError
+        There is no such file or robot.
+    """
+    path = Path(name)
+    if path.suffix != ".urdf":
+        path = share_directory() / "urdf" / f"{name}.urdf"
+    if not path.is_file():
+        known = ", ".join(resource_names("urdf", ".urdf"))
+        raise ParameterError(
+            f"There is no robot '{name}': there is no such URDF file, nor a robot of that name "
+            f"(known: {known})."
+        )
+    return path

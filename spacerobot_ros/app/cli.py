@@ -7,13 +7,17 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import wraps
 from pathlib import Path
 from typing import Any
 
 import click
 
 from spacerobot_ros import __version__
+from spacerobot_ros.app.analyze_command import analyze
+from spacerobot_ros.app.live_commands import goal as goal_command
+from spacerobot_ros.app.live_commands import up
+from spacerobot_ros.app.plan_command import plan
+from spacerobot_ros.app.record_commands import replay, salvage, verify
 from spacerobot_ros.app.scenario import (
     Scenario,
     goal_from_rotvec,
@@ -21,45 +25,26 @@ from spacerobot_ros.app.scenario import (
     parse_setting,
     scenario_names,
 )
+from spacerobot_ros.app.sentences import sentences
 from spacerobot_ros.control import LAWS
-from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.planning import METHODS, Goal
 
 GOAL_NOT_REACHED = 1
-BAD_INPUT = 2
-
-
-def _sentences(command: Callable[..., None]) -> Callable[..., None]:
-    """End a command with one sentence and exit code 2 where its input is refused."""
-
-    @wraps(command)
-    def wrapped(*arguments: Any, **options: Any) -> None:
-        try:
-            command(*arguments, **options)
-        except SpaceRobotError as error:
-            click.echo(str(error), err=True)
-            sys.exit(BAD_INPUT)
-        except ImportError as error:
-            if error.name and error.name.split(".")[0] in (
-                "rclpy",
-                "rosidl_parser",
-                "ament_index_python",
-            ):
-                click.echo(
-                    f"ROS 2 was not found ({error}); source its setup file, or install "
-                    "spacerobot_ros with its extra [jazzy].",
-                    err=True,
-                )
-                sys.exit(BAD_INPUT)
-            raise
-
-    return wrapped
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__, prog_name="spacerobot")
 def main() -> None:
     """Fly free-floating space robots: plan gaits, run them through ROS 2, record and report."""
+
+
+main.add_command(analyze)
+main.add_command(goal_command)
+main.add_command(plan)
+main.add_command(replay)
+main.add_command(up)
+main.add_command(salvage)
+main.add_command(verify)
 
 
 @main.command()
@@ -89,7 +74,8 @@ def main() -> None:
     metavar="[FACTOR]",
     help="Run on the wall clock, FACTOR times as fast.",
 )
-@_sentences
+@click.option("--processes", is_flag=True, help="Give each node a process of its own.")
+@sentences
 def run(
     scenario: str,
     goal: tuple[float, ...] | None,
@@ -100,6 +86,7 @@ def run(
     json_file: Path | None,
     report: Path | None,
     realtime: float | None,
+    processes: bool,
 ) -> None:
     """Fly SCENARIO (a name or a parameter file) to its goal and record it.
 
@@ -110,7 +97,7 @@ def run(
     from spacerobot_ros.app.run import run_scenario
 
     with _progress(chosen.name) as progress:
-        result = run_scenario(chosen, path, progress)
+        result = run_scenario(chosen, path, progress, processes=processes)
     if json_file is not None:
         result.write_json(json_file)
     for line in (*_summary_lines(result.summary), *_published_lines(chosen, result.summary)):
@@ -136,13 +123,22 @@ def scenarios() -> None:
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("--output", "-o", type=click.Path(path_type=Path), help="HTML file [beside the bag].")
 @click.option("--picture", type=click.Path(path_type=Path), help="Also draw an overview (PNG).")
-@_sentences
-def report_command(bag: Path, output: Path | None, picture: Path | None) -> None:
+@click.option(
+    "--beside",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="BAG",
+    help="Another run to compare with: a row of numbers and its path. May be repeated.",
+)
+@sentences
+def report_command(
+    bag: Path, output: Path | None, picture: Path | None, beside: tuple[Path, ...]
+) -> None:
     """Make a picture report of a BAG."""
     from spacerobot_ros.app.report import write_picture, write_report
 
     target = output or bag.with_suffix(".html")
-    write_report(bag, target)
+    write_report(bag, target, beside)
     click.echo(f"report      {target}")
     if picture is not None:
         write_picture(bag, picture)
@@ -152,7 +148,7 @@ def report_command(bag: Path, output: Path | None, picture: Path | None) -> None
 @main.command()
 @click.option("--ticks", default=20_000, show_default=True, type=click.IntRange(min=100))
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures.")
-@_sentences
+@sentences
 def bench(ticks: int, json_file: Path | None) -> None:
     """Measure the speed of the stack against a bare ping-pong in the same run."""
     from spacerobot_ros.app.bench import run_benchmark
@@ -230,6 +226,7 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         f"{summary['ticks_per_s']:.0f} ticks/s, {summary['real_time_factor']:.0f} times real time",
         f"momentum    changed by at most {summary['linear_momentum_drift']:.1e} kg m/s and "
         f"{summary['angular_momentum_drift']:.1e} kg m^2/s",
+        *_propellant_line(summary),
         f"bag         {summary['bag']} ({summary['messages_recorded']} messages)",
     ]
 
@@ -240,6 +237,11 @@ def _end_effector_line(summary: dict[str, Any]) -> list[str]:
     position = ", ".join(f"{x:.5f}" for x in summary["end_effector_final_position_m"])
     error = summary["end_effector_position_error_m"]
     return [f"end-effector ({position}) m, {error:.3g} m from its goal"]
+
+
+def _propellant_line(summary: dict[str, Any]) -> list[str]:
+    used = summary.get("propellant_kg")
+    return [] if used is None else [f"propellant  {1e3 * used:.1f} g"]
 
 
 def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:

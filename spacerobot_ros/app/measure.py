@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +12,17 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.recording import Bag, RecordingError, TopicSeries
 
+_POSE = [
+    *(f"pose.pose.position.{axis}" for axis in "xyz"),
+    *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
+]
+
 
 @dataclass(frozen=True)
 class Measured:
     """Time series of a bag: ``time`` (N,) s, base ``position`` (N, 3) m and ``quaternion`` (N, 4),
-    ``joints`` and ``joint_rates`` (N, n), ``momentum`` (N, 7) as on the topic.
+    ``joints`` and ``joint_rates`` (N, n), ``momentum`` (N, 7) as on the topic. Of imperfect sensors
+    they are the truth, which the plant publishes beside what is measured.
     """
 
     time: Array
@@ -41,17 +48,19 @@ class Measured:
         """
         topics = [f"{namespace}/{name}" for name in ("odom", "joint_states", "momentum")]
         for topic in topics:
-            if topic not in bag.topics or not bag.message_count(topic):
+            if not (_holds(bag, topic) or _holds(bag, f"{topic}_true")):
                 raise RecordingError(f"The bag holds no message on {topic}: no plant was recorded.")
-        odom, joints, momentum = (bag[topic] for topic in topics)
-        pose = "pose.pose"
+        time, pose = _truth(bag, topics[0], _POSE)
+        _, shapes = _truth(bag, topics[1], ["position", "velocity"])
+        momentum = bag[topics[2]]
+        n = shapes.shape[1] // 2
         return cls(
-            time=odom.stamp,
-            position=np.column_stack([odom.field(f"{pose}.position.{x}") for x in "xyz"]),
-            quaternion=np.column_stack([odom.field(f"{pose}.orientation.{x}") for x in "xyzw"]),
-            joint_names=list(next(joints.messages())[1].name),
-            joints=np.asarray(joints.field("position")),
-            joint_rates=np.asarray(joints.field("velocity")),
+            time=time,
+            position=pose[:, :3],
+            quaternion=pose[:, 3:],
+            joint_names=list(next(bag[topics[1]].messages())[1].name),
+            joints=shapes[:, :n],
+            joint_rates=shapes[:, n:],
             momentum=np.asarray(momentum.field("data")),
             expected=_expected(bag, f"{namespace}/momentum_expected", momentum),
             end_effector=_last_pose(bag, f"{namespace}/end_effector_pose"),
@@ -74,6 +83,26 @@ class Measured:
     def final_error(self, goal: Goal) -> PoseError:
         """Return what the last pose leaves to the goal."""
         return PoseError.between(self.position[-1], self.quaternion[-1], goal)
+
+
+def _holds(bag: Bag, topic: str) -> bool:
+    return topic in bag.topics and bag.message_count(topic) > 0
+
+
+def _truth(bag: Bag, topic: str, fields: Sequence[str]) -> tuple[Array, Array]:
+    """Return times (N,) and fields (N, m): of ``<topic>_true`` from where that begins."""
+    times: list[Array] = []
+    rows: list[Array] = []
+    begin = np.inf
+    for name in (f"{topic}_true", topic):
+        if _holds(bag, name):
+            series = bag[name]
+            before = series.stamp < begin
+            values = np.column_stack([np.asarray(series.field(field)) for field in fields])
+            times.insert(0, series.stamp[before])
+            rows.insert(0, values[before])
+            begin = series.stamp[0]
+    return np.concatenate(times), np.concatenate(rows)
 
 
 def _expected(bag: Bag, topic: str, momentum: TopicSeries) -> Array:

@@ -16,14 +16,19 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from spacerobot_ros.app.measure import Measured
+from spacerobot_ros.app.processes import ProcessStack
 from spacerobot_ros.app.scenario import Scenario
 from spacerobot_ros.app.stack import FlightStack
 from spacerobot_ros.model.attitude import rotvec_from_quaternion
 from spacerobot_ros.nodes.flight_node import use_loopback_discovery, use_private_discovery
+from spacerobot_ros.nodes.thruster_topics import PROPELLANT
 from spacerobot_ros.planning import PoseError
-from spacerobot_ros.recording import read_bag
+from spacerobot_ros.recording import Bag, read_bag
 
-_NO_GAIT = ("state", "goal", "corrections", "method")
+_NO_GAIT = (
+    *("state", "goal", "corrections", "method"),
+    *("manoeuvre_time_s", "ends_at_s"),
+)
 """Values of the planner's status that do not describe its gait."""
 
 Progress = Callable[[float, float], None]
@@ -61,8 +66,12 @@ def ros(*, private: bool) -> Iterator[None]:
         rclpy.try_shutdown()
 
 
-def run_scenario(scenario: Scenario, bag: Path, progress: Progress | None = None) -> RunResult:
+def run_scenario(
+    scenario: Scenario, bag: Path, progress: Progress | None = None, *, processes: bool = False
+) -> RunResult:
     """Fly a scenario from its initial state to its goal, in this process.
+
+    ``processes`` gives each node a process of its own instead.
 
     SIGINT and SIGTERM end the flight early; what was flown is recorded and summed up.
 
@@ -71,15 +80,29 @@ def run_scenario(scenario: Scenario, bag: Path, progress: Progress | None = None
     SpaceRobotError
         A parameter, the robot or the recording is refused.
     """
-    with ros(private=scenario.lockstep), _stop_on_signals() as stopped:
-        stack = FlightStack(scenario, bag)
+    if processes:
+        return _run(scenario, bag, progress, ProcessStack, private=False)
+    return _run(scenario, bag, progress, FlightStack, private=scenario.lockstep)
+
+
+def _run(
+    scenario: Scenario,
+    bag: Path,
+    progress: Progress | None,
+    make: Callable[[Scenario, Path], FlightStack | ProcessStack],
+    *,
+    private: bool,
+) -> RunResult:
+    with ros(private=private), stop_on_signals() as stopped:
+        stack = make(scenario, bag)
         try:
             began = time.perf_counter()
             stack.start(scenario.goal)
+            ends_at = float(scenario.parameter("coordinated_control", "time_limit", 0.0))
 
             def look() -> bool:
                 if progress is not None:
-                    progress(stack.plant.time_ns / 1e9, _ends_at(stack))
+                    progress(stack.time_ns / 1e9, stack.operator.ends_at or ends_at)
                 return stopped()
 
             stack.spin(look)
@@ -87,7 +110,7 @@ def run_scenario(scenario: Scenario, bag: Path, progress: Progress | None = None
             if progress is not None and not stopped():
                 progress(1.0, 1.0)
             stack.finish()
-            facts = _Facts.of(stack, wall_time, stopped())
+            facts = _Facts.of(stack, wall_time, stopped=stopped())
         finally:
             stack.close()
     return _summarise(scenario, bag, facts)
@@ -95,70 +118,49 @@ def run_scenario(scenario: Scenario, bag: Path, progress: Progress | None = None
 
 @dataclass(frozen=True)
 class _Facts:
-    """What only the live nodes know."""
+    """What the nodes said of the flight, and how long it took."""
 
     state: str
     sentence: str
     method: str
     plan_time: float
     wall_time: float
-    ticks: int
-    messages: int
     manoeuvre_time: float
     corrections: int
     gait: dict[str, str]
     end_effector_turns: bool
 
     @classmethod
-    def of(cls, stack: FlightStack, wall_time: float, stopped: bool) -> _Facts:
-        sentence = stack.sentence
-        if stopped:
-            sentence = f"Interrupted after {stack.plant.time_ns / 1e9:.6g} s of simulated time."
-        assert stack.recorder is not None
+    def of(cls, stack: FlightStack | ProcessStack, wall_time: float, *, stopped: bool) -> _Facts:
+        scenario, operator = stack.scenario, stack.operator
+        status = operator.status
+        node, name = (
+            ("planner", "method")
+            if "planner" in scenario.commanders
+            else ("coordinated_control", "law")
+        )
         return cls(
-            state="interrupted" if stopped else stack.status.get("state", ""),
-            sentence=sentence,
-            method=_method(stack),
-            plan_time=stack.planner.plan_time if stack.planner else 0.0,
+            state="interrupted" if stopped else status.get("state", ""),
+            sentence="" if stopped else operator.sentence,
+            method=operator.gait.get("method")
+            or status.get(name)
+            or str(scenario.parameter(node, name, "")),
+            plan_time=stack.plan_time,
             wall_time=wall_time,
-            ticks=stack.plant.tick,
-            messages=stack.recorder.messages_recorded,
-            manoeuvre_time=(
-                stack.planner.flown_time if stack.planner else stack.plant.time_ns / 1e9
-            ),
-            corrections=int(stack.status.get("corrections", 0)),
-            gait=stack.gait,
-            end_effector_turns=_controls_rotation(stack),
+            manoeuvre_time=float(status.get("manoeuvre_time_s", 0.0)),
+            corrections=int(status.get("corrections", 0)),
+            gait=operator.gait,
+            end_effector_turns=any(key.startswith("error.end_effector.r") for key in status),
         )
 
 
-def _method(stack: FlightStack) -> str:
-    """Name the gait method, or the control law where nobody plans."""
-    node, name = (stack.planner, "method") if stack.planner else (stack.controller, "law")
-    return str(node.parameters[name]) if node is not None else ""
-
-
-def _controls_rotation(stack: FlightStack) -> bool:
-    """Whether the attitude of the end-effector is one of the outputs."""
-    if stack.controller is None:
-        return False
-    return any(
-        axis[0] == "r" for axis in stack.controller.controller.law.outputs.selection.end_effector
-    )
-
-
-def _ends_at(stack: FlightStack) -> float:
-    """Simulated time at which the flight will end as far as is known, s; 0 if it is not."""
-    if stack.planner is not None:
-        return stack.planner.ends_at
-    assert stack.controller is not None
-    return float(stack.controller.parameters["time_limit"])  # type: ignore[arg-type]
-
-
 def _summarise(scenario: Scenario, path: Path, facts: _Facts) -> RunResult:
-    measured = Measured.of(read_bag(path))
+    bag = read_bag(path)
+    measured = Measured.of(bag)
     error = measured.final_error(scenario.goal)
     sim_time = float(measured.time[-1] - measured.time[0])
+    ticks = len(measured.time) - 1
+    sentence = facts.sentence or f"Interrupted after {sim_time:.6g} s of simulated time."
     goal = scenario.goal
     summary: dict[str, Any] = {
         "scenario": scenario.name,
@@ -171,13 +173,13 @@ def _summarise(scenario: Scenario, path: Path, facts: _Facts) -> RunResult:
         "position_error_m": error.distance,
         "attitude_error_rad": error.angle,
         "sim_time_s": sim_time,
-        "manoeuvre_time_s": facts.manoeuvre_time,
+        "manoeuvre_time_s": facts.manoeuvre_time or sim_time,
         "plan_time_s": facts.plan_time,
         "wall_time_s": facts.wall_time,
-        "ticks": facts.ticks,
-        "ticks_per_s": facts.ticks / facts.wall_time,
+        "ticks": ticks,
+        "ticks_per_s": ticks / facts.wall_time,
         "real_time_factor": sim_time / facts.wall_time,
-        "messages_recorded": facts.messages,
+        "messages_recorded": bag.message_count(),
         "bag": str(path),
         "momentum_drift": max(measured.linear_drift, measured.angular_drift),
         "linear_momentum_drift": measured.linear_drift,
@@ -186,7 +188,7 @@ def _summarise(scenario: Scenario, path: Path, facts: _Facts) -> RunResult:
         "corrections": facts.corrections,
         "gait": {name: _numbers(text) for name, text in facts.gait.items() if name not in _NO_GAIT},
         "state": facts.state,
-        "message": facts.sentence,
+        "message": sentence,
         "succeeded": facts.state == "reached",
     }
     if scenario.end_effector_goal is not None and measured.end_effector is not None:
@@ -195,7 +197,21 @@ def _summarise(scenario: Scenario, path: Path, facts: _Facts) -> RunResult:
         summary["end_effector_position_error_m"] = end.distance
         if facts.end_effector_turns:
             summary["end_effector_attitude_error_rad"] = end.angle
-    return RunResult(summary, facts.sentence, measured)
+    propellant = _last_diagnosis(bag, PROPELLANT)
+    if propellant is not None:
+        summary["propellant_kg"] = float(propellant)
+    return RunResult(summary, sentence, measured)
+
+
+def _last_diagnosis(bag: Bag, key: str) -> str | None:
+    """Return the last value of a key in the recorded diagnostics, None where there is none."""
+    if not bag.message_count("/diagnostics"):
+        return None
+    value = None
+    for _, array in bag["/diagnostics"].messages():
+        for status in array.status:
+            value = next((pair.value for pair in status.values if pair.key == key), value)
+    return value
 
 
 def _numbers(text: str) -> list[float] | float | str:
@@ -208,7 +224,7 @@ def _numbers(text: str) -> list[float] | float | str:
 
 
 @contextmanager
-def _stop_on_signals() -> Iterator[Callable[[], bool]]:
+def stop_on_signals() -> Iterator[Callable[[], bool]]:
     """Turn SIGINT and SIGTERM into a flag while the flight lasts."""
     caught: list[int] = []
     before = {

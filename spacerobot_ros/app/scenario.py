@@ -65,6 +65,12 @@ class Scenario:
         """Whether the plant waits for commands instead of the wall clock (unless overridden)."""
         return self.overrides.get("plant", {}).get("time_mode", "lockstep") == "lockstep"
 
+    def parameter(self, node: str, name: str, default: Any) -> Any:
+        """Return what a node's parameter is set to, by the overrides or the file."""
+        section = yaml.safe_load(self.path.read_text(encoding="utf-8")).get(node) or {}
+        given = {**section.get("ros__parameters", {}), **self.overrides.get(node, {})}
+        return given.get(name, default)
+
     def with_overrides(self, node: str, values: Mapping[str, Any]) -> Scenario:
         """Return the scenario with more parameters of one node set."""
         merged = {**self.overrides, node: {**self.overrides.get(node, {}), **values}}

@@ -2,46 +2,36 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.experimental import EventsExecutor
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import JointState
 
+from spacerobot_ros.app.description import scenario_record
+from spacerobot_ros.app.operator import Operator
 from spacerobot_ros.app.scenario import NODES, Scenario
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.nodes import (
+    NODE_TYPES,
     CoordinatedControlNode,
     FlightNode,
     PlannerNode,
     PlantNode,
     RecorderNode,
 )
-from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, spin_until
+from spacerobot_ros.nodes.flight_node import spin_until
 from spacerobot_ros.nodes.recorder import parameters_of
 from spacerobot_ros.planning import Goal
 
-_CLASSES: dict[str, type[FlightNode]] = {
-    "plant": PlantNode,
-    "planner": PlannerNode,
-    "coordinated_control": CoordinatedControlNode,
-    "recorder": RecorderNode,
-}
 _DISCOVERY_TIMEOUT = 10.0
 _LOOK_PERIOD = 0.2
-_STATUS = {"planner": "planner/status", "coordinated_control": "controller/status"}
-_ENDED = ("reached", "failed", "refused", "aborted")
 
 
 class FlightStack:
@@ -70,11 +60,6 @@ class FlightStack:
     ) -> None:
         self.scenario = scenario
         self.executor = EventsExecutor(context=context) if context else EventsExecutor()
-        self.done = rclpy.task.Future(executor=None)
-        self.status: dict[str, str] = {}
-        self.sentence = ""
-        self.gait: dict[str, str] = {}
-        """What the planner said of its first schedule for the present goal."""
         self._nodes: list[Node] = []
         overrides = {name: dict(scenario.overrides.get(name, {})) for name in NODES}
         overrides["plant"].setdefault("time_mode", "lockstep")
@@ -91,20 +76,17 @@ class FlightStack:
             for node in self.commanders:
                 # Their warnings are their status, which whoever runs the stack is told anyway.
                 node.get_logger().set_level(LoggingSeverity.ERROR)
-            self.operator = rclpy.create_node("operator", context=context)
-            self._nodes.append(self.operator)
-            self._goal_topic = self.operator.create_publisher(PoseStamped, "goal_pose", STREAM)
-            if scenario.goal.joint_positions is not None:
-                self._shape_topic = self.operator.create_publisher(
-                    JointState, "goal_joint_states", STREAM
-                )
-            if scenario.end_effector_goal is not None:
-                self._end_effector_topic = self.operator.create_publisher(
-                    PoseStamped, "end_effector/goal_pose", STREAM
-                )
-            # Whoever plans decides; a controller alone decides for itself.
-            decider = _STATUS[scenario.commanders[0]]
-            self.operator.create_subscription(DiagnosticStatus, decider, self._on_status, LATCHED)
+            shaped = scenario.goal.joint_positions is not None
+            self.operator = Operator(
+                # Whoever plans decides; a controller alone decides for itself.
+                scenario.commanders[0],
+                str(self.commanders[0].parameters["world_frame"]),
+                joint_names=(lambda: self.plant.plant.robot.joint_names) if shaped else None,
+                end_effector=scenario.end_effector_goal is not None,
+                on_end=self.plant.trigger_deactivate,
+                context=context,
+            )
+            self._nodes.append(self.operator.node)
             for name in wanted:
                 if name != "recorder":
                     nodes[name].require(nodes[name].trigger_configure)
@@ -119,43 +101,35 @@ class FlightStack:
             self.close()
             raise
 
-    def start(self, goal: Goal) -> None:
-        """Activate everything and send the goal; the plant's first state is planned from.
+    @property
+    def time_ns(self) -> int:
+        """Simulated time, ns."""
+        return self.plant.time_ns
+
+    @property
+    def plan_time(self) -> float:
+        """Wall time that planning took, s."""
+        return self.planner.plan_time if self.planner is not None else 0.0
+
+    def start(self, goal: Goal | None) -> None:
+        """Activate everything and send the goal, if any; the plant's first state is planned from.
 
         It happens at the next spin, inside a callback: what is published from a callback is
         delivered in the order of publication, what is published between spins is not.
         """
 
         def launch() -> None:
-            self.operator.destroy_timer(timer)
+            self.operator.node.destroy_timer(timer)
             if self.recorder is not None:
                 self.recorder.trigger_activate()
             for node in reversed(self.commanders):
                 node.trigger_activate()
-            self.send(goal, self.scenario.end_effector_goal)
+            if goal is not None:
+                self.operator.send(goal, self.scenario.end_effector_goal)
             self.plant.trigger_activate()
 
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        timer = self.operator.create_timer(0.001, launch, clock=steady)
-
-    def send(self, goal: Goal, end_effector: Goal | None = None) -> None:
-        """Publish goal poses of the base and, where there is one, of the end-effector."""
-        if goal.joint_positions is not None:
-            names = self.plant.plant.robot.joint_names
-            self._shape_topic.publish(
-                JointState(name=list(names), position=goal.joint_positions.tolist())
-            )
-        self._goal_topic.publish(self._pose(goal))
-        if end_effector is not None:
-            self._end_effector_topic.publish(self._pose(end_effector))
-
-    def _pose(self, goal: Goal) -> PoseStamped:
-        message = PoseStamped()
-        message.header.frame_id = str(self.commanders[0].parameters["world_frame"])
-        p, o = message.pose.position, message.pose.orientation
-        p.x, p.y, p.z = goal.position.tolist()
-        o.x, o.y, o.z, o.w = goal.quaternion.tolist()
-        return message
+        timer = self.operator.node.create_timer(0.001, launch, clock=steady)
 
     def spin(self, look: Callable[[], bool]) -> None:
         """Run until the goal is decided, or until ``look``, called five times a second, is true.
@@ -164,14 +138,14 @@ class FlightStack:
         """
 
         def on_look() -> None:
-            if look() and not self.done.done():
+            if look() and not self.operator.done.done():
                 self.plant.trigger_deactivate()
-                self.done.set_result("stopped")
+                self.operator.done.set_result("stopped")
 
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        timer = self.operator.create_timer(_LOOK_PERIOD, on_look, clock=steady)
-        spin_until(self.executor, self.done)
-        self.operator.destroy_timer(timer)
+        timer = self.operator.node.create_timer(_LOOK_PERIOD, on_look, clock=steady)
+        spin_until(self.executor, self.operator.done)
+        self.operator.node.destroy_timer(timer)
 
     def finish(self) -> None:
         """Stop the plant, record what is still on its way, and complete the bag.
@@ -187,11 +161,8 @@ class FlightStack:
             node.trigger_deactivate()
         if self.recorder is None:
             return
-        quiet = 0
-        while quiet < 20:
-            before = self.recorder.messages_recorded
-            self.executor.spin_once(timeout_sec=0.001)
-            quiet = quiet + 1 if self.recorder.messages_recorded == before else 0
+        # In one process what is published is there.
+        self.recorder.drain(self.executor, quiet=0.02)
         self.recorder.trigger_deactivate()
         self.recorder.trigger_cleanup()
         if self.recorder.failure or self.recorder.fault:
@@ -215,13 +186,13 @@ class FlightStack:
             parameters = [Parameter(key, value=value) for key, value in overrides.items()]
         except (TypeError, ValueError) as error:
             raise ParameterError(f"A parameter of node '{name}' is refused: {error}.") from error
-        known = {spec.name for spec in _CLASSES[name].SPECS}
+        known = {spec.name for spec in NODE_TYPES[name].SPECS}
         unknown = [key for key in overrides if key not in known]
         if unknown:
             raise ParameterError(f"Node '{name}' has no parameter '{unknown[0]}'.")
         arguments = ["--ros-args", "--params-file", str(self.scenario.path)]
         try:
-            node = _CLASSES[name](
+            node = NODE_TYPES[name](
                 name,
                 autostart=False,
                 context=context,
@@ -236,30 +207,10 @@ class FlightStack:
 
     def _describe(self, names: list[str], nodes: Mapping[str, FlightNode]) -> None:
         assert self.recorder is not None
-        goal = self.scenario.goal
-        self.recorder.describe(
-            "scenario",
-            {
-                "name": self.scenario.name,
-                "description": self.scenario.description,
-                "goal_position": " ".join(repr(x) for x in goal.position.tolist()),
-                "goal_orientation": " ".join(repr(x) for x in goal.quaternion.tolist()),
-                **self._end_effector_record(),
-                "published": json.dumps([asdict(row) for row in self.scenario.published]),
-            },
-        )
+        self.recorder.describe("scenario", scenario_record(self.scenario))
         for name in names:
             if name != "recorder":
                 self.recorder.describe(f"parameters/{name}", parameters_of(nodes[name]))
-
-    def _end_effector_record(self) -> dict[str, str]:
-        goal = self.scenario.end_effector_goal
-        if goal is None:
-            return {}
-        return {
-            "end_effector_goal_position": " ".join(repr(x) for x in goal.position.tolist()),
-            "end_effector_goal_orientation": " ".join(repr(x) for x in goal.quaternion.tolist()),
-        }
 
     def _connect(self) -> None:
         """Wait until every subscription in this process has met its publisher."""
@@ -273,7 +224,7 @@ class FlightStack:
             self.executor.spin_once(timeout_sec=0.01)
             if self.recorder is not None:
                 self.recorder.scan()
-        if self.operator.count_publishers("odom") > 1:
+        if self.operator.node.count_publishers("odom") > 1:
             raise SpaceRobotError(
                 "Another plant already publishes 'odom' in this ROS domain; "
                 "set ROS_DOMAIN_ID to a number of its own for this run."
@@ -293,13 +244,3 @@ class FlightStack:
             for publisher in ours
             if publisher.topic_name in topics
         )
-
-    def _on_status(self, message: DiagnosticStatus) -> None:
-        self.status = {pair.key: pair.value for pair in message.values}
-        self.sentence = message.message
-        if self.status.get("state") == "executing" and not self.gait:
-            self.gait = dict(self.status)
-        if self.status.get("state") in _ENDED and not self.done.done():
-            # Here and not when the spin returns: the run ends at the same tick every time.
-            self.plant.trigger_deactivate()
-            self.done.set_result(self.status["state"])

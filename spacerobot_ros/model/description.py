@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from spacerobot_ros.errors import RobotDescriptionError
 
 Array = npt.NDArray[np.float64]
 
@@ -102,6 +105,15 @@ class Joint:
     axis: Array
     limits: JointLimits
 
+    def locked(self, position: float) -> Joint:
+        """Return the fixed joint that holds the child where this one has it at ``position``."""
+        moved = Pose(r=position * self.axis)
+        if self.kind is not JointKind.PRISMATIC:
+            hat = np.cross(np.eye(3), self.axis)
+            turn = np.eye(3) + np.sin(position) * hat + (1 - np.cos(position)) * (hat @ hat)
+            moved = Pose(turn)
+        return replace(self, kind=JointKind.FIXED, origin=self.origin @ moved, limits=JointLimits())
+
 
 @dataclass(frozen=True)
 class Body:
@@ -157,3 +169,85 @@ class RobotDescription:
         """Return one limit (n,) of the movable joints: lower, upper, velocity or effort."""
         values: list[Any] = [getattr(joint.limits, what) for joint in self.movable_joints]
         return np.array(values, dtype=float)
+
+    def with_links(self, links: tuple[Link, ...]) -> RobotDescription:
+        """Return the robot with other links of the same names; ``urdf`` stays what it was."""
+        return self._rebuilt(links, self.joints)
+
+    def with_locked(self, positions: Mapping[str, float]) -> RobotDescription:
+        """Return the robot with joints fixed at positions (m or rad) by their names.
+
+        Links and the other joints keep their names and their order; ``urdf`` stays what it was.
+
+        Raises
+        ------
+        KeyError
+            There is no movable joint of a name.
+        """
+        unknown = set(positions) - set(self.joint_names)
+        if unknown:
+            raise KeyError(f"robot '{self.name}' has no movable joint '{min(unknown)}'")
+        joints = tuple(
+            joint.locked(positions[joint.name]) if joint.name in positions else joint
+            for joint in self.joints
+        )
+        return self._rebuilt(self.links, joints)
+
+    def _rebuilt(self, links: tuple[Link, ...], joints: tuple[Joint, ...]) -> RobotDescription:
+        bodies, frames = weld({link.name: link for link in links}, joints)
+        return replace(self, links=links, joints=joints, bodies=tuple(bodies), frames=frames)
+
+
+def weld(
+    links: Mapping[str, Link], joints: Sequence[Joint]
+) -> tuple[list[Body], dict[str, tuple[int, Pose]]]:
+    """Order the tree from the root and merge what fixed joints hold together.
+
+    Returns ``bodies`` and ``frames`` of a :class:`RobotDescription`.
+
+    Raises
+    ------
+    RobotDescriptionError
+        The links and joints are no tree.
+    """
+    children: dict[str, list[Joint]] = {name: [] for name in links}
+    parents: dict[str, str] = {}
+    for joint in joints:
+        if joint.child in parents:
+            raise RobotDescriptionError(
+                f"Link '{joint.child}' is the child of two joints ('{parents[joint.child]}' and "
+                f"'{joint.name}'); a robot is a tree."
+            )
+        parents[joint.child] = joint.name
+        children[joint.parent].append(joint)
+    roots = [name for name in links if name not in parents]
+    if len(roots) != 1:
+        found = ", ".join(f"'{name}'" for name in roots) or "none"
+        raise RobotDescriptionError(
+            f"A robot has exactly one root link (the base); found: {found}."
+        )
+
+    bodies = [Body(roots[0], links[roots[0]].inertia, None, -1, Pose())]
+    frames = {roots[0]: (0, Pose())}
+    queue = [roots[0]]
+    while queue:
+        parent = queue.pop(0)
+        index, parent_pose = frames[parent]
+        for joint in children[parent]:
+            inertia = links[joint.child].inertia
+            pose = parent_pose @ joint.origin
+            if joint.kind is JointKind.FIXED:
+                body = bodies[index]
+                welded = body.inertia + inertia.moved(pose)
+                bodies[index] = Body(body.name, welded, body.joint, body.parent, body.origin)
+                frames[joint.child] = (index, pose)
+            else:
+                frames[joint.child] = (len(bodies), Pose())
+                bodies.append(Body(joint.child, inertia, joint, index, pose))
+            queue.append(joint.child)
+    if len(frames) != len(links):
+        lost = sorted(set(links) - set(frames))
+        raise RobotDescriptionError(
+            f"Link '{lost[0]}' is not connected to the root: its joints form a ring."
+        )
+    return bodies, frames

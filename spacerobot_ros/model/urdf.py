@@ -15,7 +15,6 @@ from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.attitude import matrix_from_rpy
 from spacerobot_ros.model.description import (
     Array,
-    Body,
     Inertia,
     Joint,
     JointKind,
@@ -24,6 +23,7 @@ from spacerobot_ros.model.description import (
     Pose,
     RobotDescription,
     Shape,
+    weld,
 )
 
 
@@ -71,7 +71,7 @@ def parse_robot(text: str) -> RobotDescription:
             raise RobotDescriptionError(
                 f"The {kind} name '{twice[0]}' is used twice; names are unique."
             )
-    bodies, frames = _weld(links, joints)
+    bodies, frames = weld(links, joints)
     description = RobotDescription(
         name=tree.name or "robot",
         links=tuple(links.values()),
@@ -227,53 +227,6 @@ def _limits(joint: Any, kind: JointKind, where: str) -> JointLimits:
             f"({values['upper']}): it could not move; give a stroke, or make it fixed."
         )
     return JointLimits(**values)
-
-
-def _weld(
-    links: dict[str, Link], joints: list[Joint]
-) -> tuple[list[Body], dict[str, tuple[int, Pose]]]:
-    """Order the tree from the root and merge what fixed joints hold together."""
-    children: dict[str, list[Joint]] = {name: [] for name in links}
-    parents: dict[str, str] = {}
-    for joint in joints:
-        if joint.child in parents:
-            raise RobotDescriptionError(
-                f"Link '{joint.child}' is the child of two joints ('{parents[joint.child]}' and "
-                f"'{joint.name}'); a robot is a tree."
-            )
-        parents[joint.child] = joint.name
-        children[joint.parent].append(joint)
-    roots = [name for name in links if name not in parents]
-    if len(roots) != 1:
-        found = ", ".join(f"'{name}'" for name in roots) or "none"
-        raise RobotDescriptionError(
-            f"A robot has exactly one root link (the base); found: {found}."
-        )
-
-    bodies = [Body(roots[0], links[roots[0]].inertia, None, -1, Pose())]
-    frames = {roots[0]: (0, Pose())}
-    queue = [roots[0]]
-    while queue:
-        parent = queue.pop(0)
-        index, parent_pose = frames[parent]
-        for joint in children[parent]:
-            inertia = links[joint.child].inertia
-            pose = parent_pose @ joint.origin
-            if joint.kind is JointKind.FIXED:
-                body = bodies[index]
-                welded = body.inertia + inertia.moved(pose)
-                bodies[index] = Body(body.name, welded, body.joint, body.parent, body.origin)
-                frames[joint.child] = (index, pose)
-            else:
-                frames[joint.child] = (len(bodies), Pose())
-                bodies.append(Body(joint.child, inertia, joint, index, pose))
-            queue.append(joint.child)
-    if len(frames) != len(links):
-        lost = sorted(set(links) - set(frames))
-        raise RobotDescriptionError(
-            f"Link '{lost[0]}' is not connected to the root: its joints form a ring."
-        )
-    return bodies, frames
 
 
 def _require_mass(robot: RobotDescription) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from spacerobot_ros.control import LAWS, PROFILES, GainPair, Gains
 from spacerobot_ros.nodes.parameters import ParameterSpec, Value, option_specs
-from spacerobot_ros.nodes.robot_source import ROBOT_SPECS
+from spacerobot_ros.nodes.robot_source import MODEL_ERROR_SPECS, ROBOT_SPECS
 
 _GROUPS = (
     ("base_position", 30.0, 60.0),
@@ -33,6 +33,7 @@ _GAIN_SPECS = tuple(
 
 CONTROL_SPECS = (
     *ROBOT_SPECS,
+    *MODEL_ERROR_SPECS,
     ParameterSpec("law", "transposed_jacobian", "", "control law", choices=tuple(LAWS)),
     ParameterSpec("tick_rate", 100.0, "Hz", "commands a second; the plant's", 1e-3, 1e5),
     ParameterSpec("world_frame", "world", "", "frame that goals must be given in"),

@@ -39,10 +39,10 @@ from spacerobot_ros.nodes.cdr import (
 from spacerobot_ros.nodes.control_parameters import CONTROL_SPECS, gains_of
 from spacerobot_ros.nodes.controller_status import ControllerState, ControllerStatus
 from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
+from spacerobot_ros.nodes.goal_messages import goal_of
 from spacerobot_ros.nodes.joint_command import JointReader
 from spacerobot_ros.nodes.plant_topics import DEFAULT_END_EFFECTOR
-from spacerobot_ros.nodes.robot_source import robot_of
-from spacerobot_ros.planning import Goal
+from spacerobot_ros.nodes.robot_source import robot_from_text, robot_of
 
 
 class CoordinatedControlNode(FlightNode):
@@ -67,6 +67,8 @@ class CoordinatedControlNode(FlightNode):
         self._odom_raw = self._joints_raw = b""
         self._reference_raw = self._base_reference_raw = b""
         self._odom_fresh = self._joints_fresh = self._hold = False
+        self._blind = False
+        """Whether odom has failed to come: states are answered without it until it does."""
         self._goals: dict[str, PoseReference] = {}
         self._odom = TemplateReader(
             Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
@@ -176,7 +178,7 @@ class CoordinatedControlNode(FlightNode):
     def _on_description(self, message: String) -> None:
         if self._robot is None:
             try:
-                self._use(SpaceRobot.from_urdf(message.data))
+                self._use(robot_from_text(message.data, self.parameters))
             except SpaceRobotError as error:
                 self.get_logger().error(f"robot_description: {error}")
                 return
@@ -191,15 +193,9 @@ class CoordinatedControlNode(FlightNode):
     def _on_goal(self, group: str, message: PoseStamped) -> None:
         if not self._running:
             return
-        frame = str(self.parameters["world_frame"])
-        p, o = message.pose.position, message.pose.orientation
         try:
-            if message.header.frame_id not in ("", frame):
-                raise PlanningError(
-                    f"The goal of the {group.replace('_', '-')} is in frame "
-                    f"'{message.header.frame_id}'; goals are taken in '{frame}'."
-                )
-            goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w])
+            frame = str(self.parameters["world_frame"])
+            goal = goal_of(message, frame, f"The goal of the {group.replace('_', '-')}")
             if self._robot is not None and not getattr(
                 self.controller.law.outputs.selection, group
             ):
@@ -216,13 +212,15 @@ class CoordinatedControlNode(FlightNode):
     def _on_odom(self, raw: bytes) -> None:
         self._odom_raw = raw
         self._odom_fresh = True
+        self._blind = False
         self._on_part()
 
     def _on_joints(self, raw: bytes) -> None:
         if self._joints_fresh and self._running and self._robot is not None:
             # The tick before was not answered: its odom is missing, or whoever gives references
             # is silent.
-            self._on_state(measured=self._odom_raw[4:12] == self._joints_raw[4:12])
+            self._blind = self._odom_raw[4:12] != self._joints_raw[4:12]
+            self._on_state(measured=not self._blind)
         self._joints_raw = raw
         self._joints_fresh = True
         self._on_part()
@@ -242,15 +240,15 @@ class CoordinatedControlNode(FlightNode):
         stamp = self._joints_raw[4:12]
         if (
             self._running
-            and self._odom_fresh
+            and (self._odom_fresh or self._blind)
             and self._joints_fresh
             and self._robot is not None
-            and stamp == self._odom_raw[4:12]
+            and (self._blind or stamp == self._odom_raw[4:12])
             and (not self._joints_driven or stamp == self._reference_raw[4:12])
             and (not self._base_driven or stamp == self._base_reference_raw[4:12])
         ):
             self._odom_fresh = self._joints_fresh = False
-            self._on_state(measured=True)
+            self._on_state(measured=not self._blind)
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self._running and self._robot is not None

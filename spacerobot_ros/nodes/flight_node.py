@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
@@ -12,6 +13,7 @@ from typing import Any, ClassVar
 import rclpy
 from lifecycle_msgs.msg import State
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
@@ -38,6 +40,9 @@ AUTOSTART = ParameterSpec(
     "autostart", True, "", "configure and activate at once; false: wait for a supervisor"
 )
 
+
+_LONGEST_DELIVERY = 1.0
+"""Wall s after a signal in which readers may still confirm what they were sent."""
 
 _DISCOVERY_CHOICES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
 
@@ -69,6 +74,8 @@ class FlightNode(LifecycleNode):
         super().__init__(name, **kwargs)
         self._specs = [AUTOSTART, *self.SPECS]
         self.fault: SpaceRobotError | None = None
+        self.on_end: Callable[[int], None] = lambda code: None
+        """Called with an exit code by a node that has nothing left to do."""
         self._raising = False
         try:
             self.parameters: dict[str, Value] = declare(self, self._specs)
@@ -132,6 +139,9 @@ class FlightNode(LifecycleNode):
 
     def cleanup(self) -> None:
         """Give up what configure created."""
+
+    def drain(self, executor: EventsExecutor) -> None:
+        """Take in what is still on its way before the node ends."""
 
     def parameters_changed(self) -> None:
         """React to a change of live parameters; ``self.parameters`` has the new values."""
@@ -223,7 +233,7 @@ def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = No
     """Run one node in its own process until SIGINT or SIGTERM.
 
     Returns the exit code: 0 after a signal, 2 when the node cannot start (the sentence is on
-    standard error).
+    standard error), the node's own when it ends by itself.
     """
     use_loopback_discovery()
     try:
@@ -241,15 +251,27 @@ def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = No
         except SpaceRobotError as error:
             print(f"{error}", file=sys.stderr)
             return 2
+        node.on_end = stop.set_result
         executor = EventsExecutor()
         executor.add_node(node)
         spin_until(executor, stop)
+        node.drain(executor)
+        _deliver(node)
         node.trigger_shutdown()
-        return 0
+        return stop.result() or 0
     finally:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _deliver(node: FlightNode) -> None:
+    """Wait until readers have what was published: it would go with the process."""
+    end = time.monotonic() + _LONGEST_DELIVERY
+    for publisher in node.publishers:
+        left = end - time.monotonic()
+        if left > 0 and publisher.get_subscription_count():
+            publisher.wait_for_all_acked(Duration(seconds=left))
 
 
 def spin_until(executor: EventsExecutor, done: rclpy.task.Future) -> None:

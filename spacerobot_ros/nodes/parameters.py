@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 
 from spacerobot_ros.errors import ParameterError
 
-Value = bool | int | float | str | list[float]
+Value = bool | int | float | str | list[float] | list[str]
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,8 @@ class ParameterSpec:
     """One parameter of a node; the type of ``default`` is the type of the parameter.
 
     ``choices`` limits a string, ``minimum`` and ``maximum`` a number, ``length`` an array (None:
-    any). ``live`` ones may change while the node runs.
+    any). ``live`` ones may change while the node runs. ``texts``: an array of texts, also taken as
+    one text whose parts stand on lines of their own or between semicolons.
     """
 
     name: str
@@ -33,6 +34,7 @@ class ParameterSpec:
     choices: Sequence[str] = ()
     length: int | None = None
     live: bool = False
+    texts: bool = False
 
     def descriptor(self) -> ParameterDescriptor:
         """Return what ``ros2 param describe`` shows."""
@@ -75,6 +77,8 @@ class ParameterSpec:
             if self.choices and value not in self.choices:
                 raise self._refusal(value, f"one of {', '.join(self.choices)}")
             return value
+        if self.texts:
+            return self._lines(value)
         try:
             numbers = [float(x) for x in value]
         except (TypeError, ValueError):
@@ -84,6 +88,13 @@ class ParameterSpec:
         if not all(math.isfinite(x) and self.minimum <= x <= self.maximum for x in numbers):
             raise self._refusal(value, f"finite numbers{self._range()}")
         return numbers
+
+    def _lines(self, value: Any) -> list[str]:
+        if isinstance(value, str):
+            value = value.replace("\n", ";").split(";")
+        if not isinstance(value, Sequence) or not all(isinstance(line, str) for line in value):
+            raise self._refusal(value, "a list of texts")
+        return [line.strip() for line in value if line.strip()]
 
     def _number(self, value: Any, whole: bool) -> int | float:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -149,7 +160,8 @@ def declare(node: Node, specs: Sequence[ParameterSpec]) -> dict[str, Value]:
         node.undeclare_parameter(spec.name)
         value = spec.default if given is None else spec.checked(given)
         # rclpy cannot tell the type of an empty list: declare the type and leave it unset.
-        stored = Parameter.Type.DOUBLE_ARRAY if value == [] else value
+        empty = Parameter.Type.STRING_ARRAY if spec.texts else Parameter.Type.DOUBLE_ARRAY
+        stored = empty if value == [] else value
         node.declare_parameter(spec.name, stored, spec.descriptor(), ignore_override=True)
         values[spec.name] = value
     return values

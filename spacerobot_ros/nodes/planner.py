@@ -8,12 +8,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
-from trajectory_msgs.msg import JointTrajectory
-from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.errors import CommandError, PlanningError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
@@ -21,22 +19,25 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.cdr import (
     NANOSECONDS,
     MessageTemplate,
-    TemplateReader,
     raw_publish,
     stamp_bytes,
 )
 from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
+from spacerobot_ros.nodes.goal_messages import goal_of, shape_of
 from spacerobot_ros.nodes.joint_command import JointReader
-from spacerobot_ros.nodes.markers import goal_markers
-from spacerobot_ros.nodes.parameters import ParameterSpec, option_specs
-from spacerobot_ros.nodes.planner_status import PlannerState, PlannerStatus
-from spacerobot_ros.nodes.robot_source import ROBOT_SPECS, robot_of
-from spacerobot_ros.nodes.trajectory_message import path_message, serialised_trajectory
-from spacerobot_ros.planning import METHODS, GaitSchedule, Goal, PoseError, RobotState, Tolerance
+from spacerobot_ros.nodes.measured_state import MeasuredState
+from spacerobot_ros.nodes.plan_topics import PlanTopics
+from spacerobot_ros.nodes.planner_parameters import PLANNER_SPECS
+from spacerobot_ros.nodes.planner_status import PlannerState, PlannerStatus, what_is_left
+from spacerobot_ros.nodes.robot_source import robot_from_text, robot_of
+from spacerobot_ros.planning import GaitSchedule, Goal, PoseError, Tolerance
+from spacerobot_ros.planning.braking import BrakingFollower
 from spacerobot_ros.planning.follower import GaitFollower
+from spacerobot_ros.planning.registry import build_method
+from spacerobot_ros.planning.stuck_joints import RemainingJointsGait, StuckJointWatch
 
-_AT_REST = 1e-9
-"""Joint rates below which the joints rest, m/s or rad/s."""
+PLANNED = "Planned in {:.6f} s."
+"""What is logged when a plan is made."""
 
 
 class PlannerNode(FlightNode):
@@ -45,29 +46,11 @@ class PlannerNode(FlightNode):
     A goal is planned from the next measured state. When its schedule has ended the measured pose
     is compared with the goal, and the rest is planned again until the tolerance is met or
     ``max_corrections`` are used up; the pieces of a gait that its method plans one by one (a
-    *partial* schedule) do not count. A new goal replaces the one that is being flown.
+    *partial* schedule) do not count. A new goal replaces the one that is being flown. When a joint
+    does not follow, the rest is planned with the joints that remain.
     """
 
-    SPECS: ClassVar = (
-        *ROBOT_SPECS,
-        ParameterSpec("method", "lie_bracket", "", "gait method", choices=tuple(METHODS)),
-        ParameterSpec("tick_rate", 20.0, "Hz", "commands a second; the plant's", 1e-3, 1e5),
-        ParameterSpec("integration_step", 0.01, "s", "longest step of the prediction", 1e-6),
-        ParameterSpec("world_frame", "world", "", "frame that goals must be given in"),
-        ParameterSpec("position_tolerance", 1e-3, "m", "a goal is met within", 0.0, live=True),
-        ParameterSpec("attitude_tolerance", 1e-3, "rad", "a goal is met within", 0.0, live=True),
-        ParameterSpec("joint_tolerance", 1e-3, "m or rad", "a shape is met within", 0.0, live=True),
-        ParameterSpec(
-            "output",
-            "commands",
-            "",
-            "joint_commands (velocities) for the plant, or joint_reference for a controller",
-            choices=("commands", "reference"),
-        ),
-        ParameterSpec("max_corrections", 3, "", "new plans after the first", 0, 1000, live=True),
-        ParameterSpec("shape_gain", 2.0, "1/s", "feedback on the shape while flying", 0.0, 1e3),
-        *option_specs(METHODS),
-    )
+    SPECS: ClassVar = PLANNER_SPECS
 
     def __init__(self, name: str = "planner", **kwargs: Any) -> None:
         self._running = False
@@ -89,20 +72,19 @@ class PlannerNode(FlightNode):
         self._held: Array | None = None
         self._pending = False
         self._corrections = 0
-        self._follower: GaitFollower | None = None
-        self._momenta = np.zeros(3), np.zeros(3)
-        self._odom_raw = b""
-        self._joints_raw = b""
+        self._follower: GaitFollower | BrakingFollower | None = None
+        self._landed: GaitSchedule | None = None
+        """A schedule that has ended, and whose result is still to be judged."""
+        self._stuck: list[int] = []
+        self._replanning = False
+        """Whether the next plan is the first without a joint that was found stuck."""
+        self._odom_raw = self._joints_raw = b""
+        self._stamp = 0
         self._odom_fresh = self._joints_fresh = False
-        self._odom = TemplateReader(
-            Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
-        )
         self._commands_plant = self.parameters["output"] == "commands"
         topic = "joint_commands" if self._commands_plant else "joint_reference"
         self._send_command = raw_publish(self.create_publisher(JointState, topic, STREAM))
-        self._schedule_topic = self.create_publisher(JointTrajectory, "gait_schedule", LATCHED)
-        self._path_topic = self.create_publisher(Path, "planned_path", LATCHED)
-        self._marker_topic = self.create_publisher(MarkerArray, "markers", STREAM)
+        self._plan_topics = PlanTopics(self, str(self.parameters["world_frame"]))
         self._status = PlannerStatus(self)
         robot = robot_of(self.parameters)
         if robot is None:
@@ -125,25 +107,26 @@ class PlannerNode(FlightNode):
     def deactivate(self) -> None:
         """Give up the present goal and command nothing any more."""
         self._running = False
-        self._follower = None
+        self._follower = self._landed = None
         self._goal = self._held = None
 
     def _use(self, robot: SpaceRobot) -> None:
         self._robot = robot
         values: dict[str, Any] = self.parameters
-        self._method = METHODS[values["method"]](
+        tick_period = round(NANOSECONDS / values["tick_rate"]) / NANOSECONDS
+        self._all_joints = self._method = build_method(
+            values["method"],
             robot,
-            round(NANOSECONDS / values["tick_rate"]) / NANOSECONDS,
+            tick_period,
             self._tolerance(),
             values["integration_step"],
-            **{
-                option.name: values[f"{values['method']}.{option.name}"]
-                for option in METHODS[values["method"]].options
-            },
+            values,
         )
+        self._state = MeasuredState(robot, values["averaging"], values["rest_tolerance"])
+        band = 2 * values["shape_deadband"]
+        self._watch = StuckJointWatch(robot.n, values["stuck_ticks"], tick_period, band)
         n = robot.n
         self._joints = JointReader(robot.joint_names, ["position"], complete=True)
-        self._motion = JointReader(robot.joint_names, ["position", "velocity"], complete=True)
         self._command = MessageTemplate(
             JointState(
                 name=list(robot.joint_names),
@@ -166,14 +149,14 @@ class PlannerNode(FlightNode):
     def parameters_changed(self) -> None:
         """Plan and judge with the new tolerances."""
         if self._robot is not None:
-            self._method.tolerance = self._tolerance()
+            self._method.tolerance = self._all_joints.tolerance = self._tolerance()
 
     # -- topics -------------------------------------------------------------------------------
 
     def _on_description(self, message: String) -> None:
         if self._robot is None:
             try:
-                self._use(SpaceRobot.from_urdf(message.data))
+                self._use(robot_from_text(message.data, self.parameters))
             except SpaceRobotError as error:
                 self.get_logger().error(f"robot_description: {error}")
                 return
@@ -182,21 +165,17 @@ class PlannerNode(FlightNode):
     def _on_goal(self, message: PoseStamped) -> None:
         if not self._running:
             return
-        frame = str(self.parameters["world_frame"])
-        p, o = message.pose.position, message.pose.orientation
         try:
-            if message.header.frame_id not in ("", frame):
-                raise PlanningError(
-                    f"The goal pose is in frame '{message.header.frame_id}'; goals are taken in "
-                    f"'{frame}'."
-                )
-            goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w], self._goal_shape)
+            frame = str(self.parameters["world_frame"])
+            goal = goal_of(message, frame, shape=self._goal_shape)
         except PlanningError as error:
             self._status.publish(PlannerState.REFUSED, str(error))
             return
         self._proposed = goal
         self._pending = True
-        if self._robot is None:
+        if self._robot is not None:
+            self._state.restart()
+        else:
             self._status.publish(
                 PlannerState.PLANNING, "The goal waits for a robot on robot_description."
             )
@@ -205,13 +184,10 @@ class PlannerNode(FlightNode):
         """Keep the shape that goals from now on are to end in, for methods that take one."""
         if self._robot is None:
             return
-        missing = set(self._robot.joint_names) - set(message.name)
-        values = dict(zip(message.name, message.position, strict=False))
-        if missing or not np.all(np.isfinite(list(values.values()))):
-            what = f"joint '{min(missing)}' is missing" if missing else "a position is not finite"
-            self._status.publish(PlannerState.REFUSED, f"The goal shape is refused: {what}.")
-            return
-        self._goal_shape = np.array([values[name] for name in self._robot.joint_names])
+        try:
+            self._goal_shape = shape_of(message, self._robot.joint_names)
+        except PlanningError as error:
+            self._status.publish(PlannerState.REFUSED, str(error))
 
     def _on_odom(self, raw: bytes) -> None:
         self._odom_raw = raw
@@ -224,47 +200,58 @@ class PlannerNode(FlightNode):
         self._on_part()
 
     def _on_part(self) -> None:
-        """Answer a state once, as soon as both of its messages are there and the planner is."""
+        """Answer a state once, as soon as its joints are there; only plans need its pose."""
+        if not self._running or self._robot is None:
+            return
         # Header first in both messages: bytes 4 to 12 are the stamp.
-        if (
-            self._running
-            and self._odom_fresh
-            and self._joints_fresh
-            and self._robot is not None
-            and self._odom_raw[4:12] == self._joints_raw[4:12]
-        ):
-            self._odom_fresh = self._joints_fresh = False
-            self._on_state()
+        together = self._odom_raw[4:12] == self._joints_raw[4:12]
+        if self._joints_fresh:
+            self._joints_fresh = False
+            self._on_state(posed=together and self._odom_fresh)
+        elif together and self._odom_fresh:
+            # What was answered without the pose is planned from when the next joints come.
+            self._observe()
+        self._odom_fresh = self._odom_fresh and not together
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._follower is not None
-        response.message = "The joints come to rest." if self._follower else "Nothing is flown."
-        if self._follower is not None:
-            self._follower = None
-            self._status.publish(PlannerState.ABORTED, "Aborted on request; the joints rest.")
+        response.success = self._follower is not None or self._landed is not None
+        response.message = "Nothing is flown." if not response.success else "The joints rest."
+        if isinstance(self._follower, GaitFollower):
+            within = float(self.parameters["abort_time"])  # type: ignore[arg-type]
+            self._follower = self._follower.braking(self._stamp, within)
+            response.message = f"The joints come to rest along the gait within {within:g} s."
+        if response.success:
+            self._status.publish(PlannerState.ABORTED, f"Aborted on request. {response.message}")
         self._pending = False
-        self._goal = None
+        self._goal = self._landed = None
         return response
 
     # -- flying -------------------------------------------------------------------------------
 
-    def _on_state(self) -> None:
-        """Answer one measured state with one command of the same stamp."""
+    def _on_state(self, *, posed: bool) -> None:
+        """Answer one state with one command of the same stamp; ``posed``: odom is there too."""
         try:
             stamp = self._joints.accept(self._joints_raw)
         except CommandError as error:
             self.get_logger().error(f"joint_states: {error}.", throttle_duration_sec=5.0)
             return
-        if self._pending:
-            self._pending = False
-            self._plan_proposed(stamp)
+        self._stamp = stamp
         q = self._joints.values["position"]
         if self._follower is not None and self._follower.ended(stamp, q):
-            self._judge(stamp)
+            self._land()
+        if self._pending or self._landed is not None:
+            if posed:
+                self._observe()
+            self._decide(stamp)
         if self._follower is not None:
             self._follower.command(stamp, q, self._command_position, self._command_velocity)
             self._held = None
-        else:
+            if self._stuck:
+                self._command_velocity[self._stuck] = 0.0
+            stuck = self._watch.look(q, self._command_position, self._command_velocity)
+            if stuck and self._goal is not None:
+                self._go_on_without(stuck)
+        if self._follower is None:
             # A reference must stay where it is; what the plant makes of rest is its affair.
             if self._held is None or self._commands_plant:
                 self._held = q.copy()
@@ -272,101 +259,132 @@ class PlannerNode(FlightNode):
             self._command_velocity[:] = 0.0
         self._send_command(self._command.serialised(stamp_bytes(stamp)))
 
-    def _measured(self) -> RobotState:
+    def _land(self) -> None:
+        """End what is flown; its result is judged unless it was broken off."""
+        assert self._follower is not None
+        if self._goal is not None:
+            self._landed = self._follower.schedule
+            self._held = self._landed.positions[-1]
+            self._state.restart()
+        self._follower = None
+
+    def _observe(self) -> None:
+        """Take the measured state to plan from; of a robot that moves only the last one counts."""
+        if self._pending or self._landed is not None:
+            if self._follower is not None:
+                self._state.restart()
+            self._state.read(self._odom_raw, self._joints_raw)
+
+    def _decide(self, stamp: int) -> None:
+        """Plan or judge when the state is known well enough."""
+        if not (self._state.complete or (self._follower is not None and self._state.count)):
+            return
+        if self._pending:
+            self._pending = False
+            self._plan_proposed(stamp)
+        if self._landed is not None:
+            self._judge(stamp)
+        self._state.restart()
+
+    def _go_on_without(self, stuck: list[int]) -> None:
+        """Come to rest, and plan what is left with the joints that are not stuck."""
         assert self._robot is not None
-        self._odom.accept(self._odom_raw)
-        pose = self._odom.floats("pose.pose.position.x")
-        twist = self._odom.floats("twist.twist.linear.x")
-        self._motion.accept(self._joints_raw)
-        q, qdot = self._motion.values["position"].copy(), self._motion.values["velocity"]
-        if not np.all(np.isfinite(np.concatenate([pose, twist, q, qdot]))):
-            raise PlanningError("The measured state is not finite; see odom and joint_states.")
-        if np.abs(qdot).max(initial=0.0) <= _AT_REST:
-            # While joints move, the momentum of a robot whose masses are not quite known is
-            # uncertain; at rest the base alone shows it, and without thrust it stays.
-            self._momenta = self._robot.momentum(pose[3:], q, twist[:3], twist[3:], qdot)[:2]
-        return RobotState(pose[:3].copy(), pose[3:].copy(), q, *self._momenta)
+        self._stuck += stuck
+        names = [self._robot.joint_names[i] for i in self._stuck]
+        self._method = RemainingJointsGait.instead_of(
+            self._all_joints, names, str(self.parameters["method"]), self.parameters
+        )
+        self._replanning = True
+        self._land()
+        self._held = None
+        self.get_logger().warning(f"Stuck: {', '.join(names)}. What is left is planned without.")
 
     def _plan_proposed(self, stamp: int) -> None:
         self.plan_time = self.flown_time = 0.0
+        before, self._method = self._method, self._all_joints
         try:
             schedule = self._plan(self._proposed, correction=False)
         except PlanningError as error:
+            self._method = before
             kept = " The earlier goal is still flown." if self._follower else ""
             self._status.publish(PlannerState.REFUSED, f"{error}{kept}", goal=self._proposed)
             return
-        self._goal = self._proposed
+        self._goal, self._landed = self._proposed, None
         self._corrections = 0
+        self._stuck = []
+        self._replanning = False
         self._fly(schedule, stamp)
 
     def _plan(self, goal: Goal, *, correction: bool) -> GaitSchedule:
         began = time.perf_counter()
         try:
-            return self._method.plan(self._measured(), goal, correction=correction)
+            return self._method.plan(self._state.state(), goal, correction=correction)
         finally:
-            self.plan_time += time.perf_counter() - began
+            took = time.perf_counter() - began
+            self.plan_time += took
+            # Not in the status: what is published is the same in every run.
+            self.get_logger().info(PLANNED.format(took))
 
     def _fly(self, schedule: GaitSchedule, stamp: int, error: PoseError | None = None) -> None:
         # A controller closes its own loop round the reference.
         gain = float(self.parameters["shape_gain"]) if self._commands_plant else 0.0  # type: ignore[arg-type]
-        self._follower = GaitFollower(schedule, stamp, gain)
+        deadband = float(self.parameters["shape_deadband"])  # type: ignore[arg-type]
+        self._follower = GaitFollower(schedule, stamp, gain, deadband)
+        self._watch.restart()
         self.flown_time += schedule.duration
         self.ends_at = stamp / NANOSECONDS + schedule.duration
-        frame = str(self.parameters["world_frame"])
         self._status.publish(
             PlannerState.EXECUTING,
             f"Flying a {schedule.method} gait of {schedule.duration:.6g} s.",
             goal=schedule.goal,
             schedule=schedule,
             error=error,
-            corrections=self._corrections,
+            **self._account(),
         )
         assert self._robot is not None
-        base_link = self._robot.base_link
-        self._schedule_topic.publish(serialised_trajectory(schedule, stamp, base_link))
-        self._path_topic.publish(path_message(schedule.path, stamp, frame))
-        shapes = self._robot.description.links[0].shapes
-        self._marker_topic.publish(goal_markers(schedule.goal, schedule.path, shapes, frame))
+        self._plan_topics.publish(self._robot.description, schedule, stamp)
+
+    def _account(self) -> dict[str, Any]:
+        """Return what the present goal has cost so far, for the status."""
+        return {
+            "corrections": self._corrections,
+            "flown_time": self.flown_time,
+            "ends_at": self.ends_at,
+        }
 
     def _judge(self, stamp: int) -> None:
         """Compare the measured pose with the goal; plan what is left, or be done."""
         assert self._goal is not None
+        assert self._landed is not None
+        flown, self._landed = self._landed, None
+        replanned, self._replanning = self._replanning, False
         try:
-            state = self._measured()
+            state = self._state.state()
         except PlanningError as reason:
-            self._follower = None
             self._status.publish(PlannerState.FAILED, str(reason), goal=self._goal)
             return
         error = PoseError.between(state.position, state.quaternion, self._goal, state.q)
-        assert self._follower is not None
-        flown, self._follower = self._follower.schedule, None
-        self._held = flown.positions[-1]
         result: dict[str, Any] = {
             "goal": self._goal,
             "error": error,
-            "corrections": self._corrections,
+            **self._account(),
         }
         controls = self._method.controls
-        parts = {
-            "position": f"{error.distance:.3g} m",
-            "attitude": f"{error.angle:.3g} rad",
-            "shape": f"{error.farthest_joint:.3g} at the joints",
-        }
-        left = " and ".join(text for part, text in parts.items() if part in controls)
-        left = f"{left} from the goal"
+        left = what_is_left(error, controls)
         if self._tolerance().admits(error, controls):
             self._status.publish(PlannerState.REACHED, f"The goal is met: {left}.", **result)
             return
-        if not flown.partial and self._corrections >= int(self.parameters["max_corrections"]):  # type: ignore[arg-type]
+        counts = not flown.partial and not replanned
+        if counts and self._corrections >= int(self.parameters["max_corrections"]):  # type: ignore[arg-type]
             self._status.publish(
                 PlannerState.FAILED,
                 f"The goal is not met: {left} after {self._corrections} correction(s).",
                 **result,
             )
             return
-        self._corrections += not flown.partial
+        self._corrections += counts
         try:
-            self._fly(self._plan(self._goal, correction=True), stamp, error)
+            self._fly(self._plan(self._goal, correction=not replanned), stamp, error)
         except PlanningError as reason:
             self._status.publish(
                 PlannerState.FAILED, f"The goal is not met: {left}, and {reason}", **result

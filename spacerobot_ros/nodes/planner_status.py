@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from enum import Enum
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -46,14 +47,23 @@ class PlannerStatus:
         error: PoseError | None = None,
         corrections: int = 0,
         schedule: GaitSchedule | None = None,
+        flown_time: float = 0.0,
+        ends_at: float = 0.0,
     ) -> None:
-        """Publish the state with a sentence and what belongs to it."""
+        """Publish the state with a sentence and what belongs to it.
+
+        ``flown_time`` is the duration of the schedules for the goal so far, ``ends_at`` the
+        simulated time at which the last one ends, s.
+        """
         values = {"state": state.value, "corrections": str(corrections)}
         if goal is not None:
             values["goal"] = " ".join(f"{x:.9g}" for x in (*goal.position, *goal.quaternion))
         if error is not None:
             values["position_error_m"] = f"{error.distance:.9g}"
             values["attitude_error_rad"] = f"{error.angle:.9g}"
+        if ends_at:
+            values["manoeuvre_time_s"] = f"{flown_time:.9g}"
+            values["ends_at_s"] = f"{ends_at:.9g}"
         if schedule is not None:
             values["method"] = schedule.method
             values["duration_s"] = f"{schedule.duration:.9g}"
@@ -77,3 +87,14 @@ class PlannerStatus:
             logger.info(sentence)
         else:
             logger.warning(sentence)
+
+
+def what_is_left(error: PoseError, controls: Collection[str]) -> str:
+    """Say how far from the goal the robot is, in the parts of it that are controlled."""
+    parts = {
+        "position": f"{error.distance:.3g} m",
+        "attitude": f"{error.angle:.3g} rad",
+        "shape": f"{error.farthest_joint:.3g} at the joints",
+    }
+    left = " and ".join(text for part, text in parts.items() if part in controls)
+    return f"{left} from the goal"

@@ -21,8 +21,11 @@ from spacerobot_ros.nodes.plant_parameters import PLANT_SPECS
 from spacerobot_ros.nodes.plant_report import PlantReport
 from spacerobot_ros.nodes.plant_topics import PlantTopics
 from spacerobot_ros.nodes.robot_source import robot_of
+from spacerobot_ros.nodes.thruster_topics import ThrusterTopics
 from spacerobot_ros.simulation.brakes import JointBrakes
 from spacerobot_ros.simulation.building import PLANTS, build_plant, period_ns
+from spacerobot_ros.simulation.sensors import SensorModel, Sensors
+from spacerobot_ros.simulation.thrusters import thrusters_in
 
 _LATE_JOINER_CHECK = 0.1
 """How often a waiting lockstep plant looks for new subscribers, wall s."""
@@ -73,16 +76,22 @@ class PlantNode(FlightNode):
         self._lockstep = values["time_mode"] == "lockstep"
         self._period_ns = period_ns(values["tick_rate"])
         self.plant = build_plant(robot, values)
-        self._tick = 0
+        self._tick, self._looked_at = 0, -1
+        self._sensors = Sensors(self.plant, SensorModel.of(values), self._period_ns / NANOSECONDS)
         self._topics = PlantTopics(
             self,
             self.plant,
+            self._sensors,
             values["world_frame"],
             values["end_effector_frame"],
             thrusters=PLANTS[values["actuation"]].thrusters,
         )
         self._gate = CommandGate(values["latched_faults"])
         self._report = PlantReport(self, self.plant, self._gate)
+        thrusters = thrusters_in(self.plant)
+        self._thrusters = ThrusterTopics(self, thrusters) if thrusters is not None else None
+        if self._thrusters is not None:
+            self._report.others.append(self._thrusters.status)
         self._intake = CommandIntake(
             self, CHANNELS[values["actuation"]](robot), self._gate, self._report, values
         )
@@ -102,6 +111,7 @@ class PlantNode(FlightNode):
                 STREAM,
                 raw=True,
             )
+        self.create_subscription(String, "fault_injection", self._on_fault, STREAM)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/abort", self._on_abort)
@@ -154,7 +164,10 @@ class PlantNode(FlightNode):
 
     def _publish(self) -> None:
         now = self._tick * self._period_ns
+        self._sensors.measure()
         self._topics.publish(now, with_pose=self._tick % self._pose_ticks == 0)
+        if self._thrusters is not None:
+            self._thrusters.publish(now)
         if self._marker_ticks and self._tick % self._marker_ticks == 0:
             self._topics.publish_markers(now)
         if self._report_ticks and self._tick % self._report_ticks == 0:
@@ -182,7 +195,12 @@ class PlantNode(FlightNode):
         self._look_round()
         if self._readers > before:
             self._topics.publish(self.time_ns, with_pose=True)
-        self._step_if_complete()
+        waited, self._looked_at = self._looked_at == self._tick, self._tick
+        if waited and self._sensors.dropout:
+            # Who needs odom cannot know that none comes before another state does.
+            self._step()
+        else:
+            self._step_if_complete()
 
     def _look_round(self) -> None:
         """See who listens and who commands."""
@@ -200,6 +218,13 @@ class PlantNode(FlightNode):
     def _step_if_complete(self) -> None:
         if not self._paused and self._intake.complete:
             self._step()
+
+    def _on_fault(self, message: String) -> None:
+        """Inject the faults of a message, one a line, or repair everything: "clear"."""
+        try:
+            self.plant.inject(message.data)
+        except ParameterError as error:
+            self.get_logger().warning(str(error))
 
     # -- services -----------------------------------------------------------------------------
 

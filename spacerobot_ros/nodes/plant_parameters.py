@@ -39,6 +39,12 @@ PLANT_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
         "integration_step", 0.0, "s", "longest step; 0: 0.01 (velocity), 0.001 (effort)", 0.0
     ),
+    ParameterSpec(
+        "thrusters", "", "", "'urdf': those of the robot's URDF; a YAML file; '': any wrench"
+    ),
+    ParameterSpec(
+        "thrusters_excluded", "", "", "names of thrusters that are not used, separated by spaces"
+    ),
     ParameterSpec("world_frame", "world", "", "name of the inertial frame"),
     ParameterSpec(
         "end_effector_frame", "", "", "link of end_effector_pose; '': 'end_effector', if any"
@@ -75,4 +81,23 @@ PLANT_SPECS: tuple[ParameterSpec, ...] = (
         "total, about the centre of mass, in world",
         length=3,
     ),
+    ParameterSpec(
+        "faults",
+        [],
+        "",
+        "what goes wrong and when, e.g. 'joint_stuck joint_2 at 10 until 50'; see docs/faults.md",
+        texts=True,
+    ),
+    ParameterSpec("sensors.position_noise", 0.0, "m", "1 sigma an axis of odom, in world", 0.0),
+    ParameterSpec("sensors.attitude_noise", 0.0, "rad", "likewise, a rotation vector in base", 0.0),
+    ParameterSpec("sensors.velocity_noise", 0.0, "m/s", "likewise, of the twist", 0.0),
+    ParameterSpec("sensors.angular_velocity_noise", 0.0, "rad/s", "likewise", 0.0),
+    ParameterSpec("sensors.joint_noise", 0.0, "m or rad", "1 sigma of every joint position", 0.0),
+    ParameterSpec("sensors.joint_rate_noise", 0.0, "m/s or rad/s", "of every joint velocity", 0.0),
+    ParameterSpec("sensors.position_bias", [0.0, 0.0, 0.0], "m", "of odom, in world", length=3),
+    ParameterSpec(
+        "sensors.attitude_bias", [0.0, 0.0, 0.0], "rad", "rotation vector in base", length=3
+    ),
+    ParameterSpec("sensors.joint_bias", [], "m or rad", "by joint order of the URDF; []: none"),
+    ParameterSpec("sensors.seed", 0, "", "of the noise of sensors and actuators", 0),
 )

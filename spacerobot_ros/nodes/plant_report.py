@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -11,7 +11,7 @@ from rclpy.node import Node
 from spacerobot_ros.nodes.cdr import NANOSECONDS
 from spacerobot_ros.nodes.command_gate import CommandGate
 from spacerobot_ros.nodes.flight_node import STREAM
-from spacerobot_ros.simulation.plant import Plant
+from spacerobot_ros.simulation.faults_plant import FaultyPlant
 
 _ROUNDING = 1e-9
 """Momenta that change by less than this times the mass only round, m/s and m^2/s."""
@@ -23,9 +23,11 @@ _LOG_PERIOD = 5.0
 class PlantReport:
     """Counters of one plant. Every refusal has a reason; the last one stays in the diagnostics."""
 
-    def __init__(self, node: Node, plant: Plant, gate: CommandGate) -> None:
+    def __init__(self, node: Node, plant: FaultyPlant, gate: CommandGate) -> None:
         self._node, self._plant, self._gate = node, plant, gate
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
+        self.others: list[Callable[[], DiagnosticStatus]] = [self._faults]
+        """Status of further parts of the plant, published with the rest."""
         self.command_timeouts = 0
         self.deadlines_missed = 0
         self.last_refusal = ""
@@ -102,8 +104,19 @@ class PlantReport:
                     "angular_change": f"{self._drift(3):.3e}",
                 },
             ),
+            *(status() for status in self.others),
         ]
         self._publisher.publish(array)
+
+    def _faults(self) -> DiagnosticStatus:
+        """Name every fault that is active."""
+        active = [str(fault) for fault in self._plant.active]
+        return _status(
+            f"{self._node.get_fully_qualified_name()}: faults",
+            DiagnosticStatus.WARN if active else DiagnosticStatus.OK,
+            f"injected: {'; '.join(active)}" if active else "no fault is injected",
+            {f"fault_{i}": fault for i, fault in enumerate(active, 1)},
+        )
 
     def _levels(self) -> dict[str, tuple[int, ...]]:
         plant = self._plant

@@ -17,6 +17,7 @@ from spacerobot_ros.nodes.cdr import MessageTemplate, raw_publish, stamp_bytes
 from spacerobot_ros.nodes.flight_node import STREAM
 from spacerobot_ros.nodes.markers import LinkMarkers
 from spacerobot_ros.simulation.plant import Plant
+from spacerobot_ros.simulation.sensors import Sensors
 
 MOMENTUM_LABEL = "linear_x linear_y linear_z angular_x angular_y angular_z kinetic_energy"
 """What the seven numbers of the momentum topic are (kg m/s, kg m^2/s, J; world components)."""
@@ -36,6 +37,9 @@ class PlantTopics:
         The node that owns the publishers.
     plant
         Whose state they show.
+    sensors
+        What odom and joint_states carry as soon as they err; the truth then goes to odom_true and
+        joint_states_true.
     world_frame, end_effector_frame
         Frame names; an empty end-effector frame means the link ``end_effector``, if there is one.
 
@@ -49,37 +53,25 @@ class PlantTopics:
         self,
         node: Node,
         plant: Plant,
+        sensors: Sensors,
         world_frame: str,
         end_effector_frame: str,
         *,
         thrusters: bool,
     ) -> None:
-        self._plant = plant
+        self._node, self._plant, self._sensors = node, plant, sensors
+        self._world_frame = world_frame
         robot = plant.robot
-        n = robot.n
 
         clock = MessageTemplate(Clock())
-        odom_message = Odometry(child_frame_id=robot.base_link)
-        odom_message.header.frame_id = world_frame
-        odom = MessageTemplate(odom_message)
+        odom = self._odom_template(plant)
+        joints = self._joints_template(plant)
         pose_message = PoseStamped()
         pose_message.header.frame_id = world_frame
         base_pose = MessageTemplate(pose_message)
-        joints_message = JointState(
-            name=list(robot.joint_names), position=[0.0] * n, velocity=[0.0] * n, effort=[0.0] * n
-        )
-        joints_message.header.frame_id = robot.base_link
-        joints = MessageTemplate(joints_message)
         momentum = MessageTemplate(_labelled(MOMENTUM_LABEL))
-
-        odom.feed("pose.pose.position.x", plant.pose)
-        odom.feed("twist.twist.linear.x", plant.twist)
         base_pose.feed("pose.position.x", plant.pose)
         momentum.feed("data", plant.momentum)
-        if n:
-            joints.feed("position", plant.q)
-            joints.feed("velocity", plant.qdot)
-            joints.feed("effort", plant.effort)
         # The clock first: whoever sees a state has seen its time.
         self._streams = [
             (node.create_publisher(kind, topic, STREAM), template)
@@ -98,9 +90,50 @@ class PlantTopics:
             self._streams.insert(3, (publisher, expected))
         self._end_effector: tuple[int, Any] | None = None
         self._add_end_effector(node, world_frame, end_effector_frame, pose_message)
-        self._sends = [(raw_publish(publisher), template) for publisher, template in self._streams]
-        self._sends_without_pose = [send for send in self._sends if send[1] is not base_pose]
+        self._base_pose = base_pose
+        self._prepare()
+        self._measured_odom: MessageTemplate | None = None
+        if sensors.used:
+            self._show_measurements()
         self._markers = LinkMarkers(node, robot.description, world_frame)
+
+    def _prepare(self) -> None:
+        self._sends = [(raw_publish(publisher), template) for publisher, template in self._streams]
+        self._sends_without_pose = [send for send in self._sends if send[1] is not self._base_pose]
+
+    def _show_measurements(self) -> None:
+        """From now on publish what is measured, and before it the truth on topics of its own."""
+        (odom_topic, odom), (joints_topic, joints) = self._streams[-2:]
+        self._measured_odom = self._odom_template(self._sensors)
+        self._streams[-2:] = [
+            (self._node.create_publisher(Odometry, "odom_true", STREAM), odom),
+            (self._node.create_publisher(JointState, "joint_states_true", STREAM), joints),
+            (odom_topic, self._measured_odom),
+            (joints_topic, self._joints_template(self._sensors)),
+        ]
+        self._prepare()
+
+    def _odom_template(self, source: Plant | Sensors) -> MessageTemplate:
+        message = Odometry(child_frame_id=self._plant.robot.base_link)
+        message.header.frame_id = self._world_frame
+        template = MessageTemplate(message)
+        template.feed("pose.pose.position.x", source.pose)
+        template.feed("twist.twist.linear.x", source.twist)
+        return template
+
+    def _joints_template(self, source: Plant | Sensors) -> MessageTemplate:
+        robot = self._plant.robot
+        zeros = [0.0] * robot.n
+        message = JointState(
+            name=list(robot.joint_names), position=zeros, velocity=zeros, effort=zeros
+        )
+        message.header.frame_id = robot.base_link
+        template = MessageTemplate(message)
+        if robot.n:
+            template.feed("position", source.q)
+            template.feed("velocity", source.qdot)
+            template.feed("effort", self._plant.effort)
+        return template
 
     def publish(self, time_ns: int, *, with_pose: bool) -> None:
         """Publish the plant's state, stamped ``time_ns``; ``with_pose``: base_pose too."""
@@ -110,9 +143,13 @@ class PlantTopics:
             target[:3] = r_WB + R_WB @ self._plant.link_r[:, index]
             R_WE = R_WB @ self._plant.link_R[:, 3 * index : 3 * index + 3]
             target[3:] = quaternion_from_matrix(R_WE)
+        if self._sensors.used and self._measured_odom is None:
+            self._show_measurements()
+        lost = self._measured_odom if self._sensors.dropout else None
         stamp = stamp_bytes(time_ns)
         for send, template in self._sends if with_pose else self._sends_without_pose:
-            send(template.serialised(stamp))
+            if template is not lost:
+                send(template.serialised(stamp))
 
     def publish_markers(self, time_ns: int) -> None:
         """Publish the links' shapes where they are."""

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ClassVar
 
 from rclpy.clock import Clock as RosClock
 from rclpy.clock import ClockType
+from rclpy.experimental import EventsExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 
 from spacerobot_ros import __version__
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.nodes.cdr import NANOSECONDS, first_time_ns
 from spacerobot_ros.nodes.flight_node import FlightNode, run_node
+from spacerobot_ros.nodes.message_loss import MessageLoss
+from spacerobot_ros.nodes.message_types import message_class
 from spacerobot_ros.nodes.parameters import ParameterSpec
 from spacerobot_ros.recording import BagWriter, QosProfile, RecordingError
 
@@ -28,6 +31,9 @@ _QUEUE = 2000
 
 _SCAN_PERIOD = 0.1
 """Wall s between two looks for new topics."""
+
+_LONGEST_DRAIN = 1.5
+"""Wall s after a signal in which what is on its way is still recorded."""
 
 _NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event")
 """Ends of topics with the middleware's own chatter, left out unless asked for by name."""
@@ -52,7 +58,14 @@ class RecorderNode(FlightNode):
         ParameterSpec(
             "clock_wait", 2.0, "s", "wall time to wait for a clock before using the wall's"
         ),
+        ParameterSpec(
+            "describe", "", "", "JSON file of named objects to put into the bag as metadata"
+        ),
         ParameterSpec("flush_period", 0.5, "s", "wall time that a kill can lose at most", 0.01),
+        ParameterSpec(
+            "max_size", 0.0, "MB", "begin the next file (NAME_0, NAME_1, ...) at; 0: never", 0.0
+        ),
+        ParameterSpec("max_duration", 0.0, "s", "bag time in a file, likewise; 0: never", 0.0),
     )
 
     def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
@@ -65,7 +78,14 @@ class RecorderNode(FlightNode):
     def configure(self) -> None:
         """Open the bag and look for topics; they are subscribed, and recorded once active."""
         path = str(self.parameters["bag"]) or time.strftime("spacerobot-%Y%m%d-%H%M%S.mcap")
-        self._writer = BagWriter(path, compression=str(self.parameters["compression"]))
+        values: dict[str, Any] = self.parameters
+        self._writer = BagWriter(
+            path,
+            compression=values["compression"],
+            max_size=round(values["max_size"] * 1e6),
+            max_duration_ns=round(values["max_duration"] * NANOSECONDS),
+        )
+        self.loss = MessageLoss(self)
         self._wanted = {
             self.resolve_topic_name(topic) for topic in str(self.parameters["topics"]).split()
         }
@@ -84,6 +104,8 @@ class RecorderNode(FlightNode):
         flush_period = float(self.parameters["flush_period"])  # type: ignore[arg-type]
         self.create_timer(flush_period, self._flush, clock=steady)
         self.describe("spacerobot", {"version": __version__})
+        for title, values in _descriptions(str(self.parameters["describe"])):
+            self.describe(title, values)
         if self._wanted and "/clock" not in self._wanted:
             depth = QoSProfile(depth=_QUEUE)
             self.create_subscription(Clock, "/clock", self._on_time, depth, raw=True)
@@ -98,6 +120,17 @@ class RecorderNode(FlightNode):
         """Pause: what arrives is not recorded."""
         self._active = self._steady = False
 
+    def drain(self, executor: EventsExecutor, quiet: float = 0.3) -> None:
+        """Record what is still on its way, until nothing has come for ``quiet`` wall s."""
+        began = last = time.monotonic()
+        while self._active and last - began < _LONGEST_DRAIN:
+            before = self.messages_recorded
+            executor.spin_once(timeout_sec=0.001)
+            if self.messages_recorded != before:
+                last = time.monotonic()
+            elif time.monotonic() - last > quiet:
+                return
+
     def cleanup(self) -> None:
         """Complete the bag.
 
@@ -108,6 +141,8 @@ class RecorderNode(FlightNode):
         """
         if self._writer is not None:
             self._release_early(None)
+            counts = {"messages": self.messages_recorded, "messages_lost": self.loss.total}
+            self.describe("recorder", {name: str(count) for name, count in counts.items()})
             writer, self._writer = self._writer, None
             writer.close()
 
@@ -152,7 +187,7 @@ class RecorderNode(FlightNode):
         if not infos:
             return  # Only readers so far: its quality of service is not known yet.
         try:
-            message_type = _message_class(type_name)
+            message_type = message_class(type_name)
             channel = self._add_topic(topic, type_name, infos[0].qos_profile)
         except SpaceRobotError as error:
             self._unknown.add(topic)
@@ -167,7 +202,12 @@ class RecorderNode(FlightNode):
         )
         self._recorded[topic] = channel
         self.create_subscription(
-            message_type, topic, self._callback(topic, type_name, channel), qos, raw=True
+            message_type,
+            topic,
+            self._callback(topic, type_name, channel),
+            qos,
+            event_callbacks=self.loss.events(topic),
+            raw=True,
         )
 
     def _add_topic(self, topic: str, type_name: str, qos: QoSProfile) -> int:
@@ -223,7 +263,7 @@ class RecorderNode(FlightNode):
             return on_clock
         if topic.endswith("/robot_description"):
             return on_description
-        header = next(iter(_message_class(type_name).get_fields_and_field_types().values()), "")
+        header = next(iter(message_class(type_name).get_fields_and_field_types().values()), "")
         if header == "std_msgs/Header":
             return on_stamped
         return lambda raw: store(raw, 0)
@@ -255,6 +295,7 @@ class RecorderNode(FlightNode):
                 self._wall = True
                 self._release_early(None)
         self._guarded(lambda writer: writer.flush())
+        self.loss.report(self._now)
 
     def _guarded(self, act: Callable[[BagWriter], None]) -> None:
         if self._writer is None or self.failure is not None:
@@ -271,17 +312,21 @@ class RecorderNode(FlightNode):
         self.get_logger().error(f"Recording has ended: {error}")
 
 
+def _descriptions(path: str) -> list[tuple[str, dict[str, str]]]:
+    if not path:
+        return []
+    try:
+        records = json.loads(Path(path).read_text(encoding="utf-8"))
+        return [(n, {k: str(v) for k, v in values.items()}) for n, values in records.items()]
+    except (OSError, ValueError, AttributeError) as error:
+        raise ParameterError(
+            f"Parameter 'describe' is '{path}', which is no JSON file of named objects: {error}."
+        ) from error
+
+
 def parameters_of(node: FlightNode) -> dict[str, str]:
     """Return a node's parameters as JSON texts by name, for a bag's metadata."""
     return {name: json.dumps(value) for name, value in node.parameters.items()}
-
-
-def _message_class(type_name: str) -> Any:
-    package, _, name = type_name.split("/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), name)
-    except (ImportError, AttributeError):
-        raise SpaceRobotError(f"its type {type_name} is not installed here.") from None
 
 
 def main() -> None:

@@ -2,7 +2,8 @@
 
 from spacerobot_ros.planning.goal import Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.method import GaitMethod
-from spacerobot_ros.planning.registry import METHODS
+from spacerobot_ros.planning.one_call import plan
+from spacerobot_ros.planning.registry import METHODS, build_method
 from spacerobot_ros.planning.schedule import BasePath, GaitSchedule
 
 __all__ = [
@@ -14,4 +15,6 @@ __all__ = [
     "PoseError",
     "RobotState",
     "Tolerance",
+    "build_method",
+    "plan",
 ]

@@ -10,7 +10,6 @@ Their area is smaller by ``sin(x)/x``, ``x`` the phase per tick; the amplitudes 
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -27,15 +26,22 @@ from spacerobot_ros.model.attitude import (
     quaternion_multiply,
     rotvec_from_quaternion,
 )
-from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.planning.controllability import (
+    WORST_CONDITION,
+    best_triple,
+    sliders_of,
+    sliding_masses,
+    slot_matrix,
+    slot_objection,
+)
 from spacerobot_ros.planning.goal import Goal, RobotState, Tolerance
 from spacerobot_ros.planning.method import GaitMethod, Option
 from spacerobot_ros.planning.prediction import BasePrediction
 from spacerobot_ros.planning.schedule import BasePath, GaitSchedule
 
 _FEWEST_TICKS_A_CYCLE = 12
-_WORST_CONDITION = 1e6
 _MOST_REFINEMENTS = 20
 _NO_ROTATION = 1e-9
 _NO_MOTION = 1e-9
@@ -79,12 +85,14 @@ class LieBracketGait(GaitMethod):
         self.longest = longest
         # Whole ticks a cycle: every cycle is then the same commands and the same rotation.
         self.ticks_a_cycle = max(round(cycle_period / tick_period), _FEWEST_TICKS_A_CYCLE)
-        self.sliders = [
-            i
-            for i, joint in enumerate(robot.description.movable_joints)
-            if joint.kind is JointKind.PRISMATIC
-        ]
+        self.sliders = sliders_of(robot)
         self._prediction = BasePrediction(robot, tick_period, integration_step)
+
+    @classmethod
+    def objection(cls, robot: SpaceRobot) -> str:
+        """Return which of the conditions of paper 1 the sliders do not meet."""
+        found = sliding_masses(robot)
+        return "" if found.controllable else found.sentence
 
     def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
         """Plan steps 1 to 3; see :meth:`GaitMethod.plan`."""
@@ -122,13 +130,9 @@ class LieBracketGait(GaitMethod):
         c0 = robot.center_of_mass(state.q)
         # The system's mass centre stays: r_f + R_f c(zf) = r_0 + R_0 c(z0).
         shift = Rf.T @ (state.position + R0 @ c0 - goal.position) - c0
-        P = np.column_stack([self._center_rate(state.q, i, c0) for i in self.sliders] or [c0 * 0])
-        if len(self.sliders) < 3 or np.linalg.matrix_rank(P, tol=1e-9 * np.abs(P).max()) < 3:
-            raise PlanningError(
-                "lie_bracket needs three sliders with linearly independent slots "
-                f"(paper 1, section 4.1); robot '{robot.description.name}' has "
-                f"{len(self.sliders)} slider(s) of rank {np.linalg.matrix_rank(P)}."
-            )
+        P = slot_matrix(robot, state.q, self.sliders)
+        if objection := slot_objection(robot, P):
+            raise PlanningError(objection)
         z0, lower, upper = (x[self.sliders] for x in (state.q, robot.lower, robot.upper))
         dz: Array = np.linalg.lstsq(P, shift, rcond=None)[0].astype(float)
         if np.any(z0 + dz < lower) or np.any(z0 + dz > upper):
@@ -136,12 +140,6 @@ class LieBracketGait(GaitMethod):
         z_f = state.q.copy()
         z_f[self.sliders] = np.clip(z0 + dz, lower, upper)
         return z_f
-
-    def _center_rate(self, q: Array, i: int, c: Array) -> Array:
-        """Column of dc/dq of slider i; c is linear in it, so a unit step is exact."""
-        stepped = q.copy()
-        stepped[i] += 1.0
-        return self.robot.center_of_mass(stepped) - c
 
     def _within_strokes(
         self, P: Array, shift: Array, z0: Array, dz: Array, lower: Array, upper: Array
@@ -249,13 +247,11 @@ class LieBracketGait(GaitMethod):
 
     def _best_triple(self, z_f: Array) -> tuple[tuple[int, int, int], Array]:
         """The three sliders whose brackets ``[w12, w23, w13]`` at zf are best conditioned."""
-        w = self.robot.lie_brackets(z_f)
-        found = []
-        for i, j, k in itertools.combinations(self.sliders, 3):
-            brackets = np.column_stack([w[:, i, j], w[:, j, k], w[:, i, k]])
-            found.append((float(np.linalg.cond(brackets)), (i, j, k), brackets))
-        condition, triple, brackets = min(found, key=lambda entry: entry[0])
-        if not condition < _WORST_CONDITION:
+        triple, M = best_triple(self.robot.curvature(z_f)[3:], self.sliders)
+        # M holds the curvature of the pairs 12, 23 and 31, which brackets are the negative of.
+        brackets = M * np.array([-1.0, -1.0, 1.0])
+        condition = float(np.linalg.cond(brackets))
+        if not condition < WORST_CONDITION:
             raise PlanningError(
                 "The first-order Lie brackets of the sliders do not span the three axes of "
                 f"rotation at the final shape {np.round(z_f, 4).tolist()} (condition number "

@@ -10,6 +10,10 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.attitude import matrix_from_quaternion
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.goal import RobotState
+from spacerobot_ros.planning.schedule import BasePath
+
+_KNOTS = 200
+"""A predicted path has this many poses of the base, or up to twice as many."""
 
 
 class BasePrediction:
@@ -27,6 +31,7 @@ class BasePrediction:
 
     def __init__(self, robot: SpaceRobot, tick_period: float, integration_step: float) -> None:
         self._robot = robot
+        self._tick_period = tick_period
         self._step = robot.velocity_step(max(1, math.ceil(tick_period / integration_step - 1e-9)))
         self._step.inputs[3][:] = tick_period
 
@@ -59,3 +64,16 @@ class BasePrediction:
                 for t, q, quaternion in zip(time, shapes, quaternions, strict=True)
             ]
         )
+
+    def path(self, state: RobotState, positions: Array, attitudes: Array | None = None) -> BasePath:
+        """Return the base path of the shapes ``positions`` (N + 1, n), at some of the ticks.
+
+        ``attitudes`` (N + 1, 4) at the ticks, where they are known already.
+        """
+        if attitudes is None:
+            attitudes = self.attitudes(positions, state.quaternion, state.angular_momentum)
+        last = len(positions) - 1
+        chosen = np.unique(np.append(np.arange(0, last, max(1, last // _KNOTS)), last))
+        time, quaternions = chosen * self._tick_period, attitudes[chosen]
+        positions_W = self.positions(state, time, positions[chosen], quaternions)
+        return BasePath(time, positions_W, quaternions)

@@ -2,11 +2,62 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning.area_loop import AreaLoopGait
+from spacerobot_ros.planning.auto import AutoGait, Candidate
+from spacerobot_ros.planning.goal import Tolerance
 from spacerobot_ros.planning.lie_bracket import LieBracketGait
 from spacerobot_ros.planning.method import GaitMethod
+from spacerobot_ros.planning.optimal import OptimalGait
 from spacerobot_ros.planning.square_path import SquarePathGait
 
 METHODS: dict[str, type[GaitMethod]] = {
+    # In the order in which `auto` tries them: those made for a kind of robot first.
     LieBracketGait.name: LieBracketGait,
     SquarePathGait.name: SquarePathGait,
+    AreaLoopGait.name: AreaLoopGait,
+    OptimalGait.name: OptimalGait,
+    AutoGait.name: AutoGait,
 }
+
+
+def build_method(
+    name: str,
+    robot: SpaceRobot,
+    tick_period: float,
+    tolerance: Tolerance,
+    integration_step: float,
+    options: Mapping[str, Any],
+) -> GaitMethod:
+    """Return a method for a robot; ``options`` are keyed ``<method>.<option>``.
+
+    Raises
+    ------
+    KeyError
+        There is no such method.
+    ParameterError
+        An option does not go with the robot or with another option.
+    """
+    method = METHODS[name]
+    if method is AutoGait:
+        candidates = {
+            other: Candidate(
+                entry,
+                partial(
+                    build_method, other, robot, tick_period, tolerance, integration_step, options
+                ),
+            )
+            for other, entry in METHODS.items()
+            if entry is not AutoGait
+        }
+        return AutoGait(robot, tick_period, tolerance, integration_step, candidates=candidates)
+    chosen = {
+        option.name: options[key]
+        for option in method.options
+        if (key := f"{name}.{option.name}") in options
+    }
+    return method(robot, tick_period, tolerance, integration_step, **chosen)

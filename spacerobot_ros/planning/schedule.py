@@ -40,6 +40,9 @@ class GaitSchedule:
         What it was planned for.
     notes
         Named results of the method, for reports (a paper's symbols where it has them).
+    partial
+        It ends short of the goal on purpose: the measured pose at its end decides on the next
+        piece.
     """
 
     method: str
@@ -49,6 +52,7 @@ class GaitSchedule:
     path: BasePath
     goal: Goal
     notes: dict[str, list[float] | float | str] = field(default_factory=dict)
+    partial: bool = False
 
     @property
     def ticks(self) -> int:

@@ -26,20 +26,16 @@ from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.planning.geometric_phase import PlanarPhase
 from spacerobot_ros.planning.goal import Controlled, Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.method import GaitMethod, Option
+from spacerobot_ros.planning.planar import planar_axis
 from spacerobot_ros.planning.prediction import BasePrediction
-from spacerobot_ros.planning.schedule import BasePath, GaitSchedule
+from spacerobot_ros.planning.schedule import GaitSchedule
 from spacerobot_ros.planning.square_loop import SquareLoop, SquareSearch
+from spacerobot_ros.planning.straight_legs import shapes_at_ticks, straight_legs, total_duration
 
 _WORTHWHILE = 0.1
 """A missing turn below this share of the tolerance is left as it is."""
 
 _NO_ROTATION = 1e-9
-_NO_MOTION = 1e-9
-_BEYOND = 1e-9
-"""Rounding that a goal shape may be beyond a limit by, rad."""
-
-_KNOTS = 200
-"""A predicted path has this many poses of the base, or up to twice as many."""
 
 
 class SquarePathGait(GaitMethod):
@@ -49,7 +45,7 @@ class SquarePathGait(GaitMethod):
     """
 
     name: ClassVar[str] = "square_path"
-    controls: ClassVar[frozenset[Controlled]] = frozenset({"attitude", "shape"})
+    controls: frozenset[Controlled] = frozenset({"attitude", "shape"})
     options: ClassVar[tuple[Option, ...]] = (
         Option("t1", 8.0, "s", "end of step 1, the motion to the final shape", 1e-3),
         Option("t2", 12.0, "s", "end of step 2, the motion to the square", 1e-3),
@@ -102,13 +98,24 @@ class SquarePathGait(GaitMethod):
         self._search = SquareSearch(robot, self._phase, most_loops, centre)
         self._prediction = BasePrediction(robot, tick_period, integration_step)
 
+    @classmethod
+    def objection(cls, robot: SpaceRobot) -> str:
+        """Return why the robot is not planar, or has too few links."""
+        try:
+            planar_axis(robot)
+        except PlanningError as refusal:
+            return str(refusal)
+        return ""
+
     def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
         """Plan steps 1 to 4; see :meth:`GaitMethod.plan`."""
         if self._refusal is not None:
             raise PlanningError(str(self._refusal))
         self._require_rest(state)
         turn = self._turn(state, goal)
-        psi_e = self._final_shape(state, goal)
+        psi_e = self._goal_shape(goal)
+        if psi_e is None:
+            psi_e = np.clip(state.q, self.robot.lower, self.robot.upper)
         step_1 = float(self._phase.legs(state.q[np.newaxis], psi_e[np.newaxis])[0])
         # Whole turns are no matter: the smaller of the two ways round.
         wanted = math.remainder(turn - step_1, 2 * math.pi)
@@ -116,7 +123,7 @@ class SquarePathGait(GaitMethod):
         if abs(wanted) > max(_NO_ROTATION, _WORTHWHILE * self.tolerance.attitude):
             loop = self._search.loop(psi_e, wanted)
         positions = self._motion(state.q, self._legs(psi_e, loop))
-        path = self._path(state, positions)
+        path = self._prediction.path(state, positions)
         left = PoseError.between(path.position[-1], path.quaternion[-1], goal)
         if self._check_position and left.distance > self.tolerance.position:
             raise PlanningError(
@@ -158,27 +165,6 @@ class SquarePathGait(GaitMethod):
             )
         return math.remainder(2 * math.atan2(about, float(w)), 2 * math.pi)
 
-    def _final_shape(self, state: RobotState, goal: Goal) -> Array:
-        """Return ``psi_e`` (n,): the goal's shape, or the present one."""
-        robot = self.robot
-        if goal.joint_positions is None:
-            return np.clip(state.q, robot.lower, robot.upper)
-        psi_e = goal.joint_positions
-        if len(psi_e) != robot.n:
-            raise PlanningError(
-                f"The goal shape has {len(psi_e)} joint position(s); robot "
-                f"'{robot.description.name}' has {robot.n} joints."
-            )
-        beyond = np.maximum(robot.lower - psi_e, psi_e - robot.upper)
-        worst = int(np.argmax(beyond))
-        if beyond[worst] > _BEYOND:
-            raise PlanningError(
-                f"The goal shape is beyond limits: joint '{robot.joint_names[worst]}' at "
-                f"{psi_e[worst]:.4g} rad, and its limits are "
-                f"[{robot.lower[worst]:.4g}, {robot.upper[worst]:.4g}] rad."
-            )
-        return np.clip(psi_e, robot.lower, robot.upper)
-
     def _legs(self, psi_e: Array, loop: SquareLoop | None) -> list[tuple[Array, float]]:
         """Return the ends (n,) of the straight legs, and how long each is to take, s."""
         step_1, step_2, step_3, step_4 = self._durations
@@ -190,20 +176,16 @@ class SquarePathGait(GaitMethod):
             legs.append((psi_e, step_4))
         return legs
 
-    def _motion(self, start: Array, legs: Sequence[tuple[Array, float]]) -> Array:
+    def _motion(self, start: Array, ends: Sequence[tuple[Array, float]]) -> Array:
         """Return the shapes (N + 1, n) at the ticks, each leg from rest to rest.
-
-        Under ``u = (2 pi D / T^2) sin(2 pi t / T)``, eqs (12) to (18), a leg D is travelled as
-        ``D (t/T - sin(2 pi t/T) / (2 pi))``.
 
         Raises
         ------
         PlanningError
             The manoeuvre takes longer than ``longest``.
         """
-        starts = [start, *(end for end, _ in legs)]
-        moves = [(a, b, self._duration(b - a, T)) for a, (b, T) in zip(starts, legs, strict=False)]
-        total = sum(duration for _, _, duration in moves)
+        legs = straight_legs(self.robot, start, ends)
+        total = total_duration(legs)
         if total > self._longest:
             slowest = int(np.argmin(self.robot.velocity_limit))
             raise PlanningError(
@@ -212,32 +194,7 @@ class SquarePathGait(GaitMethod):
                 f"'{self.robot.joint_names[slowest]}', has "
                 f"{self.robot.velocity_limit[slowest]:.3g} rad/s."
             )
-        pieces = [start[np.newaxis]]
-        for a, b, duration in moves:
-            tau = np.linspace(0.0, 1.0, 1 + math.ceil(duration / self.tick_period - 1e-9))[1:]
-            progress = tau - np.sin(2 * math.pi * tau) / (2 * math.pi)
-            pieces.append(a + progress[:, np.newaxis] * (b - a))
-            pieces[-1][-1:] = b
-        return np.vstack(pieces)
-
-    def _duration(self, move: Array, wanted: float) -> float:
-        """Return how long a leg takes, s: not at all without a move, longer with slow joints."""
-        active = np.abs(move) > _NO_MOTION
-        if not active.any():
-            return 0.0
-        # The peak speed is twice the mean. A joint without speed takes for ever.
-        with np.errstate(divide="ignore"):
-            slowest = np.max(2 * np.abs(move[active]) / self.robot.velocity_limit[active])
-        return max(wanted, float(slowest))
-
-    def _path(self, state: RobotState, positions: Array) -> BasePath:
-        """Return the base path, integrated as the plant does, at some of the ticks."""
-        attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
-        last = len(positions) - 1
-        chosen = np.unique(np.append(np.arange(0, last, max(1, last // _KNOTS)), last))
-        time, quaternions = chosen * self.tick_period, attitudes[chosen]
-        positions_W = self._prediction.positions(state, time, positions[chosen], quaternions)
-        return BasePath(time, positions_W, quaternions)
+        return shapes_at_ticks(start, legs, self.tick_period)
 
     def _loop_notes(self, loop: SquareLoop | None) -> dict[str, list[float] | float | str]:
         if loop is None:

@@ -70,12 +70,15 @@ class McapFile:
         path: the file; its folders are made.
         compression: of the chunks: `zstd`, `lz4` or `none`.
         overwrite: whether a file that is there is replaced.
+        profile: what the messages are; `ros2` unless they are of something else.
 
     Raises:
         RecordingError: the file cannot be made, or is there and is not to be replaced.
     """
 
-    def __init__(self, path: Path, *, compression: str, overwrite: bool) -> None:
+    def __init__(
+        self, path: Path, *, compression: str, overwrite: bool, profile: str = "ros2"
+    ) -> None:
         if compression not in _COMPRESSIONS:
             raise RecordingError(
                 f"The compression {compression!r} is not one of {', '.join(_COMPRESSIONS)}."
@@ -101,10 +104,15 @@ class McapFile:
                 f"Cannot make the bag {path}: {error.strerror or error}."
             ) from error
         try:
-            self._append(MCAP0_MAGIC + encode(Header(profile="ros2", library="spacerobot_ros")))
+            self._append(MCAP0_MAGIC + encode(Header(profile=profile, library="spacerobot_ros")))
         except RecordingError:
             self.close()
             raise
+
+    @property
+    def size(self) -> int:
+        """How many bytes the file has."""
+        return self._size
 
     def append_chunk(self, records: bytearray, entries: dict[int, list[int]]) -> None:
         """Append one chunk and the indexes of its messages.

@@ -75,7 +75,7 @@ def _require_both_ends(path: Path, file: BinaryIO) -> None:
     if length < 2 * size or file.read(size) != MCAP0_MAGIC:
         raise RecordingError(
             f"The bag {path} was cut short, its writer having been killed or its disk full: "
-            "'spacerobot salvage' makes a complete bag of what is in it."
+            f"'spacerobot salvage {path}' makes a complete bag of what is in it."
         )
     file.seek(0)
 
@@ -96,7 +96,7 @@ def read_summary(path: Path, file: BinaryIO) -> Summary:
     summary = SeekingReader(file).get_summary()
     if summary is None or summary.statistics is None:
         raise RecordingError(
-            f"The bag {path} has no summary: 'mcap recover' makes a bag with one of it."
+            f"The bag {path} has no summary: 'spacerobot salvage {path}' makes one."
         )
     return summary
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
+
+import yaml
 
 from spacerobot_ros.recording.errors import RecordingError
 
@@ -15,6 +18,15 @@ _POLICIES = {
     "durability": ("volatile", "transient_local", "system_default", "best_available", "unknown"),
     "liveliness": ("automatic", "manual_by_topic", "system_default", "best_available", "unknown"),
 }
+
+# Before Jazzy rosbag2 wrote the numbers of rmw's enumerations.
+_NUMBERS = {
+    "history": {0: "system_default", 1: "keep_last", 2: "keep_all"},
+    "reliability": {0: "system_default", 1: "reliable", 2: "best_effort"},
+    "durability": {0: "system_default", 1: "transient_local", 2: "volatile"},
+    "liveliness": {0: "system_default", 1: "automatic", 3: "manual_by_topic"},
+}
+_DURATIONS = ("deadline", "lifespan", "liveliness_lease_duration")
 
 
 @dataclass(frozen=True)
@@ -55,6 +67,26 @@ class QosProfile:
             if word not in words:
                 raise RecordingError(f"The QoS {policy} {word!r} is not one of {', '.join(words)}.")
 
+    @classmethod
+    def from_yaml(cls, text: str) -> list[QosProfile]:
+        """Read the value of a channel's `offered_qos_profiles`, in words or in numbers.
+
+        Args:
+            text: YAML of a list with one profile for each publisher; empty for none.
+
+        Returns:
+            The profiles. What one does not say is as in `QosProfile()`.
+
+        Raises:
+            RecordingError: the text is not such a list.
+        """
+        try:
+            entries = yaml.safe_load(text) or []
+            return [cls(**_arguments(entry)) for entry in entries]
+        except (yaml.YAMLError, TypeError, ValueError, AttributeError) as error:
+            reason = " ".join(str(error).split())
+            raise RecordingError(f"A QoS profile of the bag cannot be read: {reason}.") from error
+
     def to_yaml(self) -> str:
         """Give the YAML of a list with this profile in it, as rosbag2 dumps it.
 
@@ -84,3 +116,21 @@ LATCHED = QosProfile(depth=1, durability="transient_local")
 def _duration(name: str, nanoseconds: int) -> tuple[str, str, str]:
     seconds, rest = divmod(nanoseconds, 10**9)
     return f"  {name}:", f"    sec: {seconds}", f"    nsec: {rest}"
+
+
+def _arguments(entry: dict[str, Any]) -> dict[str, Any]:
+    """Turn one entry of the YAML into the arguments of a profile."""
+    arguments: dict[str, Any] = {}
+    for name, value in entry.items():
+        if name in _DURATIONS:
+            nanoseconds = int(value["sec"]) * 10**9 + int(value["nsec"])
+            arguments[f"{name}_ns"] = min(nanoseconds, INFINITE_NS)
+        elif name in _POLICIES:
+            arguments[name] = _NUMBERS[name].get(value, "unknown") if _is_number(value) else value
+        elif name in {field.name for field in fields(QosProfile)}:
+            arguments[name] = value
+    return arguments
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)

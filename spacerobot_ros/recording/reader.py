@@ -3,32 +3,22 @@
 from __future__ import annotations
 
 import os
-import struct
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, ChunkIndex
+from mcap.records import Channel
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from spacerobot_ros.recording.errors import RecordingError
-from spacerobot_ros.recording.mcap_reading import (
-    decompress,
-    messages_in_file_order,
-    open_bag,
-    read_summary,
-)
+from spacerobot_ros.recording.mcap_reading import messages_in_file_order, open_bag, read_summary
+from spacerobot_ros.recording.ordered import messages_in_time_order
+from spacerobot_ros.recording.qos import QosProfile
 from spacerobot_ros.recording.series import TopicSeries
-
-_RECORD_HEADER_SIZE = 9
-_MESSAGE_INDEX_HEADER = struct.Struct("<BQHI")
-_MESSAGE_HEADER_SIZE = 22
-_record_length = struct.Struct("<Q").unpack_from
 
 
 def read_bag(path: str | os.PathLike[str]) -> Bag:
@@ -120,6 +110,16 @@ class Bag:
         """Log time of the latest message in seconds; nan without messages."""
         return self._statistics.message_end_time / 1e9 if self.message_count() else float("nan")
 
+    @property
+    def start_time_ns(self) -> int:
+        """Log time of the earliest message in nanoseconds; 0 without messages."""
+        return int(self._statistics.message_start_time)
+
+    @property
+    def end_time_ns(self) -> int:
+        """Log time of the latest message in nanoseconds; 0 without messages."""
+        return int(self._statistics.message_end_time)
+
     def message_count(self, topic: str | None = None) -> int:
         """Say how many messages a topic has, or the whole bag.
 
@@ -130,6 +130,23 @@ class Bag:
             return int(self._statistics.message_count)
         counts = self._statistics.channel_message_counts
         return sum(counts.get(channel.id, 0) for channel in self._channels(topic))
+
+    def channel_ids(self, topic: str) -> set[int]:
+        """Give the numbers under which a topic's messages are in the file.
+
+        Raises:
+            RecordingError: there is no such topic.
+        """
+        return {channel.id for channel in self._channels(topic)}
+
+    def qos(self, topic: str) -> list[QosProfile]:
+        """Give what the publishers of a topic offered, as far as the bag says it.
+
+        Raises:
+            RecordingError: there is no such topic, or what the bag says cannot be read.
+        """
+        texts = [c.metadata.get("offered_qos_profiles", "") for c in self._channels(topic)]
+        return [profile for text in texts for profile in QosProfile.from_yaml(text)]
 
     def times(self, topic: str) -> NDArray[np.float64]:
         """Give the log times of a topic in seconds, shape (N,).
@@ -154,7 +171,7 @@ class Bag:
         if topic not in self._series:
             channels = self._channels(topic)
             decode = self._decoder(channels[0])
-            times, data = self._read({channel.id for channel in channels})
+            times, data = self._read(self.channel_ids(topic))
             self._series[topic] = TopicSeries(
                 topic, self.topics[topic], times, data, self._typestore.fielddefs, decode
             )
@@ -203,45 +220,10 @@ class Bag:
         """Read some channels: log times in nanoseconds in order, serialised messages."""
         times: list[int] = []
         data: list[bytes] = []
-        with open_bag(self.path) as file:
-            for log_time_ns, message in self._raw_messages(file, channel_ids):
-                times.append(log_time_ns)
-                data.append(message)
-        order = np.argsort(np.array(times, np.int64), kind="stable")
-        return np.array(times, np.int64)[order], [data[i] for i in order.tolist()]
-
-    def _raw_messages(self, file: BinaryIO, channel_ids: set[int]) -> Iterator[tuple[int, bytes]]:
-        indexes = self._summary.chunk_indexes
-        if not indexes or not all(index.message_index_offsets for index in indexes):
-            # Written without chunks or without message indexes.
-            for channel_id, log_time_ns, _, message in messages_in_file_order(file):
-                if channel_id in channel_ids:
-                    yield log_time_ns, message
-            return
-        for index in indexes:
-            wanted = [
-                offset for c, offset in index.message_index_offsets.items() if c in channel_ids
-            ]
-            if wanted:
-                chunk = _read_chunk(file, index)
-                for offset in wanted:
-                    yield from _indexed_messages(file, offset, chunk)
-
-
-def _read_chunk(file: BinaryIO, index: ChunkIndex) -> bytes:
-    file.seek(index.chunk_start_offset + _RECORD_HEADER_SIZE)
-    return decompress(Chunk.read(ReadDataStream(file)))
-
-
-def _indexed_messages(file: BinaryIO, offset: int, chunk: bytes) -> Iterator[tuple[int, bytes]]:
-    file.seek(offset)
-    header = file.read(_MESSAGE_INDEX_HEADER.size)
-    size = _MESSAGE_INDEX_HEADER.unpack(header)[3]
-    entries = struct.unpack(f"<{size // 8}Q", file.read(size))
-    for log_time_ns, start in zip(entries[::2], entries[1::2], strict=True):
-        body = start + _RECORD_HEADER_SIZE
-        end = body + _record_length(chunk, start + 1)[0]
-        yield log_time_ns, chunk[body + _MESSAGE_HEADER_SIZE : end]
+        for _, log_time_ns, _, message in messages_in_time_order(self.path, channel_ids):
+            times.append(log_time_ns)
+            data.append(message)
+        return np.array(times, np.int64), data
 
 
 def _type_name(schemas: dict[int, Any], channel: Channel) -> str:

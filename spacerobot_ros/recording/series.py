@@ -58,10 +58,20 @@ class TopicSeries:
     @cached_property
     def stamp(self) -> NDArray[np.float64]:
         """Stamps of the headers in seconds, shape (N,); the log times where messages have none."""
-        if dict(self._fields[self.type_name][1]).get("header") != _HEADER:
-            return self.time
+        return np.asarray(self.stamp_ns / 1e9)
+
+    @cached_property
+    def stamp_ns(self) -> NDArray[np.int64]:
+        """The same in nanoseconds."""
+        if not self.stamped:
+            return self.time_ns
         seconds, nanoseconds = self.field("header.stamp.sec"), self.field("header.stamp.nanosec")
-        return np.asarray(seconds) + 1e-9 * np.asarray(nanoseconds)
+        return np.asarray(seconds, np.int64) * 10**9 + np.asarray(nanoseconds, np.int64)
+
+    @property
+    def stamped(self) -> bool:
+        """Whether the messages have a header."""
+        return dict(self._fields[self.type_name][1]).get("header") == _HEADER
 
     def field(self, path: str) -> Any:
         """Give one field of all messages.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,6 +45,11 @@ class BagWriter:
         compression: of the chunks: `zstd`, `lz4` or `none`.
         chunk_size: how large a chunk grows, in bytes before compression.
         overwrite: whether a file that is there is replaced.
+        max_size: how large a file grows, in bytes, before the next one is begun; 0 for ever. The
+            files of a bag that may be split are `NAME_0.mcap`, `NAME_1.mcap`, ..., each complete,
+            with all attachments and metadata.
+        max_duration_ns: how much log time a file spans, in nanoseconds, likewise. Both are looked
+            at after every chunk.
 
     Raises:
         RecordingError: the file cannot be made, or is there and is not to be replaced.
@@ -56,8 +62,16 @@ class BagWriter:
         compression: str = "zstd",
         chunk_size: int = 65536,
         overwrite: bool = True,
+        max_size: int = 0,
+        max_duration_ns: int = 0,
     ) -> None:
-        self._file = McapFile(Path(path), compression=compression, overwrite=overwrite)
+        self._whole_path = Path(path)
+        self._limits = max_size, max_duration_ns
+        self._number = 0
+        self._compression, self._overwrite = compression, overwrite
+        self._earlier: Counter[str] = Counter()
+        self._context: list[Attachment | Metadata] = []
+        self._file = self._new_file()
         self._chunk_size = chunk_size
         self._chunk = bytearray()
         # Of each channel, log time and offset in the chunk of each message. Empty as soon as
@@ -77,13 +91,16 @@ class BagWriter:
 
     @property
     def path(self) -> Path:
-        """Where the bag is."""
+        """Where the bag is, or the file of it that is being written."""
         return self._file.path
 
     @property
     def message_counts(self) -> dict[str, int]:
         """How many messages of each topic are in the bag or in the chunk in progress."""
-        return {name: self._count(channel) for name, (channel, _, _) in self._topics.items()}
+        return {
+            name: self._earlier[name] + self._count(channel)
+            for name, (channel, _, _) in self._topics.items()
+        }
 
     @property
     def messages_written(self) -> int:
@@ -178,6 +195,7 @@ class BagWriter:
         attachment = Attachment(
             create_time=0, log_time=log_time_ns, name=name, media_type=media_type, data=data
         )
+        self._context.append(attachment)
         with self._refusing_after_failure():
             self._file.append_attachment(attachment)
 
@@ -192,8 +210,10 @@ class BagWriter:
             RecordingError: the disk refused it, or nothing more can be written.
         """
         self._require_open()
+        metadata = Metadata(name=name, metadata=data)
+        self._context.append(metadata)
         with self._refusing_after_failure():
-            self._file.append_metadata(Metadata(name=name, metadata=data))
+            self._file.append_metadata(metadata)
 
     def flush(self) -> None:
         """Hand the chunk in progress to the operating system, so that a kill loses nothing of it.
@@ -257,6 +277,41 @@ class BagWriter:
         self._chunk = bytearray()
         for entries in self._entries.values():
             entries.clear()
+        if not self._closed and self._is_full():
+            with self._refusing_after_failure():
+                self._begin_next_file()
+
+    def _is_full(self) -> bool:
+        max_size, max_duration_ns = self._limits
+        span = (self._file.end_ns or 0) - (self._file.start_ns or 0)
+        return 0 < max_size <= self._file.size or 0 < max_duration_ns <= span
+
+    def _new_file(self) -> McapFile:
+        path = self._whole_path
+        if any(self._limits):
+            path = path.with_name(f"{path.stem}_{self._number}{path.suffix}")
+        return McapFile(path, compression=self._compression, overwrite=self._overwrite)
+
+    def _begin_next_file(self) -> None:
+        """Complete a file and go on in the next, with the same schemas and channels."""
+        self._append_rosbag2_metadata()
+        self._file.finish()
+        self._file.close()
+        for name, (channel, _, _) in self._topics.items():
+            self._earlier[name] += self._count(channel)
+        self._number += 1
+        schemas, channels = self._file.schemas, self._file.channels
+        self._file = self._new_file()
+        self._append_rosbag2_metadata()
+        for record in self._context:
+            if isinstance(record, Attachment):
+                self._file.append_attachment(record)
+            else:
+                self._file.append_metadata(record)
+        self._file.schemas += schemas
+        self._file.channels += channels
+        for known in (*schemas, *channels):
+            self._chunk += encode(known)
 
     def _append_rosbag2_metadata(self) -> None:
         topics = [

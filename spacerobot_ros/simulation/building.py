@@ -12,8 +12,10 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot, reconstruction
 from spacerobot_ros.simulation import effort_plant
 from spacerobot_ros.simulation.effort_plant import EffortPlant
+from spacerobot_ros.simulation.faults_plant import FaultyPlant
 from spacerobot_ros.simulation.initial_state import InitialState
 from spacerobot_ros.simulation.plant import Plant
+from spacerobot_ros.simulation.thrusters import with_thrusters
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
 _SECOND = 10**9
@@ -49,35 +51,51 @@ def period_ns(tick_rate: float) -> int:
 
 def build_plant(
     robot: SpaceRobot, values: Mapping[str, Any], initial: InitialState | None = None
-) -> Plant:
-    """Build the plant that these parameters describe.
+) -> FaultyPlant:
+    """Build the plant that these parameters describe, with its faults.
 
     Parameters
     ----------
     robot
         The model.
     values
-        ``actuation``, ``tick_rate`` (Hz), ``integration_step`` (s; 0: by the actuation) and what
-        :func:`initial_state` takes.
+        ``actuation``, ``tick_rate`` (Hz), ``integration_step`` (s; 0: by the actuation), what
+        :func:`initial_state` takes, and optionally ``faults`` (lines), ``sensors.seed``,
+        and ``thrusters`` with ``thrusters_excluded`` (:func:`with_thrusters`).
     initial
         Where to start instead.
 
     Raises
     ------
     ParameterError
-        The integration step is too short, or the initial state is refused.
+        The integration step is too short, or the initial state, a thruster or a fault is refused.
     """
     kind, step = PLANTS[values["actuation"]], values["integration_step"]
+    thrusters = values.get("thrusters", "")
     if 0.0 < step < _SHORTEST_STEP:
         raise ParameterError(
             f"Parameter 'integration_step' is {step}; it must be 0 (by the actuation) or at least "
             f"{_SHORTEST_STEP:g} s."
         )
-    return kind.plant(
+    tick_period = period_ns(values["tick_rate"]) / _SECOND
+    plant = kind.plant(
         robot,
-        period_ns(values["tick_rate"]) / _SECOND,
+        tick_period,
         initial_state(values) if initial is None else initial,
         step or kind.integration_step,
+    )
+    if thrusters and not kind.thrusters:
+        raise ParameterError(
+            f"Parameter 'thrusters' is '{thrusters}', but under actuation '{values['actuation']}' "
+            "nothing pushes the base: set actuation to effort, or thrusters to ''."
+        )
+    plant = with_thrusters(plant, tick_period, thrusters, values.get("thrusters_excluded", ""))
+    return FaultyPlant(
+        plant,
+        values.get("faults", ()),
+        tick_period,
+        wrench=kind.thrusters,
+        seed=values.get("sensors.seed", 0),
     )
 
 

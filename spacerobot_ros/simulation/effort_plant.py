@@ -21,6 +21,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.free_flight import repeated, state_slices
 from spacerobot_ros.simulation.initial_state import InitialState
 from spacerobot_ros.simulation.joint_stops import JointStops
+from spacerobot_ros.simulation.plant import Flags
 
 DEFAULT_INTEGRATION_STEP = 0.001
 """Longest Runge-Kutta step, s.
@@ -95,6 +96,8 @@ class EffortPlant:
         self.effort, self.wrench = self._realised[:n], self._realised[n:]
         self.effort_limited = np.zeros(n, dtype=np.int64)
         self.stroke_limited = np.zeros(n, dtype=np.int64)
+        self._held = np.zeros(n, dtype=np.bool_)
+        self._holding = False
         self.reset()
 
     @property
@@ -123,6 +126,14 @@ class EffortPlant:
         self._command[:] = 0.0
         self._report()
 
+    def hold(self, joints: Flags) -> None:
+        """Hold these joints (n,) where they are from now on, by inner forces.
+
+        A joint that moves is stopped by an inner impulse; neither total momentum changes.
+        """
+        self._held[:] = joints
+        self._holding = bool(joints.any())
+
     def step(self, effort: npt.ArrayLike, wrench: npt.ArrayLike = 0.0) -> bool:
         """Advance one tick under joint efforts (n,), clipped to their limits, and a base wrench.
 
@@ -144,21 +155,21 @@ class EffortPlant:
         self._command[:n] = effort
         self._command[n:] = wrench
         self._advance.evaluate()
-        if self._limited[0] == 0.0:
+        if self._limited[0] == 0.0 and not self._holding:
             return False
         return self._apply_limits()
 
     def _apply_limits(self) -> bool:
-        """Count what was clipped, and take the tick again if a joint touched a stop."""
+        """Count what was clipped, and take the tick again if a joint touched a stop or is held."""
         n = self.robot.n
         clipped, touched = self._limited[1 : 1 + n] != 0.0, self._limited[1 + n] != 0.0
         stopped = np.zeros(n, dtype=np.bool_)
         try:
             if not np.all(np.isfinite(self._command)):
                 raise CommandError(f"A command is not finite: {self._command.tolist()}.")
-            if touched:
+            if touched or self._holding:
                 self._state[:], stopped = self._stops.advance(
-                    self._state, self._realised, self.tick_period
+                    self._state, self._realised, self.tick_period, self._held
                 )
                 self._report()
         except SpaceRobotError:

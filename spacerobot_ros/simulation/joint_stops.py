@@ -12,6 +12,8 @@ inertia matrix of the shape (:mod:`spacerobot_ros.model.composite_rigid_body`), 
   principle of least constraint over a step, Moreau's time stepping). So it leaves with a delay of
   at most one step, and the endless shorter and shorter hops of joints that knock each
   other off their stops end.
+
+A joint that is locked where it is (a brake, a jam) is brought to rest by the same impulse and held.
 """
 
 from __future__ import annotations
@@ -53,9 +55,14 @@ class JointStops:
         self._step = robot.buffered("holding_step")
         self._equations = robot.buffered("shape_equations")
 
-    def advance(self, state: Array, command: Array, duration: float) -> tuple[Array, Flags]:
-        """Return the state after ``duration`` s under a held command, and the joints that were
+    def advance(
+        self, state: Array, command: Array, duration: float, locked: Flags | None = None
+    ) -> tuple[Array, Flags]:
+        """Return the state after ``duration`` s under a held command, and the joints that stops
         stopped or held.
+
+        ``locked`` (n,) are joints that something holds wherever they are; moving ones are brought
+        to rest at once, as by a stop.
 
         Raises
         ------
@@ -63,30 +70,43 @@ class JointStops:
             The motion is no longer finite.
         """
         x, left = state.copy(), duration
-        held, stopped = self._rest(x, command, np.zeros(self._lower.size, dtype=np.bool_))
+        none = np.zeros(self._lower.size, dtype=np.bool_)
+        locked = none if locked is None else locked
+        held, stopped = self._rest(x, command, none, locked)
         while left > 1e-12 * duration:
             step = min(self._integration_step, left)
-            after = self._move(x, command, held, step)
+            fixed = held | locked
+            after = self._move(x, command, fixed, step)
             if self._outside(after):
-                step = self._arrival(x, command, held, step)
-                after = self._move(x, command, held, step)
+                step = self._arrival(x, command, fixed, step)
+                after = self._move(x, command, fixed, step)
                 after[self._q] = np.clip(after[self._q], self._lower, self._upper)
             x, left = after, left - step
-            held, touched = self._rest(x, command, held)
+            held, touched = self._rest(x, command, held, locked)
             stopped |= touched
         return x, stopped
 
-    def _rest(self, x: Array, command: Array, held: Flags) -> tuple[Flags, Flags]:
-        """Bring joints on their stops to rest, in ``x``; return those that stay so through the next
-        step, and these with those that have arrived. ``held`` are the joints held until now.
+    def _rest(self, x: Array, command: Array, held: Flags, locked: Flags) -> tuple[Flags, Flags]:
+        """Bring locked joints and joints on their stops to rest, in ``x``; return which stops hold
+        through the next step, and these with those that have arrived. ``held`` are the joints that
+        stops held until now.
         """
         q, qdot = x[self._q], x[self._qdot]
         inward = np.where(q <= self._lower, 1.0, np.where(q >= self._upper, -1.0, 0.0))
+        inward[locked] = 0.0
         touched = np.zeros(q.size, dtype=np.bool_)
-        if not inward.any():
+        if not inward.any() and not qdot[locked].any():
             return touched, touched
-        K, Q = self._equations(x, command)
-        compliance: Array = np.asarray(np.linalg.inv(K.reshape(q.size, q.size)))
+        flat, Q = self._equations(x, command)
+        K: Array = flat.reshape(q.size, q.size)
+        if locked.any():
+            if qdot[locked].any():
+                qdot[:], _ = at_rest(np.asarray(np.linalg.inv(K)), qdot, locked)
+                _, Q = self._equations(x, command)
+            # From here on they are as good as part of the bodies they join.
+            free = np.where(locked, 0.0, 1.0)
+            K, Q = np.where(np.eye(q.size) > 0, K, K * np.outer(free, free)), Q * free
+        compliance: Array = np.asarray(np.linalg.inv(K))
         if np.any(inward * qdot < 0.0):
             touched = pushed_out(compliance, qdot, inward, touched)
             qdot[:], _ = at_rest(compliance, qdot, touched)

@@ -13,6 +13,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.simulation.initial_state import InitialState
 
 Counts = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 
 class Plant(Protocol):
@@ -31,6 +32,9 @@ class Plant(Protocol):
 
     def reset(self) -> None:
         """Return to the initial state."""
+
+    def hold(self, joints: Flags) -> None:
+        """Hold these joints (n,) where they are from now on, and no others."""
 
     @property
     def step(self) -> Callable[..., bool]:

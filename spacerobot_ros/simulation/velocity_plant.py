@@ -18,6 +18,7 @@ from spacerobot_ros.model.compilation import BufferedFunction, compiled
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.simulation.initial_state import InitialState
+from spacerobot_ros.simulation.plant import Flags
 
 
 class VelocityPlant:
@@ -79,6 +80,7 @@ class VelocityPlant:
         self.effort = np.zeros(robot.n)
         self.velocity_limited = np.zeros(robot.n, dtype=np.int64)
         self.stroke_limited = np.zeros(robot.n, dtype=np.int64)
+        self._held: Flags | None = None
         self.reset()
 
     @property
@@ -109,6 +111,10 @@ class VelocityPlant:
         self._advance.evaluate()
         self._h[:] = self.tick_period
 
+    def hold(self, joints: Flags) -> None:
+        """Hold these joints (n,) where they are from now on, whatever is commanded."""
+        self._held = joints.copy() if joints.any() else None
+
     def step(self, command: Array) -> bool:
         """Advance one tick under the joint velocities ``command`` (n,), clipped to rate and stroke.
 
@@ -118,6 +124,8 @@ class VelocityPlant:
         """
         self._state[:] = self._next_state
         self._command[:] = command
+        if self._held is not None:
+            self._command[self._held] = 0.0
         self._advance.evaluate()
         self._r_cm[:] = self._next_r_cm
         if self._limited[0] == 0.0:

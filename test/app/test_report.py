@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 import re
 import struct
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from hashlib import sha256
 from pathlib import Path
 
 import matplotlib as mpl
@@ -27,7 +29,7 @@ from support.flight_bags import (
     tell,
     urdf_of,
 )
-from support.html_page import Page
+from support.html_page import Page, leave_blank
 
 from spacerobot_ros.app.report import figures_scene, write_picture, write_report
 from spacerobot_ros.app.report.figures import shape_plate
@@ -36,7 +38,16 @@ from spacerobot_ros.app.report.style import Plate, paper_style
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.recording import RecordingError
 
-FIGURES = ["position", "attitude", "shape", "velocities", "loops", "momentum", "robot", "path"]
+FIGURES = [
+    "configurations",
+    "position",
+    "attitude",
+    "shape",
+    "velocities",
+    "loops",
+    "momentum",
+    "path",
+]
 
 
 def numbers_in(text: str) -> list[float]:
@@ -49,6 +60,11 @@ def _coarse_pictures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(figures_scene, "PIXELS", 120)
         yield
+
+
+@pytest.fixture
+def blank(monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_blank(monkeypatch)
 
 
 def report_of(tmp_path: Path, story: Story) -> Page:
@@ -103,7 +119,7 @@ def test_says_what_was_flown(flown: Page) -> None:
 
 
 def test_has_every_figure_in_order(flown: Page) -> None:
-    assert list(flown.figures) == FIGURES
+    assert list(flown.figures) == [*FIGURES[:3], "cycles", *FIGURES[3:]]
     assert "Meshes are not drawn." in flown.text
     assert "last 3 of 20 cycles" in flown.text
     for svg in flown.figures.values():
@@ -112,7 +128,16 @@ def test_has_every_figure_in_order(flown: Page) -> None:
 
 def test_needs_nothing_besides_itself(flown: Page) -> None:
     for tag, key, value in flown.attributes:
-        assert tag not in ("script", "iframe", "object", "embed", "base")
+        assert tag not in ("iframe", "object", "embed", "base")
+        if value.startswith("default-src"):
+            policy = dict(rule.split(" ", 1) for rule in value.split("; "))
+            assert policy["default-src"] == "'none'"
+            # The two scripts of the page and no other.
+            allowed = policy["script-src"].split()
+            texts = [text for text in flown.scripts if not text.startswith("{")]
+            hashes = [base64.b64encode(sha256(text.encode()).digest()).decode() for text in texts]
+            assert allowed == [f"'sha256-{digest}'" for digest in hashes]
+            continue
         if key in ("src", "href", "srcset", "data", "action", "poster"):
             assert value.startswith("data:"), (tag, key)
         assert not re.search(r"https?:|file:|//", value.partition(";base64,")[0])
@@ -179,9 +204,10 @@ def test_dense_traces_become_bands_and_say_so(tmp_path: Path) -> None:
     assert len(plate.svg) < 250_000
 
 
+@pytest.mark.usefixtures("blank")
 def test_a_robot_without_joints(tmp_path: Path) -> None:
     page = report_of(tmp_path, Story(np.empty((50, 0)), goals=[(0.0, *GOAL)]))
-    assert list(page.figures) == ["position", "attitude", "momentum", "robot", "path"]
+    assert list(page.figures) == ["configurations", "position", "attitude", "momentum", "path"]
     assert "The robot has no joints in this bag." in page.text
     assert "joints" not in page.tables
 
@@ -195,6 +221,7 @@ def test_any_number_of_joints(tmp_path: Path, n: int) -> None:
     assert "velocities" in page.figures
 
 
+@pytest.mark.usefixtures("blank")
 def test_without_goal_and_planner_and_in_a_namespace(tmp_path: Path) -> None:
     page = report_of(tmp_path, Story(still(), prefix="/free_flyer"))
     assert list(page.figures) == FIGURES
@@ -203,6 +230,7 @@ def test_without_goal_and_planner_and_in_a_namespace(tmp_path: Path) -> None:
     assert "Position error" not in dict(page.tables["numbers"])
 
 
+@pytest.mark.usefixtures("blank")
 def test_a_refused_goal(tmp_path: Path) -> None:
     statuses = [
         (0.0, "Waiting for a goal pose.", {"state": "idle"}),
@@ -214,14 +242,16 @@ def test_a_refused_goal(tmp_path: Path) -> None:
     assert "Manoeuvre time" not in dict(page.tables["numbers"])
 
 
+@pytest.mark.usefixtures("blank")
 def test_what_was_sent_and_is_no_pose(tmp_path: Path) -> None:
     goals = [(0.0, [math.nan, 0.0, 0.0], [0.0, 0.0, 0.0])]
     page = report_of(tmp_path, Story(still(2), goals=goals, urdf="<robot/>"))
     assert "The bag holds no goal pose." in page.text
     assert "nan" not in page.text
-    assert "robot" not in page.figures
+    assert "configurations" not in page.figures
 
 
+@pytest.mark.usefixtures("blank")
 def test_several_schedules(tmp_path: Path) -> None:
     other = ([0.0, 0.0, 1.0], [0.0, 0.0, 0.1])
     statuses = [
@@ -245,6 +275,7 @@ def test_cut_short_right_after_the_start(tmp_path: Path) -> None:
     assert "Flying a gait. The recording ends before that is decided." in page.text
 
 
+@pytest.mark.usefixtures("blank")
 @pytest.mark.parametrize("topics", [(), ("odom",), ("joint_states",), ("momentum",)])
 def test_what_is_missing_is_left_out(tmp_path: Path, topics: tuple[str, ...]) -> None:
     page = report_of(tmp_path, Story(still(), urdf=None, topics=topics))
@@ -264,6 +295,19 @@ def test_a_robot_without_shapes_and_with_odd_names(tmp_path: Path) -> None:
     page = report_of(tmp_path, story)
     assert list(page.figures) == FIGURES
     assert page.tables["joints"][1][0] == "a$^_b$" * 8 + "0"
+
+
+@pytest.mark.usefixtures("blank")
+def test_runs_stand_side_by_side(folder: Path, flown: Page, tmp_path: Path) -> None:
+    assert flown.figures
+    other = tell(tmp_path / "other.mcap", Story(still(count=3), goals=[(0.0, *GOAL)]))
+    write_report(folder / "flight.mcap", tmp_path / "both.html", beside=[other])
+    page = Page((tmp_path / "both.html").read_text(encoding="utf-8"))
+    head, *rows = page.tables["runs"]
+    assert [row[0] for row in rows] == ["flight.mcap", "other.mcap"]
+    ticks = [row[head.index("Recorded")] for row in rows]
+    assert ticks == [f"{len(cyclic_shapes()) - 1} ticks", "2 ticks"]
+    assert rows[1][head.index("Method")] == "–"
 
 
 def test_picture(tmp_path: Path, folder: Path, flown: Page) -> None:

@@ -338,6 +338,15 @@ def test_a_new_goal_replaces_the_one_that_is_flown(harness: Harness) -> None:
     np.testing.assert_array_equal(second.points[0].positions, at_switch.position)
 
 
+def distance_from(path: Array, shape: Array) -> float:
+    """Return how far a shape is from the polygon through the shapes of a path."""
+    legs = np.diff(path, axis=0)
+    lengths = np.maximum((legs**2).sum(axis=1), 1e-30)
+    share = np.clip(((shape - path[:-1]) * legs).sum(axis=1) / lengths, 0.0, 1.0)
+    nearest = path[:-1] + share[:, np.newaxis] * legs
+    return float(np.linalg.norm(shape - nearest, axis=1).min())
+
+
 def test_abortion_brings_the_joints_to_rest(harness: Harness) -> None:
     flight = Flight(harness)
     flight.send(NEAR)
@@ -351,8 +360,16 @@ def test_abortion_brings_the_joints_to_rest(harness: Harness) -> None:
     status = flight.wait("aborted")
     assert status.level == DiagnosticStatus.WARN
     assert_one_sentence(status.message)
-    flight.ticks(3)  # A command that was on its way, and then rest.
-    place = list(flight.probe.last("joint_states").position)
+    began = flight.probe.count("joint_states")
+    flight.ticks(10**9 // TICK_NS + 3)  # abort_time, and commands that were on their way.
+    braking = flight.probe.messages["joint_states"][began:]
+    place = list(braking[-1].position)
+    (schedule,) = flight.probe.messages["gait_schedule"]
+    path = np.array([point.positions for point in schedule.points])
+    for state in braking:
+        assert distance_from(path, np.array(state.position)) < 1e-9, "it rests on its path"
+    speeds = [np.abs(m.velocity).max() for m in braking]
+    assert max(np.abs(np.diff(speeds))) < 0.5 * max(speeds), "and does not stop dead"
     flight.ticks(60)
     assert list(flight.probe.last("joint_states").position) == place
     assert list(flight.probe.last("joint_states").velocity) == [0.0] * 3

@@ -73,7 +73,7 @@ def project(tmp_path: Path) -> Path:
     project.mkdir()
     for name in ("LICENSE", "package.xml", "pyproject.toml", "setup.cfg", "setup.py"):
         shutil.copy2(ROOT / name, project)
-    for name in ("bags", "config", "launch", "resource", "scripts", "urdf"):
+    for name in ("bags", "config", "foxglove", "launch", "resource", "rviz", "scripts", "urdf"):
         if (ROOT / name).is_dir():
             shutil.copytree(ROOT / name, project / name)
     for folder in ("urdf/meshes", "config"):
@@ -125,7 +125,7 @@ def test_manifest_setup_and_module_say_the_same(manifest: Package) -> None:
 
 
 def test_a_node_has_a_script_that_runs_its_module() -> None:
-    assert {"plant", "planner", "recorder"} <= set(NODES)
+    assert {"plant", "planner", "recorder", "replay"} <= set(NODES)
     for node in NODES:
         script = ROOT / "scripts" / node
         assert os.access(script, os.X_OK)

@@ -12,6 +12,7 @@ from spacerobot_ros.nodes import (
     PlannerNode,
     PlantNode,
     RecorderNode,
+    ReplayNode,
 )
 from spacerobot_ros.nodes.flight_node import AUTOSTART
 
@@ -25,6 +26,7 @@ README = Path(__file__).resolve().parents[2] / "README.md"
         ("planner", PlannerNode),
         ("coordinated_control", CoordinatedControlNode),
         ("recorder", RecorderNode),
+        ("replay", ReplayNode),
     ],
 )
 def test_parameters_are_documented_with_their_defaults(

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import math
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+import spacerobot_ros
 from spacerobot_ros.recording import (
     BagWriter,
     iterate_raw,
@@ -218,3 +221,21 @@ def test_the_raw_messages(path: Path) -> None:
     assert [(topic, len(data)) for topic, _, _, _, data in raw] == [
         (topic, len(data)) for topic, data in expected
     ]
+
+
+def test_read_bag_is_there_at_once_and_costs_nothing_before() -> None:
+    program = """
+import sys
+import spacerobot_ros
+assert "numpy" not in sys.modules and "mcap" not in sys.modules
+from spacerobot_ros import read_bag
+print(read_bag.__module__)
+assert not hasattr(spacerobot_ros, "write_bag")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=Path(spacerobot_ros.__file__).parents[1],
+        capture_output=True,
+        text=True,
+    )
+    assert (done.stdout, done.stderr) == ("spacerobot_ros.recording.reader\n", "")

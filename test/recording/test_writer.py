@@ -194,3 +194,45 @@ def test_where_no_bag_can_be_made(tmp_path: Path) -> None:
         BagWriter(tmp_path / "file" / "a.mcap")
     with pytest.raises(RecordingError, match="'gzip' is not one of zstd, lz4, none"):
         BagWriter(tmp_path / "a.mcap", compression="gzip")
+
+
+@pytest.mark.parametrize("limit", [{"max_size": 20_000}, {"max_duration_ns": 10**9}])
+def test_a_bag_is_split_into_complete_files(tmp_path: Path, limit: dict[str, int]) -> None:
+    count, step = 3000, 10**7
+    with BagWriter(
+        tmp_path / "a.mcap",
+        chunk_size=2000,
+        compression="none",
+        **limit,  # type: ignore[arg-type]
+    ) as writer:
+        writer.add_attachment("robot.urdf", b"<robot/>", "application/xml", 0)
+        channel = writer.add_topic("/a", "std_msgs/msg/String")
+        for n in range(count):
+            if n == 2000:
+                # Metadata and topics of later files.
+                writer.add_metadata("late", {"n": "2000"})
+                writer.add_topic("/b", "std_msgs/msg/String")
+            writer.write(channel, n.to_bytes(8, "little"), n * step, n * step)
+        assert writer.messages_written == count
+    files = sorted(tmp_path.iterdir(), key=lambda path: int(path.stem.split("_")[1]))
+    assert [path.name for path in files] == [f"a_{k}.mcap" for k in range(len(files))]
+    assert len(files) > 4
+    found = []
+    for path in files:
+        with path.open("rb") as file:
+            reader = make_reader(file)
+            summary = reader.get_summary()
+            assert summary is not None
+            assert summary.statistics is not None
+            messages = [message for _, _, message in reader.iter_messages()]
+            assert summary.statistics.message_count == len(messages) > 0
+            assert [a.data for a in reader.iter_attachments()] == [b"<robot/>"]
+            names = [metadata.name for metadata in reader.iter_metadata()]
+        found += [int.from_bytes(message.data, "little") for message in messages]
+        assert ("late" in names) == (found[-1] >= 2000)
+        # A chunk of 2000 bytes holds some fifty messages of 10 ms.
+        if "max_size" in limit:
+            assert path.stat().st_size < 20_000 + 10_000
+        else:
+            assert messages[-1].log_time - messages[0].log_time < 1.7e9
+    assert found == list(range(count))

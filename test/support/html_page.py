@@ -4,12 +4,28 @@ from __future__ import annotations
 
 import base64
 from html.parser import HTMLParser
+from typing import Any, BinaryIO
+
+import pytest
+from matplotlib.figure import Figure
+
+from spacerobot_ros.app.report import figures_scene
+
+
+def leave_blank(patch: pytest.MonkeyPatch) -> None:
+    """Leave figures blank: it saves most of the time of a report whose text is tested."""
+
+    def savefig(figure: Figure, stream: BinaryIO, **_: Any) -> None:
+        stream.write(b'<svg xmlns="http://www.w3.org/2000/svg"/>')
+
+    patch.setattr(Figure, "savefig", savefig)
+    patch.setattr(figures_scene, "PIXELS", 20)
 
 
 class Page(HTMLParser):
     """A parsed report: its tables as rows of cells, its figures as SVG, all text and attributes."""
 
-    _VOID = ("meta", "link", "img", "br")
+    _VOID = ("meta", "link", "img", "input", "br")
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -17,6 +33,7 @@ class Page(HTMLParser):
         self.attributes: list[tuple[str, str, str]] = []
         self.tables: dict[str, list[list[str]]] = {}
         self.figures: dict[str, bytes] = {}
+        self.scripts: list[str] = []
         self.text = ""
         self._table = self._figure = ""
         self.feed(text)
@@ -28,6 +45,8 @@ class Page(HTMLParser):
         self.attributes += [(tag, key, value) for key, value in values.items()]
         if tag not in self._VOID:
             self.open.append(tag)
+        if tag == "script":
+            self.scripts.append("")
         if tag == "table":
             self._table = values.get("id", "")
             self.tables[self._table] = []
@@ -47,7 +66,9 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        if "style" in self.open:
+        if "script" in self.open:
+            self.scripts[-1] += data
+        if {"style", "script"} & set(self.open):
             return
         self.text += data
         if self.open and self.open[-1] in ("td", "th"):

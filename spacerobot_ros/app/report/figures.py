@@ -17,6 +17,7 @@ from spacerobot_ros.app.report.style import (
     FAINT,
     MUTED,
     PALETTE,
+    SLICES,
     Plate,
     colour,
     draw_traces,
@@ -66,7 +67,12 @@ class Group:
 
 def position_group(flight: Flight) -> Group:
     """Return the base position and its goals."""
-    goals = [(t.start, t.end, i, x) for t in flight.targets for i, x in enumerate(t.goal.position)]
+    goals = [
+        (t.start, t.end, i, x)
+        for t in flight.targets
+        for i, x in enumerate(t.goal.position)
+        if flight.position_counts
+    ]
     return Group(flight.position, ["x", "y", "z"], "base position", "m", PALETTE[:3], goals)
 
 
@@ -115,7 +121,7 @@ def position_plate(flight: Flight) -> Plate | str:
     if not len(flight.position):
         return NO_STATES
     what = "Position of the base link in the world frame"
-    return _plate(flight, "position", "Base position", what, [position_group(flight)])
+    return time_plate(flight, "position", "Base position", what, [position_group(flight)])
 
 
 def attitude_plate(flight: Flight) -> Plate | str:
@@ -128,14 +134,14 @@ def attitude_plate(flight: Flight) -> Plate | str:
     )
     if np.linalg.norm(flight.attitude.values, axis=1).max() > np.pi:
         what += ", counted on continuously beyond half a turn"
-    return _plate(flight, "attitude", "Base attitude", what, [attitude_group(flight)])
+    return time_plate(flight, "attitude", "Base attitude", what, [attitude_group(flight)])
 
 
 def shape_plate(flight: Flight) -> Plate | str:
     """Joint positions, with the limits of the URDF that are in range."""
     if not len(flight.shape) or not flight.joint_names:
         return NO_JOINTS
-    return _plate(flight, "shape", "Shape", "Joint positions", shape_groups(flight))
+    return time_plate(flight, "shape", "Shape", "Joint positions", shape_groups(flight))
 
 
 def draw_whole(axes: Axes, flight: Flight, group: Group, share: float = 1.0) -> bool:
@@ -171,7 +177,11 @@ def draw_whole(axes: Axes, flight: Flight, group: Group, share: float = 1.0) -> 
     return dense
 
 
-def _plate(flight: Flight, name: str, heading: str, what: str, groups: list[Group]) -> Plate:
+def time_plate(flight: Flight, name: str, heading: str, what: str, groups: list[Group]) -> Plate:
+    """Return groups over time, one panel each, with close-ups where there are cycles.
+
+    ``what`` is the first words of the caption.
+    """
     cycles = flight.cycles
     rows, heights = [[1.0]], [2.3]
     if cycles is not None:
@@ -259,7 +269,7 @@ def momentum_plate(flight: Flight) -> Plate | str:
     above.set_title("change of the total momenta since the start")
     above.set_ylabel("SI units")
     above.minorticks_off()
-    above.yaxis.set_major_formatter(lambda value, _: _power_of_ten(value))
+    above.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
     names = ("|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)")
     legend_above(above, [key(colour(i), name) for i, name in enumerate(names)])
     energy = ledger[:, 6:7]
@@ -268,18 +278,18 @@ def momentum_plate(flight: Flight) -> Plate | str:
     below.set_title("kinetic energy")
     below.set_ylabel("J")
     set_time(below, 0.0, flight.end)
+    largest_of = ", the largest in each slice of time" if len(time) > 2 * SLICES else ""
     caption = (
         "The ledger that the plant keeps of the whole system. Top: how far the linear momentum p "
         "and the angular momentum L about the centre of mass are from their values at the start, "
-        "what thrusters have put in taken off"
-        f"{', the largest in each slice of time' if dense else ''}, on a logarithmic axis; less "
-        "than it shows, and zero, lies on its lower edge. Bottom: kinetic energy."
+        f"what thrusters have put in taken off{largest_of}, on a logarithmic axis; less than it "
+        "shows, and zero, lies on its lower edge. Bottom: kinetic energy."
     )
     caption += f" {BAND}" if dense else ""
     return Plate("momentum", "Momentum ledger", caption, svg_of(figure))
 
 
-def _power_of_ten(value: float) -> str:
+def power_of_ten(value: float) -> str:
     """Return a power of ten as it is written, for a logarithmic axis."""
     exponent = str(round(np.log10(value))).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"10{exponent}"

@@ -89,7 +89,8 @@ def loops_plate(flight: Flight) -> Plate | str:
     part = flight.shape
     if cycles is not None:
         part = part.between(*cycles.last(SHOWN_CYCLES))
-    figure, (row, *_) = sheet([[1.0] * _LOOP_JOINTS], [2.35])
+    one = len(pairs) == 1
+    figure, (row, *_) = sheet([[1.0] * (2 if one else _LOOP_JOINTS)], [3.4 if one else 2.35])
     for axes in row[len(pairs) :]:
         axes.set_visible(False)
     for axes, (i, j) in zip(row[: len(pairs)], pairs, strict=True):
@@ -103,13 +104,15 @@ def loops_plate(flight: Flight) -> Plate | str:
         axes.set_xlabel(f"{names[i]} ({units[0]})")
         axes.set_ylabel(f"{names[j]} ({units[1]})")
         if cycles is not None:
-            one = part.between(cycles.end - cycles.period, cycles.end).values
-            area = _signed_area(one[:, i], one[:, j])
+            last = part.between(cycles.end - cycles.period, cycles.end).values
+            area = _signed_area(last[:, i], last[:, j])
             unit = {"m": "m²", "rad": "rad²"}.get(units[0] if units[0] == units[1] else "", "SI")
             axes.set_title(f"area {area:+.4g} {unit}")
             _arrow(axes, x, y)
     if cycles is None:
-        caption = "Path in shape space; a circle marks the first shape, a dot the last."
+        caption = (
+            "Joint positions against each other; a circle marks the first shape, a dot the last."
+        )
     else:
         caption = (
             f"The last {SHOWN_CYCLES} of {cycles.count} cycles in shape space. Each begins and "
@@ -118,7 +121,8 @@ def loops_plate(flight: Flight) -> Plate | str:
         )
     if len(flight.joint_names) > _LOOP_JOINTS:
         caption += f" The first three of {len(flight.joint_names)} joints are shown."
-    return Plate("loops", "Loops in shape space", caption, svg_of(figure))
+    heading = "Path in shape space" if cycles is None else "Loops in shape space"
+    return Plate("loops", heading, caption, svg_of(figure))
 
 
 def _set_across(axes: Axes, values: Array) -> None:

@@ -1,4 +1,4 @@
-"""The page of a report: HTML that stands alone, without scripts and without anything to fetch."""
+"""The page of a report: HTML that stands alone, without anything to fetch."""
 
 from __future__ import annotations
 
@@ -6,9 +6,17 @@ import base64
 from collections.abc import Sequence
 from html import escape
 
+from spacerobot_ros.app.report.animation import Player
 from spacerobot_ros.app.report.flight import Flight
 from spacerobot_ros.app.report.style import Plate
-from spacerobot_ros.app.report.tables import Table, joint_table, published_table, result_table
+from spacerobot_ros.app.report.tables import (
+    Table,
+    headline,
+    joint_table,
+    published_table,
+    result_table,
+    runs_table,
+)
 
 _CSS = """
 :root { color-scheme: light; --ink: #1f2328; --muted: #5b6472; --line: #dfe3e8; --wash: #f6f7f9;
@@ -50,6 +58,33 @@ details { margin-top: .75rem; font-size: .92rem; }
 summary { cursor: pointer; color: var(--muted); }
 code { font-family: ui-monospace, "Liberation Mono", Menlo, monospace; font-size: .95em; }
 footer { margin-top: 3rem; color: var(--muted); font-size: .88rem; }
+.tiles { display: grid; gap: .6rem; margin: 1.25rem 0; padding: 0;
+  grid-template-columns: repeat(auto-fit, minmax(min(10.5rem, 45%), 1fr)); }
+.tiles div { border: 1px solid var(--line); border-radius: 6px; padding: .5rem .75rem; }
+.tiles dt { color: var(--muted); font-size: .82rem; }
+.tiles dd { margin: 0; font-size: 1.12rem; font-weight: 600; font-variant-numeric: tabular-nums;
+  overflow-wrap: anywhere; }
+.tiles small { display: block; color: var(--muted); font-weight: 400; font-size: .8rem; }
+#animation { margin: 1.5rem 0 2rem; }
+#stage { position: relative; border: 1px solid var(--line); border-radius: 6px; overflow: hidden;
+  background: var(--wash); }
+#pane { width: 100%; height: clamp(300px, 62vh, 640px); }
+#stage .dg.main, #stage .dg .close-button { max-width: 100%; }
+#stage .dg.main .close-button { background: transparent; color: var(--muted); }
+#bar { display: flex; flex-wrap: wrap; gap: .5rem .75rem; align-items: center; margin-top: .6rem; }
+#bar button, #bar select { font: inherit; font-size: .9rem; color: var(--ink); background: #fff;
+  border: 1px solid var(--line); border-radius: 6px; padding: .35rem .7rem; min-height: 2.3rem; }
+#bar button { min-width: 5em; cursor: pointer; }
+#time { flex: 1 1 14rem; min-width: 10rem; accent-color: var(--tone); }
+#now { min-width: 9.5em; font-variant-numeric: tabular-nums; font-size: .9rem; }
+.caption { color: var(--muted); font-size: .92rem; max-width: 60em; }
+.caption b { color: var(--ink); }
+#animation > .missing { display: none; }
+.without #stage, .without #bar, .without .caption { display: none; }
+#animation.without > .missing { display: block; }
+@media (max-width: 600px) { main { padding: 1.25rem .9rem 2rem; } h1 { font-size: 1.5rem; }
+  #pane { height: 70vw; } .tiles dd { font-size: 1rem; } }
+@media print { #animation { display: none; } }
 @media print { figure { break-inside: avoid; } main { max-width: none; padding: 0; } }
 """
 
@@ -57,8 +92,13 @@ _SCROLL = '<div class="scroll">'
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
-def page(flight: Flight, plates: Sequence[Plate | str]) -> str:
-    """Return the whole page."""
+def page(
+    flight: Flight,
+    player: Player,
+    plates: Sequence[Plate | str | None],
+    beside: Sequence[Flight] = (),
+) -> str:
+    """Return the whole page; flights ``beside`` this one get a row in a table."""
     name = flight.scenario
     title = ", ".join(filter(None, (name, flight.method, flight.robot_name)))
     body = [
@@ -67,7 +107,10 @@ def page(flight: Flight, plates: Sequence[Plate | str]) -> str:
         f"<p>{escape(flight.description)}</p>" if flight.description else "",
         _facts(flight),
         _outcome(flight),
+        _tiles(flight),
         "</header>",
+        *_runs(flight, beside),
+        player.markup,
         *_numbers(flight),
         *_published(flight),
         "<h2>Figures</h2>",
@@ -75,14 +118,15 @@ def page(flight: Flight, plates: Sequence[Plate | str]) -> str:
         *_parameters(flight),
         _footer(flight),
     ]
+    policy = "; ".join(filter(None, (_POLICY, player.policy)))
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<link rel="icon" href="data:,">\n'
         f"<title>{escape(title)}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n<main>\n"
         + "\n".join(part for part in body if part)
-        + "\n</main>\n</body>\n</html>\n"
+        + f"\n</main>\n{player.scripts}\n</body>\n</html>\n"
     )
 
 
@@ -110,6 +154,21 @@ def _outcome(flight: Flight) -> str:
         sentence += " The recording ends before that is decided."
     state = f"<b>{escape(last.state.capitalize())}</b>" if last.state else ""
     return f'<p class="outcome {escape(last.state)}">{state}{escape(sentence)}</p>'
+
+
+def _tiles(flight: Flight) -> str:
+    """The numbers of the run that are looked for first."""
+    made = []
+    for label, value, note in headline(flight):
+        small = f"<small>{escape(note)}</small>" if note else ""
+        made.append(f"<div><dt>{escape(label)}</dt><dd>{escape(value)}{small}</dd></div>")
+    return f'<dl class="tiles">{"".join(made)}</dl>' if made else ""
+
+
+def _runs(flight: Flight, beside: Sequence[Flight]) -> list[str]:
+    if not beside:
+        return []
+    return ["<h2>Runs side by side</h2>", _table("runs", runs_table([flight, *beside]))]
 
 
 def _numbers(flight: Flight) -> list[str]:
@@ -156,12 +215,12 @@ def _table(identity: str, table: Table) -> str:
     )
 
 
-def _figures(plates: Sequence[Plate | str]) -> list[str]:
+def _figures(plates: Sequence[Plate | str | None]) -> list[str]:
     parts, number = [], 0
     for sentence in dict.fromkeys(plate for plate in plates if isinstance(plate, str)):
         parts.append(f'<p class="missing">{escape(sentence)}</p>')
     for plate in plates:
-        if isinstance(plate, str):
+        if not isinstance(plate, Plate):
             continue
         number += 1
         data = base64.b64encode(plate.svg).decode()

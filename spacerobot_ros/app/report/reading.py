@@ -24,6 +24,10 @@ _TYPES = {
     "planner/status": "diagnostic_msgs/msg/DiagnosticStatus",
     "controller/status": "diagnostic_msgs/msg/DiagnosticStatus",
     "goal_pose": "geometry_msgs/msg/PoseStamped",
+    "end_effector/goal_pose": "geometry_msgs/msg/PoseStamped",
+    "end_effector_pose": "geometry_msgs/msg/PoseStamped",
+    "base_wrench": "geometry_msgs/msg/WrenchStamped",
+    "joint_commands": "sensor_msgs/msg/JointState",
     "planned_path": "nav_msgs/msg/Path",
     "robot_description": "std_msgs/msg/String",
 }
@@ -51,9 +55,9 @@ def read_flight(path: Path) -> Flight:
     odom, joints = space["odom"], space["joint_states"]
     first = next(joints.messages())[1] if joints is not None else None
     names = [str(name) for name in first.name] if first is not None else []
-    pose = [f"pose.pose.position.{x}" for x in "xyz"]
-    pose += [f"pose.pose.orientation.{x}" for x in "xyzw"]
-    base = space.signal(odom, pose, 7)
+    base = space.signal(odom, _pose("pose.pose."), 7)
+    twist = [f"twist.twist.{part}.{x}" for part in ("linear", "angular") for x in "xyz"]
+    wrench = [f"wrench.{part}.{x}" for part in ("force", "torque") for x in "xyz"]
     attitude = Signal(base.time, rotvecs(base.values[:, 3:]))
     return Flight(
         file_name=bag.path.name,
@@ -65,14 +69,20 @@ def read_flight(path: Path) -> Flight:
         quaternion=base.values[:, 3:],
         attitude=attitude,
         shape=space.signal(joints, ["position"], len(names)),
+        twist=space.signal(odom, twist, 6),
         rates=space.signal(joints, ["velocity"], len(names)),
         momentum=_ledger(space),
+        tool=space.signal(space["end_effector_pose"], _pose("pose."), 7),
+        wrench=space.signal(space["base_wrench"], wrench, 6),
+        efforts=_efforts(space, names),
         statuses=[
             Status(time, message.message, {pair.key: pair.value for pair in message.values})
             for time, message in space.messages("planner/status")
             or space.messages("controller/status")
         ],
-        sent=_goals(space, odom),
+        sent=_goals(space, odom, "goal_pose"),
+        tool_goals=_goals(space, odom, "end_effector/goal_pose"),
+        outputs=_outputs(space),
         planned=[
             np.array([[getattr(p.pose.position, x) for x in "xyz"] for p in message.poses]).reshape(
                 -1, 3
@@ -88,6 +98,7 @@ class _Namespace:
     def __init__(self, bag: Bag, prefix: str) -> None:
         self._bag, self._prefix = bag, prefix
         states = [s for name in ("odom", "joint_states", "momentum") if (s := self[name])]
+        self.actuation = bag.metadata.get("parameters/plant", {}).get("actuation", "").strip('"')
         self._stamped = all(abs(s.stamp[0] - s.time[0]) < _SAME_CLOCK for s in states)
         self._began = min((self._times(s)[0] for s in states), default=bag.start_time)
 
@@ -148,11 +159,42 @@ def _robot(bag: Bag, space: _Namespace) -> RobotDescription | None:
     return None
 
 
-def _goals(space: _Namespace, odom: TopicSeries | None) -> list[tuple[float, Goal]]:
+def _pose(before: str) -> list[str]:
+    """Fields of a pose: position, then quaternion x, y, z, w."""
+    return [f"{before}position.{x}" for x in "xyz"] + [f"{before}orientation.{x}" for x in "xyzw"]
+
+
+def _efforts(space: _Namespace, names: list[str]) -> Signal:
+    """Return the commanded joint efforts (N, n), by the names of the states."""
+    nothing = Signal(np.empty(0), np.empty((0, len(names))))
+    # Commands of velocities hold no efforts, and reading them takes a while.
+    commands = space["joint_commands"] if space.actuation != "velocity" else None
+    if commands is None:
+        return nothing
+    given = [str(name) for name in next(commands.messages())[1].name]
+    if sorted(given) != sorted(names):
+        return nothing
+    efforts = space.signal(commands, ["effort"], len(names))
+    return Signal(efforts.time, efforts.values[:, [given.index(name) for name in names]])
+
+
+def _outputs(space: _Namespace) -> frozenset[str]:
+    """Names of what the controller says the errors of; none where a planner has the goals."""
+    if space["planner/status"] is not None:
+        return frozenset()
+    return frozenset(
+        pair.key.removeprefix("error.")
+        for _, message in space.messages("controller/status")
+        for pair in message.values
+        if pair.key.startswith("error.")
+    )
+
+
+def _goals(space: _Namespace, odom: TopicSeries | None, topic: str) -> list[tuple[float, Goal]]:
     """Goal poses that are poses in the frame of the odometry."""
     world = next(odom.messages())[1].header.frame_id if odom is not None else ""
     goals = []
-    for time, message in space.messages("goal_pose"):
+    for time, message in space.messages(topic):
         p, o = message.pose.position, message.pose.orientation
         try:
             goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w])

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import heapq
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from spacerobot_ros.model.description import Array
 
+Indices = npt.NDArray[np.int64]
+
 _FEWEST_CYCLES = 12
+_STRETCHES = 64
+"""Stretches a long recording is first cut into before it is simplified, which bounds the work."""
+
 _LONGEST_LOOK = 1 << 14
 """Samples at the end of a gait in which a period is looked for."""
 
@@ -70,6 +78,45 @@ def envelope(signal: Signal, column: int, columns: int) -> tuple[Array, Array, A
     # The band reaches from the very first sample to the very last.
     time[0], time[-1] = signal.time[0], signal.time[-1]
     return time, low, high
+
+
+def simplified(motion: Signal, most: int) -> tuple[Indices, float]:
+    """Drop samples that lie on the line between others (Douglas and Peucker), the worst kept first.
+
+    Parameters
+    ----------
+    motion
+        Each column divided by its tolerance.
+    most
+        Samples to keep at most, and some dozens that are kept anyhow.
+
+    Returns
+    -------
+    The samples kept, and the largest distance, in tolerances, of one that was dropped.
+    """
+    bounds = np.unique(np.linspace(0, len(motion) - 1, _STRETCHES + 1).astype(int)).tolist()
+    if len(bounds) < 2:
+        return np.array(bounds, np.int64), 0.0
+    kept = set(bounds)
+    heap = [_worst(motion, a, b) for a, b in itertools.pairwise(bounds)]
+    heapq.heapify(heap)
+    while -heap[0][0] > 1.0 and len(kept) < most:
+        _, a, b, k = heapq.heappop(heap)
+        kept.add(k)
+        heapq.heappush(heap, _worst(motion, a, k))
+        heapq.heappush(heap, _worst(motion, k, b))
+    return np.array(sorted(kept), np.int64), -heap[0][0]
+
+
+def _worst(motion: Signal, a: int, b: int) -> tuple[float, int, int, int]:
+    """Minus the largest distance from the line between samples a and b, a, b, and where it is."""
+    if b - a < 2:
+        return 0.0, a, b, a
+    time, values = motion.time[a : b + 1], motion.values[a : b + 1]
+    share: Array = ((time - time[0]) / max(time[-1] - time[0], 1e-12))[:, np.newaxis]
+    off = np.abs(values - values[0] - share * (values[-1] - values[0])).max(axis=1, initial=0.0)
+    k = int(np.argmax(off))
+    return -float(off[k]), a, b, a + k
 
 
 def rotvecs(quaternions: Array) -> Array:

@@ -15,7 +15,7 @@ from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shap
 from spacerobot_ros.model.kinematics import tree_kinematics
 
 _BASE = "#c4c9d2"
-_EDGE = "#3d4450"
+EDGE = "#3d4450"
 _AROUND = 24
 """Facets around a cylinder or sphere."""
 
@@ -37,25 +37,43 @@ class Solids:
         return np.concatenate([f.corners for f in self.faces] + [e.line for e in self.edges])
 
 
-def robot_solids(robot: RobotDescription, q: Array, base: Pose) -> Solids:
-    """Return the robot at joint positions ``q`` (n,), its base at a pose in the world.
+class SolidRobot:
+    """A robot that can be asked where its links are and what it looks like."""
 
-    A robot without boxes, cylinders and spheres is drawn as lines between its bodies.
-    """
-    poses = {name: base @ pose for name, pose in _link_poses(robot, q).items()}
-    solids = Solids()
-    for link in robot.links:
-        fill = _tint(robot, link.name)
-        for shape in link.shapes:
-            pose = poses[link.name] @ shape.pose
-            for corners, normal in _facets(shape):
-                solids.faces.append(Face(pose.r + corners @ pose.R.T, pose.R @ normal, fill))
-            if not _is_rod(shape):
-                solids.edges += [
-                    Edge(pose.r + line @ pose.R.T, normals @ pose.R.T, _rgb(_EDGE))
-                    for line, normals in _edges(shape)
-                ]
-    return solids if solids.faces else _skeleton(robot, poses)
+    def __init__(self, robot: RobotDescription) -> None:
+        self.robot = robot
+        kinematics = tree_kinematics(robot)
+        frames = [kinematics.frame(link.name) for link in robot.links]
+        poses = [x for R, r, _ in frames for x in (R, r)]
+        self._evaluate = ca.Function("poses", [kinematics.q], poses)
+
+    def link_poses(self, q: Array, base: Pose) -> dict[str, Pose]:
+        """Poses of all links in the world, at joint positions ``q`` (n,) and a pose of the base."""
+        values = [np.array(value) for value in self._evaluate.call([ca.DM(q)])]
+        return {
+            link.name: base @ Pose(R, r.ravel())
+            for link, R, r in zip(self.robot.links, values[::2], values[1::2], strict=True)
+        }
+
+    def at(self, q: Array, base: Pose) -> Solids:
+        """Return the robot at joint positions ``q`` (n,), its base at a pose in the world.
+
+        A robot without boxes, cylinders and spheres is drawn as lines between its bodies.
+        """
+        poses = self.link_poses(q, base)
+        solids = Solids()
+        for link in self.robot.links:
+            fill = _rgb(link_color(self.robot, link.name))
+            for shape in link.shapes:
+                pose = poses[link.name] @ shape.pose
+                for corners, normal in _facets(shape):
+                    solids.faces.append(Face(pose.r + corners @ pose.R.T, pose.R @ normal, fill))
+                if not is_rod(shape):
+                    solids.edges += [
+                        Edge(pose.r + line @ pose.R.T, normals @ pose.R.T, _rgb(EDGE))
+                        for line, normals in _edges(shape)
+                    ]
+        return solids if solids.faces else _skeleton(self.robot, poses)
 
 
 def base_outlines(robot: RobotDescription, base: Pose) -> list[Array]:
@@ -66,20 +84,8 @@ def base_outlines(robot: RobotDescription, base: Pose) -> list[Array]:
         if body == 0:
             for shape in link.shapes:
                 placed = base @ pose @ shape.pose
-                lines += [placed.r + line @ placed.R.T for line in _outline(shape)]
+                lines += [placed.r + line @ placed.R.T for line in outline(shape)]
     return lines or _cross(base)
-
-
-def _link_poses(robot: RobotDescription, q: Array) -> dict[str, Pose]:
-    """Poses of all links in the base frame."""
-    kinematics = tree_kinematics(robot)
-    frames = [kinematics.frame(link.name) for link in robot.links]
-    evaluate = ca.Function("poses", [kinematics.q], [x for R, r, _ in frames for x in (R, r)])
-    values = [np.array(value) for value in evaluate.call([ca.DM(q)])]
-    return {
-        link.name: Pose(R, r.ravel())
-        for link, R, r in zip(robot.links, values[::2], values[1::2], strict=True)
-    }
 
 
 def _rgb(name: str) -> Colour:
@@ -87,14 +93,26 @@ def _rgb(name: str) -> Colour:
     return r, g, b
 
 
-def _tint(robot: RobotDescription, link: str) -> Colour:
+def link_color(robot: RobotDescription, link: str) -> str:
+    """Return the color of a link: that of the joint that moves it, grey on the base."""
     body = robot.frames[link][0]
-    return _rgb(_BASE if body == 0 else colour(body - 1))
+    return _BASE if body == 0 else colour(body - 1)
 
 
-def _is_rod(shape: Shape) -> bool:
+def is_rod(shape: Shape) -> bool:
+    """Whether a shape is too thin to draw its edges."""
     size = sorted(shape.size) if shape.kind == "box" else [0.0, 1.0, 1.0]
     return size[1] < _ROD * size[2]
+
+
+def outline(shape: Shape) -> list[Array]:
+    """Lines (k, 3) that show a solid without hiding what is behind: its axis if it is a rod."""
+    if shape.kind == "sphere":
+        return [shape.size[0] * np.roll(_ring(), k, axis=1) for k in range(3)]
+    if is_rod(shape):
+        longest = int(np.argmax(shape.size))
+        return [np.outer([-0.5, 0.5], np.eye(3)[longest] * shape.size[longest])]
+    return [line for line, _ in _edges(shape)]
 
 
 def _facets(shape: Shape) -> list[tuple[Array, Array]]:
@@ -149,16 +167,6 @@ def _edges(shape: Shape) -> list[tuple[Array, Array]]:
     return found
 
 
-def _outline(shape: Shape) -> list[Array]:
-    """Lines (k, 3) that show a solid without hiding what is behind: its axis if it is a rod."""
-    if shape.kind == "sphere":
-        return [shape.size[0] * np.roll(_ring(), k, axis=1) for k in range(3)]
-    if _is_rod(shape):
-        longest = int(np.argmax(shape.size))
-        return [np.outer([-0.5, 0.5], np.eye(3)[longest] * shape.size[longest])]
-    return [line for line, _ in _edges(shape)]
-
-
 def _ring() -> Array:
     """Points (k, 3) around the unit circle, the first also the last."""
     angles = np.linspace(0.0, 2 * np.pi, _AROUND + 1)
@@ -173,7 +181,7 @@ def _cross(pose: Pose) -> list[Array]:
 def _skeleton(robot: RobotDescription, poses: dict[str, Pose]) -> Solids:
     """Lines from each body to those it carries, and a cross at the base."""
     nowhere = np.empty((0, 2, 3))
-    edges = [Edge(line, nowhere, _rgb(_EDGE)) for line in _cross(poses[robot.base_link])]
+    edges = [Edge(line, nowhere, _rgb(EDGE)) for line in _cross(poses[robot.base_link])]
     for index, body in enumerate(robot.bodies[1:]):
         ends = np.array([poses[robot.bodies[body.parent].name].r, poses[body.name].r])
         edges.append(Edge(ends, nowhere, _rgb(colour(index))))

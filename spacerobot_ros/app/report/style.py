@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from spacerobot_ros.app.report.signals import Signal, envelope
+from spacerobot_ros.app.report.signals import Signal, envelope, simplified
 from spacerobot_ros.model.description import Array
 
 INK, MUTED, FAINT = "#1f2328", "#667085", "#c3c8d0"
@@ -26,11 +26,20 @@ _TOL = ("#332288", "#882255", "#999933", "#44AA99")
 PALETTE = (*_OKABE_ITO, *_TOL)
 """Colours that people with any colour vision tell apart."""
 
+GHOST = PALETTE[3]
+"""Of goals in space."""
+
 WIDTH = 9.6
 """Width of a figure, inches."""
 
 COLUMNS = 960
 """Slices of time across a figure in which a dense trace is summed up."""
+
+SLICES = 240
+"""Slices of time in which what matters is the largest value."""
+
+_UNSEEN = 5e-4
+"""Of the height of a panel, what a line may leave out."""
 
 _PATH_DATA = re.compile(rb' d="[^"]*"')
 _DECIMALS = re.compile(rb"(\.\d\d)\d+")
@@ -167,36 +176,54 @@ def draw_traces(
 ) -> bool:
     """Draw every column of a signal; return whether any was summed up as a band.
 
-    Where there are more samples than the panel, ``share`` of a figure's width, has room for, a
-    band spans the smallest and the largest value in each slice of time.
+    A line leaves out samples that nobody could see beside it. Where it would still have more of
+    them than the panel, ``share`` of a figure's width, has room for, a band spans the smallest and
+    the largest value in each slice of time.
     """
     columns = max(int(COLUMNS * share), 20)
-    dense = len(signal) > 2 * columns
+    low, high = axes.get_ylim()
+    dense = False
     for index, tint in enumerate(colours):
-        if dense:
-            time, low, high = envelope(signal, index, columns)
+        values = factor * signal.values[:, index]
+        in_sight = Signal(signal.time, values[:, np.newaxis] / (_UNSEEN * (high - low)))
+        crowded = len(signal) > 2 * columns
+        if crowded and _shakes(in_sight, columns):
+            kept, off = np.empty(0, np.int64), np.inf
+        else:
+            kept, off = simplified(in_sight, columns)
+        if off > 1.0 and crowded:
+            dense = True
+            time, least, most = envelope(signal, index, columns)
             axes.fill_between(
                 time,
-                factor * low,
-                factor * high,
+                factor * least,
+                factor * most,
                 facecolor=(*mpl.colors.to_rgb(tint), 0.3),
                 edgecolor=tint,
                 linewidth=0.9,
                 zorder=2.5,
             )
-        else:
-            marker = "o" if len(signal) < 3 else ""
-            axes.plot(
-                signal.time, factor * signal.values[:, index], color=tint, marker=marker, ms=4
-            )
+            continue
+        if off > 1.0:
+            kept = np.arange(len(signal))
+        marker = "o" if len(signal) < 3 else ""
+        axes.plot(signal.time[kept], values[kept], color=tint, marker=marker, ms=4)
     return dense
+
+
+def _shakes(signal: Signal, columns: int) -> bool:
+    """Whether a signal, in tolerances, is mostly off the line through so many of its samples."""
+    nodes = np.linspace(0, len(signal) - 1, columns + 1).astype(int)
+    values = signal.values[:, 0]
+    line = np.interp(signal.time, signal.time[nodes], values[nodes])
+    return bool(np.mean(np.abs(values - line) > 1.0) > 0.5)
 
 
 def upper_edge(signal: Signal, column: int) -> tuple[Array, Array]:
     """Return times and values to draw: the largest in each slice of time where it is dense."""
-    if len(signal) <= 2 * COLUMNS:
+    if len(signal) <= 2 * SLICES:
         return signal.time, signal.values[:, column]
-    time, _, high = envelope(signal, column, COLUMNS)
+    time, _, high = envelope(signal, column, SLICES)
     return time, high
 
 

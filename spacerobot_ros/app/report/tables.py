@@ -12,6 +12,7 @@ from spacerobot_ros.app.report.figures import joint_unit
 from spacerobot_ros.app.report.flight import Flight
 from spacerobot_ros.app.scenario import Published
 from spacerobot_ros.model.attitude import rotvec_from_quaternion
+from spacerobot_ros.planning import PoseError
 
 _ABSENT = "–"
 
@@ -25,24 +26,64 @@ class Table:
     numeric: tuple[int, ...] = ()
 
 
+def headline(flight: Flight) -> list[tuple[str, str, str]]:
+    """Label, value and a note for each of the numbers that stand on top."""
+    rows: list[tuple[str, str, str]] = []
+    error, tool = flight.final_error, flight.tool_error
+    if error is not None:
+        if flight.position_counts:
+            rows.append(("Position error", f"{error.distance:.3g} m", ""))
+        angle = f"{math.degrees(error.angle):.3g}°"
+        rows.append(("Attitude error", f"{error.angle:.3g} rad", angle))
+    if tool is not None:
+        turned = set(flight.controls("end_effector")) & {3, 4, 5}
+        note = f"{tool.angle:.3g} rad" if turned else ""
+        rows.append(("End-effector error", f"{tool.distance:.3g} m", note))
+    if flight.manoeuvre_time is not None:
+        rows.append(("Manoeuvre", f"{flight.manoeuvre_time:.6g} s", ""))
+    if flight.method:
+        rows.append(("Method", flight.method, ""))
+    if len(flight.momentum):
+        drift = f"{flight.drift(0):.1e} kg m/s"
+        rows.append(("Momentum drift", drift, f"angular {flight.drift(3):.1e} kg m²/s"))
+    if len(flight.position) > 1:
+        time = flight.position.time
+        rows.append(("Recorded", f"{len(time) - 1} ticks", f"{time[-1] - time[0]:.6g} s"))
+    return rows
+
+
+def runs_table(flights: Sequence[Flight]) -> Table:
+    """What several flights came to, a row each: the numbers on top that any of them has."""
+    found = [{label: value for label, value, _ in headline(flight)} for flight in flights]
+    labels = list(dict.fromkeys(label for values in found for label in values))
+    rows = [
+        (flight.file_name, *(values.get(label, _ABSENT) for label in labels))
+        for flight, values in zip(flights, found, strict=True)
+    ]
+    return Table(("Bag", *labels), rows)
+
+
 def result_table(flight: Flight) -> Table:
     """Goal, end, errors, times and momentum drift: the rows that the bag has numbers for."""
     rows: list[tuple[str, ...]] = []
     goal, error = flight.goal, flight.final_error
-    if goal is not None:
+    if goal is not None and (flight.controls("base") or not flight.outputs):
         last = flight.statuses[-1].state if flight.statuses else ""
         refused = " (refused)" if last == "refused" and not flight.executing else ""
-        rows.append((f"Goal position{refused}", f"({_vector(goal.position)}) m"))
+        if flight.position_counts:
+            rows.append((f"Goal position{refused}", f"({_vector(goal.position)}) m"))
         rows.append((f"Goal attitude{refused}", _attitude(rotvec_from_quaternion(goal.quaternion))))
     if len(flight.position):
         rows.append(("Final position", f"({_vector(flight.position.values[-1])}) m"))
         rows.append(("Final attitude", _attitude(rotvec_from_quaternion(flight.quaternion[-1]))))
     if error is not None:
-        rows.append(
-            ("Position error", f"{error.distance:.4g} m{_tolerance(flight, 'position', 'm')}")
-        )
+        if flight.position_counts:
+            left = f"{error.distance:.4g} m{_tolerance(flight, 'position', 'm')}"
+            rows.append(("Position error", left))
         angle = f"{error.angle:.4g} rad = {math.degrees(error.angle):.4g}°"
         rows.append(("Attitude error", f"{angle}{_tolerance(flight, 'attitude', 'rad')}"))
+    if flight.tool_error is not None:
+        rows += _tool_rows(flight, flight.tool_error)
     if flight.manoeuvre_time is not None:
         rows.append(("Manoeuvre time", f"{flight.manoeuvre_time:.6g} s{_schedules(flight)}"))
     if len(flight.position):
@@ -51,6 +92,19 @@ def result_table(flight: Flight) -> Table:
         drifts = f"{flight.drift(0):.3g} kg m/s, angular {flight.drift(3):.3g} kg m²/s"
         rows.append(("Momentum drift", f"linear {drifts}"))
     return Table(("Quantity", "Value"), rows)
+
+
+def _tool_rows(flight: Flight, error: PoseError) -> list[tuple[str, ...]]:
+    goal, last = flight.tool_goals[-1][1], flight.tool.values[-1]
+    rows: list[tuple[str, ...]] = [
+        ("End-effector goal", f"({_vector(goal.position)}) m"),
+        ("End-effector, final", f"({_vector(last[:3])}) m"),
+        ("End-effector error", f"{error.distance:.4g} m"),
+    ]
+    if set(flight.controls("end_effector")) & {3, 4, 5}:
+        angle = f"{error.angle:.4g} rad = {math.degrees(error.angle):.4g}°"
+        rows.append(("End-effector attitude error", angle))
+    return rows
 
 
 def joint_table(flight: Flight) -> Table | None:

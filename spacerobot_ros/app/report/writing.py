@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from spacerobot_ros.app.report.animation import player_of
 from spacerobot_ros.app.report.figures import (
     NO_STATES,
     attitude_group,
@@ -17,17 +19,20 @@ from spacerobot_ros.app.report.figures import (
     shape_groups,
     shape_plate,
 )
+from spacerobot_ros.app.report.figures_control import efforts_plate, errors_plate, twist_plate
+from spacerobot_ros.app.report.figures_cycles import cycles_plate
 from spacerobot_ros.app.report.figures_joints import loops_plate, rates_plate
+from spacerobot_ros.app.report.figures_path import path_plate
 from spacerobot_ros.app.report.figures_scene import (
+    configurations_plate,
     draw_goal_and_path,
     draw_robot,
-    path_plate,
-    robot_plate,
-    solids_at,
+    view_of,
 )
 from spacerobot_ros.app.report.flight import Flight
 from spacerobot_ros.app.report.page import page
 from spacerobot_ros.app.report.reading import read_flight
+from spacerobot_ros.app.report.scene import scene_of
 from spacerobot_ros.app.report.style import (
     WIDTH,
     legend_above,
@@ -46,30 +51,37 @@ _ROBOT_WIDTH = 3.9
 """Of the robot in the picture, inches."""
 
 _PLATES = (
+    configurations_plate,
     position_plate,
     attitude_plate,
+    cycles_plate,
     shape_plate,
     rates_plate,
     loops_plate,
+    errors_plate,
+    efforts_plate,
+    twist_plate,
     momentum_plate,
-    robot_plate,
-    path_plate,
 )
 
 
-def write_report(bag: Path, html: Path) -> None:
+def write_report(bag: Path, html: Path, beside: Sequence[Path] = ()) -> None:
     """Write the report of a bag as one HTML file, which needs nothing besides itself.
 
-    Any bag makes a page: what it does not hold is left out, with a sentence that says so.
+    Any bag makes a page: what it does not hold is left out, with a sentence that says so. Bags
+    ``beside`` it, of other methods to the same goal for one, get a row in a table and their paths
+    in the figure of paths.
 
     Raises
     ------
     SpaceRobotError
-        There is no such bag, it is damaged, or the file cannot be written.
+        There is no such bag, one is damaged, or the file cannot be written.
     """
     flight = read_flight(bag)
+    others = [read_flight(other) for other in beside]
     with paper_style():
-        text = page(flight, [plate(flight) for plate in _PLATES])
+        plates = [*(plate(flight) for plate in _PLATES), path_plate(flight, others)]
+        text = page(flight, player_of(scene_of(flight)), plates, others)
     _write(html, text.encode())
 
 
@@ -93,7 +105,8 @@ def _overview(flight: Flight) -> Figure:
     groups = [position_group(flight), attitude_group(flight)]
     if len(flight.shape):
         groups += shape_groups(flight)[:1]
-    robot = solids_at(flight, -1)
+    drawn = flight.drawn
+    robot = drawn.at(flight.joints[-1], flight.base_at(-1)) if drawn is not None else None
     height, gap, left = 1.25, 0.42, 0.72
     up = 0.5 + (height + gap) * len(groups) + 0.35
     figure = new_figure(up)
@@ -109,8 +122,9 @@ def _overview(flight: Flight) -> Figure:
     if robot is not None:
         size = _ROBOT_WIDTH - 0.15
         axes = panel(figure, WIDTH - size - 0.1, 0.2, size, up - 1.0)
-        draw_robot(axes, robot, robot.points())
-        legend_above(axes, draw_goal_and_path(axes, flight))
+        view = view_of(flight)
+        draw_robot(axes, robot, robot.points(), view)
+        legend_above(axes, draw_goal_and_path(axes, flight, view))
     title = f"{flight.scenario}: {flight.description}" if flight.description else flight.scenario
     figure.text(0.1 / WIDTH, 1 - 0.24 / up, title, size=10.5, weight="bold")
     return figure

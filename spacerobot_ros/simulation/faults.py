@@ -1,0 +1,216 @@
+"""What can go wrong, and when: a timeline of faults, each written as one line.
+
+``KIND TARGET [VALUE] [at SECONDS] [until SECONDS]``, for example
+``joint_stuck joint_2 at 10 until 50``. Without ``at`` a fault begins at once, without ``until`` it
+never ends. Kinds, their targets and what their values mean are in :data:`KINDS`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from spacerobot_ros.errors import ParameterError
+
+WRENCH_AXES = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
+"""Components of the thrusters' wrench on the base, base components."""
+
+POSE_AXES = (
+    "position_x",
+    "position_y",
+    "position_z",
+    "attitude_x",
+    "attitude_y",
+    "attitude_z",
+)
+"""Components of the measured pose: position in W, rotation vector in B."""
+
+GROUPS = ("position", "attitude", "velocity", "angular_velocity", "joints", "joint_rates")
+"""What sensors measure: the base's pose and twist, joint positions and rates."""
+
+
+@dataclass(frozen=True)
+class FaultKind:
+    """A kind of fault: its targets (``joint`` and ``nozzle`` stand for all names of such), and its
+    value if any.
+
+    ``value`` says what the number is, empty where a fault has none, ``minimum`` and ``maximum``
+    bound it. ``sensor`` are the kinds that change what is measured and not what happens.
+    """
+
+    targets: tuple[str, ...]
+    value: str = ""
+    minimum: float = -math.inf
+    maximum: float = math.inf
+    sensor: bool = False
+
+
+KINDS: dict[str, FaultKind] = {
+    "joint_stuck": FaultKind(("joint",)),
+    "joint_slow": FaultKind(("joint",), "factor on the command", 0.0, 1.0),
+    "actuator_bias": FaultKind(("joint",), "added to the command, in its unit"),
+    "actuator_noise": FaultKind(("joint",), "1 sigma on the command, in its unit", 0.0),
+    "thruster_stuck": FaultKind(
+        WRENCH_AXES, "held whatever is commanded, N or N m"
+    ),
+    "thruster_off": FaultKind((*WRENCH_AXES, "all")),
+    "thruster_weak": FaultKind((*WRENCH_AXES, "all"), "factor on the command", 0.0, 1.0),
+    "nozzle_open": FaultKind(("nozzle",)),
+    "nozzle_closed": FaultKind(("nozzle",)),
+    "nozzle_weak": FaultKind(("nozzle",), "factor on the thrust", 0.0, 1.0),
+    "sensor_bias": FaultKind(
+        (*POSE_AXES, "joint"), "added to the measurement, m or rad", sensor=True
+    ),
+    "sensor_noise": FaultKind(GROUPS, "1 sigma a component, m or rad (/s)", 0.0, sensor=True),
+    "sensor_dropout": FaultKind(("odom",), sensor=True),
+    "sensor_delay": FaultKind(("odom",), "s, to whole ticks", 0.0, 60.0, sensor=True),
+}
+"""The kinds of faults by name."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault: active from ``start`` s on and until before ``end`` s of simulated time."""
+
+    kind: str
+    target: str
+    value: float = 0.0
+    start: float = 0.0
+    end: float = math.inf
+
+    def __str__(self) -> str:
+        value = f" {self.value:g}" if KINDS[self.kind].value else ""
+        until = f" until {self.end:g}" if math.isfinite(self.end) else ""
+        return f"{self.kind} {self.target}{value} at {self.start:g}{until}"
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What faults can hit: joints by name, the thrusters' wrench if there is one, and the nozzles
+    that give it by name, if they are modelled.
+    """
+
+    joints: Sequence[str] = ()
+    wrench: bool = False
+    nozzles: Sequence[str] = ()
+
+    def of(self, kind: FaultKind) -> list[str]:
+        """Return the targets of a kind."""
+        names: list[str] = []
+        for target in kind.targets:
+            if target == "joint":
+                names += self.joints
+            elif target == "nozzle":
+                names += self.nozzles
+            elif self.wrench or target not in (*WRENCH_AXES, "all"):
+                names.append(target)
+        return names
+
+
+def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
+    """Read a fault from its line.
+
+    Parameters
+    ----------
+    line
+        As the module describes.
+    targets
+        What there is to hit.
+    now
+        When the fault begins if the line does not say, s.
+
+    Raises
+    ------
+    ParameterError
+        The line is no fault of this robot; the sentence quotes it.
+    """
+
+    def refusal(reason: str) -> ParameterError:
+        return ParameterError(f"The fault '{line.strip()[:80]}' is refused: {reason}.")
+
+    words = line.split()
+    if len(words) < 2:
+        raise refusal("it must be KIND TARGET [VALUE] [at SECONDS] [until SECONDS]")
+    name, target, *rest = words
+    if name not in KINDS:
+        raise refusal(f"there is no kind '{name}'; there are {', '.join(KINDS)}")
+    kind = KINDS[name]
+    known = targets.of(kind)
+    if not known:
+        raise refusal(f"this plant has nothing that {name} could hit")
+    if target not in known:
+        raise refusal(f"the target of {name} is one of {', '.join(known)}")
+    value = 0.0
+    if kind.value:
+        if not rest or rest[0] in ("at", "until"):
+            raise refusal(f"{name} needs a value: {kind.value}")
+        value = _number(rest.pop(0), refusal)
+        if not kind.minimum <= value <= kind.maximum:
+            top = f" to {kind.maximum:g}" if math.isfinite(kind.maximum) else " up"
+            raise refusal(f"its value is {value:g} and must be from {kind.minimum:g}{top}")
+    times = {"at": now, "until": math.inf}
+    if rest[0::2] not in ([], ["at"], ["until"], ["at", "until"]) or len(rest) % 2:
+        raise refusal(f"after {name} {target} come only 'at SECONDS' and 'until SECONDS'")
+    for word, text in zip(rest[0::2], rest[1::2], strict=True):
+        times[word] = _number(text, refusal)
+    if not times["until"] > times["at"]:
+        raise refusal(f"it ends at {times['until']:g} s and begins at {times['at']:g} s")
+    return Fault(name, target, value, times["at"], times["until"])
+
+
+def _number(text: str, refusal: Callable[[str], ParameterError]) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise refusal(f"'{text}' is not a finite number")
+    return number
+
+
+class FaultTimeline:
+    """The faults of one plant by time.
+
+    Parameters
+    ----------
+    lines
+        One fault each; see :func:`parse_fault`.
+    targets
+        What there is to hit.
+    """
+
+    def __init__(self, lines: Iterable[str], targets: Targets) -> None:
+        self._targets = targets
+        self.faults: list[Fault] = []
+        self.active: tuple[Fault, ...] = ()
+        """Another tuple whenever other faults are active than before."""
+        self.next_change = -math.inf
+        """When ``active`` changes next, s."""
+        self.read(lines)
+
+    def read(self, lines: Iterable[str], now: float = 0.0) -> None:
+        """Add a fault a line, which begins ``now`` (s) unless it says when.
+
+        Raises
+        ------
+        ParameterError
+            A line is no fault; none is added.
+        """
+        self.faults += [parse_fault(line, self._targets, now) for line in lines if line.strip()]
+        self.next_change = -math.inf
+
+    def clear(self) -> None:
+        """Forget every fault, those to come too."""
+        self.faults.clear()
+        self.next_change = -math.inf
+
+    def at(self, time: float) -> tuple[Fault, ...]:
+        """Return the faults that are active at a time (s), which must not run backwards."""
+        if time >= self.next_change:
+            active = tuple(f for f in self.faults if f.start <= time < f.end)
+            if active != self.active:
+                self.active = active
+            edges = [edge for f in self.faults for edge in (f.start, f.end) if edge > time]
+            self.next_change = min(edges, default=math.inf)
+        return self.active

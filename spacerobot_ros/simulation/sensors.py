@@ -1,0 +1,154 @@
+"""What a robot measures of itself: the truth with bias, noise, delay, and now and then nothing."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model.attitude import quaternion_from_rotvec, quaternion_multiply
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.simulation.faults import GROUPS, KINDS, POSE_AXES, Fault
+from spacerobot_ros.simulation.faults_plant import FaultyPlant
+
+_NOISES = {
+    "position": "position_noise",
+    "attitude": "attitude_noise",
+    "velocity": "velocity_noise",
+    "angular_velocity": "angular_velocity_noise",
+    "joints": "joint_noise",
+    "joint_rates": "joint_rate_noise",
+}
+"""The parameter of each group's noise."""
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """How the sensors of a robot with n joints err without faults; nothing by default.
+
+    ``noise`` is 1 sigma of every component by group (:data:`GROUPS`): position (m, in W), attitude
+    (rad, rotation vector in B), velocity (m/s) and angular velocity (rad/s, both in B), joints (m
+    or rad) and their rates. The biases are those of position and attitude (6,) and of the joints
+    (n,), empty: none.
+    """
+
+    noise: Mapping[str, float] = field(default_factory=dict)
+    pose_bias: Sequence[float] = (0.0,) * 6
+    joint_bias: Sequence[float] = ()
+    seed: int = 0
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> SensorModel:
+        """Return the model that the parameters ``sensors.*`` of a plant describe."""
+        return cls(
+            {group: values[f"sensors.{name}"] for group, name in _NOISES.items()},
+            [*values["sensors.position_bias"], *values["sensors.attitude_bias"]],
+            values["sensors.joint_bias"],
+            values["sensors.seed"],
+        )
+
+
+class Sensors:
+    """The measured state of a plant beside the true one.
+
+    ``pose`` (7,), ``twist`` (6,), ``q`` and ``qdot`` (n,) are what was measured last, arranged as
+    those of the plant. Each call of :meth:`measure` draws new noise from the seed, so a flight of
+    as many ticks is the same again.
+
+    Parameters
+    ----------
+    plant
+        Whose state is measured, and whose faults the sensors share.
+    model
+        How they err.
+    tick_period
+        s.
+
+    Raises
+    ------
+    ParameterError
+        The bias of the joints has the wrong length.
+    """
+
+    def __init__(self, plant: FaultyPlant, model: SensorModel, tick_period: float) -> None:
+        n = plant.robot.n
+        if len(model.joint_bias) not in (0, n):
+            raise ParameterError(
+                f"Parameter 'sensors.joint_bias' has {len(model.joint_bias)} number(s); the robot "
+                f"has {n} joints."
+            )
+        self._plant, self._model, self._tick_period = plant, model, tick_period
+        self._rng = np.random.default_rng(model.seed)
+        self._joint_index = {name: i for i, name in enumerate(plant.robot.joint_names)}
+        self.pose, self.twist = plant.pose.copy(), plant.twist.copy()
+        self.q, self.qdot = plant.q.copy(), plant.qdot.copy()
+        self.dropout = False
+        """Whether the pose was not measured at all."""
+        self._pose_bias, self._joint_bias = np.zeros(6), np.zeros(n)
+        self._noise = dict.fromkeys(GROUPS, 0.0)
+        self._delay = 0
+        self._past: deque[tuple[Array, Array]] = deque([(self.pose, self.twist)], maxlen=1)
+        self._adopt(plant.active)
+        self.used = self.imperfect or any(KINDS[f.kind].sensor for f in plant.timeline.faults)
+        """Whether what is measured has ever been, or will be, another thing than the truth."""
+
+    @property
+    def imperfect(self) -> bool:
+        """Whether what is measured now differs from the truth."""
+        return bool(
+            self.dropout
+            or self._delay
+            or self._pose_bias.any()
+            or self._joint_bias.any()
+            or any(self._noise.values())
+        )
+
+    def measure(self) -> None:
+        """Measure the present state of the plant; perfect sensors that were never used do not."""
+        if self._plant.active is not self._faults:
+            self._adopt(self._plant.active)
+            self.used = self.used or self.imperfect
+        if not self.used:
+            return
+        plant, normal, noise = self._plant, self._rng.standard_normal, self._noise
+        self._past.append((plant.pose.copy(), plant.twist.copy()))
+        # After a change of the delay the past may still be shorter than it.
+        pose, twist = self._past[max(0, len(self._past) - 1 - self._delay)]
+        n = len(self.q)
+        errors = normal(12)
+        turn = self._pose_bias[3:] + noise["attitude"] * errors[3:6]
+        self.pose[:3] = pose[:3] + self._pose_bias[:3] + noise["position"] * errors[:3]
+        self.pose[3:] = pose[3:]
+        if turn.any():
+            self.pose[3:] = quaternion_multiply(pose[3:], quaternion_from_rotvec(turn))
+        self.twist[:3] = twist[:3] + noise["velocity"] * errors[6:9]
+        self.twist[3:] = twist[3:] + noise["angular_velocity"] * errors[9:]
+        self.q[:] = plant.q + self._joint_bias + noise["joints"] * normal(n)
+        self.qdot[:] = plant.qdot + noise["joint_rates"] * normal(n)
+
+    def _adopt(self, faults: tuple[Fault, ...]) -> None:
+        """Take over the sensors' share of the faults that are active now."""
+        self._faults = faults
+        model = self._model
+        self._pose_bias[:] = model.pose_bias
+        self._joint_bias[:] = model.joint_bias if len(model.joint_bias) else 0.0
+        variances = {group: model.noise.get(group, 0.0) ** 2 for group in GROUPS}
+        self.dropout, delay = False, 0.0
+        for fault in faults:
+            if fault.kind == "sensor_bias" and fault.target in POSE_AXES:
+                self._pose_bias[POSE_AXES.index(fault.target)] += fault.value
+            elif fault.kind == "sensor_bias":
+                self._joint_bias[self._joint_index[fault.target]] += fault.value
+            elif fault.kind == "sensor_noise":
+                variances[fault.target] += fault.value**2
+            elif fault.kind == "sensor_dropout":
+                self.dropout = True
+            elif fault.kind == "sensor_delay":
+                delay = max(delay, fault.value)
+        self._noise = {group: variance**0.5 for group, variance in variances.items()}
+        self._delay = round(delay / self._tick_period)
+        self._past = deque(self._past, maxlen=self._delay + 1)

@@ -1,0 +1,186 @@
+"""A plant whose base wrench comes from thrusters as they are: discrete, one way, on or off."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.errors import CommandError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.thrusters import ThrusterTable, load_thrusters, thrusters_of_urdf
+from spacerobot_ros.simulation.plant import Counts, Flags, Plant
+from spacerobot_ros.simulation.thruster_pulses import ThrusterPulses
+
+IN_URDF = "urdf"
+"""Where a table of thrusters is that is in no file of its own."""
+
+_UNMET = 1e-6
+"""Smaller parts of a wrench are not missed, N or N m."""
+
+
+class ThrusterPlant:
+    """A plant under efforts, its wanted base wrench realised by pulses of thrusters.
+
+    Everything of the plant within is as it was; its ledger stays exact because what the thrusters
+    put in is the wrench that it is stepped with. A thruster that is on for part of a tick gives its
+    impulse evenly over the tick. Besides, there are
+
+    ``wrench``
+        (6,) force (N) over torque (N m) at the origin of the base link, base components, that the
+        thrusters gave in the last tick, on the average.
+    ``on_time``, ``duty``, ``thrust``
+        (m,) for how long each was on since the beginning (s), for what part of the last tick, and
+        its mean force in it (N).
+    ``pulses``
+        (m,) how often each was turned on.
+    ``propellant``
+        Used since the beginning, kg. The mass of the robot does not change by it.
+    ``unmet``, ``unmet_ticks``
+        (6,) what the last tick's wanted wrench lost to the thrusters' limits, and in how many ticks
+        it lost anything.
+    ``thruster_health``, ``stuck_on``
+        (m,) thrust over what the table says, 1 unless set, and whether a thruster is on whatever it
+        is told, false unless set. The allocation does not know of either; :meth:`exclude` tells it.
+
+    Parameters
+    ----------
+    plant
+        The plant within; its steps take efforts and a wrench.
+    tick_period
+        Duration of a tick, s.
+    table
+        The thrusters.
+    excluded
+        Names of thrusters that are not used.
+
+    Raises
+    ------
+    ParameterError
+        There is no thruster of an excluded name.
+    """
+
+    def __init__(
+        self, plant: Plant, tick_period: float, table: ThrusterTable, excluded: Sequence[str] = ()
+    ) -> None:
+        self.plant, self.table = plant, table
+        # Views: the plant within changes them in place.
+        self.robot, self.initial = plant.robot, plant.initial
+        self.pose, self.twist, self.momentum = plant.pose, plant.twist, plant.momentum
+        self.q, self.qdot, self.effort = plant.q, plant.qdot, plant.effort
+        self.link_R, self.link_r = plant.link_R, plant.link_r
+        self._tick_period = tick_period
+        self._pulses = ThrusterPulses(table, tick_period, excluded)
+        self._excluded = list(excluded)
+        self._wrenches, self._mass_flow = table.wrenches, table.mass_flow
+        count = len(table.names)
+        self.wrench = np.zeros(6)
+        self.on_time, self.duty, self.thrust = (np.zeros(count) for _ in range(3))
+        self.pulses = np.zeros(count, dtype=np.int64)
+        self.propellant = 0.0
+        self.unmet, self.unmet_ticks = self._pulses.unmet, 0
+        self.thruster_health = np.ones(count)
+        self.stuck_on: npt.NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
+
+    @property
+    def limit_counts(self) -> Mapping[str, Counts]:
+        """Ticks in which each joint (n,) was limited, by what limited it."""
+        return self.plant.limit_counts
+
+    @property
+    def expected_momenta(self) -> Array:
+        """Linear over angular momentum (6,) in W: from the beginning and by the thrusters."""
+        return self.plant.expected_momenta
+
+    @property
+    def missing(self) -> str:
+        """What the thrusters in use cannot give; empty if they give every wrench."""
+        return self.table.missing(self._excluded)
+
+    def exclude(self, name: str) -> None:
+        """Use a thruster no more, because it is dead; the others give the wrench, if they can.
+
+        Raises
+        ------
+        ParameterError
+            There is no thruster of that name.
+        """
+        self._pulses.exclude(name)
+        self._excluded.append(name)
+
+    def hold(self, joints: Flags) -> None:
+        """Hold these joints (n,) where they are from now on, and no others."""
+        self.plant.hold(joints)
+
+    def reset(self) -> None:
+        """Return to the initial state, thrusters off; what was used and counted goes on."""
+        self.plant.reset()
+        self._pulses.reset()
+        self.wrench[:] = self.duty[:] = self.thrust[:] = 0.0
+
+    def step(self, effort: npt.ArrayLike, wrench: npt.ArrayLike = 0.0) -> bool:
+        """Advance one tick under joint efforts (n,) and the wrench (6,) that is wanted on the base.
+
+        Returns whether any joint was limited.
+
+        Raises
+        ------
+        CommandError
+            A command is not finite; the tick is not taken.
+        SpaceRobotError
+            The plant within refuses.
+        """
+        wanted = np.broadcast_to(np.asarray(wrench, dtype=float), (6,))
+        for command in (effort, wanted):
+            if not np.all(np.isfinite(command)):
+                raise CommandError(f"A command is not finite: {np.asarray(command).tolist()}.")
+        tick = self._tick_period
+        on_time = self._pulses.fire(wanted)
+        on_time[self.stuck_on] = tick
+        self.duty[:] = on_time / tick
+        works = self.thruster_health * self.duty
+        self.thrust[:] = self.table.force * works
+        self.wrench[:] = self._wrenches @ works
+        self.on_time += on_time
+        self.pulses += self._pulses.begun
+        self.propellant += tick * float(self._mass_flow @ works)
+        self.unmet_ticks += bool(np.any(np.abs(self.unmet) > _UNMET))
+        limited: bool = self.plant.step(effort, self.wrench)
+        return limited
+
+
+def with_thrusters(plant: Plant, tick_period: float, source: str, excluded: str = "") -> Plant:
+    """Give a plant under efforts the thrusters of its URDF, of a YAML file, or none.
+
+    Parameters
+    ----------
+    plant
+        The plant, which takes any wrench.
+    tick_period
+        Duration of a tick, s.
+    source
+        :data:`IN_URDF`, the path of a file, or empty: then the plant is returned as it is.
+    excluded
+        Names of thrusters that are not used, separated by spaces.
+
+    Raises
+    ------
+    ParameterError
+        The file or a thruster in it is refused, or an excluded thruster is unknown.
+    RobotDescriptionError
+        A thruster of the URDF is refused, or there is none.
+    """
+    if not source:
+        return plant
+    robot = plant.robot.description
+    table = thrusters_of_urdf(robot) if source == IN_URDF else load_thrusters(source, robot)
+    return ThrusterPlant(plant, tick_period, table, excluded.split())
+
+
+def thrusters_in(plant: Plant) -> ThrusterPlant | None:
+    """Return the thrusters of a plant, which may be wrapped (``plant.plant``); None without."""
+    within: Plant | None = plant
+    while within is not None and not isinstance(within, ThrusterPlant):
+        within = getattr(within, "plant", None)
+    return within

@@ -1,0 +1,139 @@
+"""`spacerobot analyze`: what it says, writes and draws."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from support.random_robots import random_robot_urdf
+
+from spacerobot_ros.app.analyze import analyze, json_of, lines_of
+from spacerobot_ros.app.cli import main
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import METHODS
+from spacerobot_ros.resources import resource_names, robot_file
+
+
+@pytest.fixture(autouse=True)
+def _interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+
+
+def spacerobot(*arguments: str) -> Result:
+    return CliRunner().invoke(main, list(arguments))
+
+
+def analyzed(folder: Path, robot: str, *more: str) -> tuple[dict[str, Any], list[str], Path]:
+    """Return the JSON, the printed lines and the picture of a robot."""
+    picture, findings = folder / "sub" / "a.png", folder / "sub" / "a.json"
+    result = spacerobot("analyze", robot, "--picture", str(picture), "--json", str(findings), *more)
+    assert result.exit_code == 0, result.output
+    # Not a number and infinity are no JSON.
+    content = json.loads(findings.read_text(), parse_constant=pytest.fail)
+    return content, result.output.splitlines(), picture
+
+
+@pytest.mark.parametrize(
+    ("robot", "suits", "rank", "first"),
+    [
+        ("sliding_masses", {"lie_bracket", "area_loop"}, 3, "lie_bracket"),
+        ("three_joint_arm", {"area_loop"}, 3, "area_loop"),
+        ("planar_chain", {"square_path"}, 1, "square_path"),
+    ],
+)
+def test_the_robots_of_the_papers(
+    tmp_path: Path, robot: str, suits: set[str], rank: int, first: str
+) -> None:
+    found, lines, picture = analyzed(tmp_path, robot)
+    assert len(lines) <= 24
+    methods = found["methods"]
+    assert {*methods, "auto"} == set(METHODS)
+    paper_methods = {"lie_bracket", "square_path", "area_loop"}
+    assert {name for name in paper_methods if methods[name] is None} == suits
+    assert found["anywhere"]["rank"] == rank
+    assert found["auto"] == first
+    assert any(line.split() == ["auto", first] for line in lines)
+    for name in paper_methods - suits:
+        assert any(line.startswith(name) and methods[name] in line for line in lines)
+    content = picture.read_bytes()
+    assert content.startswith(b"\x89PNG")
+    assert len(content) > 20_000
+
+
+def test_the_papers_nominal_shape() -> None:
+    shape = [0.0, -math.pi / 4, math.pi / 2]
+    findings = analyze(SpaceRobot.from_file(robot_file("three_joint_arm")), shape)
+    found = json_of(findings)
+    M = np.array(found["curvature_matrix"])
+    assert np.linalg.cond(M) == pytest.approx(3.60, abs=5e-3)
+    assert found["at_shape"]["condition"] == pytest.approx(3.60, abs=5e-3)
+    assert found["shape"] == shape
+    assert any("condition 3.6" in line for line in lines_of(findings))
+
+
+def test_the_best_shape_is_better_than_the_papers() -> None:
+    found = json_of(analyze(SpaceRobot.from_file(robot_file("three_joint_arm"))))
+    assert found["at_shape"]["condition"] < 3.60
+    over = found["condition_over_shapes"]
+    assert over["best"] <= over["median"]
+    assert over["spanning"] == over["shapes"]
+
+
+def test_masses_and_limits_are_those_of_the_urdf() -> None:
+    findings = analyze(SpaceRobot.from_file(robot_file("planar_chain")))
+    found = json_of(findings)
+    assert found["mass_kg"] == pytest.approx(144.0)
+    assert [joint["name"] for joint in found["joints"]] == ["pin_1", "pin_2"]
+    # A joint without limits has none.
+    assert [joint["lower"] for joint in found["joints"]] == [None, None]
+    assert "144 kg, of which the base 120 kg" in lines_of(findings)[0]
+
+
+def test_a_urdf_of_ones_own(tmp_path: Path) -> None:
+    urdf = tmp_path / "own.urdf"
+    urdf.write_text(random_robot_urdf(np.random.default_rng(7), 4))
+    found, lines, picture = analyzed(tmp_path, str(urdf))
+    assert found["anywhere"]["rank"] == 3
+    assert found["auto"] == "area_loop"
+    assert picture.is_file()
+    assert len(lines) <= 24
+
+
+def test_a_robot_whose_loops_turn_nothing_has_no_picture(tmp_path: Path) -> None:
+    urdf = tmp_path / "one.urdf"
+    urdf.write_text(random_robot_urdf(np.random.default_rng(7), 1))
+    found, lines, picture = analyzed(tmp_path, str(urdf))
+    assert found["anywhere"]["rank"] == 0
+    assert found["curvature_matrix"] is None
+    assert not picture.exists()
+    assert lines[-1].startswith("picture      none")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["nobody"], "There is no robot 'nobody'"),
+        (["nobody.urdf"], "no such URDF file"),
+        (["three_joint_arm", "--shape", "0 1"], "The shape has 2 number(s)"),
+        (["three_joint_arm", "--shape", "0 1 nan"], "The shape has 3 number(s)"),
+        (["three_joint_arm", "--shape", "0 1 two"], "it must be numbers"),
+    ],
+)
+def test_what_is_refused_with_a_sentence(arguments: list[str], sentence: str) -> None:
+    result = spacerobot("analyze", *arguments)
+    assert result.exit_code == 2
+    assert sentence in result.output
+    assert len(result.output.splitlines()) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", resource_names("urdf", ".urdf"))
+def test_every_robot_of_the_package_is_drawn(tmp_path: Path, robot: str) -> None:
+    _, lines, picture = analyzed(tmp_path, robot)
+    assert picture.is_file()
+    assert len(lines) <= 30

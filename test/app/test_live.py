@@ -1,0 +1,143 @@
+"""Stacks of several processes, and stacks that stay up, through the command."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spacerobot_ros.recording import read_bag
+
+ROOT = Path(__file__).parents[2]
+COMMAND = (sys.executable, "-m", "spacerobot_ros.app.cli")
+GAIT = (
+    *("--set", "planner.lie_bracket.t1=4", "--set", "planner.lie_bracket.cycles=0"),
+    *("--set", "planner.attitude_tolerance=0.001", "--set", "planner.position_tolerance=0.001"),
+)
+PATIENCE = 120.0
+
+
+@pytest.fixture
+def environment(ros_domain: int) -> dict[str, str]:
+    # The commands run elsewhere, where their files are to go.
+    return {**os.environ, "ROS_DOMAIN_ID": str(ros_domain), "PYTHONPATH": str(ROOT)}
+
+
+def spacerobot(
+    *words: str, environment: dict[str, str], folder: Path
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*COMMAND, *words],
+        env=environment,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+
+
+def test_each_node_in_a_process_of_its_own_flies_the_same_manoeuvre(
+    environment: dict[str, str], tmp_path: Path
+) -> None:
+    results = []
+    for name, words in (("one", ()), ("many", ("--processes",))):
+        json_file = tmp_path / f"{name}.json"
+        run = spacerobot(
+            *("run", "planar_chain", *words, "--bag", f"{name}.mcap", "--json", str(json_file)),
+            environment=environment,
+            folder=tmp_path,
+        )
+        assert run.returncode == 0, run.stderr
+        results.append(json.loads(json_file.read_text("utf-8")))
+    one, many = results
+    assert one["succeeded"]
+    assert many["succeeded"]
+    for key in ("final_attitude_rotvec_rad", "final_joint_positions", "manoeuvre_time_s"):
+        np.testing.assert_allclose(many[key], one[key], atol=1e-12)
+    bag = read_bag(tmp_path / "many.mcap")
+    assert bag.message_count("/odom") == many["ticks"] + 1, "from the first state on, none lost"
+    assert bag.metadata["scenario"]["name"] == "planar_chain"
+
+
+@pytest.fixture
+def robot(environment: dict[str, str], tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """Sliding masses that are up, twenty times as fast as real time."""
+    process = subprocess.Popen(
+        [*COMMAND, "up", "sliding_masses", "--rate", "20", "--bag", "up.mcap", *GAIT],
+        env=environment,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait(PATIENCE)
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+def test_goals_are_sent_to_a_robot_that_is_up(
+    robot: subprocess.Popen[str], environment: dict[str, str], tmp_path: Path
+) -> None:
+    refused = spacerobot("goal", "5", "0", "0", environment=environment, folder=tmp_path)
+    assert refused.returncode == 1, refused.stdout + refused.stderr
+    assert "stroke" in refused.stdout
+    reached = spacerobot("goal", "-0.05", "0.02", "0", environment=environment, folder=tmp_path)
+    assert reached.returncode == 0, reached.stdout + reached.stderr
+    assert "The goal is met" in reached.stdout
+    # What is latched of the goal before is no answer to the next.
+    again = spacerobot(
+        *("goal", "0.02", "0", "0", "--rotvec", "0", "0", "0.01"),
+        environment=environment,
+        folder=tmp_path,
+    )
+    assert again.returncode == 0, again.stdout + again.stderr
+    assert "Flying" in again.stdout
+    robot.send_signal(signal.SIGINT)
+    assert robot.wait(PATIENCE) == 0
+    assert robot.stdout is not None
+    assert "The goal is met" in robot.stdout.read()
+    bag = read_bag(tmp_path / "up.mcap")
+    last = [bag["/odom"].field(f"pose.pose.position.{x}")[-1] for x in "xyz"]
+    np.testing.assert_allclose(last, [0.02, 0.0, 0.0], atol=1e-3)
+
+
+def test_a_goal_that_nobody_takes_is_one_sentence(
+    environment: dict[str, str], tmp_path: Path
+) -> None:
+    run = spacerobot("goal", "0", "0", "0", environment=environment, folder=tmp_path)
+    assert run.returncode == 2
+    assert run.stderr.count("\n") == 1
+    assert "spacerobot up" in run.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "mention"),
+    [
+        (("goal", "1", "2"), "X Y Z"),
+        (("goal", "0", "0", "0", "0", "0", "0", "0"), "zero quaternion"),
+        (("up", "no_such"), "no_such"),
+        (("up", "sliding_masses", "--set", "plant.tick_rate=-1"), "tick_rate"),
+        (("run", "sliding_masses", "--processes", "--set", "plant.tick_rate=-1"), "tick_rate"),
+    ],
+)
+def test_bad_words_are_refused(
+    environment: dict[str, str], tmp_path: Path, words: tuple[str, ...], mention: str
+) -> None:
+    run = spacerobot(*words, environment=environment, folder=tmp_path)
+    assert run.returncode == 2, run.stdout + run.stderr
+    assert mention in run.stderr
+    assert "Traceback" not in run.stderr

@@ -1,0 +1,208 @@
+"""Faults and imperfect sensors of the plant node, from outside."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from rcl_interfaces.msg import Log
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from support.fault_flights import FaultFlight, values_of
+from support.ros_harness import Harness, assert_one_sentence, construction, nanoseconds
+
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.nodes import PlantNode
+
+PLANT: dict[str, Any] = {"robot": "sliding_masses"}
+TICK = 0.05
+RATES = np.array([0.1, -0.2, 0.05])
+
+
+class Commanded(FaultFlight):
+    """A plant whose every state is answered with the same joint velocities."""
+
+    def __init__(self, harness: Harness, *faults: str, **parameters: Any) -> None:
+        super().__init__(harness, {**PLANT, "faults": list(faults), **parameters})
+        self.commands = self.probe.create_publisher(JointState, "joint_commands", 10)
+        self._unanswered = 0
+        self.probe.react["joint_states"] = self._answer
+        harness.connect()
+
+    def run(self, ticks: int) -> None:
+        """Step so many times, and hear all of it."""
+        before = self.plant.tick
+        self._unanswered = ticks
+        if not self.plant.is_active:
+            self.plant.trigger_activate()
+        else:
+            self._answer(self.probe.last("joint_states"))
+        self.harness.spin_until(lambda: self.plant.tick == before + ticks, f"{ticks} ticks")
+        self.harness.settle(self.probe)
+
+    def _answer(self, state: JointState) -> None:
+        if self._unanswered:
+            self._unanswered -= 1
+            command = JointState(name=list(state.name), velocity=RATES.tolist())
+            command.header.stamp = state.header.stamp
+            self.commands.publish(command)
+
+
+# -- sensors ----------------------------------------------------------------------------------
+
+
+def test_perfect_sensors_publish_nothing_more(harness: Harness) -> None:
+    flight = Commanded(harness, "joint_stuck slider_1")
+    flight.run(5)
+    for topic in ("odom_true", "joint_states_true"):
+        assert flight.probe.count_publishers(topic) == 0
+    np.testing.assert_allclose(flight.series("joint_states")[1][-1], 5 * TICK * RATES * [0, 1, 1])
+
+
+def test_imperfect_ones_publish_what_they_measure_and_the_truth(harness: Harness) -> None:
+    flight = Commanded(
+        harness,
+        **{
+            "sensors.position_noise": 0.01,
+            "sensors.joint_bias": [0.0, 0.5, 0.0],
+            "sensors.seed": 4,
+        },
+    )
+    flight.run(40)
+    stamps, measured = flight.series("odom")
+    true_stamps, true = flight.series("odom_true")
+    np.testing.assert_array_equal(stamps, true_stamps)
+    assert len(stamps) == 41
+    off = measured[:, :3] - true[:, :3]
+    assert 0.005 < off.std() < 0.015
+    np.testing.assert_array_equal(measured[:, 3:], true[:, 3:])
+    shapes, truth = flight.series("joint_states")[1], flight.series("joint_states_true")[1]
+    np.testing.assert_allclose(truth, np.arange(41)[:, None] * TICK * RATES, atol=1e-14)
+    np.testing.assert_allclose(shapes - truth, np.tile([0.0, 0.5, 0.0], (41, 1)), atol=1e-15)
+    # The truth before what is measured of it: who hears a state has heard what it is.
+    order = [t for t in flight.probe.order if t.startswith(("odom", "joint_states"))]
+    assert order[-4:] == ["odom_true", "joint_states_true", "odom", "joint_states"]
+
+
+def test_a_lost_pose_is_not_published_and_a_late_one_is(harness: Harness) -> None:
+    flight = Commanded(
+        harness, "sensor_dropout odom at 0.5 until 1", "sensor_delay odom 0.1 at 1.5 until 3"
+    )
+    flight.run(50)
+    stamps, measured = flight.series("odom")
+    ticks = np.round(stamps / TICK).astype(int)
+    assert ticks.tolist() == [*range(10), *range(20, 51)]
+    true = flight.series("odom_true")[1]
+    assert len(true) == 51
+    late = (ticks >= 32) & (ticks < 50)
+    np.testing.assert_array_equal(measured[late], true[ticks[late] - 2])
+    np.testing.assert_array_equal(measured[~late & (ticks < 30)], true[ticks[~late & (ticks < 30)]])
+
+
+def test_a_lockstep_plant_does_not_wait_for_an_answer_to_a_lost_pose(harness: Harness) -> None:
+    flight = Commanded(harness, "sensor_dropout odom at 0.1 until 0.25")
+    flight.run(2)
+    # Nobody answers any more: what was commanded holds until the pose is there again.
+    flight.harness.spin_until(lambda: flight.plant.tick == 5, "the end of the dropout")
+    flight.harness.spin_for(0.3)
+    assert flight.plant.tick == 5
+    np.testing.assert_allclose(flight.plant.plant.q, 5 * TICK * RATES)
+
+
+# -- injection --------------------------------------------------------------------------------
+
+
+def test_faults_are_injected_reported_and_cleared(harness: Harness) -> None:
+    flight = Commanded(harness, "joint_slow slider_3 0.5 at 0.1")
+    flight.run(2)
+    assert flight.diagnosis("faults").level == DiagnosticStatus.WARN
+    flight.inject("joint_stuck slider_2\nsensor_bias position_x 0.25")
+    flight.run(4)
+    status = flight.diagnosis("faults")
+    assert set(values_of(status).values()) == {
+        "joint_slow slider_3 0.5 at 0.1",
+        "joint_stuck slider_2 at 0.1",
+        "sensor_bias position_x 0.25 at 0.1",
+    }
+    assert "joint_stuck slider_2" in status.message
+    stamps, measured = flight.series("odom")
+    true_stamps, true = flight.series("odom_true")
+    assert true_stamps[0] > stamps[0], "the truth is told apart from when it differs"
+    assert measured[-1, 0] - true[-1, 0] == pytest.approx(0.25)
+    np.testing.assert_allclose(flight.plant.plant.q, TICK * RATES * [6, 2, 2 + 4 * 0.5])
+    flight.inject("clear")
+    flight.run(1)
+    assert flight.diagnosis("faults").level == DiagnosticStatus.OK
+    assert flight.diagnosis("faults").message == "no fault is injected"
+    np.testing.assert_allclose(flight.plant.plant.q, TICK * RATES * [7, 3, 5])
+    assert flight.diagnosis("momentum").level == DiagnosticStatus.OK
+
+
+def test_an_injection_that_is_no_fault_is_refused_with_a_sentence(harness: Harness) -> None:
+    flight = Commanded(harness)
+    flight.probe.watch("/rosout", Log)
+    flight.harness.connect()
+    flight.run(1)
+    flight.faults.publish(String(data="joint_stuck elbow"))
+    flight.harness.spin_until(
+        lambda: any("joint_stuck elbow" in m.msg for m in flight.probe.messages["/rosout"]),
+        "a word on the refusal",
+    )
+    line = next(m.msg for m in flight.probe.messages["/rosout"] if "elbow" in m.msg)
+    assert_one_sentence(line, "slider_1, slider_2, slider_3")
+    assert not flight.plant.plant.active
+
+
+def test_time_goes_on_over_a_reset(harness: Harness) -> None:
+    flight = Commanded(harness, "joint_stuck slider_1 at 0.2 until 0.4")
+    flight.run(3)
+    flight.plant.plant.reset()
+    flight.run(10)
+    # Of ticks 3 to 12, 4 to 7 are under the fault.
+    np.testing.assert_allclose(flight.plant.plant.q, TICK * RATES * [6, 10, 10])
+
+
+BAD: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "no fault": (["joint_stuck elbow"], ("joint_stuck elbow", "slider_1")),
+    "no thrusters": (["thruster_off all"], ("thruster_off all", "nothing")),
+    "a number": (3.0, ("'faults'", "list of texts")),
+    "text of several": ("joint_stuck slider_1; joint_slow slider_2", ("joint_slow slider_2",)),
+}
+
+
+@pytest.mark.parametrize(("faults", "mentions"), BAD.values(), ids=BAD)
+def test_bad_faults_are_refused_with_a_sentence(
+    ros_context: rclpy.Context, faults: Any, mentions: tuple[str, ...]
+) -> None:
+    with pytest.raises(SpaceRobotError) as refusal:
+        PlantNode(**construction(ros_context, {**PLANT, "faults": faults}))
+    assert_one_sentence(str(refusal.value), *mentions)
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        ["joint_stuck slider_1", "joint_slow slider_2 0.5 at 9"],
+        "joint_stuck slider_1; joint_slow slider_2 0.5 at 9",
+        "joint_stuck slider_1\njoint_slow slider_2 0.5 at 9\n",
+    ],
+)
+def test_faults_are_a_list_or_a_text(ros_context: rclpy.Context, faults: Any) -> None:
+    plant = PlantNode(**construction(ros_context, {**PLANT, "faults": faults}))
+    assert [str(f) for f in plant.plant.timeline.faults] == [
+        "joint_stuck slider_1 at 0",
+        "joint_slow slider_2 0.5 at 9",
+    ]
+    assert list(plant.get_parameter("faults").value) == plant.parameters["faults"]
+    plant.destroy_node()
+
+
+def test_stamps_are_of_the_tick_they_show(harness: Harness) -> None:
+    flight = Commanded(harness, "sensor_delay odom 0.2")
+    flight.run(6)
+    assert [nanoseconds(m.header.stamp) for m in flight.probe.messages["odom"]] == [
+        k * 50_000_000 for k in range(7)
+    ]

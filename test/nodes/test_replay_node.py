@@ -1,0 +1,278 @@
+"""The replay node: what is heard against what is in the bag."""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+from support.ros_harness import Harness, Probe, assert_one_sentence, construction, nanoseconds
+
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.nodes import ReplayNode
+from spacerobot_ros.recording import LATCHED, BagWriter, QosProfile
+
+ROOT = Path(__file__).parents[2]
+STRING = "std_msgs/msg/String"
+BEGAN = 5_000_000_000
+"""Log time of the first message, ns."""
+
+SPACING = 10_000_000
+COUNT = 60
+
+
+def string(text: str) -> bytes:
+    """Serialise a std_msgs/String by hand."""
+    data = text.encode() + b"\0"
+    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    """A stream of 60 messages every 10 ms, and a latched topic that spoke once, at the start."""
+    path = tmp_path / "a.mcap"
+    with BagWriter(path) as writer:
+        latched = writer.add_topic("/latched", STRING, LATCHED)
+        loose = QosProfile(history="unknown", depth=0, reliability="best_effort")
+        stream = writer.add_topic("/stream", STRING)
+        writer.add_topic("/loose", STRING, loose)
+        writer.write(latched, string("for ever"), BEGAN, BEGAN)
+        for k in range(COUNT):
+            writer.write(stream, string(f"{k}"), BEGAN + k * SPACING, BEGAN)
+    return path
+
+
+class Played:
+    """A replay of a bag and a probe that hears it."""
+
+    def __init__(self, harness: Harness, bag: Path, **parameters: Any) -> None:
+        self.probe: Probe = harness.probe(
+            {"/stream": String, "/latched": String, "/clock": Clock}, latched=("/latched",)
+        )
+        self.codes: list[int] = []
+        self.node: ReplayNode = harness.make(ReplayNode, {"bag": str(bag), **parameters})
+        self.node.on_end = self.codes.append
+        self.harness = harness
+
+    def finish(self) -> None:
+        self.harness.spin_until(lambda: bool(self.codes), "the replay ends")
+
+    def texts(self, topic: str = "/stream") -> list[str]:
+        return [message.data for message in self.probe.messages[topic]]
+
+
+ALL = [str(k) for k in range(COUNT)]
+
+
+def test_everything_is_heard_in_its_rhythm(harness: Harness, bag: Path) -> None:
+    played = Played(harness, bag)
+    played.finish()
+    harness.spin_until(lambda: played.probe.count("/stream") == COUNT, "all are heard")
+    assert played.codes == [0]
+    assert played.texts() == ALL
+    assert played.texts("/latched") == ["for ever"]
+    assert played.node.messages_replayed == COUNT + 1
+    arrivals = np.array(played.probe.arrivals["/stream"])
+    late = arrivals - arrivals[0] - np.arange(COUNT) * SPACING / 1e9
+    # The first one sets the time: its own delay is everybody's.
+    assert np.median(np.abs(late - np.median(late))) < 2e-3
+    assert np.median(np.abs(np.diff(arrivals) - SPACING / 1e9)) < 2e-3
+
+
+def test_publishers_offer_what_was_recorded(harness: Harness, bag: Path) -> None:
+    played = Played(harness, bag, paused=True)
+    offers = {
+        topic: played.node.get_publishers_info_by_topic(topic)[0].qos_profile
+        for topic in ("/latched", "/stream", "/loose")
+    }
+    assert offers["/latched"].durability == DurabilityPolicy.TRANSIENT_LOCAL
+    assert offers["/stream"].durability == DurabilityPolicy.VOLATILE
+    assert offers["/stream"].reliability == ReliabilityPolicy.RELIABLE
+    assert offers["/loose"].reliability == ReliabilityPolicy.BEST_EFFORT
+
+
+def test_a_late_reader_gets_what_is_latched(harness: Harness, bag: Path) -> None:
+    played = Played(harness, bag)
+    played.finish()
+    late = harness.probe({"/latched": String}, latched=("/latched",), name="late")
+    harness.spin_until(lambda: late.count("/latched") == 1, "the latched message is heard")
+
+
+def test_pause_step_and_resume(harness: Harness, bag: Path) -> None:
+    played = Played(harness, bag, paused=True, topics="/stream", wait=0.0)
+    harness.spin_until(
+        lambda: all(p.get_subscription_count() for p in played.node._outputs), "it is heard"
+    )
+    pause = played.probe.create_client(SetBool, "/replay/pause")
+    resume = played.probe.create_client(Trigger, "/replay/resume")
+    step = played.probe.create_client(Trigger, "/replay/step")
+    for k in range(3):
+        answer = harness.call(step, Trigger.Request())
+        assert answer.success
+        assert answer.message == f"/stream at {(BEGAN + k * SPACING) / 1e9:.9f} s"
+    harness.spin_until(lambda: played.probe.count("/stream") == 3, "three steps are heard")
+    assert harness.call(pause, SetBool.Request(data=False)).message == "running"
+    harness.spin_until(lambda: played.probe.count("/stream") > 3, "it goes on")
+    assert harness.call(pause, SetBool.Request(data=True)).message == "paused"
+    harness.spin_until(
+        lambda: played.probe.count("/stream") == played.node.messages_replayed, "all are heard"
+    )
+    heard = played.probe.count("/stream")
+    harness.spin_for(5 * SPACING / 1e9)
+    assert heard == played.probe.count("/stream") < COUNT
+    assert harness.call(resume, Trigger.Request()).success
+    refused = harness.call(step, Trigger.Request())
+    assert not refused.success
+    assert_one_sentence(refused.message, "pause")
+    played.finish()
+    harness.spin_until(lambda: played.probe.count("/stream") == COUNT, "all are heard")
+    assert played.texts() == ALL
+
+
+def test_a_clock_of_its_own_is_never_behind_a_message(harness: Harness, bag: Path) -> None:
+    played = Played(harness, bag, clock=50.0, topics="/stream")
+    now: list[int] = []
+    played.probe.react["/clock"] = lambda m: now.append(nanoseconds(m.clock))
+    at: list[int] = []
+    played.probe.react["/stream"] = lambda m: at.append(now[-1])
+    played.finish()
+    harness.spin_until(lambda: played.probe.count("/stream") == COUNT, "all are heard")
+    assert at == [BEGAN + k * SPACING for k in range(COUNT)]
+    assert now == sorted(now)
+
+
+def test_a_loop_goes_on_until_it_is_told_to_stop(harness: Harness, bag: Path) -> None:
+    played = Played(harness, bag, loop=True, start=0.5, topics="/stream", rate=2.0)
+    harness.spin_until(lambda: played.probe.count("/stream") >= 25, "three turns are heard")
+    played.node.trigger_deactivate()
+    assert played.texts()[:25] == (ALL[50:] * 3)[:25]
+    assert played.codes == []
+    before = played.node.messages_replayed
+    played.node.trigger_activate()
+    harness.spin_until(lambda: played.node.messages_replayed > before, "it goes on")
+
+
+def test_topics_get_other_names(harness: Harness, bag: Path) -> None:
+    probe = harness.probe({"/other/name": String})
+    node = harness.make(
+        ReplayNode,
+        {"bag": str(bag), "remap": "/stream:=/other/name", "rate": 50.0, "topics": "/stream"},
+    )
+    harness.spin_until(lambda: probe.count("/other/name") == COUNT, "all are heard")
+    assert node.count_publishers("/stream") == 0
+
+
+@pytest.mark.parametrize(
+    ("parameters", "mention"),
+    [
+        ({"bag": ""}, "'bag'"),
+        ({"bag": "/nowhere/a.mcap"}, "There is no bag at /nowhere/a.mcap"),
+        ({"rate": 0.0}, "'rate'"),
+        ({"start": -1.0}, "'start'"),
+        ({"start": 9.0}, "it lasts 0.59 s"),
+        ({"topics": "/stream /none"}, "has no topic /none"),
+        ({"remap": "/stream=/b"}, "'old:=new'"),
+        ({"remap": "/none:=/b"}, "'/none'"),
+        ({"remap": "/stream:=/a-b"}, "'/a-b'"),
+    ],
+)
+def test_bad_parameters_are_refused(
+    harness: Harness, bag: Path, parameters: dict[str, Any], mention: str
+) -> None:
+    with pytest.raises(SpaceRobotError) as refusal:
+        ReplayNode(**construction(harness.context, {"bag": str(bag), **parameters}))
+    assert_one_sentence(str(refusal.value), mention)
+
+
+def test_a_type_that_is_not_installed_is_left_out(harness: Harness, tmp_path: Path) -> None:
+    path = tmp_path / "foreign.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        for topic, kind in (("/stream", STRING), ("/foreign", "foreign_msgs/msg/Thing")):
+            schema = writer.register_schema(kind, "ros2msg", b"string data")
+            channel = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channel, BEGAN, string(topic), BEGAN)
+        writer.finish()
+    played = Played(harness, path)
+    harness.spin_until(lambda: played.probe.count("/stream") == 1, "the known one is heard")
+    played.finish()
+    assert played.codes == [0]
+    assert played.node.messages_replayed == 1
+    node = ReplayNode(
+        context=harness.context,
+        autostart=False,
+        parameter_overrides=[
+            Parameter("bag", value=str(path)),
+            Parameter("topics", value="/foreign"),
+        ],
+    )
+    try:
+        with pytest.raises(SpaceRobotError, match="None of the bag's message types"):
+            node.start()
+    finally:
+        node.destroy_node()
+
+
+@contextmanager
+def command(bag: Path, domain: int, *options: str) -> Iterator[subprocess.Popen[str]]:
+    """Run `spacerobot replay`; nothing of it outlives the context."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "spacerobot_ros.app.cli", "replay", str(bag), *options],
+        cwd=ROOT,
+        env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_the_command_loses_nothing_and_ends_with_the_bag(
+    harness: Harness, bag: Path, ros_domain: int
+) -> None:
+    probe = harness.probe({"/stream": String, "/latched": String}, latched=("/latched",))
+    # Nothing but the readers' arrival decides when it begins.
+    with command(bag, ros_domain, "--rate", "10", "--wait", "30") as process:
+        harness.spin_until(lambda: probe.count("/stream") == COUNT, "all are heard")
+        assert process.wait(timeout=30) == 0
+    assert [message.data for message in probe.messages["/stream"]] == ALL
+    with bag.open("rb") as file:
+        recorded = [m.data for _, c, m in make_reader(file).iter_messages() if c.topic == "/stream"]
+    assert [string(message.data) for message in probe.messages["/stream"]] == recorded
+    assert [message.data for message in probe.messages["/latched"]] == ["for ever"]
+
+
+def test_the_command_ends_cleanly_on_a_signal(harness: Harness, bag: Path, ros_domain: int) -> None:
+    probe = harness.probe({"/stream": String})
+    with command(bag, ros_domain, "--loop") as process:
+        harness.spin_until(lambda: probe.count("/stream") > 0, "it plays")
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert "Traceback" not in errors
+
+
+def test_the_command_refuses_a_bag_that_was_cut(bag: Path, ros_domain: int) -> None:
+    bag.write_bytes(bag.read_bytes()[:-20])
+    with command(bag, ros_domain) as process:
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == 2
+    assert_one_sentence(errors, f"'spacerobot salvage {bag}'")

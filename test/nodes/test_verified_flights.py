@@ -1,0 +1,201 @@
+"""Flights of the plant node under commands that it takes and refuses, flown again by their bags."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from geometry_msgs.msg import WrenchStamped
+from rclpy.lifecycle import TransitionCallbackReturn
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from support.altered_bags import altered
+from support.ros_harness import Harness
+
+from spacerobot_ros.nodes import PlantNode, RecorderNode
+from spacerobot_ros.nodes.recorder import parameters_of
+from spacerobot_ros.recording import RecordingError
+from spacerobot_ros.recording.verification import verify_bag
+
+SLIDERS = ["slider_1", "slider_2", "slider_3"]
+VELOCITY = {
+    "robot": "sliding_masses",
+    "tick_rate": 20.0,
+    "linear_momentum": [0.1, 0.0, -0.2],
+    "angular_momentum": [0.02, 0.05, -0.01],
+}
+EFFORT = {
+    "robot": "planar_manipulator",
+    "actuation": "effort",
+    "tick_rate": 100.0,
+    "initial_joint_positions": [0.3, -0.8],
+    "initial_joint_velocities": [0.1, 0.2],
+}
+TICKS = 60
+
+Answer = Callable[[int], Sequence[Any]]
+"""What is published in answer to the state of a tick, stamps left out."""
+
+
+class Flight:
+    """A plant in lockstep, a recorder, and commands by a script."""
+
+    def __init__(self, harness: Harness, bag: Path, plant: dict[str, Any], answer: Answer) -> None:
+        self.harness, self.bag = harness, bag
+        self.plant = harness.make(PlantNode, {**plant, "time_mode": "lockstep"}, autostart=False)
+        assert self.plant.trigger_configure() is TransitionCallbackReturn.SUCCESS
+        self.probe = harness.probe({"/joint_states": JointState})
+        self.probe.react["/joint_states"] = self._on_state
+        self._publishers = {
+            JointState: self.probe.create_publisher(JointState, "joint_commands", 100)
+        }
+        if plant.get("actuation") == "effort":
+            self._publishers[WrenchStamped] = self.probe.create_publisher(
+                WrenchStamped, "base_wrench", 100
+            )
+        self._answer = answer
+        self.recorder = harness.make(RecorderNode, {"bag": str(bag)}, autostart=False)
+        assert self.recorder.trigger_configure() is TransitionCallbackReturn.SUCCESS
+        wanted = {"/odom", "/joint_states", "/joint_commands", "/clock", "/robot_description"}
+
+        def scanned() -> bool:
+            self.recorder.scan()
+            return wanted <= self.recorder.topics
+
+        harness.spin_until(scanned, "the recorder listens")
+        harness.connect()
+        self.recorder.trigger_activate()
+        self.recorder.describe("parameters/plant", parameters_of(self.plant))
+
+    def fly(self, ticks: int = TICKS) -> Path:
+        """Fly so many ticks and complete the bag."""
+        timer = self.probe.create_timer(0.001, self._launch)
+        self._timer = timer
+        self.harness.spin_until(lambda: self.plant.tick >= ticks, f"{ticks} ticks")
+        self.plant.trigger_deactivate()
+        before = -1
+        while before != self.recorder.messages_recorded:
+            before = self.recorder.messages_recorded
+            self.harness.spin_for(0.05)
+        self.recorder.trigger_deactivate()
+        self.recorder.trigger_cleanup()
+        return self.bag
+
+    def _launch(self) -> None:
+        self.probe.destroy_timer(self._timer)
+        self.plant.trigger_activate()
+
+    def _on_state(self, state: JointState) -> None:
+        stamp = state.header.stamp
+        tick = round((stamp.sec + stamp.nanosec * 1e-9) * float(self.plant.parameters["tick_rate"]))  # type: ignore[arg-type]
+        for message in self._answer(tick):
+            if not message.header.stamp.nanosec:
+                message.header.stamp = stamp
+            self._publishers[type(message)].publish(message)
+
+
+def velocities(values: Sequence[float], names: Sequence[str] = SLIDERS) -> JointState:
+    return JointState(name=list(names), velocity=[float(v) for v in values])
+
+
+def sliding(tick: int) -> Sequence[Any]:
+    """Smooth commands, and in between everything that a plant refuses."""
+    t = tick / 20.0
+    good = velocities([0.2 * math.sin(t), -0.1 * math.cos(2 * t), 0.05])
+    if tick == 11:
+        return [velocities([0.1, math.nan, 0.0]), good]
+    if tick == 17:
+        return [velocities([0.1], ["slider_9"])]
+    if tick == 23:
+        return [velocities([0.1, 0.2], ["slider_3", "slider_1"])]
+    if tick == 29:
+        stale = velocities([9.0, 9.0, 9.0])
+        stale.header.stamp.nanosec = 50_000_000
+        return [stale, good, velocities([0.9, 0.9, 0.9])]
+    if tick == 31:
+        return [velocities([0.1, 0.2], SLIDERS)]
+    return [velocities([50.0, 0.0, 0.0]) if tick == 37 else good]
+
+
+def arm(tick: int) -> Sequence[Any]:
+    """Efforts and a wrench; refused ones have the motors brake."""
+    t = tick / 100.0
+    joints = JointState(
+        name=["elbow", "shoulder"], effort=[3.0 * math.cos(9 * t), -2.0 * math.sin(5 * t)]
+    )
+    wrench = WrenchStamped()
+    wrench.wrench.force.x, wrench.wrench.torque.z = 4.0, math.sin(3 * t)
+    if 11 <= tick < 14:
+        joints.effort = [math.inf, 0.0]
+    if tick == 23:
+        wrench.header.frame_id = "elsewhere"
+    return [wrench, joints]
+
+
+FLIGHTS: dict[str, tuple[dict[str, Any], Answer]] = {
+    "velocity": (VELOCITY, sliding),
+    "effort": (EFFORT, arm),
+}
+
+
+@pytest.mark.parametrize("kind", FLIGHTS)
+def test_a_flight_with_refused_commands_is_verified(
+    harness: Harness, tmp_path: Path, kind: str
+) -> None:
+    plant, answer = FLIGHTS[kind]
+    bag = Flight(harness, tmp_path / "flown.mcap", plant, answer).fly()
+    result = verify_bag(bag)
+    assert result.difference is None
+    assert result.ticks >= TICKS
+    # Every tick has odom, joint states, momentum and base pose; with thrusters what is expected.
+    assert result.messages >= 4 * TICKS
+    assert result.largest < 1e-12
+
+
+def test_a_latched_fault_rests_for_the_rest_of_the_flight(harness: Harness, tmp_path: Path) -> None:
+    parameters = {**VELOCITY, "beyond_limits": "refuse", "latched_faults": "beyond_limits"}
+    bag = Flight(harness, tmp_path / "flown.mcap", parameters, sliding).fly()
+    assert verify_bag(bag).difference is None
+    # It rests from tick 37 on: a plant that only clips would not.
+    clips = altered(bag, tmp_path / "b.mcap", parameters={"beyond_limits": '"clip"'})
+    difference = verify_bag(clips).difference
+    assert difference is not None
+    assert difference.time == pytest.approx(38 / 20)
+
+
+def test_faults_and_noise_are_flown_again(harness: Harness, tmp_path: Path) -> None:
+    parameters = {
+        **EFFORT,
+        "faults": ["joint_stuck elbow at 0.2 until 0.4"],
+        "sensors.joint_noise": 1e-3,
+        "sensors.position_noise": 1e-2,
+        "sensors.seed": 5,
+    }
+    bag = Flight(harness, tmp_path / "flown.mcap", parameters, arm).fly()
+    result = verify_bag(bag)
+    assert result.difference is None, str(result.difference)
+    again = altered(bag, tmp_path / "b.mcap", parameters={"sensors.seed": "6"})
+    difference = verify_bag(again).difference
+    assert difference is not None
+    assert (difference.time, difference.field) == (0.0, "position of shoulder")
+
+
+def test_a_reset_is_refused(harness: Harness, tmp_path: Path) -> None:
+    flight = Flight(harness, tmp_path / "flown.mcap", VELOCITY, sliding)
+    client = flight.probe.create_client(Trigger, "/plant/reset")
+    flight.harness.spin_until(client.service_is_ready, "the service")
+    flown = flight._answer
+
+    def answer(tick: int) -> Sequence[Any]:
+        if tick == 20 and not called:
+            called.append(client.call_async(Trigger.Request()))
+            return []
+        return flown(tick)
+
+    called: list[Any] = []
+    flight._answer = answer
+    with pytest.raises(RecordingError, match=r"was reset at 1 s"):
+        verify_bag(flight.fly())

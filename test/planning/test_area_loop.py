@@ -1,0 +1,270 @@
+"""Loops of three joints: paper 2's convergence, in the plant; curvature against another engine."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from planning.flown import STEP, fly, measured, plant_at
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+from support.oracles import PinocchioOracle
+from support.random_robots import random_robot_urdf
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import METHODS, GaitMethod, Goal, RobotState, Tolerance
+from spacerobot_ros.planning.edge_path import edge_path
+from spacerobot_ros.planning.nominal_shape import NominalShape, best_nominal, given_nominal
+
+Array = npt.NDArray[np.float64]
+
+URDF = Path(__file__).parents[2] / "urdf" / "three_joint_arm.urdf"
+NOMINAL = np.radians([0.0, -45.0, 90.0])
+PERIOD = 0.25
+
+
+@pytest.fixture(scope="module")
+def arm() -> SpaceRobot:
+    return SpaceRobot.from_file(URDF)
+
+
+def planner(
+    robot: SpaceRobot, attitude: float = 1e-3, period: float = PERIOD, **options: Any
+) -> GaitMethod:
+    return METHODS["area_loop"](robot, period, Tolerance(1.0, attitude, 1e-6), STEP, **options)
+
+
+def goal_of(attitude: Rotation, shape: npt.ArrayLike | None = None) -> Goal:
+    return Goal.checked([0.0, 0.0, 0.0], attitude.as_quat(), shape)
+
+
+def turned(*degrees: float) -> Rotation:
+    return Rotation.from_rotvec(np.radians(degrees))
+
+
+def integrated(oracle: PinocchioOracle, corners: Array) -> Array:
+    """Return the rotation vector (3,) of the base along straight legs of the shape (V, n), by
+    Pinocchio's base rate at zero momentum and DOP853.
+    """
+    attitude = Rotation.identity()
+    for a, b in itertools.pairwise(corners):
+
+        def rate(t: float, q: Array, a: Array = a, b: Array = b) -> Array:
+            omega = oracle.base_twist(a + t * (b - a), b - a)[3:]
+            scalar = -q[:3] @ omega
+            return 0.5 * np.append(q[3] * omega + np.cross(q[:3], omega), scalar)
+
+        start = [0.0, 0.0, 0.0, 1.0]
+        end = solve_ivp(rate, (0, 1), start, "DOP853", rtol=1e-12, atol=1e-15).y[:, -1]
+        attitude = attitude * Rotation.from_quat(end)
+    return np.asarray(attitude.as_rotvec())
+
+
+def around(nominal: NominalShape, areas: Array) -> Array:
+    """Return the shapes (V, n) along the path that encloses areas (3,) round a nominal shape."""
+    path = edge_path(areas, nominal.longest)
+    shapes = [nominal.shape]
+    for loop in path.loops:
+        for corner in loop:
+            shape = nominal.shape.copy()
+            shape[list(nominal.joints)] += corner
+            shapes.append(shape)
+        shapes.append(nominal.shape)
+    return np.array(shapes)
+
+
+# -- first order ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("areas", [(1, 0.7, 0.5), (-0.6, 1, 0.8), (1, 0, 0), (0, -1, 0.4)])
+@pytest.mark.parametrize("seed", [None, 3])
+def test_small_loops_turn_the_base_by_the_curvature_matrix(
+    arm: SpaceRobot, seed: int | None, areas: tuple[float, float, float]
+) -> None:
+    urdf = URDF.read_text() if seed is None else random_robot_urdf(np.random.default_rng(seed), 4)
+    robot = arm if seed is None else SpaceRobot.from_urdf(urdf)
+    oracle = PinocchioOracle(urdf, robot.joint_names)
+    shape = NOMINAL if seed is None else np.clip([0.3, -0.4, 0.5, 0.2], robot.lower, robot.upper)
+    joints = (0, 1, 2) if seed is None else (3, 0, 2)
+    nominal = given_nominal(robot, shape, [joints], 1.0)
+    errors = []
+    for size in (4e-3, 1e-3):
+        S = size * np.array(areas)
+        wanted = nominal.M @ S
+        turn = integrated(oracle, around(nominal, S))
+        errors.append(np.linalg.norm(turn - wanted) / np.linalg.norm(wanted))
+    # To first order: what is left goes down with the size of the loop, at least as its side.
+    assert errors[1] < 0.02
+    assert errors[1] < 0.55 * errors[0]
+
+
+def test_the_condition_number_of_the_papers_nominal_shape(arm: SpaceRobot) -> None:
+    nominal = given_nominal(arm, NOMINAL, [(0, 1, 2)], 1.0)
+    assert nominal.condition == pytest.approx(3.60, abs=5e-3)
+
+
+def test_the_best_nominal_shape_is_better_than_any_of_many(arm: SpaceRobot) -> None:
+    best = best_nominal(arm, np.zeros(3), [(0, 1, 2)], 1.0)
+
+    def worst_turn(nominal: NominalShape) -> float:
+        room = np.minimum(nominal.shape - arm.lower, arm.upper - nominal.shape)
+        edges = np.clip(2 * room, 0.0, 1.0)
+        areas = edges * np.roll(edges, -1)
+        return float(np.linalg.svd(nominal.M * areas)[1][-1])
+
+    rng = np.random.default_rng(5)
+    for shape in rng.uniform(arm.lower, arm.upper, (500, 3)):
+        assert worst_turn(given_nominal(arm, shape, [(0, 1, 2)], 1.0)) <= worst_turn(best) + 1e-6
+    # Loops of a radian fit round it.
+    assert np.all(best.shape - 0.5 >= arm.lower)
+    assert np.all(best.shape + 0.5 <= arm.upper)
+
+
+# -- convergence ------------------------------------------------------------------------------
+
+
+def test_five_degrees_about_each_axis_converge_as_in_the_paper(arm: SpaceRobot) -> None:
+    goal = goal_of(turned(5, 5, 5))
+    method = planner(arm, 1e-3, nominal=NOMINAL.tolist())
+    flight = fly(method, plant_at(arm, NOMINAL, PERIOD), goal)
+    left = np.degrees(np.abs(flight.left(goal)))
+    assert left[19].max() <= 0.22
+    assert left[29].max() <= 0.045
+    # k = 0.15 to first order leaves 0.85^N.
+    np.testing.assert_allclose(left[19], 5 * 0.85**20, rtol=0.05)
+    assert np.radians(np.linalg.norm(left[-1])) <= 1e-3
+    # All but the last know that they end short of the goal.
+    assert [piece.partial for piece in flight.pieces] == [True] * (len(left) - 1) + [False]
+    # The first estimate of the number of cycles was right.
+    assert flight.pieces[0].notes["expected_cycles"] == pytest.approx(len(left), abs=2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("nominal", [NOMINAL.tolist(), []])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_quarter_turn_about_any_axis(
+    arm: SpaceRobot, axis: int, sign: int, nominal: list[float]
+) -> None:
+    goal = goal_of(turned(*(90.0 * sign * np.eye(3)[axis])))
+    method = planner(arm, np.radians(0.1), nominal=nominal)
+    flight = fly(method, plant_at(arm, NOMINAL, PERIOD), goal)
+    assert np.degrees(np.linalg.norm(flight.left(goal)[-1])) <= 0.1
+    assert len(flight.pieces) < 60
+
+
+def test_the_prediction_is_what_the_plant_does(arm: SpaceRobot) -> None:
+    attitude = turned(40, -70, 100)
+    plant = plant_at(arm, [0.4, -1.2, 0.3], PERIOD, attitude)
+    goal = goal_of(attitude * turned(3, 8, -5))
+    method = planner(arm, cycles_per_plan=3)
+    schedule = method.plan(measured(plant), goal)
+    assert schedule.notes["cycles"] == 3
+    knots = np.round(schedule.path.time / PERIOD).astype(int).tolist()
+    assert (knots[0], knots[-1]) == (0, schedule.ticks)
+    for k, rates in enumerate(schedule.velocities):
+        if k in knots:
+            i = knots.index(k)
+            np.testing.assert_allclose(schedule.path.position[i], plant.pose[:3], atol=1e-9)
+            np.testing.assert_allclose(schedule.path.quaternion[i], plant.pose[3:], atol=1e-9)
+        assert not plant.step(rates)
+    np.testing.assert_allclose(plant.q, schedule.positions[-1], atol=1e-9)
+    left = Rotation.from_quat(plant.pose[3:]).inv() * Rotation.from_quat(goal.quaternion)
+    assert schedule.notes["predicted_attitude_error"] == pytest.approx(left.magnitude(), abs=1e-9)
+
+
+@pytest.mark.parametrize("cycles", [1, 4])
+def test_cycles_planned_ahead_are_the_same_cycles(arm: SpaceRobot, cycles: int) -> None:
+    goal = goal_of(turned(2, -3, 4))
+    plant = plant_at(arm, NOMINAL, PERIOD)
+    flight = fly(planner(arm, 0.05, cycles_per_plan=cycles), plant, goal)
+    one = fly(planner(arm, 0.05), plant_at(arm, NOMINAL, PERIOD), goal)
+    assert sum(float(str(piece.notes["cycles"])) for piece in flight.pieces) == len(one.pieces)
+    np.testing.assert_allclose(flight.poses[-1], one.poses[-1], atol=1e-6)
+
+
+# -- other robots, shapes and limits ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_any_robot_of_three_joints_or_more(seed: int) -> None:
+    rng = np.random.default_rng(40 + seed)
+    robot = SpaceRobot.from_urdf(random_robot_urdf(rng, 3 + seed % 2))
+    q = np.clip(rng.uniform(-1, 1, robot.n), robot.lower, robot.upper)
+    attitude = Rotation.from_rotvec(rng.normal(size=3))
+    goal = goal_of(attitude * Rotation.from_rotvec(rng.uniform(-0.2, 0.2, 3)))
+    method = planner(robot, 0.02, k=0.6)
+    flight = fly(method, plant_at(robot, q, PERIOD, attitude), goal)
+    assert np.linalg.norm(flight.left(goal)[-1]) <= 0.02
+    # Three joints move, the others rest.
+    moved = np.ptp(np.vstack([piece.positions for piece in flight.pieces]), axis=0) > 1e-9
+    assert moved.sum() <= 3
+
+
+def test_the_final_shape_is_reached_with_the_attitude(arm: SpaceRobot) -> None:
+    final = np.array([1.0, -2.0, -0.5])
+    goal = goal_of(turned(-4, 6, 2), final)
+    method = planner(arm, 2e-3, k=0.5)
+    flight = fly(method, plant_at(arm, [0.4, -1.2, 0.3], PERIOD), goal)
+    assert np.linalg.norm(flight.left(goal)[-1]) <= 2e-3
+    np.testing.assert_allclose(flight.shapes[-1], final, atol=1e-9)
+    # There, nothing is left to do.
+    end = plant_at(arm, final, PERIOD, Rotation.from_quat(flight.poses[-1][3:]))
+    schedule = method.plan(measured(end), goal, correction=True)
+    assert (schedule.ticks, schedule.partial) == (0, False)
+
+
+def test_the_nominal_shape_at_the_end_of_a_stroke_moves_its_loops_inside(arm: SpaceRobot) -> None:
+    shape = np.array([0.0, arm.upper[1], arm.lower[2]])
+    method = planner(arm, 0.01, nominal=shape.tolist(), k=0.5)
+    goal = goal_of(turned(8, -4, 3))
+    flight = fly(method, plant_at(arm, shape, PERIOD), goal)
+    assert np.linalg.norm(flight.left(goal)[-1]) <= 0.01
+    shapes = np.vstack([piece.positions for piece in flight.pieces])
+    assert np.all(shapes >= arm.lower - 1e-12)
+    assert np.all(shapes <= arm.upper + 1e-12)
+
+
+def test_edges_are_no_longer_than_allowed_and_rates_are_kept(arm: SpaceRobot) -> None:
+    goal = goal_of(turned(0, 0, 170))
+    method = planner(arm, largest_edge=0.3, edge_time=0.5, nominal=NOMINAL.tolist())
+    schedule = method.plan(measured(plant_at(arm, NOMINAL, PERIOD)), goal)
+    assert np.abs(schedule.positions - NOMINAL).max() <= 0.15 + 1e-9
+    assert np.abs(schedule.velocities).max() <= 0.5 + 1e-9
+    # Slower than half a second an edge: the servos' 0.5 rad/s.
+    assert np.abs(schedule.velocities).max() > 0.4
+
+
+def test_slow_edges_take_their_time_and_start_and_end_at_rest(arm: SpaceRobot) -> None:
+    goal = goal_of(turned(5, 5, 5))
+    method = planner(arm, period=0.01, edge_time=10.0, nominal=NOMINAL.tolist())
+    schedule = method.plan(measured(plant_at(arm, NOMINAL, 0.01)), goal)
+    # Six edges, and half an edge's time to the first corner and back.
+    assert schedule.duration == pytest.approx(70.0)
+    corners = np.array([0, 5, *range(15, 70, 10), 70]) * 100
+    speed = np.linalg.norm(schedule.velocities, axis=1)
+    for k in corners[1:-1]:
+        assert max(speed[k - 1], speed[k]) < 1e-3 * speed.max()
+    np.testing.assert_allclose(schedule.positions[-1], NOMINAL, atol=1e-12)
+
+
+def test_a_joint_without_limits_takes_the_nearest_turn(arm: SpaceRobot) -> None:
+    text = URDF.read_text().replace(
+        'name="shoulder_yaw" type="revolute"', 'name="shoulder_yaw" type="continuous"'
+    )
+    robot = SpaceRobot.from_urdf(text.replace('lower="-3.0" upper="3.0" ', ""))
+    method = planner(robot, nominal=NOMINAL.tolist())
+    q = np.array([4 * np.pi + 1.0, 0.0, 1.0])
+    state = RobotState(np.zeros(3), np.array([0, 0, 0, 1.0]), q)
+    schedule = method.plan(state, goal_of(turned(5, 5, 5)))
+    np.testing.assert_allclose(schedule.positions[-1], NOMINAL + np.array([4 * np.pi, 0.0, 0.0]))
+
+
+def test_a_goal_that_is_met_already_moves_nothing(arm: SpaceRobot) -> None:
+    state = RobotState(np.zeros(3), turned(1, 2, 3).as_quat(), np.array([0.4, -1.2, 0.3]))
+    schedule = planner(arm).plan(state, goal_of(turned(1, 2, 3.01)))
+    assert (schedule.ticks, schedule.partial) == (0, False)

@@ -1,0 +1,158 @@
+"""What closed motions turn: papers 1 to 3, against curvature by differences of another engine."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from planning.sliding_robots import paper_robot, random_sliding_robot
+from support.oracles import PinocchioOracle
+from support.random_robots import random_robot_urdf
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import METHODS
+from spacerobot_ros.planning.controllability import (
+    best_triple,
+    brackets_anywhere,
+    brackets_at,
+    curvature_matrices,
+    curvatures,
+    planar_chain,
+    sample_shapes,
+    sliding_masses,
+)
+
+Array = npt.NDArray[np.float64]
+
+FOLDER = Path(__file__).parents[2] / "urdf"
+
+
+def robot_named(name: str) -> SpaceRobot:
+    return SpaceRobot.from_file(FOLDER / f"{name}.urdf")
+
+
+def bracket(oracle: PinocchioOracle, q: Array, i: int, j: int) -> Array:
+    """Return ``dF_j/dq_i - dF_i/dq_j + F_i x F_j`` (3,), F the base rate of unit joint rates."""
+    h, unit = 1e-5, np.eye(oracle.n)
+
+    def F(at: Array, column: int) -> Array:
+        return oracle.base_twist(at, unit[column])[3:]
+
+    def slope(column: int, along: int) -> Array:
+        return (F(q + h * unit[along], column) - F(q - h * unit[along], column)) / (2 * h)
+
+    return slope(j, i) - slope(i, j) + np.cross(F(q, i), F(q, j))
+
+
+@pytest.mark.parametrize(("seed", "joints"), [(1, 3), (2, 5)])
+def test_curvatures_of_many_shapes_at_once(seed: int, joints: int) -> None:
+    urdf = random_robot_urdf(np.random.default_rng(seed), joints)
+    robot = SpaceRobot.from_urdf(urdf)
+    oracle = PinocchioOracle(urdf, robot.joint_names)
+    shapes = sample_shapes(robot, 3)
+    K = curvatures(robot, shapes)
+    assert K.shape == (3, 3, joints, joints)
+    for k, q in enumerate(shapes):
+        for i, j in itertools.permutations(range(joints), 2):
+            np.testing.assert_allclose(K[k, :, i, j], bracket(oracle, q, i, j), atol=1e-7)
+        M = curvature_matrices(K[k], (0, 2, 1))
+        columns = [K[k, :, 0, 2], K[k, :, 2, 1], K[k, :, 1, 0]]
+        np.testing.assert_array_equal(M, np.column_stack(columns))
+
+
+def test_samples_are_within_the_limits_and_spread() -> None:
+    robot = robot_named("three_joint_arm")
+    shapes = sample_shapes(robot, 200)
+    assert np.all(shapes >= robot.lower)
+    assert np.all(shapes <= robot.upper)
+    for column, low, high in zip(shapes.T, robot.lower, robot.upper, strict=True):
+        counts, _ = np.histogram(column, 5, (low, high))
+        assert counts.min() > 30
+    # A joint that turns for ever is looked at once round.
+    chain = sample_shapes(robot_named("planar_chain"), 200)
+    assert np.ptp(chain, axis=0) == pytest.approx(2 * np.pi, rel=0.05)
+
+
+def test_the_best_three_brackets_have_the_smallest_condition_number() -> None:
+    robot = SpaceRobot.from_urdf(random_robot_urdf(np.random.default_rng(4), 5))
+    shape = sample_shapes(robot, 1)[0]
+    K = robot.curvature(shape)[3:]
+    conditions = {
+        (i, j, k): np.linalg.cond(np.column_stack([K[:, i, j], K[:, j, k], K[:, k, i]]))
+        for i, j, k in itertools.combinations(range(5), 3)
+    }
+    triple, M = best_triple(K, range(5))
+    assert triple == min(conditions, key=lambda names: conditions[names])
+    found = brackets_at(robot, shape)
+    assert found.controllable
+    assert found.condition == pytest.approx(conditions[triple])
+    assert found.joints == tuple(robot.joint_names[i] for i in triple)
+    assert found.condition == pytest.approx(np.linalg.cond(M))
+
+
+def test_the_papers_sliding_masses() -> None:
+    # Paper 1, section 4.2: at z = 0 without offsets the brackets span, J^-1 times the body axes.
+    at_rest = brackets_at(robot_named("sliding_masses"), np.zeros(3))
+    assert at_rest.controllable
+    np.testing.assert_allclose(at_rest.singular_values, 0.5 / np.array([1, 1.5, 1.5]), rtol=1e-9)
+    assert sliding_masses(robot_named("sliding_masses")).controllable
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_almost_all_offsets_are_controllable(seed: int) -> None:
+    robot = random_sliding_robot(np.random.default_rng(seed), 3)
+    found = sliding_masses(SpaceRobot.from_urdf(robot.urdf))
+    assert (found.rank, found.wanted, found.controllable) == (3, 3, True)
+
+
+def test_sliders_in_a_plane_or_too_few_are_not() -> None:
+    whole = paper_robot()
+    two = replace(whole, sliders=whole.sliders[:2])
+    level = replace(whole.sliders[2], direction=np.array([0.6, 0.8, 0.0]))
+    flat = replace(whole, sliders=(*whole.sliders[:2], level))
+    for robot, count in ((two, 2), (flat, 3)):
+        found = sliding_masses(SpaceRobot.from_urdf(robot.urdf))
+        assert not found.controllable
+        assert f"{count} slider(s) of rank 2" in found.sentence
+
+
+def test_planar_robots_turn_about_one_axis() -> None:
+    chain = planar_chain(robot_named("planar_chain"))
+    assert (chain.rank, chain.wanted, chain.controllable) == (1, 1, True)
+    # At the paper's peak, the entries of its pair in the right order.
+    assert chain.singular_values[0] == pytest.approx(0.5376, abs=5e-5)
+    np.testing.assert_allclose(np.degrees(np.abs(chain.shape)), [153, 121], atol=0.6)
+    assert brackets_anywhere(robot_named("planar_chain")).rank == 1
+    arm = planar_chain(robot_named("three_joint_arm"))
+    assert not arm.controllable
+    assert "not planar" in arm.sentence
+
+
+def test_a_robot_of_one_joint_encloses_no_area() -> None:
+    one = SpaceRobot.from_urdf(random_robot_urdf(np.random.default_rng(0), 1))
+    found = brackets_anywhere(one)
+    assert (found.rank, found.controllable, found.condition) == (0, False, np.inf)
+    assert "no loop encloses an area" in found.sentence
+
+
+@pytest.mark.parametrize(
+    ("name", "suits"),
+    [
+        ("sliding_masses", {"lie_bracket", "area_loop"}),
+        ("three_joint_arm", {"area_loop"}),
+        ("planar_chain", {"square_path"}),
+        ("planar_manipulator", {"square_path"}),
+    ],
+)
+def test_which_methods_suit_the_robots_of_the_papers(name: str, suits: set[str]) -> None:
+    robot = robot_named(name)
+    methods = ("lie_bracket", "square_path", "area_loop")
+    objections = {method: METHODS[method].objection(robot) for method in methods}
+    assert {method for method in methods if not objections[method]} == suits
+    for sentence in filter(None, objections.values()):
+        assert name in sentence
+        assert sentence.endswith(".")

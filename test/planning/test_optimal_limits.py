@@ -1,0 +1,249 @@
+"""What optimal manoeuvres keep on their way, what is refused, and what is remembered."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+import pytest
+from planning.test_optimal import ARM_START, FOLDER, QUICK
+from scipy.spatial.transform import Rotation
+
+from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import GaitSchedule, RobotState, plan
+from spacerobot_ros.planning.optimal.constraints import PathConstraints
+from spacerobot_ros.planning.optimal.search import ManoeuvreSearch
+from spacerobot_ros.planning.optimal.transcription import Transcription
+
+Array = npt.NDArray[np.float64]
+
+EAST = [1.0, 0.0, 0.0]
+SUN = [float(np.cos(0.3)), float(np.sin(0.3)), 0.0]
+
+
+@pytest.fixture(scope="module")
+def arm() -> SpaceRobot:
+    return SpaceRobot.from_file(FOLDER / "three_joint_arm.urdf")
+
+
+def of_arm(arm: SpaceRobot, turn: npt.ArrayLike, **options: Any) -> GaitSchedule:
+    return plan(arm, rotvec=turn, start=ARM_START, **{**QUICK, **options})
+
+
+def reached(schedule: GaitSchedule, turn: npt.ArrayLike) -> float:
+    """Return the angle left to a goal, rad."""
+    last = Rotation.from_quat(schedule.path.quaternion[-1])
+    return float((last.inv() * Rotation.from_rotvec(turn)).magnitude())
+
+
+def chain(links: int) -> str:
+    """Return a planar chain of equal links with pins half a metre from their centres, as URDF."""
+    parts = []
+    for k in range(links):
+        parts.append(
+            f'<link name="link_{k}"><inertial><mass value="10"/><inertia ixx="1" iyy="1" izz="1" '
+            'ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        )
+        if k:
+            parts.append(
+                f'<joint name="pin_{k}" type="revolute"><parent link="link_{k - 1}"/>'
+                f'<child link="link_{k}"/><origin xyz="0.5 0 0"/><axis xyz="0 0 1"/>'
+                '<limit lower="-3" upper="3" velocity="1" effort="1"/></joint>'
+            )
+    return f'<robot name="chain">{"".join(parts)}</robot>'
+
+
+# -- on the way -------------------------------------------------------------------------------
+
+
+def test_the_base_turns_no_faster_than_it_may(arm: SpaceRobot) -> None:
+    turn = [0.2, -0.1, 0.3]
+    slow = of_arm(arm, turn, max_base_rate=0.12)
+    attitudes = Rotation.from_quat(slow.path.quaternion)
+    rates = (attitudes[:-1].inv() * attitudes[1:]).magnitude() / np.diff(slow.path.time)
+    assert 0.08 < rates.max() <= 0.12
+    assert reached(slow, turn) <= 1e-6
+
+
+def test_an_axis_stays_out_of_a_cone(arm: SpaceRobot) -> None:
+    turn = [0.0, 0.0, 0.6]
+
+    def nearest(schedule: GaitSchedule) -> float:
+        axes = Rotation.from_quat(schedule.path.quaternion).apply(EAST)
+        return float(np.arccos(np.clip(axes @ SUN, -1, 1)).min())
+
+    assert nearest(of_arm(arm, turn)) < 0.22
+    away = of_arm(arm, turn, keep_axis=EAST, keep_direction=SUN, keep_angle=0.25)
+    assert nearest(away) >= 0.25
+    assert reached(away, turn) <= 1e-6
+
+
+def test_joints_stay_out_of_a_box(arm: SpaceRobot) -> None:
+    turn, far = [0.2, -0.1, 0.3], 1e9
+    assert of_arm(arm, turn).positions[:, 1].max() > 0.0
+    box = [-far, -0.7, -far, far, far, far]
+    assert of_arm(arm, turn, keep_out=box).positions[:, 1].max() <= -0.7
+
+
+def test_margins_are_kept_but_where_the_goal_is_in_them(arm: SpaceRobot) -> None:
+    turn, margin = [0.2, -0.1, 0.3], np.array([2.5, 1.0, 0.0])
+    schedule = of_arm(arm, turn, joint_margin=margin.tolist())
+    assert np.all(schedule.positions >= arm.lower + margin - 1e-9)
+    assert np.all(schedule.positions <= arm.upper - margin + 1e-9)
+    inside = plan(
+        arm,
+        rotvec=turn,
+        start=ARM_START,
+        joint_positions=[0.8, -0.8, 1.0],
+        joint_margin=margin.tolist(),
+        **QUICK,
+    )
+    assert inside.positions[-1, 0] == pytest.approx(0.8)
+    assert inside.positions[:, 0].max() <= 0.8 + 1e-9
+
+
+# -- refusals ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("robot", "asked", "sentence"),
+    [
+        ("sliding_masses", {"position": [0.4, 0, 0]}, "it needs joint 'slider_1' at -3.2 m"),
+        ("sliding_masses", {"position": [9, 0, 0]}, "out of reach"),
+        (
+            "sliding_masses",
+            {"position": [0.1, 0, 0], "joint_positions": [0, 0, 0]},
+            "put the base 0.1 m from its position",
+        ),
+        (
+            "planar_chain",
+            {"rotvec": [0, 0.1, 1]},
+            "off any rotation about the axis [0.0, 0.0, 1.0]",
+        ),
+        ("planar_chain", {"joint_positions": [0.0]}, "has 2 joints"),
+        ("three_joint_arm", {"joint_positions": [9, 0, 0]}, "beyond limits: joint 'shoulder_yaw'"),
+        (
+            "three_joint_arm",
+            {"position": [0.5, 0, 0], "base_position": 1},
+            "the goal position is out of reach",
+        ),
+    ],
+)
+def test_goals_out_of_reach_are_refused(robot: str, asked: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(PlanningError, match="(?i)" + sentence.replace("[", r"\[")):
+        plan(robot, **asked, **QUICK)
+
+
+def test_two_links_turn_but_not_in_place() -> None:
+    """One joint turns the base to and fro: by its shape, and by no loop."""
+    robot = SpaceRobot.from_urdf(chain(2))
+    schedule = plan(robot, rotvec=[0, 0, 0.3], **QUICK)
+    assert reached(schedule, [0, 0, 0.3]) <= 1e-6
+    with pytest.raises(PlanningError, match="uncontrollable where the final shape is given"):
+        plan(robot, rotvec=[0, 0, 0.3], final_shape=1, **QUICK)
+    with pytest.raises(PlanningError, match="no joints"):
+        plan(SpaceRobot.from_urdf(chain(1)), rotvec=[0, 0, 0.3], **QUICK)
+
+
+def test_a_drifting_robot_is_refused(arm: SpaceRobot) -> None:
+    spin = RobotState(
+        np.zeros(3), np.array([0.0, 0, 0, 1]), ARM_START, angular_momentum=np.array([0, 0, 1.0])
+    )
+    with pytest.raises(PlanningError, match="drifts"):
+        plan(arm, rotvec=[0, 0, 0.1], start=spin, **QUICK)
+
+
+def test_a_goal_that_takes_too_long_is_refused(arm: SpaceRobot) -> None:
+    with pytest.raises(
+        PlanningError, match=r"No manoeuvre to the goal was found from 2 start\(s\)"
+    ):
+        of_arm(arm, [0.5, 0.5, 0.5], longest=3.0, starts=2, intervals=20)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"max_velocity": [1.0]}, "optimal.max_velocity has 1 number"),
+        ({"max_acceleration": [1.0, 0.0, 1.0]}, "'shoulder_pitch' is limited to 0.5"),
+        ({"keep_axis": EAST}, "takes all of"),
+        ({"keep_axis": [0.0, 0, 0], "keep_direction": SUN, "keep_angle": 1.0}, "not all zero"),
+        ({"keep_out": [0.0, 1.0]}, "3 lower and 3 upper"),
+        ({"keep_out": [1.0, 1, 1, 0, 0, 0]}, "is not below"),
+        ({"thrust": 1}, "has no option 'thrust'"),
+    ],
+)
+def test_bad_options_are_refused(arm: SpaceRobot, options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        of_arm(arm, [0, 0, 0.1], **options)
+
+
+def test_a_start_that_breaks_a_constraint_is_refused(arm: SpaceRobot) -> None:
+    with pytest.raises(PlanningError, match="at the start, the shape enters a box"):
+        of_arm(arm, [0, 0, 0.1], keep_out=[-1, -1, 1, 1, 0, 2])
+
+
+def test_a_goal_that_is_met_takes_no_time(arm: SpaceRobot) -> None:
+    assert of_arm(arm, [0, 0, 0]).ticks == 0
+
+
+# -- memory -----------------------------------------------------------------------------------
+
+
+def test_a_plan_is_found_again_only_where_all_is_the_same(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
+    robot = SpaceRobot.from_file(FOLDER / "planar_chain.urdf")
+    asked: dict[str, Any] = {**QUICK, "cache": 1, "rotvec": [0, 0, 0.5]}
+    first = plan(robot, **asked)
+
+    def searching(*arguments: Any, **options: Any) -> None:
+        raise PlanningError("searched")
+
+    monkeypatch.setattr(ManoeuvreSearch, "search", searching)
+    again = plan(robot, **asked)
+    np.testing.assert_array_equal(again.positions, first.positions)
+    np.testing.assert_array_equal(again.path.quaternion, first.path.quaternion)
+    heavier = (FOLDER / "planar_chain.urdf").read_text().replace('"120"', '"121"')
+    others: list[tuple[SpaceRobot, dict[str, Any]]] = [
+        (robot, {"rotvec": [0, 0, 0.6]}),
+        (robot, {"start": [0.1, 0.0]}),
+        (robot, {"tick_period": 0.05}),
+        (robot, {"max_velocity": [1.0, 1.0]}),
+        (robot, {"joint_positions": [0.0, 0.0]}),
+        (SpaceRobot.from_urdf(heavier), {}),
+    ]
+    for other, change in others:
+        with pytest.raises(PlanningError, match="searched"):
+            plan(other, **{**asked, **change})
+    (kept,) = (tmp_path / "plans").glob("*.npz")
+    kept.write_bytes(kept.read_bytes()[:100])
+    with pytest.raises(PlanningError, match="searched"):
+        plan(robot, **asked)
+
+
+# -- derivatives ------------------------------------------------------------------------------
+
+
+def test_derivatives_of_the_program_are_those_of_its_functions(arm: SpaceRobot) -> None:
+    """The Jacobian and the Hessian that are put together, against CasADi's own."""
+    constraints = PathConstraints.of(arm, 0.2, EAST, SUN, 0.2, [0.5, 0, 0, 1, 1, 1])
+    program = Transcription(arm, 3, np.eye(3), position=True, constraints=constraints).program()
+    x, p, g = (program.problem[name] for name in ("x", "p", "g"))
+    lam = ca.MX.sym("lam", g.numel())
+    lagrangian = 0.7 * program.problem["f"] + ca.dot(lam, g)
+    plain = ca.Function(
+        "plain", [x, p, lam], [ca.jacobian(g, x), ca.triu(ca.hessian(lagrangian, x)[0])]
+    )
+    rng = np.random.default_rng(0)
+    at, of, by = (rng.uniform(0.2, 0.8, s.numel()) for s in (x, p, lam))
+    jacobian, hessian = plain(at, of, by)
+    values, jac = program.jac_g(at, of)
+    assert values.numel() == len(program.lower) == len(program.upper)
+    np.testing.assert_allclose(jac.full(), jacobian.full(), atol=1e-9)
+    found = program.hess_lag(at, of, 0.7, by).full()
+    np.testing.assert_allclose(found, hessian.full(), rtol=1e-9, atol=1e-8)

@@ -1,0 +1,196 @@
+"""Which messages a replay sends when: against the log times that were written."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+
+from spacerobot_ros.recording import LATCHED, BagWriter, RecordingError, Timeline, read_bag
+from spacerobot_ros.recording.replay import Playback
+
+STRING = "std_msgs/msg/String"
+S = 10**9
+BEGAN = 1_700_000_000 * S
+CLOCK = 77 * S
+"""Where the clock of a replay is when it begins."""
+
+
+def string(text: str) -> bytes:
+    """Serialise a std_msgs/String by hand."""
+    data = text.encode() + b"\0"
+    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
+
+
+def bag_of(path: Path, entries: Sequence[tuple[str, float]], chunk_size: int = 65536) -> Path:
+    """Write messages "/topic n" at so many seconds from the beginning, in the order given."""
+    with BagWriter(path, chunk_size=chunk_size) as writer:
+        for n, (topic, seconds) in enumerate(entries):
+            qos = LATCHED if topic.startswith("/latched") else None
+            channel = writer.add_topic(topic, STRING, qos)
+            time_ns = BEGAN + round(seconds * S)
+            writer.write(channel, string(f"{topic} {n}"), time_ns, time_ns)
+    return path
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """/a every 0.1 s and /b every 0.25 s for 1 s, and two messages on a latched topic."""
+    entries = [("/a", 0.1 * k) for k in range(11)] + [("/b", 0.25 * k) for k in range(5)]
+    entries += [("/latched", 0.0), ("/latched", 0.3)]
+    return bag_of(tmp_path / "a.mcap", sorted(entries, key=lambda entry: entry[1]))
+
+
+def played(playback: Playback, end: float, step: float = 0.01) -> list[tuple[float, str]]:
+    """Run a clock by steps; return when, in s since the beginning, each message was sent."""
+    playback.run(CLOCK)
+    found = []
+    for k in range(round(end / step) + 1):
+        now = round(k * step * S)
+        for message in playback.due(CLOCK + now, 1000):
+            found.append((now / S, message.data[8:-1].decode()))
+    return found
+
+
+def test_every_message_comes_at_its_time(path: Path) -> None:
+    playback = Playback(read_bag(path))
+    found = played(playback, 1.0)
+    assert len(found) == 18
+    for topic, period in (("/a", 0.1), ("/b", 0.25)):
+        times = [time for time, text in found if text.startswith(topic)]
+        assert times == pytest.approx([period * k for k in range(len(times))])
+    assert playback.ended
+    assert playback.next_due() is None
+
+
+@pytest.mark.parametrize("rate", [0.5, 3.0, 1000.0])
+def test_the_rate_divides_the_spacing(path: Path, rate: float) -> None:
+    playback = Playback(read_bag(path), topics=["/b"], rate=rate)
+    playback.run(CLOCK)
+    for k in range(5):
+        due = playback.next_due()
+        assert due is not None
+        assert due == pytest.approx(CLOCK + 0.25 * k / rate * S, abs=2)
+        assert playback.due(due - 10, 9) == []
+        (message,) = playback.due(due + 2, 9)
+        assert message.log_time_ns == BEGAN + k * S // 4
+    assert playback.ended
+
+
+def test_start_and_duration_choose_a_part(path: Path) -> None:
+    found = played(Playback(read_bag(path), topics=["/a"], start=0.25, duration=0.5), 1.0)
+    times = [time for time, _ in found]
+    assert times == pytest.approx([0.05, 0.15, 0.25, 0.35, 0.45])
+
+
+def test_what_was_latched_before_the_start_comes_first(path: Path) -> None:
+    found = played(Playback(read_bag(path), start=0.5), 1.0)
+    assert found[0][0] == 0.0
+    assert found[0][1].startswith("/latched")
+    assert [text for _, text in found if text.startswith("/latched")] == [found[0][1]]
+    assert found[0][1] in [text for time, text in played(Playback(read_bag(path)), 1) if time > 0.1]
+
+
+def test_a_late_clock_gets_everything_that_is_due_in_order(path: Path) -> None:
+    playback = Playback(read_bag(path))
+    playback.run(CLOCK)
+    first = playback.due(CLOCK + 2 * S, 5)
+    rest = playback.due(CLOCK + 2 * S, 100)
+    assert (len(first), len(rest)) == (5, 13)
+    times = [message.log_time_ns for message in first + rest]
+    assert times == sorted(times)
+
+
+def test_a_pause_shifts_what_follows(path: Path) -> None:
+    playback = Playback(read_bag(path), topics=["/a"])
+    playback.run(CLOCK)
+    assert len(playback.due(CLOCK + S // 4, 100)) == 3
+    playback.pause(CLOCK + S // 4)
+    assert not playback.running
+    assert playback.due(CLOCK + 50 * S, 100) == []
+    assert playback.next_due() is None
+    assert playback.bag_time(CLOCK + 50 * S) == BEGAN + S // 4
+    playback.run(CLOCK + 60 * S)
+    assert playback.next_due() == CLOCK + 60 * S + S // 20
+
+
+def test_steps_move_the_time_of_the_bag(path: Path) -> None:
+    playback = Playback(read_bag(path), topics=["/b"])
+    for k in range(3):
+        message = playback.step(CLOCK)
+        assert message is not None
+        assert message.log_time_ns == BEGAN + k * S // 4
+    playback.run(CLOCK + 5 * S)
+    assert playback.next_due() == CLOCK + 5 * S + S // 4
+    while playback.step(CLOCK + 9 * S) is not None:
+        pass
+    assert playback.ended
+
+
+def test_a_loop_begins_again_at_the_time_of_the_last_message(path: Path) -> None:
+    found = played(Playback(read_bag(path), topics=["/b"], start=0.25, loop=True), 2.5)
+    times = [time for time, _ in found]
+    turn = [0.0, 0.25, 0.5, 0.75]
+    assert times[:12] == pytest.approx([0.75 * n + t for n in range(3) for t in turn])
+
+
+def test_messages_written_out_of_order_are_played_in_order(tmp_path: Path) -> None:
+    seconds = [3.0, 1.0, 2.0, 9.0, 8.5, 8.75, 4.0, 5.0, 5.0, 0.0]
+    path = bag_of(tmp_path / "a.mcap", [("/a", s) for s in seconds], chunk_size=100)
+    texts = [text for _, text in played(Playback(read_bag(path)), 9.0)]
+    # Equal times keep the order in which they were written.
+    order = sorted(range(len(seconds)), key=lambda n: seconds[n])
+    assert texts == [f"/a {n}" for n in order]
+
+
+def test_a_bag_without_chunks(tmp_path: Path) -> None:
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file, use_chunking=False, compression=CompressionType.NONE)
+        writer.start("ros2")
+        schema = writer.register_schema(STRING, "ros2msg", b"string data")
+        channel = writer.register_channel("/a", "cdr", schema)
+        for n, seconds in enumerate((2, 0, 1)):
+            writer.add_message(channel, BEGAN + seconds * S, string(f"/a {n}"), BEGAN)
+        writer.finish()
+    found = played(Playback(read_bag(tmp_path / "a.mcap")), 2.0)
+    assert found == [(0.0, "/a 1"), (1.0, "/a 2"), (2.0, "/a 0")]
+
+
+def test_what_cannot_be_played_is_refused(path: Path, tmp_path: Path) -> None:
+    bag = read_bag(path)
+    with pytest.raises(RecordingError, match="has no topic /c: it has /a"):
+        Playback(bag, topics=["/c"])
+    with pytest.raises(RecordingError, match=r"no message to replay from 1.5 s on: it lasts 1 s"):
+        Playback(bag, start=1.5)
+    with pytest.raises(RecordingError, match=r"from 0.01 s on for 0.05 s: it lasts 1 s"):
+        Playback(bag, topics=["/a"], start=0.01, duration=0.05)
+    with pytest.raises(RecordingError, match="has no messages"):
+        Playback(read_bag(bag_of(tmp_path / "empty.mcap", [])))
+
+
+@given(
+    rate=st.floats(1e-3, 1e6),
+    at=st.integers(0, 10**13),
+    moves=st.lists(st.tuples(st.booleans(), st.integers(0, 10**12)), max_size=8),
+)
+def test_time_goes_on_by_the_rate_and_stands_in_pauses(
+    rate: float, at: int, moves: list[tuple[bool, int]]
+) -> None:
+    timeline = Timeline(rate, BEGAN)
+    running_ns = 0
+    clock = CLOCK
+    for runs, passed in moves:
+        (timeline.run if runs else timeline.stop)(clock)
+        clock += passed
+        running_ns += passed if runs else 0
+    exact = BEGAN + running_ns * rate
+    # A nanosecond is lost at most wherever time stopped, and the accuracy of a float.
+    assert timeline.bag_time(clock) == pytest.approx(exact, abs=9, rel=1e-15)
+    if timeline.running:
+        due = timeline.clock_time(timeline.bag_time(clock) + at)
+        assert timeline.bag_time(due) >= timeline.bag_time(clock) + at - max(1, at * 1e-12)

@@ -1,0 +1,182 @@
+"""Bags cut off anywhere, or damaged: what is saved, read with nothing of this package."""
+
+from __future__ import annotations
+
+import random
+import struct
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from click.testing import CliRunner
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+from rosbags.highlevel import AnyReader
+
+from spacerobot_ros.app.cli import main
+from spacerobot_ros.recording import LATCHED, BagWriter, RecordingError, read_bag
+from spacerobot_ros.recording.salvage import salvage_bag
+
+STRING = "std_msgs/msg/String"
+COUNT = 900
+
+
+def string(text: str) -> bytes:
+    """Serialise a std_msgs/String by hand."""
+    data = text.encode() + b"\0"
+    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """900 messages on two topics in some 30 chunks, an attachment and metadata among them."""
+    path = tmp_path_factory.mktemp("bags") / "flight.mcap"
+    with BagWriter(path, chunk_size=2000) as writer:
+        writer.add_attachment("robot.urdf", b"<robot/>" * 50, "application/xml", 5)
+        writer.add_metadata("parameters/plant", {"tick_rate": "20.0"})
+        channels = [writer.add_topic("/a", STRING), writer.add_topic("/b", STRING, LATCHED)]
+        for n in range(COUNT):
+            writer.write(channels[n % 2], string(f"{n:05d}" + "x" * 40), n * 10**7, n * 10**7 + 5)
+    return path
+
+
+class Content:
+    """What a complete bag holds, by the library of its format."""
+
+    def __init__(self, path: Path) -> None:
+        with path.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            summary = reader.get_summary()
+            assert summary is not None
+            assert summary.statistics is not None
+            self.messages: list[Any] = [
+                (channel.topic, message.log_time, message.publish_time, message.data)
+                for _, channel, message in reader.iter_messages()
+            ]
+            assert summary.statistics.message_count == len(self.messages)
+            assert summary.statistics.chunk_count == len(summary.chunk_indexes)
+            self.attachments = {a.name: a.data for a in reader.iter_attachments()}
+            self.metadata = {m.name: m.metadata for m in reader.iter_metadata()}
+            self.channels = {c.topic: c.metadata for c in summary.channels.values()}
+            file.seek(0)
+            # As a stream, every message comes after its channel.
+            assert list(StreamReader(file, validate_crcs=True).records)
+
+
+def whole_chunks(content: bytes, length: int) -> int:
+    """Say how many messages are in chunks that end before `length`, from the bag's own index."""
+    summary = make_reader(BytesIO(content)).get_summary()
+    assert summary is not None
+    total = 0
+    for index in summary.chunk_indexes:
+        if index.chunk_start_offset + index.chunk_length <= length:
+            for offset in index.message_index_offsets.values():
+                total += struct.unpack_from("<I", content, offset + 11)[0] // 16
+    return total
+
+
+def test_whatever_was_cut_off_the_rest_is_saved(bag: Path, tmp_path: Path) -> None:
+    whole = bag.read_bytes()
+    everything = Content(bag).messages
+    cut = tmp_path / "cut.mcap"
+    chance = random.Random(4)
+    lengths = [
+        len(whole) - 1,
+        len(whole) - 30,
+        *(chance.randrange(600, len(whole)) for _ in range(25)),
+    ]
+    for length in lengths:
+        cut.write_bytes(whole[:length])
+        saved = salvage_bag(cut)
+        assert saved.path == tmp_path / "cut-salvaged.mcap"
+        content = Content(saved.path)
+        assert content.messages == everything[: len(content.messages)]
+        assert len(content.messages) == saved.messages == whole_chunks(whole, length)
+        assert content.attachments == {"robot.urdf": b"<robot/>" * 50}
+        assert content.metadata["parameters/plant"] == {"tick_rate": "20.0"}
+        said = yaml.safe_load(content.metadata["rosbag2"]["serialized_metadata"])
+        assert said["message_count"] == saved.messages
+        assert said["relative_file_paths"] == ["cut-salvaged.mcap"]
+        assert content.channels == {
+            k: v for k, v in Content(bag).channels.items() if k in content.channels
+        }
+        with AnyReader([saved.path]) as reader:
+            assert reader.message_count == saved.messages
+        assert read_bag(saved.path).message_count() == saved.messages
+        assert cut.read_bytes() == whole[:length]
+        saved.path.unlink()
+
+
+def test_a_damaged_chunk_is_left_out_and_counted(bag: Path, tmp_path: Path) -> None:
+    content = bytearray(bag.read_bytes())
+    with bag.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    index = summary.chunk_indexes[10]
+    content[index.chunk_start_offset + index.chunk_length - 20] ^= 0xFF
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(content)
+    saved = salvage_bag(damaged, tmp_path / "out.mcap")
+    assert saved.lost_chunks == 1
+    assert saved.lost_bytes == 0
+    messages = Content(saved.path).messages
+    lost = [m for m in Content(bag).messages if m not in messages]
+    assert len(messages) == COUNT - len(lost) == saved.messages
+    assert index.message_start_time <= lost[0][1] <= lost[-1][1] <= index.message_end_time
+
+
+def test_a_bag_without_chunks_and_of_another_kind(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, use_chunking=False)
+        writer.start("mine")
+        schema = writer.register_schema("Thing", "jsonschema", b"{}")
+        channel = writer.register_channel("/a", "json", schema)
+        for n in range(100):
+            writer.add_message(channel, n, b"%d" % n, n)
+        writer.finish()
+    content = path.read_bytes()
+    path.write_bytes(content[: content.index(b"\x0f\x04\0\0\0\0\0\0\0") - 3])
+    saved = salvage_bag(path)
+    found = Content(saved.path)
+    assert [data for *_, data in found.messages] == [b"%d" % n for n in range(99)]
+    assert "rosbag2" not in found.metadata
+    with saved.path.open("rb") as file:
+        assert make_reader(file).get_header().profile == "mine"
+
+
+def test_what_cannot_be_salvaged_is_refused(bag: Path, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="is complete: there is nothing to salvage"):
+        salvage_bag(bag)
+    with pytest.raises(RecordingError, match="There is no bag at"):
+        salvage_bag(tmp_path / "none.mcap")
+    (tmp_path / "text.mcap").write_text("some other thing")
+    with pytest.raises(RecordingError, match="is not an MCAP file"):
+        salvage_bag(tmp_path / "text.mcap")
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(bag.read_bytes()[:30])
+    with pytest.raises(RecordingError, match="Nothing in the bag"):
+        salvage_bag(cut)
+    cut.write_bytes(bag.read_bytes()[:-1])
+    (tmp_path / "cut-salvaged.mcap").write_text("precious")
+    with pytest.raises(RecordingError, match=r"cut-salvaged.mcap: File exists"):
+        salvage_bag(cut)
+    assert (tmp_path / "cut-salvaged.mcap").read_text() == "precious"
+
+
+def test_the_commands_offer_it_and_it_does(bag: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(bag.read_bytes()[:20_000])
+    run = CliRunner().invoke
+    for command in ("verify", "report"):
+        result = run(main, [command, str(cut)])
+        assert result.exit_code == 2
+        assert f"'spacerobot salvage {cut}'" in result.output
+    result = run(main, ["salvage", str(cut), "-o", str(tmp_path / "new.mcap")])
+    assert result.exit_code == 0
+    count = len(Content(tmp_path / "new.mcap").messages)
+    assert f"saved       {count} messages over {(count - 1) / 100:g} s" in result.output
+    assert run(main, ["salvage", str(bag)]).exit_code == 2

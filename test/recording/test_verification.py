@@ -1,0 +1,121 @@
+"""A reference bag, tampered with: what its verification says of every change."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from support.altered_bags import altered
+from support.ros_harness import assert_one_sentence
+
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.recording import read_bag
+from spacerobot_ros.recording.verification import verify_bag
+from spacerobot_ros.resources import share_directory
+
+BAG = share_directory() / "bags" / "sliding_masses.mcap"
+TICK = 0.1
+TICKS = 340
+
+
+def scaled(message: JointState) -> JointState:
+    message.velocity[1] += 1e-4
+    return message
+
+
+@pytest.mark.parametrize("tick", [1, 80, 333])
+def test_an_altered_command_is_found_where_it_acts(tmp_path: Path, tick: int) -> None:
+    bag = altered(BAG, tmp_path / "b.mcap", "/joint_commands", tick, scaled)
+    difference = verify_bag(bag).difference
+    assert difference is not None
+    assert difference.time == pytest.approx((tick + 1) * TICK)
+    assert (difference.topic, difference.field) == ("/joint_states", "position of slider_2")
+    # What the slider does in a tick.
+    assert difference.expected - difference.recorded == pytest.approx(1e-4 * TICK, rel=1e-6)
+    assert_one_sentence(str(difference), "position of slider_2", f"{(tick + 1) * TICK:g} s")
+
+
+def moved(message: Any) -> Any:
+    if isinstance(message, JointState):
+        message.velocity[2] += 1e-6
+    elif isinstance(message, Odometry):
+        message.twist.twist.angular.y += 1e-6
+    elif isinstance(message, PoseStamped):
+        message.pose.orientation.x += 1e-6
+    elif isinstance(message, Float64MultiArray):
+        message.data[6] += 1e-6
+    return message
+
+
+@pytest.mark.parametrize(
+    ("topic", "field"),
+    [
+        ("/joint_states", "velocity of slider_3"),
+        ("/odom", "twist.twist.angular.y"),
+        ("/base_pose", "pose.orientation.x"),
+        ("/momentum", "kinetic energy"),
+    ],
+)
+def test_an_altered_state_is_found(tmp_path: Path, topic: str, field: str) -> None:
+    bag = altered(BAG, tmp_path / "b.mcap", topic, 33, moved)
+    difference = verify_bag(bag).difference
+    assert difference is not None
+    assert (difference.topic, difference.field) == (topic, field)
+    assert difference.time == pytest.approx(read_bag(BAG)[topic].stamp[33])
+    assert difference.recorded - difference.expected == pytest.approx(1e-6, rel=1e-6)
+    assert verify_bag(bag, tolerance=2e-6).difference is None
+
+
+def test_another_robot_is_found(tmp_path: Path) -> None:
+    text = b'<mass value="10"/>', b'<mass value="10.01"/>'
+    difference = verify_bag(altered(BAG, tmp_path / "b.mcap", urdf=text)).difference
+    assert difference is not None
+    # The joints go as commanded; the base is the first to differ.
+    assert difference.topic == "/odom"
+    assert difference.time == pytest.approx(TICK)
+
+
+def test_a_missing_command_is_named(tmp_path: Path) -> None:
+    bag = altered(BAG, tmp_path / "b.mcap", "/joint_commands", 5, lambda _: None)
+    difference = verify_bag(bag).difference
+    assert difference is not None
+    assert difference.time == pytest.approx(6 * TICK)
+    assert "no message on /joint_commands is stamped 0.5 s" in str(difference)
+
+
+def test_a_bag_that_begins_in_mid_flight(tmp_path: Path) -> None:
+    bag = BAG
+    for topic in ("/odom", "/joint_states", "/momentum", "/base_pose"):
+        name = f"{topic.strip('/')}.mcap"
+        bag = altered(bag, tmp_path / name, topic, 0, lambda _: None)
+    result = verify_bag(bag)
+    assert result.difference is None
+    assert result.ticks == TICKS - 1
+    bag = altered(bag, tmp_path / "changed.mcap", "/odom", 7, moved)
+    difference = verify_bag(bag).difference
+    assert difference is not None
+    assert difference.time == pytest.approx(8 * TICK)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "mention"),
+    [
+        ({"time_mode": '"realtime"'}, "in real time"),
+        ({"actuation": '"magic"'}, "'magic'"),
+        ({"tick_rate": "not a number"}, "cannot be read"),
+        ({"initial_position": '"here"'}, "cannot be used"),
+        ({"tick_rate": "30.01"}, "between the ticks"),
+    ],
+)
+def test_what_cannot_be_flown_again_is_refused(
+    tmp_path: Path, parameters: dict[str, str], mention: str
+) -> None:
+    bag = altered(BAG, tmp_path / "b.mcap", parameters=parameters)
+    with pytest.raises(SpaceRobotError) as refusal:
+        verify_bag(bag)
+    assert_one_sentence(str(refusal.value), mention)

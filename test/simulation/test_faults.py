@@ -1,0 +1,367 @@
+"""Faults of actuators: their lines, their times, and what a plant with them does."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.effort_flights import random_urdf, robot_of, thrusts, tumbling
+from support.oracles import Array, PinocchioOracle
+from support.ros_harness import assert_one_sentence
+
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
+from spacerobot_ros.simulation.faults import FaultTimeline, Targets, parse_fault
+from spacerobot_ros.simulation.faults_plant import FaultyPlant
+from spacerobot_ros.simulation.plant import Plant
+from spacerobot_ros.simulation.thrusters import thrusters_in, with_thrusters
+
+URDF = Path(__file__).parents[2] / "urdf"
+TICK = 0.05
+ARM = ("shoulder_yaw", "shoulder_pitch", "elbow_pitch")
+TARGETS = Targets(ARM, wrench=True, nozzles=("plus_x", "minus_x"))
+
+
+def urdf(name: str) -> str:
+    return (URDF / f"{name}.urdf").read_text("utf-8")
+
+
+def arm(*faults: str, seed: int = 0, tick: float = TICK) -> FaultyPlant:
+    """Return the three-joint arm under velocity commands."""
+    return FaultyPlant(
+        VelocityPlant(robot_of(urdf("three_joint_arm")), tick),
+        faults,
+        tick,
+        wrench=False,
+        seed=seed,
+    )
+
+
+def pushed(plant: Plant, *faults: str) -> FaultyPlant:
+    return FaultyPlant(plant, faults, TICK, wrench=True)
+
+
+def momenta(robot: str, plant: FaultyPlant) -> Array:
+    """Return linear over angular momentum (6,), world, by Pinocchio."""
+    oracle = PinocchioOracle(robot, plant.robot.joint_names)
+    oracle.set_configuration(plant.q, plant.pose[3:], plant.pose[:3])
+    oracle.move(oracle.base_velocities(plant.twist) + oracle.joint_velocities(plant.qdot))
+    p, L, _ = oracle.momentum_W()
+    return np.concatenate([p, L])
+
+
+# -- lines and times --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("line", "written"),
+    [
+        ("joint_stuck elbow_pitch", "joint_stuck elbow_pitch at 7"),
+        ("joint_stuck elbow_pitch at 10.0 until 50", "joint_stuck elbow_pitch at 10 until 50"),
+        ("  joint_slow  shoulder_yaw 0.25 until 9 ", "joint_slow shoulder_yaw 0.25 at 7 until 9"),
+        ("actuator_bias elbow_pitch -1e-3 at 0", "actuator_bias elbow_pitch -0.001 at 0"),
+        ("thruster_off all at 1", "thruster_off all at 1"),
+        ("thruster_stuck torque_z -2", "thruster_stuck torque_z -2 at 7"),
+        ("nozzle_weak minus_x 0.5", "nozzle_weak minus_x 0.5 at 7"),
+        ("sensor_bias attitude_y 0.01", "sensor_bias attitude_y 0.01 at 7"),
+        ("sensor_dropout odom until 8", "sensor_dropout odom at 7 until 8"),
+    ],
+)
+def test_a_line_is_read_and_written(line: str, written: str) -> None:
+    fault = parse_fault(line, TARGETS, now=7.0)
+    assert str(fault) == written
+    assert parse_fault(str(fault), TARGETS) == fault
+
+
+@pytest.mark.parametrize(
+    ("line", "mentions"),
+    [
+        ("stuck", ("KIND TARGET", "'stuck'")),
+        ("joint_broken elbow_pitch", ("'joint_broken'", "joint_stuck")),
+        ("joint_stuck elbow", ("shoulder_yaw, shoulder_pitch, elbow_pitch",)),
+        ("joint_slow elbow_pitch at 3", ("needs a value", "factor")),
+        ("joint_slow elbow_pitch 1.5", ("1.5", "0 to 1")),
+        ("actuator_noise elbow_pitch -1", ("-1", "from 0 up")),
+        ("actuator_bias elbow_pitch much", ("'much'", "finite")),
+        ("actuator_bias elbow_pitch nan", ("'nan'", "finite")),
+        ("joint_stuck elbow_pitch 3", ("'at SECONDS'",)),
+        ("joint_stuck elbow_pitch until 9 at 3", ("'at SECONDS'",)),
+        ("joint_stuck elbow_pitch at", ("'at SECONDS'",)),
+        ("joint_stuck elbow_pitch at 5 until 5", ("ends at 5 s", "begins at 5 s")),
+        ("sensor_dropout joint_states", ("odom",)),
+        ("nozzle_open nose", ("plus_x, minus_x",)),
+    ],
+)
+def test_a_bad_line_is_refused_with_a_sentence(line: str, mentions: tuple[str, ...]) -> None:
+    with pytest.raises(ParameterError) as refusal:
+        parse_fault(line, TARGETS)
+    assert_one_sentence(str(refusal.value), line, *mentions)
+
+
+def test_a_plant_without_thrusters_has_no_faults_of_thrusters() -> None:
+    for line in ("thruster_off all", "thruster_stuck force_x 1", "nozzle_open plus_x"):
+        with pytest.raises(ParameterError, match="nothing that"):
+            arm(line)
+
+
+def test_faults_are_active_from_their_start_until_before_their_end() -> None:
+    lines = [
+        "joint_stuck elbow_pitch at 1 until 3",
+        "thruster_off all at 2",
+        "",
+        "sensor_delay odom 1",
+    ]
+    timeline = FaultTimeline(lines, TARGETS)
+    active = {t: [f.kind for f in timeline.at(t)] for t in (0.0, 0.999, 1.0, 2.0, 2.999, 3.0, 9.0)}
+    assert active == {
+        0.0: ["sensor_delay"],
+        0.999: ["sensor_delay"],
+        1.0: ["joint_stuck", "sensor_delay"],
+        2.0: ["joint_stuck", "thruster_off", "sensor_delay"],
+        2.999: ["joint_stuck", "thruster_off", "sensor_delay"],
+        3.0: ["thruster_off", "sensor_delay"],
+        9.0: ["thruster_off", "sensor_delay"],
+    }
+
+
+# -- joints under velocity commands -----------------------------------------------------------
+
+
+def test_a_stuck_joint_stays_and_the_others_go_on() -> None:
+    plant = arm("joint_stuck shoulder_pitch at 0.2 until 0.4")
+    command = np.array([0.1, -0.2, 0.3])
+    shapes = [plant.q.copy()]
+    for _ in range(12):
+        plant.step(command)
+        shapes.append(plant.q.copy())
+    # Ticks 4 to 7 begin within [0.2, 0.4) s.
+    moves = np.arange(13)[:, None] * TICK * command
+    moves[:, 1] = command[1] * TICK * np.concatenate([np.arange(5), np.full(4, 4), np.arange(5, 9)])
+    np.testing.assert_allclose(shapes, moves, atol=1e-14)
+    np.testing.assert_allclose(momenta(urdf("three_joint_arm"), plant), 0.0, atol=1e-12)
+    np.testing.assert_array_equal(command, [0.1, -0.2, 0.3])
+
+
+def test_slow_joints_and_biased_actuators_do_what_their_values_say() -> None:
+    plant = arm(
+        "joint_slow shoulder_yaw 0.5",
+        "actuator_bias elbow_pitch 0.02",
+        "joint_slow elbow_pitch 0.1",
+    )
+    for _ in range(20):
+        plant.step(np.array([0.1, 0.2, -0.1]))
+    np.testing.assert_allclose(plant.q, [0.05, 0.2, -0.008], atol=1e-14)
+
+
+def test_actuator_noise_has_its_sigma_and_its_seed() -> None:
+    flights = []
+    for seed in (1, 1, 2):
+        plant = arm("actuator_noise shoulder_yaw 0.03", seed=seed, tick=0.01)
+        rates = []
+        for _ in range(3000):
+            plant.step(np.array([0.0, 0.01, 0.0]))
+            rates.append(plant.qdot.copy())
+        flights.append(np.array(rates))
+    np.testing.assert_array_equal(flights[0], flights[1])
+    assert np.abs(flights[0] - flights[2])[:, 0].max() > 0.01
+    yaw = flights[0][:, 0]
+    assert yaw.std() == pytest.approx(0.03, rel=0.05)
+    assert abs(yaw.mean()) < 4 * 0.03 / np.sqrt(len(yaw))
+    np.testing.assert_array_equal(flights[0][:, 1:], np.tile([0.01, 0.0], (3000, 1)))
+
+
+def test_faults_are_injected_and_repaired_while_it_runs() -> None:
+    plant = arm("joint_slow shoulder_yaw 0.5 at 0.1")
+    command = np.array([0.1, 0.0, 0.0])
+    for _ in range(4):
+        plant.step(command)
+    plant.inject("joint_stuck shoulder_yaw\njoint_slow elbow_pitch 0.5 at 100")
+    assert [str(f) for f in plant.active] == [
+        "joint_slow shoulder_yaw 0.5 at 0.1",
+        "joint_stuck shoulder_yaw at 0.2",
+    ]
+    plant.step(command)
+    assert plant.q[0] == pytest.approx(0.1 * TICK * 3)
+    with pytest.raises(ParameterError, match="joint_stuck nose"):
+        plant.inject("joint_slow elbow_pitch 0.5\njoint_stuck nose")
+    assert len(plant.active) == 2
+    plant.inject("clear")
+    assert not plant.active
+    plant.step(command)
+    assert plant.q[0] == pytest.approx(0.1 * TICK * 4)
+
+
+def test_a_plant_without_faults_is_the_plant_within() -> None:
+    robot = robot_of(urdf("three_joint_arm"))
+    bare, wrapped = (
+        VelocityPlant(robot, TICK),
+        FaultyPlant(VelocityPlant(robot, TICK), (), TICK, wrench=False),
+    )
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        command = rng.uniform(-1.0, 1.0, 3)
+        assert bare.step(command) == wrapped.step(command)
+    for part in ("pose", "twist", "q", "qdot", "momentum", "link_R", "link_r", "expected_momenta"):
+        np.testing.assert_array_equal(getattr(bare, part), getattr(wrapped, part))
+    assert all(np.array_equal(v, wrapped.limit_counts[k]) for k, v in bare.limit_counts.items())
+
+
+# -- joints under efforts ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_joint_that_jams_changes_no_momentum_and_gains_no_energy(seed: int) -> None:
+    text = random_urdf(seed)
+    robot, rng = robot_of(text), np.random.default_rng(seed)
+    plant = FaultyPlant(
+        EffortPlant(robot, 0.01, tumbling(robot, rng)),
+        [f"joint_stuck {robot.joint_names[1]} at 0.2 until 0.4"],
+        0.01,
+        wrench=True,
+    )
+    before, places, energies = momenta(text, plant), [], []
+    for effort, _ in thrusts(rng, robot.n, 60):
+        plant.step(0.2 * effort)
+        places.append(plant.q[1])
+        energies.append(plant.momentum[6])
+        if 20 <= plant.tick - 1 < 40:
+            assert plant.qdot[1] == 0.0
+    assert np.ptp(places[20:40]) == 0.0
+    assert np.ptp(places[:20]) > 1e-4
+    assert np.ptp(places[40:]) > 1e-5, "it moves again"
+    np.testing.assert_allclose(momenta(text, plant), before, atol=1e-11)
+
+
+def test_energy_is_lost_when_a_moving_joint_jams() -> None:
+    text = random_urdf(4)
+    robot = robot_of(text)
+    start = tumbling(robot, np.random.default_rng(4))
+    plant = FaultyPlant(EffortPlant(robot, 0.001, start), (), 0.001, wrench=True)
+    rest = np.zeros(robot.n)
+    plant.step(rest)
+    before = plant.momentum.copy()
+    # Carnot: by the impulse, the energy of the difference of the rates is lost.
+    H = robot.inertia_matrix(plant.q)
+    K = H[6:, 6:] - H[6:, :6] @ np.linalg.solve(H[:6, :6], H[6:, :6].T)
+    compliance = np.linalg.inv(K)
+    lost = plant.qdot[0] ** 2 / compliance[0, 0] / 2
+    plant.inject(f"joint_stuck {robot.joint_names[0]}")
+    plant.step(rest)
+    assert lost > 1e-4
+    # Within the millisecond the free motion goes on, which changes the energy by nothing.
+    assert before[6] - plant.momentum[6] == pytest.approx(lost, rel=1e-6)
+    np.testing.assert_allclose(plant.momentum[:6], before[:6], atol=1e-12)
+
+
+def test_a_held_joint_is_like_one_that_is_fixed_in_the_urdf() -> None:
+    """Another robot, in whose URDF the joint is fixed, is the reference."""
+    text = urdf("servicer")
+    place = 0.7
+    fixed = re.sub(
+        r'<joint name="elbow_pitch" type="revolute">(.*?)<origin xyz="([^"]*)"(?: rpy="[^"]*")?/>',
+        rf'<joint name="elbow_pitch" type="fixed">\1<origin xyz="\2" rpy="0 {place} 0"/>',
+        text,
+        flags=re.DOTALL,
+    )
+    assert 'name="elbow_pitch" type="fixed"' in fixed
+    assert 'axis xyz="0 1 0"' in re.search(r'name="elbow_pitch".*?</joint>', text, re.DOTALL)[0]  # type: ignore[index]
+    whole, rigid = robot_of(text), SpaceRobot.from_urdf(fixed)
+    shape = np.array([0.1, -1.0, place, 0.2, 0.8, 0.1])
+    rates = np.array([0.1, -0.1, 0.0, 0.2, 0.1, -0.1])
+    others = np.array([0, 1, 3, 4, 5])
+    start = {"linear_momentum": np.array([3.0, -2.0, 1.0]), "angular_momentum": np.full(3, 5.0)}
+    held = pushed(
+        EffortPlant(
+            whole, TICK, InitialState(joint_positions=shape, joint_velocities=rates, **start)
+        ),
+        "joint_stuck elbow_pitch",
+    )
+    reference = EffortPlant(
+        rigid,
+        TICK,
+        InitialState(joint_positions=shape[others], joint_velocities=rates[others], **start),
+    )
+    rng = np.random.default_rng(0)
+    for effort, wrench in thrusts(rng, 6, 40):
+        held.step(effort, 3 * wrench)
+        reference.step(effort[others], 3 * wrench)
+    np.testing.assert_allclose(held.q[others], reference.q, atol=1e-10)
+    np.testing.assert_allclose(held.pose, reference.pose, atol=1e-10)
+    np.testing.assert_allclose(held.twist, reference.twist, atol=1e-10)
+    assert held.q[2] == place
+
+
+def test_a_joint_can_jam_on_its_stop_while_another_meets_its_own() -> None:
+    text = urdf("sliding_masses")
+    robot = robot_of(text)
+    plant = pushed(
+        EffortPlant(robot, TICK, InitialState(joint_positions=np.array([2.5, 2.4, 0.0]))),
+        "joint_stuck slider_1",
+    )
+    for _ in range(60):
+        plant.step(np.array([-5.0, 5.0, 0.1]))
+    np.testing.assert_array_equal(plant.q[:2], [2.5, 2.5])
+    assert plant.limit_counts["stroke"][0] == 0, "it is held by the jam and not by its stop"
+    assert plant.limit_counts["stroke"][1] > 0
+    np.testing.assert_allclose(momenta(text, plant), 0.0, atol=1e-10)
+
+
+# -- thrusters --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("faults", "force"),
+    [
+        ((), [2.0, -1.0, 0.5]),
+        (("thruster_stuck force_x 3",), [3.0, -1.0, 0.5]),
+        (("thruster_off all",), [0.0, 0.0, 0.0]),
+        (("thruster_off force_y", "thruster_weak force_x 0.25"), [0.5, 0.0, 0.5]),
+        (("thruster_weak all 0.5", "thruster_stuck force_z -1"), [1.0, -0.5, -1.0]),
+    ],
+)
+def test_the_momentum_is_what_the_faulty_thrusters_gave(
+    faults: tuple[str, ...], force: list[float]
+) -> None:
+    # The sliders' robot has its centre of mass at the origin of its base: forces do not turn it.
+    text = urdf("sliding_masses")
+    plant = pushed(EffortPlant(robot_of(text), TICK), *faults)
+    wrench = np.array([2.0, -1.0, 0.5, 0.0, 0.0, 0.0])
+    for _ in range(10):
+        plant.step(np.zeros(3), wrench)
+    impulse = momenta(text, plant)[:3]
+    # Sliders are left behind by a base that is pushed, but their momentum counts.
+    np.testing.assert_allclose(impulse, 10 * TICK * np.array(force), atol=1e-9)
+    np.testing.assert_allclose(plant.expected_momenta[:3], impulse, atol=1e-9)
+    np.testing.assert_array_equal(wrench[:3], [2.0, -1.0, 0.5])
+
+
+def test_nozzles_stay_open_closed_and_weak() -> None:
+    robot = robot_of(urdf("servicer"))
+    plant = FaultyPlant(
+        with_thrusters(EffortPlant(robot, 0.1), 0.1, "urdf", ""),
+        [
+            "nozzle_open plus_x_1",
+            "nozzle_closed minus_x_1 until 1",
+            "nozzle_weak minus_x_1 0.5 at 1",
+        ],
+        0.1,
+        wrench=True,
+    )
+    thrusters = thrusters_in(plant)
+    assert thrusters is not None
+    opened, other = (thrusters.table.names.index(name) for name in ("plus_x_1", "minus_x_1"))
+    back = np.array([-40.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    for _ in range(5):
+        plant.step(np.zeros(robot.n), back)
+    assert thrusters.thrust[opened] == 10.0, "nobody asked for it"
+    assert thrusters.thrust[other] == 0.0
+    for _ in range(10):
+        plant.step(np.zeros(robot.n), back)
+    assert thrusters.thrust[other] == pytest.approx(0.5 * 10.0 * thrusters.duty[other])
+    assert thrusters.duty[other] > 0.9
+    plant.inject("clear")
+    plant.step(np.zeros(robot.n), np.zeros(6))
+    assert thrusters.thrust[opened] == 0.0
