@@ -28,6 +28,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from spacerobot_ros.app.bench_dynamics import dynamics_benchmark
+from spacerobot_ros.app.bench_planning import planning_times
 from spacerobot_ros.app.run import ros
 from spacerobot_ros.app.scenario import load_scenario
 from spacerobot_ros.app.stack import FlightStack
@@ -76,6 +77,9 @@ def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
     yield f"bare ping-pong with as many topics and a raw recorder: {peer_rate:.0f} ticks/s"
     yield f"ratio: {100 * stack_rate / peer_rate:.0f} %"
     yield f"one plant tick alone: {1e6 * tick:.1f} us (compiler: {figures['compiler']})"
+    for name, first, later in planning_times():
+        figures |= {f"plan_{name}_first_s": first, f"plan_{name}_s": later}
+        yield f"planning by {name}: {1e3 * later:.0f} ms, the first time {1e3 * first:.0f} ms"
     dynamics = dynamics_benchmark()
     figures |= dynamics
     yield from _dynamics_lines(dynamics)

@@ -167,7 +167,7 @@ def solve(problem: Problem, name: str, method: GaitMethod | None = None) -> Plan
     plan_time = time.perf_counter() - began
     while not pieces or (pieces[-1].partial and len(pieces) < _MOST_PIECES):
         began = time.perf_counter()
-        schedule = method.plan(_state(plant), problem.goal, correction=bool(pieces))
+        schedule = method.plan(start_of(plant), problem.goal, correction=bool(pieces))
         plan_time += time.perf_counter() - began
         for rates in schedule.velocities:
             plant.step(rates)
@@ -291,7 +291,8 @@ def _checked(planner: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
-def _state(plant: VelocityPlant) -> RobotState:
+def start_of(plant: VelocityPlant) -> RobotState:
+    """Return the state that a plant is in."""
     return RobotState(
         plant.pose[:3].copy(),
         plant.pose[3:].copy(),

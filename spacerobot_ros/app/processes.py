@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import rclpy
 import yaml
@@ -102,15 +103,15 @@ class ProcessStack:
             self.close()
             raise
 
-    def launch(self, name: str, *, autostart: bool = True) -> None:
-        """Start one node of the scenario, for the first time or again."""
+    def launch(self, name: str, **parameters: Any) -> None:
+        """Start one node of the scenario, for the first time or again, with more parameters."""
         overrides = dict(self.scenario.overrides.get(name, {}))
-        overrides["autostart"] = autostart
         if name == "recorder":
             overrides["bag"] = str(self._bag)
             record = Path(self._folder.name, "scenario.json")
             record.write_text(json.dumps(self._records()), "utf-8")
             overrides["describe"] = str(record)
+        overrides |= parameters
         file = Path(self._folder.name, f"{name}.yaml")
         file.write_text(yaml.safe_dump({name: {"ros__parameters": overrides}}), "utf-8")
         said = Path(self._folder.name, f"{name}.txt").open("wb")  # noqa: SIM115

@@ -220,7 +220,8 @@ class CoordinatedControlNode(FlightNode):
             # The tick before was not answered: its odom is missing, or whoever gives references
             # is silent.
             self._blind = self._odom_raw[4:12] != self._joints_raw[4:12]
-            self._on_state(measured=not self._blind)
+            # An answer to a lost pose would come a tick late; what it estimates goes on from there.
+            self._on_state(measured=not self._blind, send=not self._blind)
         self._joints_raw = raw
         self._joints_fresh = True
         self._on_part()
@@ -259,7 +260,7 @@ class CoordinatedControlNode(FlightNode):
 
     # -- flying -------------------------------------------------------------------------------
 
-    def _on_state(self, *, measured: bool) -> None:
+    def _on_state(self, *, measured: bool, send: bool = True) -> None:
         """Answer one state with one command of the same stamp."""
         try:
             stamp = self._joints.accept(self._joints_raw)
@@ -278,9 +279,10 @@ class CoordinatedControlNode(FlightNode):
             return
         self._effort[:] = result.realised.tau
         self._wrench[:] = result.realised.wrench_B
-        stamped = stamp_bytes(stamp)
-        self._send_wrench(self._wrench_message.serialised(stamped))
-        self._send_joints(self._joint_message.serialised(stamped))
+        if send:
+            stamped = stamp_bytes(stamp)
+            self._send_wrench(self._wrench_message.serialised(stamped))
+            self._send_joints(self._joint_message.serialised(stamped))
         self._joints_fresh = False
         self._status.update(now, self.controller, result)
 

@@ -13,7 +13,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from spacerobot_ros.errors import CommandError, PlanningError, SpaceRobotError
+from spacerobot_ros.errors import CommandError, ParameterError, PlanningError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.cdr import (
@@ -23,6 +23,7 @@ from spacerobot_ros.nodes.cdr import (
     stamp_bytes,
 )
 from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
+from spacerobot_ros.nodes.goal_memory import GoalMemory
 from spacerobot_ros.nodes.goal_messages import goal_of, shape_of
 from spacerobot_ros.nodes.joint_command import JointReader
 from spacerobot_ros.nodes.measured_state import MeasuredState
@@ -86,6 +87,7 @@ class PlannerNode(FlightNode):
         self._send_command = raw_publish(self.create_publisher(JointState, topic, STREAM))
         self._plan_topics = PlanTopics(self, str(self.parameters["world_frame"]))
         self._status = PlannerStatus(self)
+        self._memory = GoalMemory(str(self.parameters["resume_file"]))
         robot = robot_of(self.parameters)
         if robot is None:
             self.create_subscription(String, "robot_description", self._on_description, LATCHED)
@@ -100,7 +102,12 @@ class PlannerNode(FlightNode):
     def activate(self) -> None:
         """Answer states with commands from now on."""
         self._running = True
-        self._status.publish(PlannerState.IDLE, "Waiting for a goal pose.")
+        kept = self._memory.recall()
+        if kept is None:
+            self._status.publish(PlannerState.IDLE, "Waiting for a goal pose.")
+        else:
+            self._propose(kept)
+            self._status.publish(PlannerState.PLANNING, "Going on to an earlier goal.", goal=kept)
         # A lockstep plant may have been waiting for an answer since before.
         self._on_part()
 
@@ -171,14 +178,18 @@ class PlannerNode(FlightNode):
         except PlanningError as error:
             self._status.publish(PlannerState.REFUSED, str(error))
             return
+        self._propose(goal)
+        if self._robot is None:
+            self._status.publish(
+                PlannerState.PLANNING, "The goal waits for a robot on robot_description."
+            )
+
+    def _propose(self, goal: Goal) -> None:
+        """Plan for a goal from the next state that is measured."""
         self._proposed = goal
         self._pending = True
         if self._robot is not None:
             self._state.restart()
-        else:
-            self._status.publish(
-                PlannerState.PLANNING, "The goal waits for a robot on robot_description."
-            )
 
     def _on_goal_shape(self, message: JointState) -> None:
         """Keep the shape that goals from now on are to end in, for methods that take one."""
@@ -224,6 +235,7 @@ class PlannerNode(FlightNode):
             self._status.publish(PlannerState.ABORTED, f"Aborted on request. {response.message}")
         self._pending = False
         self._goal = self._landed = None
+        self._memory.forget()
         return response
 
     # -- flying -------------------------------------------------------------------------------
@@ -310,6 +322,10 @@ class PlannerNode(FlightNode):
             self._status.publish(PlannerState.REFUSED, f"{error}{kept}", goal=self._proposed)
             return
         self._goal, self._landed = self._proposed, None
+        try:
+            self._memory.keep(self._goal)
+        except ParameterError as error:
+            self.get_logger().error(f"{error} The goal is flown, but would not be resumed.")
         self._corrections = 0
         self._stuck = []
         self._replanning = False
@@ -362,6 +378,7 @@ class PlannerNode(FlightNode):
             state = self._state.state()
         except PlanningError as reason:
             self._status.publish(PlannerState.FAILED, str(reason), goal=self._goal)
+            self._memory.forget()
             return
         error = PoseError.between(state.position, state.quaternion, self._goal, state.q)
         result: dict[str, Any] = {
@@ -373,6 +390,7 @@ class PlannerNode(FlightNode):
         left = what_is_left(error, controls)
         if self._tolerance().admits(error, controls):
             self._status.publish(PlannerState.REACHED, f"The goal is met: {left}.", **result)
+            self._memory.forget()
             return
         counts = not flown.partial and not replanned
         if counts and self._corrections >= int(self.parameters["max_corrections"]):  # type: ignore[arg-type]
@@ -381,6 +399,7 @@ class PlannerNode(FlightNode):
                 f"The goal is not met: {left} after {self._corrections} correction(s).",
                 **result,
             )
+            self._memory.forget()
             return
         self._corrections += counts
         try:
@@ -389,6 +408,7 @@ class PlannerNode(FlightNode):
             self._status.publish(
                 PlannerState.FAILED, f"The goal is not met: {left}, and {reason}", **result
             )
+            self._memory.forget()
 
 
 def main() -> None:

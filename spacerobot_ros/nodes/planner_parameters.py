@@ -47,5 +47,8 @@ PLANNER_SPECS: tuple[ParameterSpec, ...] = (
         0,
         1e6,
     ),
+    ParameterSpec(
+        "resume_file", "", "", "keeps the present goal for a planner that starts again; '': none"
+    ),
     *option_specs(METHODS),
 )

@@ -20,6 +20,7 @@ from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_no
 from spacerobot_ros.nodes.plant_parameters import PLANT_SPECS
 from spacerobot_ros.nodes.plant_report import PlantReport
 from spacerobot_ros.nodes.plant_topics import PlantTopics
+from spacerobot_ros.nodes.resumption import resumed
 from spacerobot_ros.nodes.robot_source import robot_of
 from spacerobot_ros.nodes.thruster_topics import ThrusterTopics
 from spacerobot_ros.simulation.brakes import JointBrakes
@@ -75,8 +76,10 @@ class PlantNode(FlightNode):
             )
         self._lockstep = values["time_mode"] == "lockstep"
         self._period_ns = period_ns(values["tick_rate"])
-        self.plant = build_plant(robot, values)
-        self._tick, self._looked_at = 0, -1
+        initial, tick = resumed(values, self.get_namespace(), robot)
+        self.plant = build_plant(robot, values, initial)
+        self._tick = self.plant.tick = tick
+        self._looked_at = -1
         self._sensors = Sensors(self.plant, SensorModel.of(values), self._period_ns / NANOSECONDS)
         self._topics = PlantTopics(
             self,

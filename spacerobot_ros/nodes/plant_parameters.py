@@ -56,6 +56,9 @@ PLANT_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec(
         "diagnostics_period", 1.0, "s", "simulated time between diagnostics; 0: none", 0.0
     ),
+    ParameterSpec(
+        "resume_bag", "", "", "bag from whose last state and time to go on; '': the initial state"
+    ),
     ParameterSpec("initial_position", [0.0, 0.0, 0.0], "m", "base link in the world", length=3),
     ParameterSpec(
         "initial_orientation", [0.0, 0.0, 0.0, 1.0], "", "quaternion x, y, z, w", length=4

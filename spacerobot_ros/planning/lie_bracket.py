@@ -43,6 +43,9 @@ from spacerobot_ros.planning.schedule import BasePath, GaitSchedule
 
 _FEWEST_TICKS_A_CYCLE = 12
 _MOST_REFINEMENTS = 20
+_KNOTS = 100
+"""Poses of the predicted path in each step, up to twice as many."""
+
 _NO_ROTATION = 1e-9
 _NO_MOTION = 1e-9
 
@@ -322,12 +325,12 @@ class LieBracketGait(GaitMethod):
     def _path(
         self, state: RobotState, slide: Array, attitudes: Array, cycle: Array, n: int
     ) -> BasePath:
-        """Base path: step 2 as it goes, step 3 at the ends of (about 400 of the) cycles."""
-        stride = max(1, len(slide) // 100)
+        """Base path: step 2 as it goes, step 3 at the ends of some cycles."""
+        stride = max(1, len(slide) // _KNOTS)
         chosen = np.unique(np.append(np.arange(0, len(slide), stride), len(slide) - 1))
         time, shapes, quaternions = chosen * self.tick_period, slide[chosen], attitudes[chosen]
         if n:
-            done = np.unique(np.append(np.arange(0, n, max(1, n // 400))[1:], n))
+            done = np.unique(np.append(np.arange(0, n, max(1, n // _KNOTS))[1:], n))
             rotation = self._rotation(cycle)
             turned = [
                 quaternion_multiply(attitudes[-1], quaternion_from_rotvec(k * rotation))

@@ -73,7 +73,7 @@ def salvage_bag(
     """
     source = Path(path)
     target = Path(out) if out is not None else source.with_name(f"{source.stem}-salvaged.mcap")
-    if _is_complete(source):
+    if is_complete(source):
         raise RecordingError(f"The bag {source} is complete: there is nothing to salvage.")
     found = _Found(source)
     first = next(found.records, None)
@@ -101,7 +101,7 @@ def salvage_bag(
     )
 
 
-def _is_complete(path: Path) -> bool:
+def is_complete(path: Path) -> bool:
     """Whether every message of a bag can be read and counted as it is."""
     try:
         with open_bag(path) as file:

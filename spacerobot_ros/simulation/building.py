@@ -77,6 +77,11 @@ def build_plant(
             f"Parameter 'integration_step' is {step}; it must be 0 (by the actuation) or at least "
             f"{_SHORTEST_STEP:g} s."
         )
+    if thrusters and not kind.thrusters:
+        raise ParameterError(
+            f"Parameter 'thrusters' is '{thrusters}', but under actuation '{values['actuation']}' "
+            "nothing pushes the base: set actuation to effort, or thrusters to ''."
+        )
     tick_period = period_ns(values["tick_rate"]) / _SECOND
     plant = kind.plant(
         robot,
@@ -84,11 +89,6 @@ def build_plant(
         initial_state(values) if initial is None else initial,
         step or kind.integration_step,
     )
-    if thrusters and not kind.thrusters:
-        raise ParameterError(
-            f"Parameter 'thrusters' is '{thrusters}', but under actuation '{values['actuation']}' "
-            "nothing pushes the base: set actuation to effort, or thrusters to ''."
-        )
     plant = with_thrusters(plant, tick_period, thrusters, values.get("thrusters_excluded", ""))
     return FaultyPlant(
         plant,

@@ -52,8 +52,8 @@ class ThrusterPulses:
     ) -> None:
         self._table, self._tick_period = table, tick_period
         self._wrenches, self._shortest = table.wrenches, table.min_on_time
-        # Multiples of the golden ratio: any few costs differ as much as they can.
-        favour = np.arange(len(table.names)) * ((np.sqrt(5.0) - 1.0) / 2.0) % 1.0
+        # Numbers without rational relations: no sums of costs are equal either.
+        favour = np.sin(np.arange(1.0, len(table.names) + 1.0) ** 2)
         self._allocation = ThrusterAllocation(
             self._wrenches, table.mass_flow * (1.0 + _FAVOUR * favour)
         )

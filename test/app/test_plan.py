@@ -11,6 +11,8 @@ from click.testing import CliRunner, Result
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.app.cli import main
+from spacerobot_ros.app.plan import problem
+from spacerobot_ros.app.plan_random import fly_goals, random_goals
 
 URDF = Path(__file__).parents[2] / "urdf"
 QUICK = ("--set", "planner.optimal.answers=1", "--set", "planner.optimal.intervals=30")
@@ -99,3 +101,26 @@ def test_bad_input_is_exit_2_and_one_sentence(arguments: list[str], sentence: st
     assert result.exit_code == 2, result.output
     assert sentence in result.output
     assert len(result.output.strip().splitlines()) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("robot", "within", "options"),
+    [
+        ("sliding_masses", (0.3, 60.0), []),
+        ("three_joint_arm", (0.3, 180.0), ["plant.initial_joint_positions=[0, -0.785, 1.57]"]),
+        ("planar_chain", (0.3, 180.0), ["planner.optimal.final_shape=1"]),
+    ],
+)
+def test_random_goals_are_met(
+    robot: str,
+    within: tuple[float, float],
+    options: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("SPACEROBOT_COMPILE")
+    settings = [*options, "planner.optimal.answers=1", "planner.optimal.cache=0"]
+    asked = problem(robot, settings=settings)
+    goals = random_goals(asked, 20, within[0], np.radians(within[1]))
+    (record,) = fly_goals(asked, goals, ["optimal"])
+    assert (record.met, record.missed, record.refused) == (20, 0, [])

@@ -41,7 +41,7 @@ def test_what_thrusters_can_give_is_given(seed: int, count: int, scale: float) -
     found = ThrusterAllocation(wrenches, cost).allocate(wanted, np.full(count, np.inf))
     assert found.levels.min() >= 0.0
     np.testing.assert_array_equal(found.met, wrenches @ found.levels)
-    assert np.linalg.norm(found.met - wanted) <= 1e-9 * max(np.linalg.norm(wanted), scale)
+    assert np.linalg.norm(found.met - wanted) <= 1e-9 * (np.linalg.norm(wanted) + scale)
     assert cost @ found.levels <= cost @ levels * (1 + 1e-9)
 
 
@@ -65,7 +65,7 @@ def test_beyond_the_thrust_the_wrench_keeps_its_direction(seed: int) -> None:
     found = ThrusterAllocation(SERVICER.wrenches, SERVICER.mass_flow).allocate(wanted, most)
     assert np.all((found.levels >= 0.0) & (found.levels <= most))
     part = float(found.met @ wanted / (wanted @ wanted))
-    np.testing.assert_allclose(found.met, part * wanted, atol=1e-9 * np.linalg.norm(wanted))
+    np.testing.assert_allclose(found.met, part * wanted, atol=1e-9 * float(np.linalg.norm(wanted)))
     # max part subject to wrenches @ levels = part * wanted, scaled otherwise than in the package
     largest = linprog(
         np.append(np.zeros(24), -1.0),
@@ -78,7 +78,7 @@ def test_beyond_the_thrust_the_wrench_keeps_its_direction(seed: int) -> None:
 
 
 def test_redundant_thrusters_share_what_is_too_much_for_the_cheapest() -> None:
-    """Two pairs push along x; the cheaper gives 2 N, the rest is the other's."""
+    """Two push along x; the cheaper by the newton gives its 2 N, the rest is the other's."""
     wrenches = np.zeros((6, 2))
     wrenches[0] = 2.0, 1.0
     allocation = ThrusterAllocation(wrenches, np.array([1.0, 1.0]))

@@ -116,7 +116,7 @@ def test_a_name_is_used_once(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("entries", [[], 3, ["a"], {"a": 1}])
 def test_files_without_thrusters_are_refused(entries: Any, tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match="table.yaml"):
+    with pytest.raises(ParameterError, match=r"table\.yaml"):
         of_yaml(tmp_path, entries)
     with pytest.raises(ParameterError, match="cannot be read"):
         load_thrusters(tmp_path / "none.yaml", load_robot(SERVICER))

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 import pytest
-from planning.test_optimal import ARM_START, FOLDER, QUICK
+from planning.test_optimal import ARM_START, FOLDER, QUICK, assert_within
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import ParameterError, PlanningError
@@ -104,6 +104,14 @@ def test_margins_are_kept_but_where_the_goal_is_in_them(arm: SpaceRobot) -> None
     )
     assert inside.positions[-1, 0] == pytest.approx(0.8)
     assert inside.positions[:, 0].max() <= 0.8 + 1e-9
+
+
+def test_a_search_cut_short_gives_the_best_so_far(arm: SpaceRobot) -> None:
+    turn = [0.5, -0.6, 0.4]
+    hasty = of_arm(arm, turn, time_budget=0.7, answers=12)
+    assert float(str(hasty.notes["starts"])) < 12
+    assert reached(hasty, turn) <= 1e-6
+    assert_within(hasty, arm.velocity_limit, arm.velocity_limit / 0.5)
 
 
 # -- refusals ---------------------------------------------------------------------------------

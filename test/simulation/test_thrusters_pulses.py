@@ -149,3 +149,15 @@ def test_excluded_thrusters_stay_off() -> None:
     assert fired.sum() > 0.2
     with pytest.raises(ParameterError, match="no thruster 'nose'"):
         ThrusterPulses(SERVICER, TICK, ["nose"])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rounding_does_not_choose_the_thrusters(seed: int) -> None:
+    """The servicer's are symmetric: many allocations of a wrench cost the same."""
+    rng = np.random.default_rng(seed)
+    pulses, others = ThrusterPulses(SERVICER, TICK), ThrusterPulses(SERVICER, TICK)
+    for tick in range(150):
+        if tick % 10 == 0:
+            wrench = rng.uniform(-6.0, 6.0, 6) * rng.integers(0, 2, 6)
+        rounded = wrench + 1e-13 * rng.normal(size=6)
+        np.testing.assert_allclose(pulses.fire(wrench), others.fire(rounded), atol=1e-11)

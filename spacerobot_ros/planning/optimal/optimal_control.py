@@ -65,6 +65,11 @@ class ManoeuvreProblem:
         """Steps that the last solution took."""
         return int(self._solver.stats()["iter_count"])
 
+    @property
+    def converged(self) -> bool:
+        """Whether the last solution is one, and not what the search was cut short at."""
+        return bool(self._solver.stats()["success"])
+
     def solve(
         self,
         task: Task,
@@ -115,7 +120,7 @@ class ManoeuvreProblem:
             p=_parameters(task, limits, guess if effort else None),
         )
         x = result["x"].full().ravel()
-        if not self._solver.stats()["success"]:
+        if not self.converged:
             if self._watch.best is None:
                 return None
             x = self._watch.best

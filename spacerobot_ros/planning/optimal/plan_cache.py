@@ -31,7 +31,8 @@ class PlanCache:
     def load(self, key: str) -> dict[str, Array] | None:
         """Return what was stored under a key, or None."""
         try:
-            with np.load(self._file(key), allow_pickle=False) as content:
+            # A file that is opened here is closed where it turns out to be broken, too.
+            with self._file(key).open("rb") as file, np.load(file) as content:
                 return {name: content[name] for name in content.files}
         except FileNotFoundError:
             return None

@@ -193,7 +193,7 @@ class ManoeuvreSearch:
         elif effort.gentle:
             T = max(_UNHURRIED * guess.duration, shortest)
         else:
-            return problem.solve(
+            solution = problem.solve(
                 task,
                 limits,
                 guess,
@@ -202,6 +202,10 @@ class ManoeuvreSearch:
                 deadline=deadline,
                 last_call=last_call,
             )
+            if solution is None or problem.converged or self._constraints.base_rate > 0:
+                return solution
+            # What was cut short has time to spare.
+            return solution.hurried(limits, shortest)
         guess = guess.retimed(T / guess.duration)
         solution = problem.solve(
             task,
