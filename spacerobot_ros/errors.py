@@ -2,7 +2,10 @@
 
 
 class SpaceRobotError(Exception):
-    """Base of every error this package raises on purpose."""
+    """Base of every error this package raises on purpose; line breaks in what it quotes go."""
+
+    def __init__(self, sentence: str = "") -> None:
+        super().__init__(" ".join(str(sentence).splitlines()))
 
 
 class RobotDescriptionError(SpaceRobotError):

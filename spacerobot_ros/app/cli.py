@@ -247,7 +247,7 @@ def _propellant_line(summary: dict[str, Any]) -> list[str]:
 def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
     """Return what a publication prints beside what was measured."""
     lines = []
-    for row in scenario.published if summary["state"] in ("reached", "failed") else ():
+    for row in scenario.comparable if summary["state"] in ("reached", "failed") else ():
         measured = summary.get(row.quantity, summary["gait"].get(row.quantity))
         if isinstance(measured, list):
             printed, found = (

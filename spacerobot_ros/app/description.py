@@ -22,7 +22,7 @@ def scenario_record(scenario: Scenario) -> dict[str, str]:
         "description": scenario.description,
         **_goal_record("goal", scenario.goal),
         **_goal_record("end_effector_goal", scenario.end_effector_goal),
-        "published": json.dumps([asdict(row) for row in scenario.published]),
+        "published": json.dumps([asdict(row) for row in scenario.comparable]),
     }
 
 

@@ -38,6 +38,9 @@ _START = 60.0
 _END = 10.0
 """Wall s that a node has to end after a signal before it is killed."""
 
+_COMMANDS = ("joint_commands", "base_wrench", "joint_reference")
+"""What commanders publish for every state: nothing of it may be missed."""
+
 _SETTLING = 1.0
 """Wall s for the recorder to take in what was published before time stood still."""
 
@@ -240,10 +243,18 @@ class ProcessStack:
         self.time_ns = message.clock.sec * 1_000_000_000 + message.clock.nanosec
 
     def _met(self) -> bool:
-        """Whether commanders and recorder hear the plant, and hear the operator."""
-        readers = self.operator.node.count_subscribers("odom")
+        """Whether commanders and recorder hear the plant and the operator, and are heard."""
+        node = self.operator.node
         listeners = 2 if self._bag is not None else 1
-        return self.operator.heard(listeners) and readers >= len(self._nodes) - 1
+        return (
+            self.operator.heard(listeners)
+            and node.count_subscribers("odom") >= len(self._nodes) - 1
+            and all(
+                node.count_subscribers(topic) >= listeners
+                for topic in _COMMANDS
+                if node.count_publishers(topic)
+            )
+        )
 
     def _transit(self, transition: int) -> None:
         self._wait_for(self._change_state.service_is_ready, "the plant")

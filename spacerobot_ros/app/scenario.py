@@ -21,10 +21,14 @@ NODES = ("plant", "planner", "coordinated_control", "recorder")
 COMMANDERS = ("planner", "coordinated_control")
 """Those of them that take goals; a scenario runs the ones its file has a section for."""
 
+_LARGEST_ANGLE = 2e6 * np.pi
+"""A million turns: beyond them the digits of an angle are not its attitude's any more, rad."""
+
 _GOALS = ("goal", "end_effector_goal")
 _KEYS = (
     "description",
     "published",
+    "published_method",
     "goal_joint_positions",
     *(f"{goal}_{part}" for goal in _GOALS for part in ("position", "orientation", "rotvec")),
 )
@@ -47,6 +51,7 @@ class Published:
 class Scenario:
     """A parameter file and its goals; ``overrides``, parameters by node, go before the file.
 
+    ``published_method`` is the gait method that the published figures are of, empty: any.
     ``goal`` is of the base, ``end_effector_goal`` of the end-effector; ``commanders`` are the nodes
     that fly there.
     """
@@ -58,12 +63,19 @@ class Scenario:
     end_effector_goal: Goal | None
     commanders: tuple[str, ...]
     published: tuple[Published, ...]
+    published_method: str
     overrides: Mapping[str, Mapping[str, Any]]
 
     @property
     def lockstep(self) -> bool:
         """Whether the plant waits for commands instead of the wall clock (unless overridden)."""
         return self.overrides.get("plant", {}).get("time_mode", "lockstep") == "lockstep"
+
+    @property
+    def comparable(self) -> tuple[Published, ...]:
+        """The published figures, where the method that they are of is flown."""
+        method = self.parameter("planner", "method", "")
+        return self.published if self.published_method in ("", method) else ()
 
     def parameter(self, node: str, name: str, default: Any) -> Any:
         """Return what a node's parameter is set to, by the overrides or the file."""
@@ -104,7 +116,16 @@ def load_scenario(name: str) -> Scenario:
         raise ParameterError(
             f"The scenario file {path} has no 'scenario: ros__parameters:' section with a goal."
         )
-    unknown = sorted(set(values) - set(_KEYS))
+    for node in NODES:
+        given = content.get(node)
+        if given is not None and not (
+            isinstance(given, dict) and isinstance(given.get("ros__parameters", {}), dict)
+        ):
+            raise ParameterError(
+                f"The section '{node}' of the scenario file {path} is not 'ros__parameters:' with "
+                "the parameters under it."
+            )
+    unknown = sorted(set(map(str, values)) - set(_KEYS))
     if unknown:
         raise ParameterError(
             f"The scenario file {path} has an unknown key '{unknown[0]}' in its scenario section; "
@@ -122,6 +143,7 @@ def load_scenario(name: str) -> Scenario:
         ),
         commanders=tuple(name for name in COMMANDERS if name in content) or ("planner",),
         published=_published(values.get("published", {}), path),
+        published_method=str(values.get("published_method", "")),
         overrides={},
     )
 
@@ -132,10 +154,23 @@ def scenario_names() -> list[str]:
 
 
 def goal_from_rotvec(position: Sequence[float], rotvec: Sequence[float]) -> Goal:
-    """Return the goal at a position (m) with the attitude ``exp(hat(rotvec))`` (rad)."""
-    if not np.all(np.isfinite(rotvec)):
-        raise PlanningError(f"The rotation vector {list(rotvec)} is not finite.")
-    return Goal.checked(position, quaternion_from_rotvec(rotvec))
+    """Return the goal at a position (m) with the attitude ``exp(hat(rotvec))`` (rad).
+
+    Raises
+    ------
+    PlanningError
+        It is no goal, or the rotation vector is not three numbers of at most a million turns.
+    """
+    try:
+        vector = np.asarray(rotvec, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        vector = np.full(3, np.nan)
+    if vector.shape != (3,) or not np.all(np.abs(vector) <= _LARGEST_ANGLE):
+        raise PlanningError(
+            f"The rotation vector {rotvec} is not three finite numbers of at most "
+            f"{_LARGEST_ANGLE:.2g} rad."
+        )
+    return Goal.checked(position, quaternion_from_rotvec(vector))
 
 
 def parse_setting(text: str) -> tuple[str, str, Any]:

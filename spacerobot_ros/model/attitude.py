@@ -94,6 +94,9 @@ def unit_quaternion(quaternion: npt.ArrayLike) -> Array:
         It is zero or not finite.
     """
     q = np.asarray(quaternion, dtype=float)
+    largest = float(np.abs(q).max())
+    if math.isfinite(largest) and largest > 1.0:
+        q = q / largest  # Squares of large numbers overflow.
     norm = float(np.linalg.norm(q))
     if not math.isfinite(norm) or norm < 1e-6:
         raise ValueError(f"the quaternion {q.tolist()} is not a rotation")

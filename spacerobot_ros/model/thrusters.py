@@ -24,6 +24,9 @@ from spacerobot_ros.model.description import Array, Pose, RobotDescription
 STANDARD_GRAVITY = 9.80665
 """What a specific impulse in seconds is counted in, m/s^2."""
 
+_LARGEST = 1e12
+"""Of the numbers of a table, in SI units."""
+
 _AXES = ("force along x", "force along y", "force along z", *(f"torque about {x}" for x in "xyz"))
 _KEYS = {"name", "link", "position", "rpy", "direction", "force", "min_on_time", "isp"}
 
@@ -216,9 +219,11 @@ def _vector(
         vector = np.array([float(x) for x in entry.get(key, default)])
     except (TypeError, ValueError):
         vector = np.empty(0)
-    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
+    # Larger numbers are slips, and their squares overflow.
+    if vector.shape != (3,) or not np.all(np.abs(vector) <= _LARGEST):
         raise ParameterError(
-            f"The {key} of {where} is {entry.get(key, 'missing')}; it must be three finite numbers."
+            f"The {key} of {where} is {entry.get(key, 'missing')}; it must be three finite numbers "
+            f"of at most {_LARGEST:g}."
         )
     return vector
 
@@ -229,8 +234,9 @@ def _number(entry: Mapping[str, Any], key: str, where: str, *, positive: bool) -
         value = float(given)
     except (TypeError, ValueError):
         value = math.nan
-    if not math.isfinite(value) or value < 0 or (positive and value == 0):
+    if not 0 <= value <= _LARGEST or (positive and value < 1 / _LARGEST):
         wanted = "a positive number" if positive else "zero or more"
+        wanted += f" up to {_LARGEST:g}"
         raise ParameterError(
             f"The {key} of {where} is {'missing' if given is None else given}; it must be {wanted}."
         )

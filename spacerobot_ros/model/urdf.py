@@ -26,6 +26,9 @@ from spacerobot_ros.model.description import (
     weld,
 )
 
+_LARGEST = 1e12
+"""Larger numbers (kg, m, kg m^2) are slips, and their squares soon overflow."""
+
 
 def load_robot(path: str | Path) -> RobotDescription:
     """Read the robot of a URDF file.
@@ -109,7 +112,15 @@ def _finite(values: Any, where: str) -> Array:
     array = np.array(values, dtype=float)
     if not np.all(np.isfinite(array)):
         raise RobotDescriptionError(f"A number in {where} is not finite: {array.tolist()}.")
+    if array.size and np.abs(array).max() > _LARGEST:
+        raise RobotDescriptionError(
+            f"A number in {where} is larger than {_LARGEST:g} in its SI unit: {array.tolist()}."
+        )
     return array
+
+
+def _size(values: Any, where: str) -> tuple[float, ...]:
+    return tuple(_finite(values, f"the geometry of {where}").tolist())
 
 
 def _link(link: Any, colours: dict[str, Any]) -> Link:
@@ -138,13 +149,13 @@ def _shapes(link: Any, colours: dict[str, Any], where: str) -> list[Shape]:
         kind = type(geometry).__name__.lower()
         resource = ""
         if kind == "box":
-            size = tuple(float(x) for x in geometry.size)
+            size = _size(geometry.size, where)
         elif kind == "cylinder":
-            size = (float(geometry.radius), float(geometry.length))
+            size = _size((geometry.radius, geometry.length), where)
         elif kind == "sphere":
-            size = (float(geometry.radius),)
+            size = _size((geometry.radius,), where)
         elif kind == "mesh":
-            size = tuple(float(x) for x in (geometry.scale or (1.0, 1.0, 1.0)))
+            size = _size(geometry.scale or (1.0, 1.0, 1.0), where)
             resource = str(geometry.filename)
         else:
             continue
@@ -153,7 +164,9 @@ def _shapes(link: Any, colours: dict[str, Any], where: str) -> list[Shape]:
             if visual.material.color is not None:
                 rgba = visual.material.color.rgba
             rgba = rgba if rgba is not None else colours.get(visual.material.name)
-        colour = tuple(float(x) for x in rgba) if rgba is not None else Shape.rgba
+        colour = (
+            Shape.rgba if rgba is None else tuple(_finite(rgba, f"a color of {where}").tolist())
+        )
         shapes.append(Shape(kind, size, _pose(visual.origin, where), colour, resource))  # type: ignore[arg-type]
     return shapes
 

@@ -24,9 +24,13 @@ from rosidl_parser.definition import (
     NamespacedType,
 )
 
+from spacerobot_ros.errors import CommandError
 from spacerobot_ros.model.description import Array as FloatArray
 
 _ENCAPSULATION = 4
+_BYTE_ORDER = 2
+"""Bytes of the encapsulation that tell it."""
+
 _LARGEST_ALIGNMENT = 8
 _SIZES = {
     "boolean": 1, "octet": 1, "char": 1, "uint8": 1, "int8": 1, "uint16": 2, "int16": 2,
@@ -36,6 +40,10 @@ _TIME = struct.Struct("<iI")
 NANOSECONDS = 1_000_000_000
 
 M = TypeVar("M")
+
+
+class UnreadableError(CommandError):
+    """Bytes that are no message of their type; the clause says of which."""
 
 
 @dataclass
@@ -190,18 +198,19 @@ class TemplateReader(Generic[M]):
 
         Raises
         ------
-        RuntimeError
-            The bytes are not a message of the type.
+        UnreadableError
+            The bytes are not a message of the type; the message before stays.
         """
-        self._raw = raw
         if len(raw) == self._size:
             # One writer repeats its padding too: a few whole stretches are compared first.
             for place, text in self._stretches:
                 if raw[place] != text:
                     break
             else:
+                self._raw = raw
                 return
             if all(raw[place] == text for place, text in self._fixed):
+                self._raw = raw
                 self._remember_stretches(raw)
                 return
         self._learn(raw)
@@ -236,11 +245,19 @@ class TemplateReader(Generic[M]):
         self._stretches = [(place, raw[place]) for place in stretches]
 
     def _learn(self, raw: bytes) -> None:
-        message = deserialize_message(raw, self._type)
+        try:
+            message = deserialize_message(raw, self._type)
+        except RuntimeError as error:
+            raise UnreadableError(f"its bytes are no {self._type.__name__}") from error
         layout = Layout.of(message)
+        own = bytes(serialize_message(message))
+        fixed = [(0, _BYTE_ORDER), *layout.fixed]
+        # Another byte order, or strings that are not what they were read as: not read in place.
+        foreign = len(raw) < layout.end or any(raw[a:b] != own[a:b] for a, b in fixed)
+        self._raw = raw = own if foreign else raw
         self.prototype = message
-        self._size = len(raw)
-        self._fixed = [(slice(a, b), raw[a:b]) for a, b in layout.fixed]
+        self._size = -1 if foreign else len(raw)
+        self._fixed = [(slice(a, b), raw[a:b]) for a, b in fixed]
         self._stamp = layout.offsets["header.stamp.sec"]
         self._reads = {
             path: (layout.offsets[path], count)

@@ -13,7 +13,7 @@ from sensor_msgs.msg import JointState
 from spacerobot_ros.errors import CommandError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.nodes.cdr import TemplateReader
+from spacerobot_ros.nodes.cdr import TemplateReader, UnreadableError
 from spacerobot_ros.nodes.command_gate import Reason
 from spacerobot_ros.nodes.joint_command import JointReader
 
@@ -67,9 +67,17 @@ class CommandChannel(ABC):
         """Stamp of the message read last, ns."""
 
     def check(self, raw: bytes) -> tuple[int, Refused | None]:
-        """Read a message; return its stamp (ns), and why it is refused if it is."""
+        """Read a message; return its stamp (ns), and why it is refused if it is.
+
+        Raises
+        ------
+        UnreadableError
+            The bytes are no message of the topic's type.
+        """
         try:
             stamp, values = self.read(raw)
+        except UnreadableError:
+            raise
         except CommandError as error:
             return self.read_stamp_ns, (Reason.MALFORMED, str(error))
         self._read = values

@@ -8,7 +8,7 @@ from typing import Any
 from rclpy.node import Node
 
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.nodes.cdr import NANOSECONDS
+from spacerobot_ros.nodes.cdr import NANOSECONDS, UnreadableError
 from spacerobot_ros.nodes.command_channel import NEVER, CommandChannel, Refused
 from spacerobot_ros.nodes.command_gate import CommandGate, Reason
 from spacerobot_ros.nodes.plant_report import PlantReport
@@ -111,7 +111,12 @@ class CommandIntake:
 
     def accept(self, channel: CommandChannel, raw: bytes, now_ns: int) -> bool:
         """Take or refuse a command; return whether it is this tick's answer in lockstep."""
-        stamp, refused = channel.check(raw)
+        try:
+            stamp, refused = channel.check(raw)
+        except UnreadableError as error:
+            # It has no stamp, and so is no answer to any tick.
+            self._refuse(channel, (Reason.MALFORMED, str(error)))
+            return False
         if self._lockstep:
             if stamp != now_ns or channel.arrived:
                 self._refuse(channel, _not_this_tick(stamp, now_ns))

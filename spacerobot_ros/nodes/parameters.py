@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
@@ -81,7 +82,7 @@ class ParameterSpec:
             return self._lines(value)
         try:
             numbers = [float(x) for x in value]
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise self._refusal(value, "a list of numbers") from None
         if self.length is not None and len(numbers) not in (0, self.length):
             raise self._refusal(value, f"a list of {self.length} numbers")
@@ -99,7 +100,7 @@ class ParameterSpec:
     def _number(self, value: Any, whole: bool) -> int | float:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise self._refusal(value, "a number")
-        if not math.isfinite(value):
+        if not -sys.float_info.max <= value <= sys.float_info.max:  # Whole numbers are larger.
             raise self._refusal(value, "a finite number")
         if whole and value != int(value):
             raise self._refusal(value, "a whole number")

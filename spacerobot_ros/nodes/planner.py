@@ -6,7 +6,6 @@ import sys
 import time
 from typing import Any, ClassVar
 
-import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
@@ -18,23 +17,24 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.cdr import (
     NANOSECONDS,
-    MessageTemplate,
     raw_publish,
     stamp_bytes,
 )
 from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
 from spacerobot_ros.nodes.goal_memory import GoalMemory
 from spacerobot_ros.nodes.goal_messages import goal_of, shape_of
-from spacerobot_ros.nodes.joint_command import JointReader
+from spacerobot_ros.nodes.joint_command import JointCommand, JointReader
 from spacerobot_ros.nodes.measured_state import MeasuredState
 from spacerobot_ros.nodes.plan_topics import PlanTopics
 from spacerobot_ros.nodes.planner_parameters import PLANNER_SPECS
 from spacerobot_ros.nodes.planner_status import PlannerState, PlannerStatus, what_is_left
 from spacerobot_ros.nodes.robot_source import robot_from_text, robot_of
-from spacerobot_ros.planning import GaitSchedule, Goal, PoseError, Tolerance
+from spacerobot_ros.planning import GaitSchedule, Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.braking import BrakingFollower
+from spacerobot_ros.planning.drift import DriftWatch
 from spacerobot_ros.planning.follower import GaitFollower
 from spacerobot_ros.planning.registry import build_method
+from spacerobot_ros.planning.stitching import stitched
 from spacerobot_ros.planning.stuck_joints import RemainingJointsGait, StuckJointWatch
 
 PLANNED = "Planned in {:.6f} s."
@@ -132,20 +132,8 @@ class PlannerNode(FlightNode):
         self._state = MeasuredState(robot, values["averaging"], values["rest_tolerance"])
         band = 2 * values["shape_deadband"]
         self._watch = StuckJointWatch(robot.n, values["stuck_ticks"], tick_period, band)
-        n = robot.n
         self._joints = JointReader(robot.joint_names, ["position"], complete=True)
-        self._command = MessageTemplate(
-            JointState(
-                name=list(robot.joint_names),
-                position=[0.0] * n,
-                velocity=[0.0] * n,
-                effort=[0.0] * n,
-            )
-        )
-        self._command_position, self._command_velocity = np.zeros(n), np.zeros(n)
-        if n:
-            self._command.feed("position", self._command_position)
-            self._command.feed("velocity", self._command_velocity)
+        self._command = JointCommand(robot.joint_names)
 
     def _tolerance(self) -> Tolerance:
         values: dict[str, Any] = self.parameters
@@ -203,7 +191,9 @@ class PlannerNode(FlightNode):
     def _on_odom(self, raw: bytes) -> None:
         self._odom_raw = raw
         self._odom_fresh = True
-        self._on_part()
+        # In flight it is looked at with the joints, if at all.
+        if self._joints_fresh or self._pending or self._landed is not None:
+            self._on_part()
 
     def _on_joints(self, raw: bytes) -> None:
         self._joints_raw = raw
@@ -227,16 +217,25 @@ class PlannerNode(FlightNode):
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self._follower is not None or self._landed is not None
         response.message = "Nothing is flown." if not response.success else "The joints rest."
-        if isinstance(self._follower, GaitFollower):
-            within = float(self.parameters["abort_time"])  # type: ignore[arg-type]
-            self._follower = self._follower.braking(self._stamp, within)
-            response.message = f"The joints come to rest along the gait within {within:g} s."
+        if self._follower is not None:
+            self._follower = self._coming_to_rest()
+            response.message = (
+                "The joints come to rest along the gait within "
+                f"{self.parameters['abort_time']:g} s."
+            )
         if response.success:
             self._status.publish(PlannerState.ABORTED, f"Aborted on request. {response.message}")
         self._pending = False
         self._goal = self._landed = None
         self._memory.forget()
         return response
+
+    def _coming_to_rest(self) -> BrakingFollower | None:
+        """Return what is flown, coming to rest from now on."""
+        if isinstance(self._follower, GaitFollower):
+            within = float(self.parameters["abort_time"])  # type: ignore[arg-type]
+            return self._follower.braking(self._stamp, within)
+        return self._follower
 
     # -- flying -------------------------------------------------------------------------------
 
@@ -255,20 +254,22 @@ class PlannerNode(FlightNode):
             if posed:
                 self._observe()
             self._decide(stamp)
+        elif posed and isinstance(self._follower, GaitFollower) and self._drift.due(stamp):
+            self._look_for_drift(stamp)
         if self._follower is not None:
-            self._follower.command(stamp, q, self._command_position, self._command_velocity)
+            self._follower.command(stamp, q, self._command.position, self._command.velocity)
             self._held = None
             if self._stuck:
-                self._command_velocity[self._stuck] = 0.0
-            stuck = self._watch.look(q, self._command_position, self._command_velocity)
+                self._command.velocity[self._stuck] = 0.0
+            stuck = self._watch.look(q, self._command.position, self._command.velocity)
             if stuck and self._goal is not None:
                 self._go_on_without(stuck)
         if self._follower is None:
             # A reference must stay where it is; what the plant makes of rest is its affair.
             if self._held is None or self._commands_plant:
                 self._held = q.copy()
-            self._command_position[:] = self._held
-            self._command_velocity[:] = 0.0
+            self._command.position[:] = self._held
+            self._command.velocity[:] = 0.0
         self._send_command(self._command.serialised(stamp_bytes(stamp)))
 
     def _land(self) -> None:
@@ -298,6 +299,26 @@ class PlannerNode(FlightNode):
             self._judge(stamp)
         self._state.restart()
 
+    def _look_for_drift(self, stamp: int) -> None:
+        """Plan what is left again when the base is too far off the path that was predicted."""
+        assert self._goal is not None
+        self._state.restart()
+        self._state.read(self._odom_raw, self._joints_raw)
+        state = self._state.state()
+        distance, angle = self._drift.off(state.position, state.quaternion)
+        left = self._corrections < int(self.parameters["max_corrections"])  # type: ignore[arg-type]
+        if not left or not self._drift.too_far(distance, angle):
+            return
+        off = f"Off the path by {distance:.3g} m and {angle:.3g} rad"
+        try:
+            schedule = self._plan(self._goal, correction=False)
+        except PlanningError as reason:
+            self.get_logger().warning(f"{off}, and the rest cannot be planned again: {reason}")
+            return
+        self._corrections += 1
+        self.get_logger().warning(f"{off}: the rest is planned again.")
+        self._fly(schedule, stamp)
+
     def _go_on_without(self, stuck: list[int]) -> None:
         """Come to rest, and plan what is left with the joints that are not stuck."""
         assert self._robot is not None
@@ -326,15 +347,22 @@ class PlannerNode(FlightNode):
             self._memory.keep(self._goal)
         except ParameterError as error:
             self.get_logger().error(f"{error} The goal is flown, but would not be resumed.")
-        self._corrections = 0
-        self._stuck = []
-        self._replanning = False
+        self._corrections, self._stuck, self._replanning = 0, [], False
         self._fly(schedule, stamp)
 
     def _plan(self, goal: Goal, *, correction: bool) -> GaitSchedule:
+        """Plan from the measured state; what is flown comes to rest along its gait first."""
+
+        def plan(state: RobotState) -> GaitSchedule:
+            return self._method.plan(state, goal, correction=correction)
+
         began = time.perf_counter()
         try:
-            return self._method.plan(self._state.state(), goal, correction=correction)
+            flown = self._coming_to_rest()
+            if flown is None or self._robot is None:
+                return plan(self._state.state())
+            step = float(self.parameters["integration_step"])  # type: ignore[arg-type]
+            return stitched(flown, self._stamp, self._state.state(), self._robot, step, plan)
         finally:
             took = time.perf_counter() - began
             self.plan_time += took
@@ -346,6 +374,10 @@ class PlannerNode(FlightNode):
         gain = float(self.parameters["shape_gain"]) if self._commands_plant else 0.0  # type: ignore[arg-type]
         deadband = float(self.parameters["shape_deadband"])  # type: ignore[arg-type]
         self._follower = GaitFollower(schedule, stamp, gain, deadband)
+        values: dict[str, Any] = self.parameters
+        self._drift = DriftWatch(
+            schedule, stamp, values["drift_position"], values["drift_attitude"]
+        )
         self._watch.restart()
         self.flown_time += schedule.duration
         self.ends_at = stamp / NANOSECONDS + schedule.duration
@@ -377,8 +409,7 @@ class PlannerNode(FlightNode):
         try:
             state = self._state.state()
         except PlanningError as reason:
-            self._status.publish(PlannerState.FAILED, str(reason), goal=self._goal)
-            self._memory.forget()
+            self._conclude(PlannerState.FAILED, str(reason), goal=self._goal)
             return
         error = PoseError.between(state.position, state.quaternion, self._goal, state.q)
         result: dict[str, Any] = {
@@ -386,29 +417,26 @@ class PlannerNode(FlightNode):
             "error": error,
             **self._account(),
         }
-        controls = self._method.controls
-        left = what_is_left(error, controls)
-        if self._tolerance().admits(error, controls):
-            self._status.publish(PlannerState.REACHED, f"The goal is met: {left}.", **result)
-            self._memory.forget()
+        left = what_is_left(error, self._method.controls)
+        if self._tolerance().admits(error, self._method.controls):
+            self._conclude(PlannerState.REACHED, f"The goal is met: {left}.", **result)
             return
         counts = not flown.partial and not replanned
         if counts and self._corrections >= int(self.parameters["max_corrections"]):  # type: ignore[arg-type]
-            self._status.publish(
-                PlannerState.FAILED,
-                f"The goal is not met: {left} after {self._corrections} correction(s).",
-                **result,
-            )
-            self._memory.forget()
+            missed = f"The goal is not met: {left} after {self._corrections} correction(s)."
+            self._conclude(PlannerState.FAILED, missed, **result)
             return
         self._corrections += counts
         try:
             self._fly(self._plan(self._goal, correction=not replanned), stamp, error)
         except PlanningError as reason:
-            self._status.publish(
-                PlannerState.FAILED, f"The goal is not met: {left}, and {reason}", **result
-            )
-            self._memory.forget()
+            missed = f"The goal is not met: {left}, and {reason}"
+            self._conclude(PlannerState.FAILED, missed, **result)
+
+    def _conclude(self, state: PlannerState, sentence: str, **values: Any) -> None:
+        """Be done with the goal: nothing is to be resumed."""
+        self._status.publish(state, sentence, **values)
+        self._memory.forget()
 
 
 def main() -> None:

@@ -24,7 +24,18 @@ PLANNER_SPECS: tuple[ParameterSpec, ...] = (
         choices=("commands", "reference"),
     ),
     ParameterSpec("max_corrections", 3, "", "new plans after the first", 0, 1000, live=True),
-    ParameterSpec("abort_time", 1.0, "s", "to rest along the gait after ~/abort", 0.01, 1e3),
+    ParameterSpec(
+        "abort_time",
+        1.0,
+        "s",
+        "to rest along the gait after ~/abort, or for another goal",
+        0.01,
+        1e3,
+    ),
+    ParameterSpec(
+        "drift_position", 0.0, "m", "farther off the path the rest is planned again; 0: never", 0.0
+    ),
+    ParameterSpec("drift_attitude", 0.0, "rad", "likewise", 0.0),
     ParameterSpec("shape_gain", 2.0, "1/s", "feedback on the shape while flying", 0.0, 1e3),
     ParameterSpec(
         "shape_deadband", 0.0, "m or rad", "shape errors up to this are noise: no feedback", 0.0

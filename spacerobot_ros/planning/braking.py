@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from spacerobot_ros.model.description import Array
@@ -51,6 +53,13 @@ class BrakingFollower:
         position[:] = self._shape(since)
         tick = self.schedule.tick_period
         velocity[:] = (self._shape(since + tick) - position) / tick + self._gain * (position - q)
+
+    def shapes(self, stamp_ns: int) -> Array:
+        """Return the wanted shapes (N + 1, n) at the ticks from now until the rest."""
+        tick = self.schedule.tick_period
+        since = (stamp_ns - self._stamp_ns) / 1e9
+        ticks = max(1, math.ceil((self._duration - since) / tick - 1e-9))
+        return np.array([self._shape(since + k * tick) for k in range(ticks + 1)])
 
     def _shape(self, since: float) -> Array:
         tau = min(since / self._duration, 1.0)

@@ -19,6 +19,10 @@ POSE: frozenset[Controlled] = frozenset({"position", "attitude"})
 """The parts of a goal that are the pose of the base."""
 
 
+_FARTHEST = 1e12
+"""Beyond it a float64 does not tell a millimetre any more, m or rad."""
+
+
 @dataclass(frozen=True)
 class Goal:
     """A pose of the base link in the world, and the shape to end in where it matters.
@@ -43,20 +47,27 @@ class Goal:
         Raises
         ------
         PlanningError
-            A number is not finite, or the quaternion is zero.
+            They are no lists of finite numbers, absurdly large, or the quaternion is zero.
         """
-        r = np.asarray(position, dtype=float)
-        q = np.asarray(quaternion, dtype=float)
+        r = _numbers(position, "position")
+        q = _numbers(quaternion, "orientation")
         if r.shape != (3,) or q.shape != (4,):
             raise PlanningError("A goal has three numbers of position and four of orientation.")
         if not np.all(np.isfinite(r)):
             raise PlanningError(f"The goal position {r.tolist()} is not finite.")
+        if np.abs(r).max() > _FARTHEST:
+            raise PlanningError(
+                f"The goal position {r.tolist()} is farther than {_FARTHEST:g} m away."
+            )
         if not np.all(np.isfinite(q)):
             raise PlanningError(f"The goal orientation {q.tolist()} is not finite.")
-        shape = None if joint_positions is None else np.asarray(joint_positions, dtype=float)
-        if shape is not None and (shape.ndim != 1 or not np.all(np.isfinite(shape))):
+        shape = None if joint_positions is None else _numbers(joint_positions, "shape")
+        if shape is not None and not (
+            shape.ndim == 1 and np.all(np.isfinite(shape)) and np.all(np.abs(shape) <= _FARTHEST)
+        ):
             raise PlanningError(
-                f"The goal shape {shape.tolist()} is not a list of finite joint positions."
+                f"The goal shape {shape.tolist()} is not a list of finite joint positions "
+                f"of at most {_FARTHEST:g} m or rad."
             )
         try:
             return cls(r, unit_quaternion(q), shape)
@@ -65,6 +76,13 @@ class Goal:
                 f"The goal orientation {q.tolist()} is a zero quaternion, not a rotation; "
                 "no rotation is (0, 0, 0, 1)."
             ) from None
+
+
+def _numbers(given: npt.ArrayLike, what: str) -> Array:
+    try:
+        return np.asarray(given, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise PlanningError(f"The goal {what} {given!r} is not a list of numbers.") from None
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ _STUCK_SHARE = 0.05
 _FOLLOWS_SHARE = 0.5
 """... and one that goes more than this follows. In between it is slow, or noise hides it."""
 
-_LOOK_EVERY = 4
+_LOOK_EVERY = 16
 """Ticks between two looks at joints that have all followed so far: a look takes time."""
 
 _LEAST_BAND = 1e-6
@@ -72,11 +72,11 @@ class StuckJointWatch:
         ``q`` and ``wanted`` (n,) are the measured and the wanted shape now, ``velocity`` (n,) what
         is commanded until the next tick.
         """
-        if not self._ticks:
-            return []
         if not self._suspicious:
             self._looks += 1
-            if self._looks % _LOOK_EVERY or np.abs(wanted - q).max(initial=0.0) <= self._band:
+            if self._looks % _LOOK_EVERY or not self._ticks:
+                return []
+            if np.abs(wanted - q).max(initial=0.0) <= self._band:
                 return []
             self._suspicious = True
             self._begin(np.ones(self._joints, dtype=np.bool_), q)

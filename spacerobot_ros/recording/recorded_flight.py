@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,8 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 _WRENCH = "geometry_msgs/msg/WrenchStamped"
 _STRING = "std_msgs/msg/String"
 _SECOND = 10**9
+_TICK_RATES = (1e-3, 1e5)
+"""What a plant flies at, Hz."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,21 @@ class RecordedFlight:
         return period_ns(self.values["tick_rate"])
 
 
+@contextmanager
+def usable_parameters(bag: Bag) -> Iterator[None]:
+    """Say in one sentence that what the plant's parameters of a bag hold is of no use.
+
+    Raises:
+        RecordingError: they have other types or lengths than a plant takes.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise RecordingError(
+            f"The plant's parameters in the bag {bag.path} cannot be used: {error!r}."
+        ) from error
+
+
 def read_flight(bag: Bag) -> RecordedFlight:
     """Read all that a re-simulation needs.
 
@@ -86,7 +104,8 @@ def read_flight(bag: Bag) -> RecordedFlight:
     def wrench_values(message: Any) -> NDArray[np.float64]:
         return _wrench(message, robot.base_link)
 
-    judge = _Judge(bag, values)
+    with usable_parameters(bag):
+        judge = _Judge(bag, values)
     channels = [judge.channel(f"{prefix}/joint_commands", JOINT_STATE, limits, joint_values)]
     if PLANTS[quantity].thrusters:
         free = np.full(6, np.inf)
@@ -122,7 +141,7 @@ def _parameters(bag: Bag, prefix: str) -> dict[str, Any]:
     try:
         values = {name: json.loads(text) for name, text in texts.items()}
         mode, known = values["time_mode"], values["actuation"] in PLANTS
-        positive = values["tick_rate"] > 0
+        possible = _TICK_RATES[0] <= values["tick_rate"] <= _TICK_RATES[1]
     except (ValueError, KeyError, TypeError) as error:
         raise RecordingError(
             f"The plant's parameters in the bag {bag.path} cannot be read: {error}."
@@ -132,7 +151,7 @@ def _parameters(bag: Bag, prefix: str) -> dict[str, Any]:
             f"The bag {bag.path} was flown in real time, where nothing records which command the "
             "plant held in which tick: only flights in lockstep can be verified."
         )
-    if not (known and positive):
+    if not (known and possible):
         raise RecordingError(
             f"The bag {bag.path} names a plant that this version does not have: actuation "
             f"{values['actuation']!r} at {values['tick_rate']!r} Hz."

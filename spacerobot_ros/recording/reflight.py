@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.recording.errors import RecordingError
-from spacerobot_ros.recording.recorded_flight import RecordedFlight
+from spacerobot_ros.recording.recorded_flight import RecordedFlight, usable_parameters
 from spacerobot_ros.recording.state_topics import snapshot
 from spacerobot_ros.simulation.brakes import JointBrakes
 from spacerobot_ros.simulation.faults_plant import FaultyPlant
@@ -50,7 +50,8 @@ def fly_again(
         last: the last tick wanted.
 
     Raises:
-        RecordingError: the sensors err, and the first state is not the very first one.
+        RecordingError: the sensors err, and the first state is not the very first one, or their
+            parameters are refused.
     """
     sensors = _sensors(flight, plant)
     if first and sensors.used:
@@ -97,8 +98,9 @@ def fly_again(
 
 def _sensors(flight: RecordedFlight, plant: FaultyPlant) -> Sensors:
     known = "sensors.seed" in flight.values  # Or else they were perfect.
-    model = SensorModel.of(flight.values) if known else SensorModel()
-    return Sensors(plant, model, flight.period_ns / _SECOND)
+    with usable_parameters(flight.bag):
+        model = SensorModel.of(flight.values) if known else SensorModel()
+        return Sensors(plant, model, flight.period_ns / _SECOND)
 
 
 def _rest(flight: RecordedFlight, plant: Plant) -> list[Callable[[], NDArray[np.float64]]]:

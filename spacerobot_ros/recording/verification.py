@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from spacerobot_ros.recording.errors import RecordingError
 from spacerobot_ros.recording.reader import read_bag
-from spacerobot_ros.recording.recorded_flight import RecordedFlight, read_flight
+from spacerobot_ros.recording.recorded_flight import RecordedFlight, read_flight, usable_parameters
 from spacerobot_ros.recording.reflight import Reflight, fly_again
 from spacerobot_ros.recording.state_topics import StateTopic, state_topics
 from spacerobot_ros.simulation import InitialState
@@ -91,12 +91,9 @@ def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Ve
     published = _published(flight, names[link] if link is not None else "")
     first = min(int(p.ticks.min()) for p in published)
     last = max(int(p.ticks.max()) for p in published)
-    try:
-        plant = build_plant(flight.robot, flight.values, _initial(first, published, flight))
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise RecordingError(
-            f"The plant's parameters in the bag {flight.bag.path} cannot be used: {error!r}."
-        ) from error
+    initial = _initial(first, published, flight)
+    with usable_parameters(flight.bag):
+        plant = build_plant(flight.robot, flight.values, initial)
     if first > 0:
         # What the flight begins from is given, and what moved it there is not in the bag.
         published = [p.after(first) for p in published]

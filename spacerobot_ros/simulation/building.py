@@ -24,6 +24,10 @@ _SHORTEST_STEP = 1e-5
 """Shorter Runge-Kutta steps lose more to rounding than they gain, s."""
 
 
+_MOST_STEPS = 1e6
+"""More steps in a tick take minutes."""
+
+
 @dataclass(frozen=True)
 class PlantKind:
     """A way to drive a robot.
@@ -83,6 +87,11 @@ def build_plant(
             "nothing pushes the base: set actuation to effort, or thrusters to ''."
         )
     tick_period = period_ns(values["tick_rate"]) / _SECOND
+    if step and tick_period / step > _MOST_STEPS:
+        raise ParameterError(
+            f"Parameter 'integration_step' is {step:g} s, which is more than {_MOST_STEPS:.0e} "
+            f"steps in a tick of {tick_period:g} s; choose longer steps or shorter ticks."
+        )
     plant = kind.plant(
         robot,
         tick_period,

@@ -51,9 +51,7 @@ KINDS: dict[str, FaultKind] = {
     "joint_slow": FaultKind(("joint",), "factor on the command", 0.0, 1.0),
     "actuator_bias": FaultKind(("joint",), "added to the command, in its unit"),
     "actuator_noise": FaultKind(("joint",), "1 sigma on the command, in its unit", 0.0),
-    "thruster_stuck": FaultKind(
-        WRENCH_AXES, "held whatever is commanded, N or N m"
-    ),
+    "thruster_stuck": FaultKind(WRENCH_AXES, "held whatever is commanded, N or N m"),
     "thruster_off": FaultKind((*WRENCH_AXES, "all")),
     "thruster_weak": FaultKind((*WRENCH_AXES, "all"), "factor on the command", 0.0, 1.0),
     "nozzle_open": FaultKind(("nozzle",)),

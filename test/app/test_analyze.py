@@ -94,6 +94,7 @@ def test_masses_and_limits_are_those_of_the_urdf() -> None:
     assert "144 kg, of which the base 120 kg" in lines_of(findings)[0]
 
 
+@pytest.mark.slow
 def test_a_urdf_of_ones_own(tmp_path: Path) -> None:
     urdf = tmp_path / "own.urdf"
     urdf.write_text(random_robot_urdf(np.random.default_rng(7), 4))

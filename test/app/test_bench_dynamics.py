@@ -16,6 +16,7 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench_dynamics, "_STEPS", 100)
 
 
+@pytest.mark.slow
 def test_figures() -> None:
     figures = bench_dynamics.dynamics_benchmark()
     with_compiler = c_compiler() is not None

@@ -12,7 +12,14 @@ from spacerobot_ros.app.cli import main
 from spacerobot_ros.app.scenario import load_scenario, parse_setting, scenario_names
 from spacerobot_ros.errors import ParameterError
 
-QUICK = ["--set", "planner.lie_bracket.t1=2", "--set", "planner.lie_bracket.cycles=0"]
+QUICK = [
+    "--method",
+    "lie_bracket",
+    "--set",
+    "planner.lie_bracket.t1=2",
+    "--set",
+    "planner.lie_bracket.cycles=0",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -60,7 +67,7 @@ def test_goal_out_of_reach_is_exit_1(tmp_path: Path) -> None:
         *("--bag", str(tmp_path / "a.mcap")),
     )
     assert result.exit_code == 1
-    assert "beyond stroke" in result.output
+    assert "out of reach" in result.output
 
 
 @pytest.mark.parametrize(
@@ -69,7 +76,7 @@ def test_goal_out_of_reach_is_exit_1(tmp_path: Path) -> None:
         (["nowhere"], "There is no scenario 'nowhere'"),
         (["sliding_masses", "--goal", "nan", *"000001"], "is not finite"),
         (["sliding_masses", "--goal", *"0000000"], "zero quaternion"),
-        (["sliding_masses", "--goal-rotvec", "inf", "0", "0"], "not finite"),
+        (["sliding_masses", "--goal-rotvec", "inf", "0", "0"], "is not three finite numbers"),
         (["sliding_masses", "--set", "plant.tick_rate=fast"], "'tick_rate' is 'fast'"),
         (["sliding_masses", "--set", "tick_rate=1"], "is not node.parameter=value"),
         (["sliding_masses", "--set", "plant.nothing=1"], "no parameter 'nothing'"),

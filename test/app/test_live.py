@@ -18,6 +18,7 @@ from spacerobot_ros.recording import read_bag
 ROOT = Path(__file__).parents[2]
 COMMAND = (sys.executable, "-m", "spacerobot_ros.app.cli")
 GAIT = (
+    *("--set", "planner.method=lie_bracket"),
     *("--set", "planner.lie_bracket.t1=4", "--set", "planner.lie_bracket.cycles=0"),
     *("--set", "planner.attitude_tolerance=0.001", "--set", "planner.position_tolerance=0.001"),
 )
@@ -44,6 +45,7 @@ def spacerobot(
     )
 
 
+@pytest.mark.slow
 def test_each_node_in_a_process_of_its_own_flies_the_same_manoeuvre(
     environment: dict[str, str], tmp_path: Path
 ) -> None:
@@ -60,8 +62,10 @@ def test_each_node_in_a_process_of_its_own_flies_the_same_manoeuvre(
     one, many = results
     assert one["succeeded"]
     assert many["succeeded"]
-    for key in ("final_attitude_rotvec_rad", "final_joint_positions", "manoeuvre_time_s"):
-        np.testing.assert_allclose(many[key], one[key], atol=1e-12)
+    assert many["manoeuvre_time_s"] == one["manoeuvre_time_s"]
+    # The controller goes on until it is heard to have arrived, a tick or two longer.
+    for key in ("final_attitude_rotvec_rad", "final_joint_positions"):
+        np.testing.assert_allclose(many[key], one[key], atol=1e-6)
     bag = read_bag(tmp_path / "many.mcap")
     assert bag.message_count("/odom") == many["ticks"] + 1, "from the first state on, none lost"
     assert bag.metadata["scenario"]["name"] == "planar_chain"

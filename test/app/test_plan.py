@@ -87,7 +87,7 @@ def test_many_goals_are_counted() -> None:
     ("arguments", "sentence"),
     [
         (["nowhere"], "There is no scenario 'nowhere'"),
-        (["planar_chain", "--goal-rotvec", "nan", "0", "0"], "not finite"),
+        (["planar_chain", "--goal-rotvec", "nan", "0", "0"], "is not three finite numbers"),
         (["planar_chain", "--goal-rotvec", "0.3", "0", "0"], "off any rotation about the axis"),
         (["sliding_masses", "--goal", *"9000001"], "out of reach"),
         (["sliding_masses", "--set", "planner.optimal.speed=1"], "no parameter 'optimal.speed'"),

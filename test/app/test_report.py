@@ -189,6 +189,7 @@ def test_published_figures_stand_beside_measured_ones(flown: Page) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_the_same_bag_makes_the_same_report(folder: Path, flown: Page) -> None:
     assert flown.figures
     write_report(folder / "flight.mcap", folder / "again.html")

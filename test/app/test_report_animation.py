@@ -222,6 +222,7 @@ def base_in(window: Browser) -> Any:
     return np.reshape(matrix, (4, 4)).T
 
 
+@pytest.mark.slow
 @with_browser
 def test_play_runs_to_the_end(page: Path, window: Browser) -> None:
     window.open(page, 420, 640)

@@ -33,7 +33,13 @@ from std_msgs.msg import Float64MultiArray, Header, String
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
-from spacerobot_ros.nodes.cdr import Layout, MessageTemplate, TemplateReader, stamp_bytes
+from spacerobot_ros.nodes.cdr import (
+    Layout,
+    MessageTemplate,
+    TemplateReader,
+    UnreadableError,
+    stamp_bytes,
+)
 from spacerobot_ros.nodes.trajectory_message import serialised_trajectory
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
 from spacerobot_ros.recording import message_definition
@@ -328,7 +334,7 @@ def test_a_reader_sees_that_numbers_have_moved_from_one_field_to_the_next() -> N
 
 def test_a_reader_refuses_what_is_no_message() -> None:
     reader = TemplateReader(JointState, spans)
-    with pytest.raises(RuntimeError):
+    with pytest.raises(UnreadableError, match="its bytes are no JointState"):
         reader.accept(b"\0\1\0\0" + b"\xff" * 29)
     # And still reads the next.
     message = JointState(name=["a"], position=[1.0], velocity=[2.0], effort=[0.0])

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
+from std_srvs.srv import Trigger
 from support.fault_flights import FaultFlight, values_of
 from support.ros_harness import Harness, assert_one_sentence
 
@@ -109,6 +110,18 @@ def test_without_a_tolerance_noisy_rates_are_taken_for_drift(harness: Harness) -
     status = flight.fly(*TURNED)
     assert values_of(status)["state"] == "refused"
     assert_one_sentence(status.message, "drifts")
+
+
+def test_a_goal_is_aborted_while_its_end_is_averaged(harness: Harness) -> None:
+    flight = sliders(harness, averaging=2000)
+    flight.send(*TURNED)
+    flight.ticks(2000 + 14 * 20 + 10)
+    assert flight.states == ["idle", "executing"]
+    client = flight.probe.create_client(Trigger, "planner/abort")
+    assert harness.call(client, Trigger.Request()).success
+    harness.spin_until(lambda: flight.states[-1] == "aborted", "the abortion")
+    flight.ticks(2010)
+    assert flight.states == ["idle", "executing", "aborted"], "nothing is judged"
 
 
 # -- faults that the planner flies through ----------------------------------------------------

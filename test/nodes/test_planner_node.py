@@ -336,6 +336,39 @@ def test_a_new_goal_replaces_the_one_that_is_flown(harness: Harness) -> None:
         m for m in flight.probe.messages["joint_states"] if stamp_of(m) == stamp_of(second)
     )
     np.testing.assert_array_equal(second.points[0].positions, at_switch.position)
+    # No joint stops dead: what was flown comes to rest before the second gait begins.
+    after = next(
+        m
+        for m in flight.probe.messages["joint_states"]
+        if stamp_of(m) == stamp_of(second) + TICK_NS
+    )
+    before, now = np.array(at_switch.velocity), np.array(after.velocity)
+    assert np.abs(before).max() > 0.01
+    assert np.abs(now - before).max() < 0.2 * np.abs(before).max()
+
+
+def test_the_rest_is_planned_again_when_the_base_drifts_off_its_path(
+    harness: Harness, tmp_path: FilePath
+) -> None:
+    """The base is heavier than the planner believes, so that it does not go where it should."""
+    urdf = (URDF / "sliding_masses.urdf").read_text("utf-8")
+    heavier = tmp_path / "heavier.urdf"
+    heavier.write_text(urdf.replace('<mass value="10"/>', '<mass value="13"/>'), "utf-8")
+    flight = Flight(
+        harness, {"drift_position": 2e-3, "max_corrections": 10}, {"robot": str(heavier)}
+    )
+    flight.decide(NEAR)
+    first, second = flight.probe.messages["gait_schedule"][:2]
+    ends = stamp_of(first) + nanoseconds(first.points[-1].time_from_start)
+    assert stamp_of(first) < stamp_of(second) < ends
+    assert flight.states[-1] == "reached"
+    assert max(flight.error_to(NEAR)) <= 1e-3
+
+
+def test_small_drift_is_left_to_the_end(harness: Harness) -> None:
+    flight = Flight(harness, {"drift_position": 2e-3, "drift_attitude": 2e-3})
+    flight.decide(NEAR)
+    assert flight.states == ["idle", "executing", "reached"]
 
 
 def distance_from(path: Array, shape: Array) -> float:

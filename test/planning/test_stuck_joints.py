@@ -193,3 +193,33 @@ def test_a_shape_that_a_stuck_joint_is_not_in_is_refused() -> None:
         PlanningError, match=r"stuck at 2 rad; the goal wants .*'elbow_pitch' at 2\.1"
     ):
         gait(SERVICER, "elbow_pitch").plan(state, goal)
+
+
+def test_a_chain_turns_its_base_by_the_one_pin_that_is_left() -> None:
+    chain = (share_directory() / "urdf" / "planar_chain.urdf").read_text("utf-8")
+    robot = robot_of(chain)
+    plant = FaultyPlant(VelocityPlant(robot, TICK), ["joint_stuck pin_1"], TICK, wrench=False)
+    goal = Goal(np.zeros(3), Rotation.from_rotvec([0.0, 0.0, 0.1]).as_quat())
+    method = gait(chain, "pin_1", method="square_path")
+    for rates in method.plan(state_of(plant), goal).velocities:
+        plant.step(rates)
+    left = Rotation.from_quat(plant.pose[3:]).inv() * Rotation.from_quat(goal.quaternion)
+    assert left.magnitude() < 1e-3
+    assert plant.q[0] == 0.0
+
+
+def test_a_method_that_leaves_the_position_does_not_stand_in_for_one_that_does_not() -> None:
+    chain = (share_directory() / "urdf" / "planar_chain.urdf").read_text("utf-8")
+    method = RemainingJointsGait(
+        robot_of(chain),
+        TICK,
+        Tolerance(1e-3, 1e-3),
+        stuck=["pin_1"],
+        method="auto",
+        options={},
+        controls=frozenset({"position", "attitude"}),
+    )
+    goal = Goal(np.zeros(3), Rotation.from_rotvec([0.0, 0.0, 0.1]).as_quat())
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(2))
+    with pytest.raises(PlanningError, match="optimal would leave the position as it comes"):
+        method.plan(state, goal)

@@ -65,16 +65,20 @@ class FaultFlight:
         for node in self.nodes:
             assert node.trigger_activate() is TransitionCallbackReturn.SUCCESS
 
-    def fly(self, position: Sequence[float], rotvec: Sequence[float]) -> DiagnosticStatus:
-        """Send a goal, and return the status that decides it."""
+    def send(self, position: Sequence[float], rotvec: Sequence[float]) -> None:
+        """Send a goal, and let time run."""
         message = PoseStamped()
         p, o = message.pose.position, message.pose.orientation
         p.x, p.y, p.z = (float(x) for x in position)
         o.x, o.y, o.z, o.w = Rotation.from_rotvec(rotvec).as_quat().tolist()
-        before = self.probe.count(self.decider)
         self.goals.publish(message)
         if not self.plant.is_active:
             assert self.plant.trigger_activate() is TransitionCallbackReturn.SUCCESS
+
+    def fly(self, position: Sequence[float], rotvec: Sequence[float]) -> DiagnosticStatus:
+        """Send a goal, and return the status that decides it."""
+        before = self.probe.count(self.decider)
+        self.send(position, rotvec)
         self.harness.spin_until(
             lambda: any(s in _DECIDED for s in self.states[before:]), "the goal is decided", 60.0
         )

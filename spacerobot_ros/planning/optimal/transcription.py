@@ -164,8 +164,8 @@ class Transcription:
         parts = [
             bound - change,
             bound + change,
-            control[below, :] - ca.repmat(self._lower[below], 1, N),
-            ca.repmat(self._upper[above], 1, N) - control[above, :],
+            control[below, :] - ca.repmat(self._lower[below, :], 1, N),
+            ca.repmat(self._upper[above, :], 1, N) - control[above, :],
         ]
         if self._constraints.on_knots:
             kept = self._keeps().map(N - 1)

@@ -1,0 +1,32 @@
+"""Models without a compiler, which takes longer than an input; the count of inputs at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import rclpy
+from support.fuzzing import LONG, SENTENCES, TRIED
+from support.ros_harness import Harness
+
+
+@pytest.fixture(autouse=True)
+def _interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+
+
+@pytest.fixture
+def harness(ros_context: rclpy.Context) -> Iterator[Harness]:
+    """Return an empty executor in a ROS domain of this test's own."""
+    harness = Harness(ros_context)
+    yield harness
+    harness.close()
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    if not LONG:
+        return
+    terminalreporter.section("inputs tried")
+    for kind, count in sorted(TRIED.items()):
+        terminalreporter.line(f"{kind:<28}{count:>7} {SENTENCES[kind]:>7} refused")
+    terminalreporter.line(f"{'all':<28}{TRIED.total():>7} {SENTENCES.total():>7} refused")

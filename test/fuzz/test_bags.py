@@ -1,0 +1,145 @@
+"""Damaged bags: read, salvaged, verified, gone on from and replayed, or refused with a sentence."""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from support.fuzzing import NUMBERS, VALUES, attempt, damaged, fuzz
+
+from spacerobot_ros.app.report import write_report
+from spacerobot_ros.nodes.plant_parameters import PLANT_SPECS
+from spacerobot_ros.recording import Playback, iterate_raw, read_bag
+from spacerobot_ros.recording.last_state import last_state
+from spacerobot_ros.recording.salvage import salvage_bag
+from spacerobot_ros.recording.verification import verify_bag
+from spacerobot_ros.resources import share_directory
+
+WHOLE = (share_directory() / "bags" / "sliding_masses.mcap").read_bytes()
+_MESSAGES = 120
+
+
+def rewritten(parameters: dict[str, str] | None = None, *, guarded: bool = False) -> bytes:
+    """Return the first messages of a reference bag; unless guarded, no checksum is in it."""
+    out = BytesIO()
+    reader = make_reader(BytesIO(WHOLE))
+    writer = Writer(
+        out,
+        compression=CompressionType.ZSTD if guarded else CompressionType.NONE,
+        enable_crcs=guarded,
+        enable_data_crcs=guarded,
+    )
+    writer.start("ros2")
+    for attachment in reader.iter_attachments():
+        writer.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
+    for metadata in reader.iter_metadata():
+        given = parameters if metadata.name == "parameters/plant" else None
+        writer.add_metadata(metadata.name, {**metadata.metadata, **(given or {})})
+    channels: dict[int, int] = {}
+    for count, (schema, channel, message) in enumerate(reader.iter_messages()):
+        if count == _MESSAGES:
+            break
+        assert schema is not None
+        if channel.id not in channels:
+            number = writer.register_schema(schema.name, schema.encoding, schema.data)
+            channels[channel.id] = writer.register_channel(
+                channel.topic, channel.message_encoding, number, channel.metadata
+            )
+        writer.add_message(
+            channels[channel.id], message.log_time, message.data, message.publish_time
+        )
+    writer.finish()
+    return out.getvalue()
+
+
+@lru_cache
+def unguarded() -> bytes:
+    return rewritten()
+
+
+@lru_cache
+def guarded() -> bytes:
+    return rewritten(guarded=True)
+
+
+def read_all(path: Path) -> None:
+    """Read everything that a bag says it holds."""
+    bag = read_bag(path)
+    for topic in bag.topics:
+        bag.qos(topic)
+        series = bag[topic]
+        assert len(series.time) == len(list(series.messages()))
+    _ = (bag.metadata, bag.attachments, bag.start_time, bag.end_time)
+
+
+def replay_all(path: Path) -> None:
+    playback = Playback(read_bag(path), rate=1e9)
+    playback.run(0)
+    while not playback.ended:
+        assert playback.step(0) is not None
+
+
+def go_on(path: Path) -> None:
+    state = last_state(path)
+    for numbers in (state.position, state.quaternion, state.joints, state.rates, state.momenta):
+        assert np.all(np.isfinite(numbers))
+
+
+def exercise(kind: str, path: Path) -> None:
+    """Do to a bag all that the package does with bags."""
+    attempt(kind, read_all, path)
+    attempt(kind, lambda: list(iterate_raw(path)))
+    attempt(kind, verify_bag, path)
+    attempt(kind, go_on, path)
+    attempt(kind, replay_all, path)
+    target = path.with_name("salvaged.mcap")
+    target.unlink(missing_ok=True)
+    if attempt(kind, salvage_bag, path, target) is not None:
+        attempt(kind, read_all, target)
+
+
+@fuzz("damaged bag", st.deferred(lambda: damaged(guarded())), fast=12, long=250)
+def test_a_damaged_bag(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "b.mcap"
+    path.write_bytes(content)
+    exercise("damaged bag", path)
+
+
+@fuzz("damaged bag, no checksum", st.deferred(lambda: damaged(unguarded())), fast=12, long=400)
+def test_a_damaged_bag_without_checksums(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "b.mcap"
+    path.write_bytes(content)
+    exercise("damaged bag, no checksum", path)
+
+
+@fuzz(
+    "bag's parameters",
+    st.dictionaries(
+        st.sampled_from([spec.name for spec in PLANT_SPECS]),
+        st.one_of(
+            VALUES.map(json.dumps), st.lists(NUMBERS, min_size=3, max_size=4).map(json.dumps)
+        ),
+        min_size=1,
+        max_size=2,
+    ),
+    fast=10,
+    long=200,
+)
+def test_a_bag_with_other_parameters_of_its_plant(tmp_path: Path, given: dict[str, Any]) -> None:
+    path = tmp_path / "b.mcap"
+    path.write_bytes(rewritten(given))
+    attempt("bag's parameters", verify_bag, path)
+
+
+@fuzz("report", st.deferred(lambda: damaged(unguarded())), fast=1, long=30)
+def test_a_report_of_a_damaged_bag(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "b.mcap"
+    path.write_bytes(content)
+    attempt("report", write_report, path, tmp_path / "b.html")
