@@ -46,6 +46,10 @@ test: $(STAMP)/test ## check style and types, run the tests
 test-slow: $(STAMP)/test ## run the slow tests: long flights, builds with pip and colcon
 	$(BIN)/python3 -m pytest -m slow
 
+.PHONY: fuzz
+fuzz: $(STAMP)/test ## try more than ten thousand inputs that nobody would send, and count them
+	SPACEROBOT_FUZZ=long $(BIN)/python3 -m pytest -q test/fuzz
+
 # Short flights, so that the bags of all scenarios stay small. A goal not met in time is no failure.
 REFERENCE := --set plant.marker_period=5 --set plant.diagnostics_period=5
 FLY = @fly() { echo "bags/$$1.mcap"; $(BIN)/spacerobot run "$$@" --bag "bags/$$1.mcap" $(REFERENCE) \

@@ -236,7 +236,8 @@ def _number(entry: Mapping[str, Any], key: str, where: str, *, positive: bool) -
         value = math.nan
     if not 0 <= value <= _LARGEST or (positive and value < 1 / _LARGEST):
         wanted = "a positive number" if positive else "zero or more"
-        wanted += f" up to {_LARGEST:g}"
+        if value > _LARGEST:
+            wanted += f" up to {_LARGEST:g}"
         raise ParameterError(
             f"The {key} of {where} is {'missing' if given is None else given}; it must be {wanted}."
         )

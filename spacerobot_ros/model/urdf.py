@@ -167,7 +167,7 @@ def _shapes(link: Any, colours: dict[str, Any], where: str) -> list[Shape]:
         colour = (
             Shape.rgba if rgba is None else tuple(_finite(rgba, f"a color of {where}").tolist())
         )
-        shapes.append(Shape(kind, size, _pose(visual.origin, where), colour, resource))  # type: ignore[arg-type]
+        shapes.append(Shape(kind, size, _pose(visual.origin, where), colour, resource))
     return shapes
 
 

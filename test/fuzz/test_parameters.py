@@ -13,10 +13,11 @@ from support.fuzzing import FINITE, MODEST, NUMBERS, TEXTS, VALUES, attempt, fuz
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import NODE_TYPES, ReplayNode
-from spacerobot_ros.nodes.flight_node import AUTOSTART
+from spacerobot_ros.nodes.flight_node import AUTOSTART, FlightNode
 from spacerobot_ros.nodes.parameters import ParameterSpec
 
-SPECS = [spec for kind in (*NODE_TYPES.values(), ReplayNode) for spec in (AUTOSTART, *kind.SPECS)]
+KINDS: list[type[FlightNode]] = [*NODE_TYPES.values(), ReplayNode]
+SPECS = [AUTOSTART, *(spec for kind in KINDS for spec in kind.SPECS)]
 WHOLE = st.integers(-(2**63), 2**63 - 1)
 ROS_VALUES = st.one_of(
     st.booleans(),
@@ -76,7 +77,7 @@ def overrides(draw: st.DrawFn, node: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("node", BASES)
 def test_a_node_configures_or_says_what_is_wrong(node: str, ros_context: rclpy.Context) -> None:
-    @fuzz("node", overrides(node), fast=8, long=120)
+    @fuzz("node", overrides(node), fast=8, long=15)
     def construct(given: dict[str, Any]) -> None:
         parameters = [Parameter(name, value=value) for name, value in (BASES[node] | given).items()]
         made = attempt(

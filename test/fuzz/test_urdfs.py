@@ -16,9 +16,10 @@ from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.resources import resource_names, robot_file
 
 TEXTS = [robot_file(name).read_text(encoding="utf-8") for name in resource_names("urdf", ".urdf")]
-VALUES = ["nan", "inf", "-inf", "-1", "0", "x", "", "1e308", "-1e308", "1e-320", "1e12", "1 2", "1 2 3",
-          "0 0 0", "1e308 1e308 1e308", "1 2 3 4", "base_link", "revolute", "prismatic", "floating",
-          "planar", "continuous", "fixed", "0x10", "1,5", "é", "a b\nc", "1_0"]  # fmt: skip
+VALUES = ["nan", "inf", "-inf", "-1", "0", "x", "", "1e308", "-1e308", "1e-320", "1e12", "1 2",
+          "1 2 3", "0 0 0", "1e308 1e308 1e308", "1 2 3 4", "base_link", "revolute", "prismatic",
+          "floating", "planar", "continuous", "fixed", "0x10", "1,5", "é",
+          "a b\nc", "1_0"]  # fmt: skip
 
 
 def changed(text: str, seed: int, changes: int) -> str:

@@ -70,13 +70,14 @@ def fuzz(
             TRIED[kind] += 1
             test(*arguments, **options)
 
-        profile = settings(
+        profile: Any = settings(
             max_examples=long if LONG else fast,
             derandomize=True,
             deadline=None,
             suppress_health_check=list(HealthCheck),
         )
-        decorated: Callable[..., None] = profile(given(*strategies, **named)(counted))
+        give: Any = given(*strategies, **named)
+        decorated: Callable[..., None] = profile(give(counted))
         return decorated
 
     return decorate
@@ -90,10 +91,11 @@ def attempt(kind: str, function: Callable[..., Any], *arguments: Any, **options:
     try:
         return function(*arguments, **options)
     except SpaceRobotError as error:
-        SENTENCES[kind] += 1
-        assert_one_sentence(str(error))
-        assert len(str(error)) > 20, str(error)
-        return None
+        sentence = str(error)
+    SENTENCES[kind] += 1
+    assert_one_sentence(sentence)
+    assert len(sentence) > 20, sentence
+    return None
 
 
 @st.composite
