@@ -12,7 +12,7 @@ PIP := $(BIN)/python3 -m pip -qq --disable-pip-version-check
 # the latter because a deleted file changes nothing else.
 DECLARATION := setup.py setup.cfg
 SOURCES := package.xml LICENSE $(shell find $(wildcard bags config foxglove launch resource rviz \
-    scripts spacerobot_ros urdf) -mindepth 1 -not -path '*/__pycache__*' -not -name '.*')
+    scripts spacerobot_ros urdf) -not -path bags -not -path '*/__pycache__*' -not -name '.*')
 
 # The environment has a ROS 2 of its own, which one that the shell has sourced would be mixed with.
 ifdef AMENT_PREFIX_PATH

@@ -54,21 +54,25 @@ def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
     The stack and its peer take turns, and medians are compared: what else the machine does then
     falls on both.
     """
-    stack_rates, peer_rates = [], []
+    stack_rates, bare_stack_rates, peer_rates = [], [], []
     with ros(private=True), tempfile.TemporaryDirectory() as folder:
         bag = Path(folder, "bench.mcap")
         for _ in range(_ROUNDS):
             peer_rates.append(_peer_rate(ticks, bag))
             stack_rates.append(_stack_rate(ticks, bag))
+            bare_stack_rates.append(_stack_rate(ticks, None))
             yield (
                 f"round: {stack_rates[-1]:8.0f} ticks/s with plant, planner and recorder, "
                 f"{peer_rates[-1]:8.0f} bare"
             )
     stack_rate, peer_rate = statistics.median(stack_rates), statistics.median(peer_rates)
+    unrecorded = statistics.median(bare_stack_rates)
     tick = _plant_tick()
     figures: dict[str, float | str] = {
         "ticks_per_s": stack_rate,
         "bare_ticks_per_s": peer_rate,
+        "unrecorded_ticks_per_s": unrecorded,
+        "recorder_cost": 1 - stack_rate / unrecorded,
         "ratio_to_bare": stack_rate / peer_rate,
         "plant_tick_us": 1e6 * tick,
         "compiler": c_compiler() or "none (virtual machine)",
@@ -76,6 +80,8 @@ def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
     yield f"lockstep, recorded: {stack_rate:.0f} ticks/s (median of {_ROUNDS})"
     yield f"bare ping-pong with as many topics and a raw recorder: {peer_rate:.0f} ticks/s"
     yield f"ratio: {100 * stack_rate / peer_rate:.0f} %"
+    cost = 100 * (1 - stack_rate / unrecorded)
+    yield f"without the recorder: {unrecorded:.0f} ticks/s; recording costs {cost:.0f} % of them"
     yield f"one plant tick alone: {1e6 * tick:.1f} us (compiler: {figures['compiler']})"
     for name, first, later in planning_times():
         figures |= {f"plan_{name}_first_s": first, f"plan_{name}_s": later}
@@ -103,7 +109,7 @@ def _dynamics_lines(figures: dict[str, float | str]) -> Iterator[str]:
     yield f"... without a compiler: {without:.2f}"
 
 
-def _stack_rate(ticks: int, bag: Path) -> float:
+def _stack_rate(ticks: int, bag: Path | None) -> float:
     """Ticks a second of the first ``ticks`` of the sliding-mass flight, planning left out."""
     scenario = load_scenario("sliding_masses").with_overrides("planner", {"method": "lie_bracket"})
     stack = FlightStack(scenario, bag)

@@ -94,7 +94,8 @@ def what_is_left(error: PoseError, controls: Collection[str]) -> str:
     parts = {
         "position": f"{error.distance:.3g} m",
         "attitude": f"{error.angle:.3g} rad",
-        "shape": f"{error.farthest_joint:.3g} at the joints",
     }
+    if len(error.shape):
+        parts["shape"] = f"{error.farthest_joint:.3g} at the joints"
     left = " and ".join(text for part, text in parts.items() if part in controls)
     return f"{left} from the goal"
