@@ -43,6 +43,9 @@ _CONDITIONS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 50.0, 100.0)
 _POOR = 300.0
 """Condition numbers above are drawn as this one: singular shapes are lines between grid points."""
 
+_LEAST_ROOM = 0.25
+"""Squares are drawn round a centre that is as far from the joint limits, rad."""
+
 _SIDES = 60
 _AXES = ("x", "y", "z")
 
@@ -84,8 +87,16 @@ def _planar(found: Analysis) -> Figure:
     left.set_title("H: turn by small clockwise loops over area (1/rad)")
     _bar(figure, bar, norm, "RdBu_r")
     right = panel(figure, 5.9, 0.6, WIDTH - 6.2, 3.55)
-    room = np.minimum(robot.upper[[i, j]] - centre, centre - robot.lower[[i, j]])
-    _phases(right, plane, centre, 2 * float(room.min()))
+
+    def room(point: Array) -> float:
+        return float(np.minimum(robot.upper[[i, j]] - point, point - robot.lower[[i, j]]).min())
+
+    if room(centre) < _LEAST_ROOM:
+        # The peak is on a joint limit: squares need one that is not.
+        quarter = (upper - lower) / 4
+        inner = np.array([[lower + quarter, upper - quarter]])
+        centre = curvature_peaks(plane, np.zeros(2), inner)[0]
+    _phases(right, plane, centre, 2 * room(centre))
     return figure
 
 

@@ -79,7 +79,8 @@ def test_an_average_is_nearer_the_truth_than_what_is_measured_once(harness: Harn
     # The planner has waited at rest for its states, before the gait and after it.
     stamps, shapes = flight.series("joint_states")
     moving = stamps[:-1][np.abs(np.diff(shapes[:, 0])) > 1e-12]
-    assert moving[0] == pytest.approx(99 * 0.05)
+    # A goal may come a tick or two after the first state.
+    assert 99 * 0.05 - 1e-6 <= moving[0] <= 101 * 0.05 + 1e-6
     assert stamps[-1] - moving[-1] >= 99 * 0.05
 
 
