@@ -5,15 +5,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from spacerobot_ros.planning import plan
     from spacerobot_ros.recording import read_bag
 
 __version__ = "0.1.0"
 
-__all__ = ["__version__", "read_bag"]
+__all__ = ["__version__", "plan", "read_bag"]
 
 
 def __getattr__(name: str) -> Any:
     # Imported when first asked for: the package itself is light.
+    if name == "plan":
+        from spacerobot_ros.planning import plan
+
+        return plan
     if name == "read_bag":
         from spacerobot_ros.recording import read_bag
 
