@@ -26,7 +26,7 @@ KILLS = 20
 TIMEOUT = 0.5
 TICK = 0.05
 PACE = 4.0
-PATIENCE = 120.0
+PATIENCE = 300.0
 GOAL = Goal.checked([0.1, -0.05, 0.02], [0.0, 0.0, 0.1, 0.995])
 
 
@@ -44,7 +44,7 @@ class Flight:
             "attitude_tolerance": 1e-3,
             "max_corrections": 10,
             "lie_bracket.t1": 20.0,
-            "lie_bracket.cycles": 240,
+            "lie_bracket.cycles": 160,
         }
         scenario = (
             load_scenario("sliding_masses")

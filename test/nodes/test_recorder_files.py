@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -72,6 +73,11 @@ def test_lost_messages_are_published_and_stay_in_the_bag(harness: Harness, tmp_p
     assert read_bag(tmp_path / "flight.mcap").metadata["recorder"]["messages_lost"] == "7"
 
 
+def written(bag: Path) -> bool:
+    """Whether more than the head of a bag is on the disk."""
+    return bag.is_file() and bag.stat().st_size > 4000
+
+
 @pytest.mark.slow
 def test_a_kill_at_any_moment_leaves_all_but_the_last_second(
     harness: Harness, tmp_path: Path, ros_domain: int
@@ -97,8 +103,9 @@ def test_a_kill_at_any_moment_leaves_all_but_the_last_second(
         ) as process:
             try:
                 harness.matched(publisher)
-                began = time.time_ns()
-                harness.spin_for(chance.uniform(1.2, 3.0))
+                # The recorder may meet the publisher seconds after it was met.
+                harness.spin_until(partial(written, bag), "something is written")
+                harness.spin_for(chance.uniform(0.0, 2.0))
             finally:
                 killed = time.time_ns()
                 process.kill()
@@ -112,5 +119,4 @@ def test_a_kill_at_any_moment_leaves_all_but_the_last_second(
         # Without a gap since the recorder listened.
         found = [int(message.data[8:14]) for message in messages]
         assert found == list(range(found[0], found[0] + len(found)))
-        assert messages[0].log_time - began < 1e9
         probe.destroy_timer(timer)
