@@ -103,12 +103,15 @@ def test_a_node_killed_at_random_moments_joins_in_again(flight: Flight, name: st
     stack = flight.stack
     stack.start(GOAL)
     flight.spin(lambda: stack.operator.gait, "the goal is flown")
+    away: list[tuple[float, float]] = []
     for _ in range(KILLS):
         flight.pass_time(rng.uniform(0.1, 2.0))
         assert not flight.decided, "in mid-manoeuvre"
         flight.kill(name)
+        killed = stack.time_ns / 1e9
         flight.pass_time(2 * TIMEOUT / PACE)
         before = stack.time_ns
+        away.append((killed, before / 1e9))
         flight.restart(name)
         if name == "plant":
             flight.spin(after(stack, before), "time goes on")
@@ -123,10 +126,11 @@ def test_a_node_killed_at_random_moments_joins_in_again(flight: Flight, name: st
     last = bags[-1]["/odom"]
     position = [last.field(f"pose.pose.position.{x}")[-1] for x in "xyz"]
     assert np.linalg.norm(position - GOAL.position) <= 1e-3
-    spoken = [bag for bag in bags if {"/joint_states", "/joint_commands"} <= set(bag.topics)]
+    spoken = [bag for bag in bags if "/joint_states" in bag.topics]
     assert len(spoken) > len(bags) / 2, "few recorders were killed before their first chunk"
-    for bag in spoken:
-        assert_at_rest_without_commands(bag)
+    if name == "planner":
+        for bag in spoken:
+            assert_at_rest_while_away(bag, away)
 
 
 def whole(path: Path) -> Bag:
@@ -137,12 +141,13 @@ def whole(path: Path) -> Bag:
         return read_bag(salvage_bag(path).path)
 
 
-def assert_at_rest_without_commands(bag: Bag) -> None:
-    """Joints rest from the timeout after the last command on, until the next."""
+def assert_at_rest_while_away(bag: Bag, away: list[tuple[float, float]]) -> None:
+    """Joints rest from the timeout after their commander was killed, until it is started again."""
     states = bag["/joint_states"]
-    commanded = np.unique(bag["/joint_commands"].stamp)
     speed = np.abs(np.asarray(states.field("velocity"))).max(axis=1)
-    index = np.searchsorted(commanded, states.stamp, side="right") - 1
-    known = index >= 0
-    age = states.stamp[known] - commanded[index[known]]
-    assert not speed[known][age > TIMEOUT + 2.5 * TICK].any()
+    seen = 0
+    for killed, started in away:
+        chosen = (states.stamp > killed + TIMEOUT + 3 * TICK) & (states.stamp <= started)
+        seen += int(chosen.sum())
+        assert not speed[chosen].any()
+    assert seen > KILLS
