@@ -17,7 +17,7 @@ from spacerobot_ros.app.processes import ProcessStack
 from spacerobot_ros.app.run import ros
 from spacerobot_ros.app.scenario import load_scenario
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.recording import Bag, read_bag
+from spacerobot_ros.recording import Bag, RecordingError, read_bag
 from spacerobot_ros.recording.salvage import salvage_bag
 
 pytestmark = pytest.mark.slow
@@ -137,7 +137,7 @@ def whole(path: Path) -> Bag:
     """Read a bag; one whose recorder was killed is salvaged first."""
     try:
         return read_bag(path)
-    except Exception:
+    except RecordingError:
         return read_bag(salvage_bag(path).path)
 
 
