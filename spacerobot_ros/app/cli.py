@@ -16,20 +16,18 @@ from spacerobot_ros import __version__
 from spacerobot_ros.app.analyze_command import analyze
 from spacerobot_ros.app.live_commands import goal as goal_command
 from spacerobot_ros.app.live_commands import up
+from spacerobot_ros.app.options import (
+    changed_goal,
+    pose_option,
+    rotvec_option,
+    settings_option,
+)
 from spacerobot_ros.app.plan_command import plan
 from spacerobot_ros.app.record_commands import replay, salvage, verify
-from spacerobot_ros.app.scenario import (
-    Scenario,
-    goal_from_rotvec,
-    load_scenario,
-    parse_setting,
-    scenario_names,
-)
-from spacerobot_ros.app.sentences import sentences
+from spacerobot_ros.app.scenario import Scenario, load_scenario, scenario_names
+from spacerobot_ros.app.sentences import GOAL_NOT_REACHED, sentences
 from spacerobot_ros.control import LAWS
-from spacerobot_ros.planning import METHODS, Goal
-
-GOAL_NOT_REACHED = 1
+from spacerobot_ros.planning import METHODS
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -49,20 +47,12 @@ main.add_command(verify)
 
 @main.command()
 @click.argument("scenario")
-@click.option(
-    "--goal", nargs=7, type=float, metavar="X Y Z QX QY QZ QW", help="Goal pose (m, quaternion)."
-)
-@click.option(
-    "--goal-rotvec",
-    nargs=3,
-    type=float,
-    metavar="RX RY RZ",
-    help="Attitude of the goal as exponential coordinates (rad).",
-)
+@pose_option
+@rotvec_option
 @click.option(
     "--method", type=click.Choice(sorted({*METHODS, *LAWS})), help="Gait method, or control law."
 )
-@click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE")
+@settings_option
 @click.option("--bag", type=click.Path(path_type=Path), help="Bag to write [out/SCENARIO.mcap].")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the result.")
 @click.option("--report", type=click.Path(path_type=Path), help="Write a picture report (HTML).")
@@ -167,19 +157,11 @@ def _chosen(
 ) -> Scenario:
     """Return the scenario with what the command line changes."""
     scenario = load_scenario(name)
-    # Published figures belong to the published goal.
-    if goal is not None:
-        given = Goal.checked(goal[:3], goal[3:])
-        pose = replace(scenario.goal, position=given.position, quaternion=given.quaternion)
-        scenario = replace(scenario, goal=pose, published=())
-    if goal_rotvec is not None:
-        position = scenario.goal.position.tolist()
-        given = goal_from_rotvec(position, goal_rotvec)
-        pose = replace(scenario.goal, quaternion=given.quaternion)
-        scenario = replace(scenario, goal=pose, published=())
-    for text in settings:
-        node, parameter, value = parse_setting(text)
-        scenario = scenario.with_overrides(node, {parameter: value})
+    if goal is not None or goal_rotvec is not None:
+        # Published figures belong to the published goal.
+        other = changed_goal(scenario.goal, goal, goal_rotvec)
+        scenario = replace(scenario, goal=other, published=())
+    scenario = scenario.with_settings(settings)
     if method is not None:
         node, parameter = (
             ("planner", "method") if method in METHODS else ("coordinated_control", "law")

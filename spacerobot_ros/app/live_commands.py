@@ -7,16 +7,15 @@ from pathlib import Path
 
 import click
 
-from spacerobot_ros.app.scenario import goal_from_rotvec, load_scenario, parse_setting
-from spacerobot_ros.app.sentences import sentences
+from spacerobot_ros.app.options import settings_option
+from spacerobot_ros.app.scenario import goal_from_rotvec, load_scenario
+from spacerobot_ros.app.sentences import GOAL_NOT_REACHED, sentences
 from spacerobot_ros.planning import Goal
-
-GOAL_NOT_REACHED = 1
 
 
 @click.command()
 @click.argument("scenario")
-@click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE")
+@settings_option
 @click.option("--bag", type=click.Path(path_type=Path), help="Record into this bag.")
 @click.option(
     "--rate",
@@ -31,12 +30,8 @@ def up(
     scenario: str, settings: tuple[str, ...], bag: Path | None, rate: float, processes: bool
 ) -> None:
     """Run the nodes of SCENARIO in real time until Ctrl-C; send goals by topic."""
-    chosen = load_scenario(scenario).with_overrides(
-        "plant", {"time_mode": "realtime", "real_time_factor": rate}
-    )
-    for text in settings:
-        node, parameter, value = parse_setting(text)
-        chosen = chosen.with_overrides(node, {parameter: value})
+    pace = {"time_mode": "realtime", "real_time_factor": rate}
+    chosen = load_scenario(scenario).with_overrides("plant", pace).with_settings(settings)
     from spacerobot_ros.app.live import keep_up
 
     keep_up(chosen, bag, click.echo, processes=processes)

@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import yaml
 
-from spacerobot_ros.app.scenario import (
-    goal_from_rotvec,
-    load_scenario,
-    parse_setting,
-    scenario_names,
-)
+from spacerobot_ros.app.options import changed_goal
+from spacerobot_ros.app.scenario import load_scenario, parse_setting, scenario_names
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.attitude import rotvec_from_quaternion
@@ -133,18 +128,13 @@ def problem(
     PlanningError
         The goal is not finite.
     """
-    plant, planner, wanted = _sections(name)
+    plant, planner, own_goal = _sections(name)
     for text in settings:
         node, parameter, value = parse_setting(text)
         if node not in ("plant", "planner"):
             raise ParameterError(f"'{text}' sets a parameter of {node}, which plans nothing.")
         (plant if node == "plant" else planner)[parameter] = value
-    if goal is not None:
-        given = Goal.checked(goal[:3], goal[3:])
-        wanted = replace(wanted, position=given.position, quaternion=given.quaternion)
-    if goal_rotvec is not None:
-        given = goal_from_rotvec(wanted.position.tolist(), goal_rotvec)
-        wanted = replace(wanted, quaternion=given.quaternion)
+    wanted = changed_goal(own_goal, goal, goal_rotvec)
     robot_name = planner.get("robot") or plant.get("robot")
     if not robot_name:
         raise ParameterError(f"The scenario '{name}' names no robot; see plant.robot.")
@@ -259,12 +249,7 @@ def _sections(name: str) -> tuple[dict[str, Any], dict[str, Any], Goal]:
     ):
         return {"robot": name}, {}, Goal.checked([0, 0, 0], [0, 0, 0, 1])
     scenario = load_scenario(name)
-    content = yaml.safe_load(scenario.path.read_text(encoding="utf-8"))
-    plant, planner = (
-        dict((content.get(node) or {}).get("ros__parameters") or {})
-        for node in ("plant", "planner")
-    )
-    return plant, planner, scenario.goal
+    return scenario.parameters("plant"), scenario.parameters("planner"), scenario.goal
 
 
 def _checked(planner: Mapping[str, Any]) -> dict[str, Any]:

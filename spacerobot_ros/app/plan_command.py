@@ -14,27 +14,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spacerobot_ros.app.sentences import sentences
+from spacerobot_ros.app.options import pose_option, rotvec_option, settings_option
+from spacerobot_ros.app.sentences import GOAL_NOT_REACHED, sentences
 from spacerobot_ros.planning import METHODS
 
 if TYPE_CHECKING:
     from spacerobot_ros.app.plan import Problem
 
-_NOT_MET = 1
-
 
 @click.command()
 @click.argument("scenario", metavar="SCENARIO|ROBOT")
-@click.option(
-    "--goal", nargs=7, type=float, metavar="X Y Z QX QY QZ QW", help="Goal pose (m, quaternion)."
-)
-@click.option(
-    "--goal-rotvec",
-    nargs=3,
-    type=float,
-    metavar="RX RY RZ",
-    help="Attitude of the goal as exponential coordinates (rad).",
-)
+@pose_option
+@rotvec_option
 @click.option(
     "--method",
     type=click.Choice(sorted(METHODS)),
@@ -42,7 +33,7 @@ _NOT_MET = 1
     show_default=True,
     help="Gait method.",
 )
-@click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE")
+@settings_option
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write schedule, path.")
 @click.option("--picture", type=click.Path(path_type=Path), help="Draw both (PNG).")
 @click.option("--compare", "comparing", is_flag=True, help="Fly every method, print a table.")
@@ -91,7 +82,7 @@ def plan(
         else:
             found = solve(asked, method)
     if found is None:
-        sys.exit(_NOT_MET)
+        sys.exit(GOAL_NOT_REACHED)
     left = f"{found.error.angle:.3g} rad and {found.error.distance:.3g} m from the goal"
     if not comparing:
         click.echo(f"{scenario}, {method}: {found.duration:.6g} s, ends {left}")
@@ -114,7 +105,7 @@ def plan(
         click.echo(f"picture     {picture}")
     if not found.succeeded:
         click.echo(f"The goal is not met within the planner's tolerance: {left}.", err=True)
-        sys.exit(_NOT_MET)
+        sys.exit(GOAL_NOT_REACHED)
 
 
 def _fly_random(
@@ -133,7 +124,7 @@ def _fly_random(
         for reason in dict.fromkeys(record.refused):
             click.echo(f"{record.method} refused: {reason}")
     if records[0].missed:
-        sys.exit(_NOT_MET)
+        sys.exit(GOAL_NOT_REACHED)
 
 
 @contextmanager

@@ -49,7 +49,8 @@ class Published:
 
 @dataclass(frozen=True)
 class Scenario:
-    """A parameter file and its goals; ``overrides``, parameters by node, go before the file.
+    """A parameter file and its goals; ``overrides``, parameters by node, go before the file's,
+    ``in_file``.
 
     ``published_method`` is the gait method that the published figures are of, empty: any.
     ``goal`` is of the base, ``end_effector_goal`` of the end-effector; ``commanders`` are the nodes
@@ -64,6 +65,7 @@ class Scenario:
     commanders: tuple[str, ...]
     published: tuple[Published, ...]
     published_method: str
+    in_file: Mapping[str, Mapping[str, Any]]
     overrides: Mapping[str, Mapping[str, Any]]
 
     @property
@@ -79,14 +81,30 @@ class Scenario:
 
     def parameter(self, node: str, name: str, default: Any) -> Any:
         """Return what a node's parameter is set to, by the overrides or the file."""
-        section = yaml.safe_load(self.path.read_text(encoding="utf-8")).get(node) or {}
-        given = {**section.get("ros__parameters", {}), **self.overrides.get(node, {})}
-        return given.get(name, default)
+        return self.parameters(node).get(name, default)
+
+    def parameters(self, node: str) -> dict[str, Any]:
+        """Return what is set of a node, by the overrides or the file."""
+        return {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
 
     def with_overrides(self, node: str, values: Mapping[str, Any]) -> Scenario:
         """Return the scenario with more parameters of one node set."""
         merged = {**self.overrides, node: {**self.overrides.get(node, {}), **values}}
         return replace(self, overrides=merged)
+
+    def with_settings(self, texts: Sequence[str]) -> Scenario:
+        """Return the scenario with ``node.parameter=value`` set, each as :func:`parse_setting`.
+
+        Raises
+        ------
+        ParameterError
+            A text has another form, or names no node.
+        """
+        scenario = self
+        for text in texts:
+            node, name, value = parse_setting(text)
+            scenario = scenario.with_overrides(node, {name: value})
+        return scenario
 
 
 def load_scenario(name: str) -> Scenario:
@@ -144,6 +162,9 @@ def load_scenario(name: str) -> Scenario:
         commanders=tuple(name for name in COMMANDERS if name in content) or ("planner",),
         published=_published(values.get("published", {}), path),
         published_method=str(values.get("published_method", "")),
+        in_file={
+            node: content[node].get("ros__parameters", {}) for node in NODES if content.get(node)
+        },
         overrides={},
     )
 

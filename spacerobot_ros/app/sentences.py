@@ -1,4 +1,4 @@
-"""How a command ends where its input is refused: one sentence, exit code 2."""
+"""How a command ends: its exit codes, and one sentence where its input is refused."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import click
 
 from spacerobot_ros.errors import SpaceRobotError
 
+GOAL_NOT_REACHED = 1
 BAD_INPUT = 2
 
 _ROS = ("rclpy", "rosidl_parser", "ament_index_python")

@@ -10,7 +10,6 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from spacerobot_ros.control import (
@@ -26,7 +25,7 @@ from spacerobot_ros.control import (
 )
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.errors import NotFiniteError
-from spacerobot_ros.errors import CommandError, PlanningError, SpaceRobotError
+from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.attitude import matrix_from_quaternion
 from spacerobot_ros.nodes.cdr import (
@@ -38,14 +37,14 @@ from spacerobot_ros.nodes.cdr import (
 )
 from spacerobot_ros.nodes.control_parameters import CONTROL_SPECS, gains_of
 from spacerobot_ros.nodes.controller_status import ControllerState, ControllerStatus
-from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
+from spacerobot_ros.nodes.flight_node import STREAM, run_node
 from spacerobot_ros.nodes.goal_messages import goal_of
 from spacerobot_ros.nodes.joint_command import JointReader
 from spacerobot_ros.nodes.plant_topics import DEFAULT_END_EFFECTOR
-from spacerobot_ros.nodes.robot_source import robot_from_text, robot_of
+from spacerobot_ros.nodes.robot_node import RobotNode
 
 
-class CoordinatedControlNode(FlightNode):
+class CoordinatedControlNode(RobotNode):
     """Closes the loop over spacecraft and arm (paper 4): one command for every measured state.
 
     ``goal_pose`` is where the base is to be, ``end_effector/goal_pose`` where the end-effector is.
@@ -57,7 +56,6 @@ class CoordinatedControlNode(FlightNode):
 
     def __init__(self, name: str = "coordinated_control", **kwargs: Any) -> None:
         self._running = False
-        self._robot: SpaceRobot | None = None
         super().__init__(name, **kwargs)
 
     # -- life ---------------------------------------------------------------------------------
@@ -79,11 +77,7 @@ class CoordinatedControlNode(FlightNode):
         self._send_joints = raw_publish(self.create_publisher(JointState, "joint_commands", STREAM))
         self._send_wrench = raw_publish(self.create_publisher(WrenchStamped, "base_wrench", STREAM))
         self._status = ControllerStatus(self)
-        robot = robot_of(self.parameters)
-        if robot is None:
-            self.create_subscription(String, "robot_description", self._on_description, LATCHED)
-        else:
-            self._use(robot)
+        self.find_robot()
         self.create_subscription(PoseStamped, "goal_pose", self._on_base_goal, STREAM)
         self.create_subscription(
             PoseStamped, "end_effector/goal_pose", self._on_end_effector_goal, STREAM
@@ -174,15 +168,6 @@ class CoordinatedControlNode(FlightNode):
             self.controller.set_gains(gains_of(self.parameters))
 
     # -- topics -------------------------------------------------------------------------------
-
-    def _on_description(self, message: String) -> None:
-        if self._robot is None:
-            try:
-                self._use(robot_from_text(message.data, self.parameters))
-            except SpaceRobotError as error:
-                self.get_logger().error(f"robot_description: {error}")
-                return
-            self._on_part()
 
     def _on_base_goal(self, message: PoseStamped) -> None:
         self._on_goal("base", message)

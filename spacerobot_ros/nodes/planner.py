@@ -9,39 +9,32 @@ from typing import Any, ClassVar
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from spacerobot_ros.errors import CommandError, ParameterError, PlanningError, SpaceRobotError
+from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.nodes.cdr import (
-    NANOSECONDS,
-    raw_publish,
-    stamp_bytes,
-)
-from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
+from spacerobot_ros.nodes.cdr import NANOSECONDS, raw_publish
+from spacerobot_ros.nodes.flight_node import STREAM, run_node
+from spacerobot_ros.nodes.gait_flight import GaitFlight
 from spacerobot_ros.nodes.goal_memory import GoalMemory
 from spacerobot_ros.nodes.goal_messages import goal_of, shape_of
-from spacerobot_ros.nodes.joint_command import JointCommand, JointReader
+from spacerobot_ros.nodes.joint_command import JointReader
 from spacerobot_ros.nodes.measured_state import MeasuredState
 from spacerobot_ros.nodes.plan_topics import PlanTopics
 from spacerobot_ros.nodes.planner_parameters import PLANNER_SPECS
 from spacerobot_ros.nodes.planner_status import PlannerState, PlannerStatus, what_is_left
-from spacerobot_ros.nodes.robot_source import robot_from_text, robot_of
+from spacerobot_ros.nodes.robot_node import RobotNode
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError, RobotState, Tolerance
-from spacerobot_ros.planning.braking import BrakingFollower
-from spacerobot_ros.planning.drift import DriftWatch
-from spacerobot_ros.planning.follower import GaitFollower
 from spacerobot_ros.planning.registry import build_method
 from spacerobot_ros.planning.stitching import stitched
-from spacerobot_ros.planning.stuck_joints import RemainingJointsGait, StuckJointWatch
+from spacerobot_ros.planning.stuck_joints import RemainingJointsGait
 
 PLANNED = "Planned in {:.6f} s."
 """What is logged when a plan is made."""
 
 
-class PlannerNode(FlightNode):
+class PlannerNode(RobotNode):
     """Turns goal poses into gaits and streams their velocities, one command for every state.
 
     A goal is planned from the next measured state. When its schedule has ended the measured pose
@@ -55,7 +48,6 @@ class PlannerNode(FlightNode):
 
     def __init__(self, name: str = "planner", **kwargs: Any) -> None:
         self._running = False
-        self._robot: SpaceRobot | None = None
         self.plan_time = 0.0
         """Wall time that planning took for the present goal, s."""
         self.flown_time = 0.0
@@ -70,29 +62,22 @@ class PlannerNode(FlightNode):
         """Create the topics; without a robot of its own the planner waits for robot_description."""
         self._goal: Goal | None = None
         self._goal_shape: Array | None = None
-        self._held: Array | None = None
         self._pending = False
         self._corrections = 0
-        self._follower: GaitFollower | BrakingFollower | None = None
         self._landed: GaitSchedule | None = None
         """A schedule that has ended, and whose result is still to be judged."""
-        self._stuck: list[int] = []
         self._replanning = False
         """Whether the next plan is the first without a joint that was found stuck."""
         self._odom_raw = self._joints_raw = b""
         self._stamp = 0
         self._odom_fresh = self._joints_fresh = False
-        self._commands_plant = self.parameters["output"] == "commands"
-        topic = "joint_commands" if self._commands_plant else "joint_reference"
+        to_plant = self.parameters["output"] == "commands"
+        topic = "joint_commands" if to_plant else "joint_reference"
         self._send_command = raw_publish(self.create_publisher(JointState, topic, STREAM))
         self._plan_topics = PlanTopics(self, str(self.parameters["world_frame"]))
         self._status = PlannerStatus(self)
         self._memory = GoalMemory(str(self.parameters["resume_file"]))
-        robot = robot_of(self.parameters)
-        if robot is None:
-            self.create_subscription(String, "robot_description", self._on_description, LATCHED)
-        else:
-            self._use(robot)
+        self.find_robot()
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal, STREAM)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
         self.create_subscription(Odometry, "odom", self._on_odom, STREAM, raw=True)
@@ -114,8 +99,9 @@ class PlannerNode(FlightNode):
     def deactivate(self) -> None:
         """Give up the present goal and command nothing any more."""
         self._running = False
-        self._follower = self._landed = None
-        self._goal = self._held = None
+        self._goal = self._landed = None
+        if self._robot is not None:
+            self._flight.drop()
 
     def _use(self, robot: SpaceRobot) -> None:
         self._robot = robot
@@ -130,10 +116,8 @@ class PlannerNode(FlightNode):
             values,
         )
         self._state = MeasuredState(robot, values["averaging"], values["rest_tolerance"])
-        band = 2 * values["shape_deadband"]
-        self._watch = StuckJointWatch(robot.n, values["stuck_ticks"], tick_period, band)
+        self._flight = GaitFlight(robot, values, tick_period)
         self._joints = JointReader(robot.joint_names, ["position"], complete=True)
-        self._command = JointCommand(robot.joint_names)
 
     def _tolerance(self) -> Tolerance:
         values: dict[str, Any] = self.parameters
@@ -147,15 +131,6 @@ class PlannerNode(FlightNode):
             self._method.tolerance = self._all_joints.tolerance = self._tolerance()
 
     # -- topics -------------------------------------------------------------------------------
-
-    def _on_description(self, message: String) -> None:
-        if self._robot is None:
-            try:
-                self._use(robot_from_text(message.data, self.parameters))
-            except SpaceRobotError as error:
-                self.get_logger().error(f"robot_description: {error}")
-                return
-            self._on_part()
 
     def _on_goal(self, message: PoseStamped) -> None:
         if not self._running:
@@ -215,10 +190,11 @@ class PlannerNode(FlightNode):
         self._odom_fresh = self._odom_fresh and not together
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._follower is not None or self._landed is not None
+        flying = self._robot is not None and self._flight.flying
+        response.success = flying or self._landed is not None
         response.message = "Nothing is flown." if not response.success else "The joints rest."
-        if self._follower is not None:
-            self._follower = self._coming_to_rest()
+        if flying:
+            self._flight.break_off(self._stamp)
             response.message = (
                 "The joints come to rest along the gait within "
                 f"{self.parameters['abort_time']:g} s."
@@ -229,13 +205,6 @@ class PlannerNode(FlightNode):
         self._goal = self._landed = None
         self._memory.forget()
         return response
-
-    def _coming_to_rest(self) -> BrakingFollower | None:
-        """Return what is flown, coming to rest from now on."""
-        if isinstance(self._follower, GaitFollower):
-            within = float(self.parameters["abort_time"])  # type: ignore[arg-type]
-            return self._follower.braking(self._stamp, within)
-        return self._follower
 
     # -- flying -------------------------------------------------------------------------------
 
@@ -248,49 +217,45 @@ class PlannerNode(FlightNode):
             return
         self._stamp = stamp
         q = self._joints.values["position"]
-        if self._follower is not None and self._follower.ended(stamp, q):
-            self._land()
+        if self._flight.ended(stamp, q):
+            self._land(arrived=self._goal is not None)
         if self._pending or self._landed is not None:
             if posed:
                 self._observe()
             self._decide(stamp)
-        elif posed and isinstance(self._follower, GaitFollower) and self._drift.due(stamp):
+        elif posed and self._flight.drift_due(stamp):
             self._look_for_drift(stamp)
-        if self._follower is not None:
-            self._follower.command(stamp, q, self._command.position, self._command.velocity)
-            self._held = None
-            if self._stuck:
-                self._command.velocity[self._stuck] = 0.0
-            stuck = self._watch.look(q, self._command.position, self._command.velocity)
-            if stuck and self._goal is not None:
-                self._go_on_without(stuck)
-        if self._follower is None:
-            # A reference must stay where it is; what the plant makes of rest is its affair.
-            if self._held is None or self._commands_plant:
-                self._held = q.copy()
-            self._command.position[:] = self._held
-            self._command.velocity[:] = 0.0
-        self._send_command(self._command.serialised(stamp_bytes(stamp)))
+        stuck = self._flight.follow(stamp, q)
+        if stuck and self._goal is not None:
+            self._go_on_without(stuck)
+        self._send_command(self._flight.answer(stamp, q))
 
-    def _land(self) -> None:
+    def _land(self, *, arrived: bool) -> None:
         """End what is flown; its result is judged unless it was broken off."""
-        assert self._follower is not None
+        flown = self._flight.end(at_last_shape=arrived)
         if self._goal is not None:
-            self._landed = self._follower.schedule
-            self._held = self._landed.positions[-1]
+            self._landed = flown
             self._state.restart()
-        self._follower = None
 
     def _observe(self) -> None:
         """Take the measured state to plan from; of a robot that moves only the last one counts."""
         if self._pending or self._landed is not None:
-            if self._follower is not None:
+            if self._flight.flying:
                 self._state.restart()
+            self._read()
+
+    def _read(self) -> bool:
+        """Add what is measured to the state; return whether it is a state of this robot."""
+        try:
             self._state.read(self._odom_raw, self._joints_raw)
+        except CommandError as error:
+            self.get_logger().error(f"odom: {error}.", throttle_duration_sec=5.0)
+            return False
+        return True
 
     def _decide(self, stamp: int) -> None:
         """Plan or judge when the state is known well enough."""
-        if not (self._state.complete or (self._follower is not None and self._state.count)):
+        if not (self._state.complete or (self._flight.flying and self._state.count)):
             return
         if self._pending:
             self._pending = False
@@ -303,16 +268,17 @@ class PlannerNode(FlightNode):
         """Plan what is left again when the base is too far off the path that was predicted."""
         assert self._goal is not None
         self._state.restart()
-        self._state.read(self._odom_raw, self._joints_raw)
-        state = self._state.state()
-        distance, angle = self._drift.off(state.position, state.quaternion)
         left = self._corrections < int(self.parameters["max_corrections"])  # type: ignore[arg-type]
-        if not left or not self._drift.too_far(distance, angle):
+        if not left or not self._read():
             return
-        off = f"Off the path by {distance:.3g} m and {angle:.3g} rad"
+        off = ""
         try:
+            off = self._flight.drifted(self._state.state())
+            if not off:
+                return
             schedule = self._plan(self._goal, correction=False)
         except PlanningError as reason:
+            off = off or "The path is not known"
             self.get_logger().warning(f"{off}, and the rest cannot be planned again: {reason}")
             return
         self._corrections += 1
@@ -322,14 +288,13 @@ class PlannerNode(FlightNode):
     def _go_on_without(self, stuck: list[int]) -> None:
         """Come to rest, and plan what is left with the joints that are not stuck."""
         assert self._robot is not None
-        self._stuck += stuck
-        names = [self._robot.joint_names[i] for i in self._stuck]
+        self._flight.stuck += stuck
+        names = [self._robot.joint_names[i] for i in self._flight.stuck]
         self._method = RemainingJointsGait.instead_of(
             self._all_joints, names, str(self.parameters["method"]), self.parameters
         )
         self._replanning = True
-        self._land()
-        self._held = None
+        self._land(arrived=False)
         self.get_logger().warning(f"Stuck: {', '.join(names)}. What is left is planned without.")
 
     def _plan_proposed(self, stamp: int) -> None:
@@ -339,7 +304,7 @@ class PlannerNode(FlightNode):
             schedule = self._plan(self._proposed, correction=False)
         except PlanningError as error:
             self._method = before
-            kept = " The earlier goal is still flown." if self._follower else ""
+            kept = " The earlier goal is still flown." if self._flight.flying else ""
             self._status.publish(PlannerState.REFUSED, f"{error}{kept}", goal=self._proposed)
             return
         self._goal, self._landed = self._proposed, None
@@ -347,7 +312,7 @@ class PlannerNode(FlightNode):
             self._memory.keep(self._goal)
         except ParameterError as error:
             self.get_logger().error(f"{error} The goal is flown, but would not be resumed.")
-        self._corrections, self._stuck, self._replanning = 0, [], False
+        self._corrections, self._flight.stuck, self._replanning = 0, [], False
         self._fly(schedule, stamp)
 
     def _plan(self, goal: Goal, *, correction: bool) -> GaitSchedule:
@@ -358,7 +323,7 @@ class PlannerNode(FlightNode):
 
         began = time.perf_counter()
         try:
-            flown = self._coming_to_rest()
+            flown = self._flight.coming_to_rest(self._stamp)
             if flown is None or self._robot is None:
                 return plan(self._state.state())
             step = float(self.parameters["integration_step"])  # type: ignore[arg-type]
@@ -370,15 +335,7 @@ class PlannerNode(FlightNode):
             self.get_logger().info(PLANNED.format(took))
 
     def _fly(self, schedule: GaitSchedule, stamp: int, error: PoseError | None = None) -> None:
-        # A controller closes its own loop round the reference.
-        gain = float(self.parameters["shape_gain"]) if self._commands_plant else 0.0  # type: ignore[arg-type]
-        deadband = float(self.parameters["shape_deadband"])  # type: ignore[arg-type]
-        self._follower = GaitFollower(schedule, stamp, gain, deadband)
-        values: dict[str, Any] = self.parameters
-        self._drift = DriftWatch(
-            schedule, stamp, values["drift_position"], values["drift_attitude"]
-        )
-        self._watch.restart()
+        self._flight.begin(schedule, stamp)
         self.flown_time += schedule.duration
         self.ends_at = stamp / NANOSECONDS + schedule.duration
         self._status.publish(
