@@ -29,6 +29,7 @@ from std_msgs.msg import Float64MultiArray
 
 from spacerobot_ros.app.bench_dynamics import dynamics_benchmark
 from spacerobot_ros.app.bench_planning import planning_times
+from spacerobot_ros.app.bench_replay import replay_spacing
 from spacerobot_ros.app.run import ros
 from spacerobot_ros.app.scenario import load_scenario
 from spacerobot_ros.app.stack import FlightStack
@@ -37,7 +38,7 @@ from spacerobot_ros.model.compilation import c_compiler
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import VelocityPlant
 
-_ROUNDS = 3
+_ROUNDS = 5
 _TOPICS: tuple[tuple[str, type[Any], int, int], ...] = (
     ("/clock", Clock, 0, 1),
     ("base_pose", PoseStamped, 0, 20),
@@ -65,6 +66,7 @@ def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
                 f"round: {stack_rates[-1]:8.0f} ticks/s with plant, planner and recorder, "
                 f"{peer_rates[-1]:8.0f} bare"
             )
+        spacing, worst_spacing = replay_spacing(Path(folder))
     stack_rate, peer_rate = statistics.median(stack_rates), statistics.median(peer_rates)
     unrecorded = statistics.median(bare_stack_rates)
     tick = _plant_tick()
@@ -74,6 +76,7 @@ def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
         "unrecorded_ticks_per_s": unrecorded,
         "recorder_cost": 1 - stack_rate / unrecorded,
         "ratio_to_bare": stack_rate / peer_rate,
+        "replay_spacing_error_s": spacing,
         "plant_tick_us": 1e6 * tick,
         "compiler": c_compiler() or "none (virtual machine)",
     }
@@ -82,6 +85,10 @@ def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
     yield f"ratio: {100 * stack_rate / peer_rate:.0f} %"
     cost = 100 * (1 - stack_rate / unrecorded)
     yield f"without the recorder: {unrecorded:.0f} ticks/s; recording costs {cost:.0f} % of them"
+    yield (
+        f"replay at rate 1, 100 messages a second: spacing off by {1e3 * spacing:.2f} ms (median), "
+        f"{1e3 * worst_spacing:.1f} ms at most"
+    )
     yield f"one plant tick alone: {1e6 * tick:.1f} us (compiler: {figures['compiler']})"
     for name, first, later in planning_times():
         figures |= {f"plan_{name}_first_s": first, f"plan_{name}_s": later}

@@ -92,6 +92,7 @@ class FlightStack:
                     nodes[name].require(nodes[name].trigger_configure)
             if self.recorder is not None:
                 # Last, when every topic has its publisher.
+                self.recorder.watch(node for name, node in nodes.items() if name != "recorder")
                 self.recorder.require(self.recorder.trigger_configure)
                 self._describe(wanted, nodes)
             for node in self._nodes:

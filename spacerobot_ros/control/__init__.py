@@ -3,7 +3,7 @@
 from spacerobot_ros.control.errors import NotFiniteError, TargetNotSetError
 from spacerobot_ros.control.estimator import DeadReckoning
 from spacerobot_ros.control.gains import GainPair, Gains
-from spacerobot_ros.control.law import ControlLaw, LawStatus, Option
+from spacerobot_ros.control.law import ControlLaw, LawStatus
 from spacerobot_ros.control.reference import (
     PROFILES,
     MotionLimits,
@@ -21,6 +21,7 @@ from spacerobot_ros.control.state import (
     PoseReference,
     Reference,
 )
+from spacerobot_ros.options import Option
 
 __all__ = [
     "LAWS",

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from spacerobot_ros.control.gains import Gains
-from spacerobot_ros.control.law import SINGULAR_VALUE_THRESHOLD, ControlLaw
+from spacerobot_ros.control.law import ControlLaw
 from spacerobot_ros.control.selection import OutputSelection
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.errors import ParameterError
@@ -36,12 +36,7 @@ class ComputedTorqueLaw(ControlLaw):
     name: ClassVar[str] = "computed_torque"
 
     def __init__(
-        self,
-        robot: SpaceRobot,
-        outputs: OutputSelection,
-        gains: Gains,
-        *,
-        singular_value_threshold: float = SINGULAR_VALUE_THRESHOLD.default,
+        self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
     ) -> None:
         if outputs.base or outputs.end_effector or set(outputs.joints) != set(robot.joint_names):
             raise ParameterError(
@@ -50,7 +45,7 @@ class ComputedTorqueLaw(ControlLaw):
             )
         # In the order of q, whatever order they were named in.
         in_order = OutputSelection(joints=robot.joint_names)
-        super().__init__(robot, in_order, gains, singular_value_threshold=singular_value_threshold)
+        super().__init__(robot, in_order, gains, **options)
 
     @classmethod
     def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:

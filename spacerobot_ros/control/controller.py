@@ -155,11 +155,6 @@ class CoordinatedController:
         """Time since the base was measured last, s."""
         return self._estimator.elapsed if self._estimator is not None else 0.0
 
-    @property
-    def has_goal(self) -> bool:
-        """Whether a goal was given."""
-        return self._profile is not None and self._profile.goal is not self._profile.start
-
     def arrived(self, time: float) -> bool:
         """Whether the reference has come to its goal."""
         return self._profile is not None and time - self._began >= self._profile.duration

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import casadi as ca
 
 from spacerobot_ros.control.orientation import multiply, quaternion_from_rotvec
 from spacerobot_ros.control.state import Actuation, ControlState
-from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.compilation import BufferedFunction, compiled, dense_function
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.integration import repeated, runge_kutta_step, steps_in
 from spacerobot_ros.model.momentum import rotation_from_quaternion
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP, quaternion_rate
 from spacerobot_ros.model.space_robot import SpaceRobot
@@ -48,14 +46,11 @@ class DeadReckoning:
         tick_period: float,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
     ) -> None:
-        for name, value in (("tick period", tick_period), ("integration step", integration_step)):
-            if not (math.isfinite(value) and value > 0):
-                raise ParameterError(f"The {name} must be positive, not {value} s.")
+        substeps = steps_in(tick_period, integration_step)
         self.robot = robot
         self.tick_period = tick_period
         self.elapsed = 0.0
         """Time since the last measured state, s."""
-        substeps = max(1, math.ceil(tick_period / integration_step - 1e-9))
         self._advance = BufferedFunction(compiled(_effort_step(robot, substeps)))
         self._correct = BufferedFunction(compiled(_joint_correction(robot)))
         self._advance.inputs[3][:] = tick_period
@@ -103,15 +98,8 @@ def _effort_step(robot: SpaceRobot, substeps: int) -> ca.Function:
     """
     x, h = ca.MX.sym("x", 13 + 2 * robot.n), ca.MX.sym("h")
     held = ca.MX.sym("wrench_B", 6), ca.MX.sym("tau", robot.n)
-    rate = _center_rate(robot)
-    y, step = _center_from_origin(robot)(x), h / substeps
-    for _ in range(substeps):
-        k1 = rate(y, *held)
-        k2 = rate(y + step / 2 * k1, *held)
-        k3 = rate(y + step / 2 * k2, *held)
-        k4 = rate(y + step * k3, *held)
-        y = y + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        y = ca.vertcat(y[:3], y[3:7] / ca.norm_2(y[3:7]), y[7:])
+    march = repeated(runge_kutta_step(_center_rate(robot), attitude=slice(3, 7)), substeps)
+    y = march(_center_from_origin(robot)(x), *held, h / substeps)
     x_next = _origin_from_center(robot)(y)
     names = ["x", "wrench_B", "tau", "h"]
     return ca.Function(f"effort_step_{substeps}", [x, *held, h], [x_next], names, ["x_next"])

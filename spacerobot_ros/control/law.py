@@ -13,47 +13,10 @@ from spacerobot_ros.control.gains import Gains
 from spacerobot_ros.control.outputs import OutputVector
 from spacerobot_ros.control.selection import OutputSelection, default_selection
 from spacerobot_ros.control.state import Actuation, ControlState, Reference
-from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.compilation import BufferedFunction, compiled, dense_function
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.space_robot import SpaceRobot
-
-
-@dataclass(frozen=True)
-class Option:
-    """A parameter of a law; the default sets its type, unit and meaning are for people."""
-
-    name: str
-    default: float
-    unit: str
-    meaning: str
-    minimum: float = 0.0
-    maximum: float = 1e9
-
-    def checked(self, value: float) -> float:
-        """Return the value.
-
-        Raises
-        ------
-        ParameterError
-            It is out of range or not a number; the sentence names the option.
-        """
-        if not self.minimum <= value <= self.maximum:
-            unit = f" {self.unit}" if self.unit else ""
-            raise ParameterError(
-                f"The option '{self.name}' is {value}{unit}; it must be from "
-                f"{self.minimum:g} to {self.maximum:g}."
-            )
-        return value
-
-
-SINGULAR_VALUE_THRESHOLD = Option(
-    "singular_value_threshold",
-    0.1,
-    "",
-    "J_z is near singular where its smallest singular value (SI units) is below this",
-    1e-6,
-)
+from spacerobot_ros.options import Option, chosen_options
 
 
 @dataclass(frozen=True)
@@ -84,30 +47,34 @@ class ControlLaw(ABC):
         What is controlled; :meth:`default_outputs` chooses by the robot.
     gains
         Diagonals of Kp and Kd by group, in the law's units (:class:`GainPair`).
-    singular_value_threshold
-        Smallest singular value of ``J_z`` (SI units) below which it is called singular.
+    options
+        Values of the law's ``options`` by name; those left out have their defaults.
 
     Raises
     ------
     ParameterError
-        The robot does not have these outputs, the law cannot drive them, or an option is out of
-        range.
+        The robot does not have these outputs, the law cannot drive them, there is no such option,
+        or one is out of range.
     """
 
     name: ClassVar[str]
-    options: ClassVar[tuple[Option, ...]] = (SINGULAR_VALUE_THRESHOLD,)
+    options: ClassVar[tuple[Option, ...]] = (
+        Option(
+            "singular_value_threshold",
+            0.1,
+            "",
+            "J_z is near singular where its smallest singular value (SI units) is below this",
+            1e-6,
+        ),
+    )
 
     def __init__(
-        self,
-        robot: SpaceRobot,
-        outputs: OutputSelection,
-        gains: Gains,
-        *,
-        singular_value_threshold: float = SINGULAR_VALUE_THRESHOLD.default,
+        self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
     ) -> None:
         self.robot = robot
         self.outputs = OutputVector(robot, outputs)
-        self.singular_value_threshold = SINGULAR_VALUE_THRESHOLD.checked(singular_value_threshold)
+        self._settings = chosen_options(self.name, self.options, options)
+        self.singular_value_threshold: float = self._settings["singular_value_threshold"]
         symbols = {
             "state": self.outputs.state,
             "reference": self.outputs.reference,

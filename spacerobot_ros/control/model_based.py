@@ -9,22 +9,13 @@ import casadi as ca
 import numpy as np
 
 from spacerobot_ros.control.gains import Gains
-from spacerobot_ros.control.law import SINGULAR_VALUE_THRESHOLD, ControlLaw, Option
+from spacerobot_ros.control.law import ControlLaw
 from spacerobot_ros.control.selection import OutputSelection
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.model.connection import solve_positive_definite
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.space_robot import SpaceRobot
-
-_NULL_SPACE_DAMPING = Option(
-    "null_space_damping", 1.0, "1/s", "rate at which motion that moves no output dies out"
-)
-_POSTURE_STIFFNESS = Option(
-    "posture_stiffness",
-    0.0,
-    "1/s^2",
-    "pull of joints that are no outputs to the joint reference, as far as it moves no output",
-)
+from spacerobot_ros.options import Option
 
 
 class ModelBasedLaw(ControlLaw):
@@ -52,35 +43,33 @@ class ModelBasedLaw(ControlLaw):
 
     Parameters
     ----------
-    robot, outputs, gains, singular_value_threshold
-        See :class:`ControlLaw`; Kp in 1/s^2, Kd in 1/s.
-    null_space_damping
-        1/s.
-    posture_stiffness
-        1/s^2; acts when a reference has joints.
+    robot, outputs, gains, options
+        See :class:`ControlLaw`; Kp in 1/s^2, Kd in 1/s. ``posture_stiffness`` acts when a
+        reference has joints.
     """
 
     name: ClassVar[str] = "model_based"
     options: ClassVar[tuple[Option, ...]] = (
         *ControlLaw.options,
-        _NULL_SPACE_DAMPING,
-        _POSTURE_STIFFNESS,
+        Option(
+            "null_space_damping", 1.0, "1/s", "rate at which motion that moves no output dies out"
+        ),
+        Option(
+            "posture_stiffness",
+            0.0,
+            "1/s^2",
+            "pull of joints that are no outputs to the joint reference, as far as it moves no "
+            "output",
+        ),
     )
 
     def __init__(
-        self,
-        robot: SpaceRobot,
-        outputs: OutputSelection,
-        gains: Gains,
-        *,
-        singular_value_threshold: float = SINGULAR_VALUE_THRESHOLD.default,
-        null_space_damping: float = _NULL_SPACE_DAMPING.default,
-        posture_stiffness: float = _POSTURE_STIFFNESS.default,
+        self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
     ) -> None:
-        super().__init__(robot, outputs, gains, singular_value_threshold=singular_value_threshold)
+        super().__init__(robot, outputs, gains, **options)
         self._in["null_space"][:] = (
-            _POSTURE_STIFFNESS.checked(posture_stiffness),
-            _NULL_SPACE_DAMPING.checked(null_space_damping),
+            self._settings["posture_stiffness"],
+            self._settings["null_space_damping"],
         )
 
     def _damping(self, singular_value: float) -> float:

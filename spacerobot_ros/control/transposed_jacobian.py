@@ -7,17 +7,11 @@ from typing import ClassVar
 import casadi as ca
 
 from spacerobot_ros.control.gains import Gains
-from spacerobot_ros.control.law import SINGULAR_VALUE_THRESHOLD, ControlLaw, Option
+from spacerobot_ros.control.law import ControlLaw
 from spacerobot_ros.control.selection import OutputSelection
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.model.space_robot import SpaceRobot
-
-_JOINT_DAMPING = Option(
-    "joint_damping",
-    0.0,
-    "N m s/rad",
-    "friction that the joint efforts imitate; brings to rest what moves no output",
-)
+from spacerobot_ros.options import Option
 
 
 class TransposedJacobianLaw(ControlLaw):
@@ -33,26 +27,27 @@ class TransposedJacobianLaw(ControlLaw):
 
     Parameters
     ----------
-    robot, outputs, gains, singular_value_threshold
+    robot, outputs, gains, options
         See :class:`ControlLaw`; Kp in N/m (N m/rad), Kd in N s/m (N m s/rad).
-    joint_damping
-        N m s/rad (N s/m of prismatic joints).
     """
 
     name: ClassVar[str] = "transposed_jacobian"
-    options: ClassVar[tuple[Option, ...]] = (*ControlLaw.options, _JOINT_DAMPING)
+    options: ClassVar[tuple[Option, ...]] = (
+        *ControlLaw.options,
+        # N s/m of prismatic joints.
+        Option(
+            "joint_damping",
+            0.0,
+            "N m s/rad",
+            "friction that the joint efforts imitate; brings to rest what moves no output",
+        ),
+    )
 
     def __init__(
-        self,
-        robot: SpaceRobot,
-        outputs: OutputSelection,
-        gains: Gains,
-        *,
-        singular_value_threshold: float = SINGULAR_VALUE_THRESHOLD.default,
-        joint_damping: float = _JOINT_DAMPING.default,
+        self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
     ) -> None:
-        super().__init__(robot, outputs, gains, singular_value_threshold=singular_value_threshold)
-        self._in["joint_damping"][:] = _JOINT_DAMPING.checked(joint_damping)
+        super().__init__(robot, outputs, gains, **options)
+        self._in["joint_damping"][:] = self._settings["joint_damping"]
 
     def _parameters(self) -> dict[str, ca.SX]:
         return {"joint_damping": ca.SX.sym("joint_damping")}

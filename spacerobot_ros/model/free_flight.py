@@ -75,46 +75,6 @@ def state_rate(kin: TreeKinematics, *, holding: bool = False) -> ca.Function:
     return dense_function("flight_rate", [x, command], [x_dot], (["x", "command"], ["x_dot"]))
 
 
-def runge_kutta_step(rate: ca.Function) -> ca.Function:
-    """Return one step ``(x, held arguments of rate, h) -> x`` of Runge-Kutta 4.
-
-    The four stages call one piece of code: written out four times it would be 6 % faster, and take
-    six times as long to compile.
-    """
-    x, held = _arguments(rate)
-    h = ca.MX.sym("h")
-    k1 = rate(x, *held)
-    k2 = rate(x + h / 2 * k1, *held)
-    k3 = rate(x + h / 2 * k2, *held)
-    k4 = rate(x + h * k3, *held)
-    x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    attitude = state_slices((x.shape[0] - 13) // 2)[1]
-    x_next[attitude] = x_next[attitude] / ca.norm_2(x_next[attitude])
-    return ca.Function(rate.name().replace("rate", "step"), [x, *held, h], [x_next])
-
-
-def repeated(step: ca.Function, count: int) -> ca.Function:
-    """Return ``step`` applied ``count`` times to its first argument, the others held.
-
-    Each half is one function called twice, so that the code grows with the logarithm of ``count``.
-    """
-    if count == 1:
-        return step
-    x, held = _arguments(step)
-    half = repeated(step, count // 2)
-    x_next = half(half(x, *held), *held)
-    if count % 2:
-        x_next = step(x_next, *held)
-    return ca.Function(f"{step.name()}_{count}", [x, *held], [x_next])
-
-
-def _arguments(function: ca.Function) -> tuple[ca.MX, list[ca.MX]]:
-    x, *held = (
-        ca.MX.sym(function.name_in(i), function.size1_in(i)) for i in range(function.n_in())
-    )
-    return x, held
-
-
 def _symbols(kin: TreeKinematics) -> tuple[ca.SX, ca.SX]:
     parts = [
         kin.q if name == "q" else ca.SX.sym(name, part.stop - part.start)

@@ -22,7 +22,8 @@ from spacerobot_ros.model.composite_rigid_body import composite_dynamics
 from spacerobot_ros.model.connection import connection, curvature
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.dynamics import bias, forward_dynamics, generalised_forces
-from spacerobot_ros.model.free_flight import repeated, runge_kutta_step, shape_equations, state_rate
+from spacerobot_ros.model.free_flight import shape_equations, state_rate, state_slices
+from spacerobot_ros.model.integration import repeated, runge_kutta_step
 from spacerobot_ros.model.kinematics import tree_kinematics
 from spacerobot_ros.model.momentum import base_twist, momentum_of_bodies, rotation_from_quaternion
 from spacerobot_ros.model.reconstruction import attitude_step
@@ -218,8 +219,8 @@ class SpaceRobot:
             "forward_dynamics": self._forward_dynamics,
             "dynamics": self._dynamics,
             "shape_equations": lambda: shape_equations(self._kin),
-            "flight_step": lambda: runge_kutta_step(state_rate(self._kin)),
-            "holding_step": lambda: runge_kutta_step(state_rate(self._kin, holding=True)),
+            "flight_step": self._flight_step,
+            "holding_step": lambda: self._flight_step(holding=True),
             "jacobian": self._jacobian,
             "connection": lambda: self._shape_function("connection", self._A),
             "curvature": self._curvature,
@@ -280,6 +281,10 @@ class SpaceRobot:
             [composite_dynamics(self._kin, v, omega, qdot, wrench, tau)],
             (["q", "v_cm_B", "omega_WB_B", "qdot", "wrench_B", "tau"], ["z0ddot"]),
         )
+
+    def _flight_step(self, *, holding: bool = False) -> ca.Function:
+        rate = state_rate(self._kin, holding=holding)
+        return runge_kutta_step(rate, attitude=state_slices(self.n)[1])
 
     def _jacobian(self, link: str) -> ca.Function:
         index = self._link_index(link)

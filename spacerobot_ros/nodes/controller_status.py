@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import Enum
+from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 
 from spacerobot_ros.control import Saturated
 from spacerobot_ros.control.controller import CoordinatedController, Mode
+from spacerobot_ros.nodes.diagnostics import diagnostic_status
 from spacerobot_ros.nodes.flight_node import LATCHED, FlightNode
 
 
@@ -79,10 +82,10 @@ class ControllerStatus:
         else:
             estimated = controller.mode is Mode.ESTIMATED
             self._state = ControllerState.ESTIMATING if estimated else ControllerState.STOPPED
-        period = float(self._node.parameters["status_period"])  # type: ignore[arg-type]
         if self._state is before and result.limited == self._limited and now < self._next:
             return
-        self._next = now + period
+        values: Mapping[str, Any] = self._node.parameters
+        self._next = now + values["status_period"]
         self._limited = result.limited
         self._values = self._describe(controller, result)
         self._publish(self._state, self._sentence(controller))
@@ -90,20 +93,19 @@ class ControllerStatus:
     def _judge(self, now: float, controller: CoordinatedController) -> None:
         if self._state is not ControllerState.TRACKING or self._started < 0:
             return
-        values = self._node.parameters
+        values: Mapping[str, Any] = self._node.parameters
         errors = controller.errors()
         within = controller.arrived(now) and (
-            errors.position <= float(values["position_tolerance"])  # type: ignore[arg-type]
-            and errors.attitude <= float(values["attitude_tolerance"])  # type: ignore[arg-type]
-            and errors.joints <= float(values["joint_tolerance"])  # type: ignore[arg-type]
+            errors.position <= values["position_tolerance"]
+            and errors.attitude <= values["attitude_tolerance"]
+            and errors.joints <= values["joint_tolerance"]
         )
         if not within:
             self._within_since = -1.0
         elif self._within_since < 0:
             self._within_since = now
-        limit = float(values["time_limit"])  # type: ignore[arg-type]
-        settle = float(values["settle_time"])  # type: ignore[arg-type]
-        if within and now - self._within_since >= settle - 1e-9:
+        limit = values["time_limit"]
+        if within and now - self._within_since >= values["settle_time"] - 1e-9:
             self._state, self._next = ControllerState.REACHED, now
         elif limit and now - self._started >= limit - 1e-9:
             self._state, self._next = ControllerState.FAILED, now
@@ -143,13 +145,7 @@ class ControllerStatus:
     def _publish(self, state: ControllerState, sentence: str) -> None:
         level = _LEVELS.get(state, DiagnosticStatus.OK)
         values = {"state": state.value, **self._values}
-        self._publisher.publish(
-            DiagnosticStatus(
-                level=level,
-                name=self._node.get_fully_qualified_name(),
-                message=sentence,
-                values=[KeyValue(key=key, value=value) for key, value in values.items()],
-            )
-        )
+        name = self._node.get_fully_qualified_name()
+        self._publisher.publish(diagnostic_status(name, level, sentence, values))
         if level != DiagnosticStatus.OK:
             self._node.get_logger().warning(sentence, throttle_duration_sec=5.0)

@@ -32,7 +32,6 @@ from spacerobot_ros.nodes.cdr import (
     NANOSECONDS,
     MessageTemplate,
     TemplateReader,
-    raw_publish,
     stamp_bytes,
 )
 from spacerobot_ros.nodes.control_parameters import CONTROL_SPECS, gains_of
@@ -74,8 +73,8 @@ class CoordinatedControlNode(RobotNode):
         self._base_reference = TemplateReader(
             Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
         )
-        self._send_joints = raw_publish(self.create_publisher(JointState, "joint_commands", STREAM))
-        self._send_wrench = raw_publish(self.create_publisher(WrenchStamped, "base_wrench", STREAM))
+        self._joint_commands = self.send_raw(JointState, "joint_commands")
+        self._base_wrench = self.send_raw(WrenchStamped, "base_wrench")
         self._status = ControllerStatus(self)
         self.find_robot()
         self.create_subscription(PoseStamped, "goal_pose", self._on_base_goal, STREAM)
@@ -266,8 +265,8 @@ class CoordinatedControlNode(RobotNode):
         self._wrench[:] = result.realised.wrench_B
         if send:
             stamped = stamp_bytes(stamp)
-            self._send_wrench(self._wrench_message.serialised(stamped))
-            self._send_joints(self._joint_message.serialised(stamped))
+            self._base_wrench.take(self._wrench_message.serialised(stamped))
+            self._joint_commands.take(self._joint_message.serialised(stamped))
         self._joints_fresh = False
         self._status.update(now, self.controller, result)
 

@@ -27,6 +27,7 @@ from rclpy.timer import Timer
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes.parameters import ParameterSpec, Value, check_changes, declare
+from spacerobot_ros.nodes.raw_stream import RawInput, RawOutput, RawStream, Take
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """State and commands: reliable, deep enough for a reader that is briefly busy."""
@@ -76,6 +77,8 @@ class FlightNode(LifecycleNode):
         self.fault: SpaceRobotError | None = None
         self.on_end: Callable[[int], None] = lambda code: None
         """Called with an exit code by a node that has nothing left to do."""
+        self.raw_streams: list[RawStream] = []
+        """What passes through the node as bytes, from its configuration to its cleanup."""
         self._raising = False
         try:
             self.parameters: dict[str, Value] = declare(self, self._specs)
@@ -114,6 +117,19 @@ class FlightNode(LifecycleNode):
                 )
         finally:
             self._raising = False
+
+    def send_raw(self, kind: type[Any], topic: str, qos: QoSProfile = STREAM) -> RawOutput:
+        """Return a new stream whose ``take`` publishes serialised messages."""
+        stream = RawOutput(self.create_publisher(kind, topic, qos))
+        self.raw_streams.append(stream)
+        return stream
+
+    def take_raw(self, kind: type[Any], topic: str, callback: Take) -> None:
+        """Subscribe to serialised messages, for whoever listens to the stream as well."""
+        stream = RawInput(self.resolve_topic_name(topic), callback)
+        # Looked up for every message: a listener may come and go.
+        self.create_subscription(kind, topic, lambda raw: stream.take(raw), STREAM, raw=True)
+        self.raw_streams.append(stream)
 
     @property
     def is_active(self) -> bool:
@@ -163,6 +179,7 @@ class FlightNode(LifecycleNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run the hook and destroy the publishers, subscriptions and timers it leaves."""
         result = self._run(self.cleanup)
+        self.raw_streams.clear()
         self._destroy_configured()
         return result
 

@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.nodes.cdr import NANOSECONDS, raw_publish
+from spacerobot_ros.nodes.cdr import NANOSECONDS
 from spacerobot_ros.nodes.flight_node import STREAM, run_node
 from spacerobot_ros.nodes.gait_flight import GaitFlight
 from spacerobot_ros.nodes.goal_memory import GoalMemory
@@ -22,10 +22,10 @@ from spacerobot_ros.nodes.goal_messages import goal_of, shape_of
 from spacerobot_ros.nodes.joint_command import JointReader
 from spacerobot_ros.nodes.measured_state import MeasuredState
 from spacerobot_ros.nodes.plan_topics import PlanTopics
-from spacerobot_ros.nodes.planner_parameters import PLANNER_SPECS
+from spacerobot_ros.nodes.planner_parameters import PLANNER_SPECS, tolerance_of
 from spacerobot_ros.nodes.planner_status import PlannerState, PlannerStatus, what_is_left
 from spacerobot_ros.nodes.robot_node import RobotNode
-from spacerobot_ros.planning import GaitSchedule, Goal, PoseError, RobotState, Tolerance
+from spacerobot_ros.planning import GaitSchedule, Goal, PoseError, RobotState
 from spacerobot_ros.planning.registry import build_method
 from spacerobot_ros.planning.stitching import stitched
 from spacerobot_ros.planning.stuck_joints import RemainingJointsGait
@@ -73,7 +73,7 @@ class PlannerNode(RobotNode):
         self._odom_fresh = self._joints_fresh = False
         to_plant = self.parameters["output"] == "commands"
         topic = "joint_commands" if to_plant else "joint_reference"
-        self._send_command = raw_publish(self.create_publisher(JointState, topic, STREAM))
+        self._commands = self.send_raw(JointState, topic)
         self._plan_topics = PlanTopics(self, str(self.parameters["world_frame"]))
         self._status = PlannerStatus(self)
         self._memory = GoalMemory(str(self.parameters["resume_file"]))
@@ -111,7 +111,7 @@ class PlannerNode(RobotNode):
             values["method"],
             robot,
             tick_period,
-            self._tolerance(),
+            tolerance_of(values),
             values["integration_step"],
             values,
         )
@@ -119,16 +119,10 @@ class PlannerNode(RobotNode):
         self._flight = GaitFlight(robot, values, tick_period)
         self._joints = JointReader(robot.joint_names, ["position"], complete=True)
 
-    def _tolerance(self) -> Tolerance:
-        values: dict[str, Any] = self.parameters
-        return Tolerance(
-            values["position_tolerance"], values["attitude_tolerance"], values["joint_tolerance"]
-        )
-
     def parameters_changed(self) -> None:
         """Plan and judge with the new tolerances."""
         if self._robot is not None:
-            self._method.tolerance = self._all_joints.tolerance = self._tolerance()
+            self._method.tolerance = self._all_joints.tolerance = tolerance_of(self.parameters)
 
     # -- topics -------------------------------------------------------------------------------
 
@@ -228,7 +222,7 @@ class PlannerNode(RobotNode):
         stuck = self._flight.follow(stamp, q)
         if stuck and self._goal is not None:
             self._go_on_without(stuck)
-        self._send_command(self._flight.answer(stamp, q))
+        self._commands.take(self._flight.answer(stamp, q))
 
     def _land(self, *, arrived: bool) -> None:
         """End what is flown; its result is judged unless it was broken off."""
@@ -375,7 +369,7 @@ class PlannerNode(RobotNode):
             **self._account(),
         }
         left = what_is_left(error, self._method.controls)
-        if self._tolerance().admits(error, self._method.controls):
+        if tolerance_of(self.parameters).admits(error, self._method.controls):
             self._conclude(PlannerState.REACHED, f"The goal is met: {left}.", **result)
             return
         counts = not flown.partial and not replanned

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from spacerobot_ros.nodes.parameters import ParameterSpec, option_specs
+from collections.abc import Mapping
+from typing import Any
+
+from spacerobot_ros.nodes.parameters import ParameterSpec, Value, option_specs
 from spacerobot_ros.nodes.robot_source import MODEL_ERROR_SPECS, ROBOT_SPECS
-from spacerobot_ros.planning import METHODS
+from spacerobot_ros.planning import METHODS, Tolerance
 
 PLANNER_SPECS: tuple[ParameterSpec, ...] = (
     *ROBOT_SPECS,
@@ -63,3 +66,11 @@ PLANNER_SPECS: tuple[ParameterSpec, ...] = (
     ),
     *option_specs(METHODS),
 )
+
+
+def tolerance_of(parameters: Mapping[str, Value]) -> Tolerance:
+    """Return how near is there, as the parameters say now."""
+    values: Mapping[str, Any] = parameters
+    return Tolerance(
+        values["position_tolerance"], values["attitude_tolerance"], values["joint_tolerance"]
+    )

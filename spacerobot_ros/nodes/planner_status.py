@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection
 from enum import Enum
 
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
+from spacerobot_ros.nodes.diagnostics import diagnostic_status
 from spacerobot_ros.nodes.flight_node import LATCHED
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 
@@ -73,14 +74,8 @@ class PlannerStatus:
                     f"{x:.9g}" if isinstance(x, float) else str(x) for x in numbers
                 )
         level = _LEVELS.get(state, DiagnosticStatus.OK)
-        self._publisher.publish(
-            DiagnosticStatus(
-                level=level,
-                name=self._node.get_fully_qualified_name(),
-                message=sentence,
-                values=[KeyValue(key=key, value=value) for key, value in values.items()],
-            )
-        )
+        name = self._node.get_fully_qualified_name()
+        self._publisher.publish(diagnostic_status(name, level, sentence, values))
         logger = self._node.get_logger()
         # Two calls: rclpy refuses one that changes its severity.
         if level == DiagnosticStatus.OK:

@@ -107,13 +107,7 @@ class PlantNode(FlightNode):
         self._report_ticks = self._ticks(values["diagnostics_period"])
         self._description = self.create_publisher(String, "robot_description", LATCHED)
         for channel in self._intake.channels:
-            self.create_subscription(
-                channel.message_type,
-                channel.topic,
-                partial(self._on_command, channel),
-                STREAM,
-                raw=True,
-            )
+            self.take_raw(channel.message_type, channel.topic, partial(self._on_command, channel))
         self.create_subscription(String, "fault_injection", self._on_fault, STREAM)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 
 from spacerobot_ros.nodes.cdr import NANOSECONDS
 from spacerobot_ros.nodes.command_gate import CommandGate
+from spacerobot_ros.nodes.diagnostics import diagnostic_status
 from spacerobot_ros.nodes.flight_node import STREAM
 from spacerobot_ros.simulation.faults_plant import FaultyPlant
 
@@ -71,7 +72,7 @@ class PlantReport:
         array = DiagnosticArray()
         array.header.stamp.sec, array.header.stamp.nanosec = divmod(time_ns, NANOSECONDS)
         array.status = [
-            _status(
+            diagnostic_status(
                 f"{name}: commands",
                 self._command_level(moved["commands"]),
                 self._command_sentence(moved["commands"]),
@@ -83,7 +84,7 @@ class PlantReport:
                     "deadlines_missed": self.deadlines_missed,
                 },
             ),
-            _status(
+            diagnostic_status(
                 f"{name}: actuators",
                 DiagnosticStatus.WARN if moved["limits"] else DiagnosticStatus.OK,
                 "limits of the URDF hold joints back" if moved["limits"] else "within limits",
@@ -93,7 +94,7 @@ class PlantReport:
                     for joint, count in zip(joints, counts, strict=True)
                 },
             ),
-            _status(
+            diagnostic_status(
                 f"{name}: momentum",
                 DiagnosticStatus.ERROR if self._leaks() else DiagnosticStatus.OK,
                 "momentum changes that no thruster accounts for"
@@ -111,7 +112,7 @@ class PlantReport:
     def _faults(self) -> DiagnosticStatus:
         """Name every fault that is active."""
         active = [str(fault) for fault in self._plant.active]
-        return _status(
+        return diagnostic_status(
             f"{self._node.get_fully_qualified_name()}: faults",
             DiagnosticStatus.WARN if active else DiagnosticStatus.OK,
             f"injected: {'; '.join(active)}" if active else "no fault is injected",
@@ -145,14 +146,3 @@ class PlantReport:
         return float(
             np.linalg.norm(self._plant.momentum[part] - self._plant.expected_momenta[part])
         )
-
-
-def _status(
-    name: str, level: bytes, message: str, values: Mapping[str, object]
-) -> DiagnosticStatus:
-    return DiagnosticStatus(
-        level=level,
-        name=name,
-        message=message,
-        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
-    )

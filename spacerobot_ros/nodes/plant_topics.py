@@ -6,15 +6,14 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.attitude import matrix_from_quaternion, quaternion_from_matrix
-from spacerobot_ros.nodes.cdr import MessageTemplate, raw_publish, stamp_bytes
-from spacerobot_ros.nodes.flight_node import STREAM
+from spacerobot_ros.nodes.cdr import MessageTemplate, stamp_bytes
+from spacerobot_ros.nodes.flight_node import FlightNode
 from spacerobot_ros.nodes.markers import LinkMarkers
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import Sensors
@@ -51,7 +50,7 @@ class PlantTopics:
 
     def __init__(
         self,
-        node: Node,
+        node: FlightNode,
         plant: Plant,
         sensors: Sensors,
         world_frame: str,
@@ -74,7 +73,7 @@ class PlantTopics:
         momentum.feed("data", plant.momentum)
         # The clock first: whoever sees a state has seen its time.
         self._streams = [
-            (node.create_publisher(kind, topic, STREAM), template)
+            (node.send_raw(kind, topic), template)
             for kind, topic, template in (
                 (Clock, "/clock", clock),
                 (PoseStamped, "base_pose", base_pose),
@@ -86,8 +85,8 @@ class PlantTopics:
         if thrusters:
             expected = MessageTemplate(_labelled(EXPECTED_LABEL))
             expected.feed("data", plant.expected_momenta)
-            publisher = node.create_publisher(Float64MultiArray, "momentum_expected", STREAM)
-            self._streams.insert(3, (publisher, expected))
+            stream = node.send_raw(Float64MultiArray, "momentum_expected")
+            self._streams.insert(3, (stream, expected))
         self._end_effector: tuple[int, Any] | None = None
         self._add_end_effector(node, world_frame, end_effector_frame, pose_message)
         self._base_pose = base_pose
@@ -98,16 +97,15 @@ class PlantTopics:
         self._markers = LinkMarkers(node, robot.description, world_frame)
 
     def _prepare(self) -> None:
-        self._sends = [(raw_publish(publisher), template) for publisher, template in self._streams]
-        self._sends_without_pose = [send for send in self._sends if send[1] is not self._base_pose]
+        self._without_pose = [each for each in self._streams if each[1] is not self._base_pose]
 
     def _show_measurements(self) -> None:
         """From now on publish what is measured, and before it the truth on topics of its own."""
         (odom_topic, odom), (joints_topic, joints) = self._streams[-2:]
         self._measured_odom = self._odom_template(self._sensors)
         self._streams[-2:] = [
-            (self._node.create_publisher(Odometry, "odom_true", STREAM), odom),
-            (self._node.create_publisher(JointState, "joint_states_true", STREAM), joints),
+            (self._node.send_raw(Odometry, "odom_true"), odom),
+            (self._node.send_raw(JointState, "joint_states_true"), joints),
             (odom_topic, self._measured_odom),
             (joints_topic, self._joints_template(self._sensors)),
         ]
@@ -147,9 +145,9 @@ class PlantTopics:
             self._show_measurements()
         lost = self._measured_odom if self._sensors.dropout else None
         stamp = stamp_bytes(time_ns)
-        for send, template in self._sends if with_pose else self._sends_without_pose:
+        for stream, template in self._streams if with_pose else self._without_pose:
             if template is not lost:
-                send(template.serialised(stamp))
+                stream.take(template.serialised(stamp))
 
     def publish_markers(self, time_ns: int) -> None:
         """Publish the links' shapes where they are."""
@@ -157,13 +155,13 @@ class PlantTopics:
 
     def readers(self) -> int:
         """Return how many subscriptions the state topics have now."""
-        return sum(publisher.get_subscription_count() for publisher, _ in self._streams)
+        return sum(stream.readers() for stream, _ in self._streams)
 
     def _base(self) -> tuple[Any, Any]:
         return matrix_from_quaternion(self._plant.pose[3:]), self._plant.pose[:3]
 
     def _add_end_effector(
-        self, node: Node, world_frame: str, name: str, prototype: PoseStamped
+        self, node: FlightNode, world_frame: str, name: str, prototype: PoseStamped
     ) -> None:
         links = self._plant.robot.link_names
         if not name and DEFAULT_END_EFFECTOR not in links:
@@ -175,9 +173,9 @@ class PlantTopics:
                 f"it has {', '.join(links)}."
             )
         template = MessageTemplate(prototype)
-        publisher = node.create_publisher(PoseStamped, "end_effector_pose", STREAM)
+        stream = node.send_raw(PoseStamped, "end_effector_pose")
         # Before odom and joint_states, which set the commanders off.
-        self._streams.insert(2, (publisher, template))
+        self._streams.insert(2, (stream, template))
         self._end_effector = links.index(name), template.floats("pose.position.x", 7)
 
 

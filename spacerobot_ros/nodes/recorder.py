@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -24,10 +24,17 @@ from spacerobot_ros.nodes.flight_node import FlightNode, run_node
 from spacerobot_ros.nodes.message_loss import MessageLoss
 from spacerobot_ros.nodes.message_types import message_class
 from spacerobot_ros.nodes.parameters import ParameterSpec
+from spacerobot_ros.nodes.raw_stream import Take
+from spacerobot_ros.nodes.stream_taps import StreamTaps
 from spacerobot_ros.recording import BagWriter, QosProfile, RecordingError
+
+_CLOCK = "/clock"
 
 _QUEUE = 2000
 """Messages a subscription may be behind; the events executor wedges above 5000."""
+
+_CHUNK_SIZE = 262_144
+"""Bytes before compression: of larger ones the fixed costs are smaller, a seek's are larger."""
 
 _SCAN_PERIOD = 0.1
 """Wall s between two looks for new topics."""
@@ -70,7 +77,7 @@ class RecorderNode(FlightNode):
 
     def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
         self._writer: BagWriter | None = None
-        self._context: dict[str, dict[str, str]] = {}
+        self._taps = StreamTaps()
         super().__init__(name, **kwargs)
 
     # -- life ---------------------------------------------------------------------------------
@@ -82,6 +89,7 @@ class RecorderNode(FlightNode):
         self._writer = BagWriter(
             path,
             compression=values["compression"],
+            chunk_size=_CHUNK_SIZE,
             max_size=round(values["max_size"] * 1e6),
             max_duration_ns=round(values["max_duration"] * NANOSECONDS),
         )
@@ -106,9 +114,8 @@ class RecorderNode(FlightNode):
         self.describe("spacerobot", {"version": __version__})
         for title, values in _descriptions(str(self.parameters["describe"])):
             self.describe(title, values)
-        if self._wanted and "/clock" not in self._wanted:
-            depth = QoSProfile(depth=_QUEUE)
-            self.create_subscription(Clock, "/clock", self._on_time, depth, raw=True)
+        if self._wanted and _CLOCK not in self._wanted:
+            self._follow_clock()
         self.scan()
 
     def activate(self) -> None:
@@ -140,6 +147,7 @@ class RecorderNode(FlightNode):
             The disk refused what was left.
         """
         if self._writer is not None:
+            self._taps.release()
             self._release_early(None)
             counts = {"messages": self.messages_recorded, "messages_lost": self.loss.total}
             self.describe("recorder", {name: str(count) for name, count in counts.items()})
@@ -147,6 +155,15 @@ class RecorderNode(FlightNode):
             writer.close()
 
     # -- for whoever composes the nodes -------------------------------------------------------
+
+    def watch(self, nodes: Iterable[FlightNode]) -> None:
+        """Take the streams of nodes of this process and executor where they pass through them.
+
+        To be called before the recorder is configured. Messages are then recorded in the order of
+        their publication, and a plant's commands as the plant took them. Other topics are
+        subscribed, and so is what a node outside publishes too.
+        """
+        self._taps.nodes = list(nodes)
 
     @property
     def bag_path(self) -> str:
@@ -171,6 +188,9 @@ class RecorderNode(FlightNode):
         """Subscribe to topics that have appeared."""
         if self._writer is None:
             return
+        for topic in self._taps.release_incomplete(self.count_publishers):
+            if self._recorded.pop(topic, None) is None:
+                self._follow_clock()
         for topic, types in self.get_topic_names_and_types():
             chosen = topic in self._wanted if self._wanted else not topic.endswith(_NOT_RECORDED)
             if chosen and topic not in self._recorded and topic not in self._unknown:
@@ -181,6 +201,12 @@ class RecorderNode(FlightNode):
     def _settle(self) -> None:
         """Nothing but writing is left to do with a message once the time is known."""
         self._steady = self._active and self._early is None and not self._wall
+
+    def _follow_clock(self) -> None:
+        """Know the time of a clock that is not recorded itself."""
+        if not self._taps.tap(_CLOCK, self._on_time, self.count_publishers(_CLOCK)):
+            depth = QoSProfile(depth=_QUEUE)
+            self.create_subscription(Clock, _CLOCK, self._on_time, depth, raw=True)
 
     def _record(self, topic: str, type_name: str) -> None:
         infos = self.get_publishers_info_by_topic(topic)
@@ -193,6 +219,10 @@ class RecorderNode(FlightNode):
             self._unknown.add(topic)
             self.get_logger().warning(f"Topic '{topic}' is not recorded: {error}")
             return
+        self._recorded[topic] = channel
+        callback = self._callback(topic, type_name, channel)
+        if self._taps.tap(topic, callback, len(infos)):
+            return
         reliable = all(i.qos_profile.reliability == ReliabilityPolicy.RELIABLE for i in infos)
         latched = all(i.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for i in infos)
         qos = QoSProfile(
@@ -200,11 +230,10 @@ class RecorderNode(FlightNode):
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE),
         )
-        self._recorded[topic] = channel
         self.create_subscription(
             message_type,
             topic,
-            self._callback(topic, type_name, channel),
+            callback,
             qos,
             event_callbacks=self.loss.events(topic),
             raw=True,
@@ -224,7 +253,7 @@ class RecorderNode(FlightNode):
             ),
         )
 
-    def _callback(self, topic: str, type_name: str, channel: int) -> Callable[[bytes], None]:
+    def _callback(self, topic: str, type_name: str, channel: int) -> Take:
         """Return what takes a topic's messages: the clock sets the time of all others."""
         assert self._writer is not None
         write = self._writer.write
@@ -259,7 +288,7 @@ class RecorderNode(FlightNode):
                 self.attach(name, urdf, "application/xml")
             store(raw, 0)
 
-        if topic == "/clock":
+        if topic == _CLOCK:
             return on_clock
         if topic.endswith("/robot_description"):
             return on_description
@@ -289,7 +318,7 @@ class RecorderNode(FlightNode):
         self._guarded(write_all)
 
     def _flush(self) -> None:
-        if self._early and not self.count_publishers("/clock"):
+        if self._early and not self.count_publishers(_CLOCK):
             waited = time.time_ns() - self._early[0][3]
             if waited > float(self.parameters["clock_wait"]) * NANOSECONDS:  # type: ignore[arg-type]
                 self._wall = True

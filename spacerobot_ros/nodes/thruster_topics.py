@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import WrenchStamped
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from spacerobot_ros.nodes.cdr import MessageTemplate, raw_publish, stamp_bytes
-from spacerobot_ros.nodes.flight_node import STREAM
+from spacerobot_ros.nodes.cdr import MessageTemplate, stamp_bytes
+from spacerobot_ros.nodes.flight_node import FlightNode
 from spacerobot_ros.simulation.thrusters import ThrusterPlant
 
 PROPELLANT = "propellant_kg"
@@ -23,7 +22,7 @@ class ThrusterTopics:
     beginning (s), the velocity for what part of the last tick, the effort its mean force in it (N).
     """
 
-    def __init__(self, node: Node, thrusters: ThrusterPlant) -> None:
+    def __init__(self, node: FlightNode, thrusters: ThrusterPlant) -> None:
         self._node, self._thrusters = node, thrusters
         wrench_message = WrenchStamped()
         wrench_message.header.frame_id = thrusters.robot.base_link
@@ -37,8 +36,8 @@ class ThrusterTopics:
         states.feed("position", thrusters.on_time)
         states.feed("velocity", thrusters.duty)
         states.feed("effort", thrusters.thrust)
-        self._sends = [
-            (raw_publish(node.create_publisher(kind, topic, STREAM)), template)
+        self._streams = [
+            (node.send_raw(kind, topic), template)
             for kind, topic, template in (
                 (WrenchStamped, "base_wrench_realised", wrench),
                 (JointState, "thrusters", states),
@@ -52,8 +51,8 @@ class ThrusterTopics:
     def publish(self, time_ns: int) -> None:
         """Publish what they did in the tick that ended at ``time_ns``."""
         stamp = stamp_bytes(time_ns)
-        for send, template in self._sends:
-            send(template.serialised(stamp))
+        for stream, template in self._streams:
+            stream.take(template.serialised(stamp))
 
     def status(self) -> DiagnosticStatus:
         """Return what they used and what they could not do; a warning where that is new."""

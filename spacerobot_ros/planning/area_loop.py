@@ -12,7 +12,6 @@ the path alone, and held commands move along it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import ClassVar
@@ -23,16 +22,16 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.attitude import attitude_error, quaternion_inverse, quaternion_multiply
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.options import Option
 from spacerobot_ros.planning.controllability import brackets_anywhere
 from spacerobot_ros.planning.edge_path import EdgePath, edge_path
-from spacerobot_ros.planning.goal import Controlled, Goal, PoseError, RobotState, Tolerance
-from spacerobot_ros.planning.method import GaitMethod, Option
+from spacerobot_ros.planning.goal import Controlled, Goal, PoseError, RobotState
+from spacerobot_ros.planning.method import GaitMethod
 from spacerobot_ros.planning.nominal_choice import NominalChoice
 from spacerobot_ros.planning.nominal_shape import NominalShape
 from spacerobot_ros.planning.prediction import BasePrediction
-from spacerobot_ros.planning.schedule import GaitSchedule
-from spacerobot_ros.planning.straight_legs import shapes_at_ticks, straight_legs, total_duration
+from spacerobot_ros.planning.schedule import GaitSchedule, Notes
+from spacerobot_ros.planning.straight_legs import straight_motion
 
 _TRIALS = 6
 """A cycle that would not bring the base nearer is tried this often, each time half as large."""
@@ -42,7 +41,6 @@ _ALL = 1.0 - 1e-9
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
-Notes = dict[str, list[float] | float | str]
 Ends = list[tuple[Array, float]]
 """Shapes (n,) that straight legs lead to, and how long each leg is to take, s."""
 
@@ -60,39 +58,40 @@ class AreaLoopGait(GaitMethod):
         Option("k", 0.15, "", "share of the missing turn that one cycle makes up for", 1e-3, 1.0),
         Option("edge_time", 4.0, "s", "duration of an edge; slow joints take longer", 1e-3),
         Option("largest_edge", 1.0, "m or rad", "longest edge of a loop", 1e-3, 10.0),
-        Option("nominal", [], "m or rad", "nominal shape, all joints; []: the best", -1e6, 1e6),
-        Option("joints", "", "", "the three joints, separated by spaces; '': the best three"),
+        Option(
+            "nominal",
+            [],
+            "m or rad",
+            "nominal shape, all joints; []: the best",
+            -1e6,
+            1e6,
+            of_joints=True,
+        ),
+        Option(
+            "joints",
+            "",
+            "",
+            "the three joints, separated by spaces; '': the best three",
+            of_joints=True,
+        ),
         Option("cycles_per_plan", 1, "", "cycles before the attitude is measured again", 1, 10_000),
         Option("most_cycles", 1000, "", "cycles that a goal may take", 1, 1_000_000),
         Option("longest", 100_000.0, "s", "longest manoeuvre that is still planned", 1.0),
     )
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        tick_period: float,
-        tolerance: Tolerance,
-        integration_step: float = DEFAULT_INTEGRATION_STEP,
-        *,
-        k: float = 0.15,
-        edge_time: float = 4.0,
-        largest_edge: float = 1.0,
-        nominal: Sequence[float] = (),
-        joints: str = "",
-        cycles_per_plan: int = 1,
-        most_cycles: int = 1000,
-        longest: float = 100_000.0,
-    ) -> None:
-        super().__init__(robot, tick_period, tolerance, integration_step)
-        self._k, self._edge_time = k, edge_time
-        self._cycles_per_plan, self._most_cycles = cycles_per_plan, most_cycles
-        self._longest = longest
+    def _prepare(self) -> None:
+        robot, chosen = self.robot, self._settings
+        self._k: float = chosen["k"]
+        self._edge_time: float = chosen["edge_time"]
+        self._longest: float = chosen["longest"]
         self._goal: Goal | None = None
         self._flown = 0
         # Planners exist before goals: an unsuitable robot is refused with the first one.
         self._refusal = self.objection(robot)
-        self._nominal = NominalChoice(robot, largest_edge, joints, nominal)
-        self._prediction = BasePrediction(robot, tick_period, integration_step)
+        self._nominal = NominalChoice(
+            robot, chosen["largest_edge"], chosen["joints"], chosen["nominal"]
+        )
+        self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)
         if not self._refusal and robot.n == 3:
             # No other joints rest anywhere: the choice need not wait for a shape.
             with suppress(PlanningError):
@@ -131,13 +130,14 @@ class AreaLoopGait(GaitMethod):
         # The way from the nominal to the final shape turns the base too: aim that far beside.
         aside = self._turn(nominal, final)
         target = quaternion_multiply(goal.quaternion, quaternion_inverse(aside))
-        for planned in range(self._cycles_per_plan + 1):
+        cycles_per_plan: int = self._settings["cycles_per_plan"]
+        for planned in range(cycles_per_plan + 1):
             left = attitude_error(gait.attitudes[-1], target)
             if np.linalg.norm(left) <= self.tolerance.attitude:
                 if final is not None:
                     gait = self._moved(gait, [(final, self._edge_time)])
                 break
-            if planned < self._cycles_per_plan:
+            if planned < cycles_per_plan:
                 gait, cycle_notes = self._cycle(gait, target, left, nominal)
                 self._flown += 1
                 notes = {**cycle_notes, "cycles": float(planned + 1)}
@@ -197,10 +197,11 @@ class AreaLoopGait(GaitMethod):
         return many + max(1.0, math.log(unbounded / self.tolerance.attitude) / factor)
 
     def _require_few(self, cycles: float) -> None:
-        if cycles > self._most_cycles:
+        most = self._settings["most_cycles"]
+        if cycles > most:
             raise PlanningError(
-                f"The goal takes about {cycles:.4g} cycles, more than most_cycles = "
-                f"{self._most_cycles}; {self._flown} are flown."
+                f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
+                f"{self._flown} are flown."
             )
 
     def _ends(self, path: EdgePath, nominal: NominalShape) -> Ends:
@@ -228,15 +229,9 @@ class AreaLoopGait(GaitMethod):
 
     def _moved(self, gait: _Gait, ends: Ends) -> _Gait:
         """Return the gait with straight legs added."""
-        legs = straight_legs(self.robot, gait.positions[-1], ends)
-        if total_duration(legs) > self._longest:
-            slowest = self.robot.joint_names[int(np.argmin(self.robot.velocity_limit))]
-            raise PlanningError(
-                f"A motion along {len(legs)} straight lines would take "
-                f"{total_duration(legs):.4g} s, more than longest = {self._longest:.6g} s; the "
-                f"slowest joint is '{slowest}'."
-            )
-        shapes = shapes_at_ticks(gait.positions[-1], legs, self.tick_period)
+        shapes = straight_motion(
+            self.robot, gait.positions[-1], ends, self.tick_period, self._longest
+        )
         # At rest there is no momentum: the attitudes depend on the shapes alone.
         attitudes = self._prediction.attitudes(shapes, gait.attitudes[-1], np.zeros(3))
         return _Gait(
@@ -246,16 +241,9 @@ class AreaLoopGait(GaitMethod):
     def _schedule(self, gait: _Gait, state: RobotState, goal: Goal, notes: Notes) -> GaitSchedule:
         path = self._prediction.path(state, gait.positions, gait.attitudes)
         left = PoseError.between(path.position[-1], path.quaternion[-1], goal, gait.positions[-1])
-        return GaitSchedule(
-            method=self.name,
-            joint_names=self.robot.joint_names,
-            tick_period=self.tick_period,
-            positions=gait.positions,
-            path=path,
-            goal=goal,
-            notes={**notes, "predicted_attitude_error": left.angle},
-            partial=not self.tolerance.admits(left, self.controls),
-        )
+        notes = {**notes, "predicted_attitude_error": left.angle}
+        partial = not self.tolerance.admits(left, self.controls)
+        return self._schedule_of(goal, gait.positions, path, notes, partial=partial)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from spacerobot_ros.model.attitude import (
     rotvec_from_quaternion,
 )
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.options import Option
 from spacerobot_ros.planning.controllability import (
     WORST_CONDITION,
     best_triple,
@@ -36,10 +36,10 @@ from spacerobot_ros.planning.controllability import (
     slot_matrix,
     slot_objection,
 )
-from spacerobot_ros.planning.goal import Goal, RobotState, Tolerance
-from spacerobot_ros.planning.method import GaitMethod, Option
+from spacerobot_ros.planning.goal import Goal, RobotState
+from spacerobot_ros.planning.method import GaitMethod
 from spacerobot_ros.planning.prediction import BasePrediction
-from spacerobot_ros.planning.schedule import BasePath, GaitSchedule
+from spacerobot_ros.planning.schedule import BasePath, GaitSchedule, Notes
 
 _FEWEST_TICKS_A_CYCLE = 12
 _MOST_REFINEMENTS = 20
@@ -65,31 +65,21 @@ class LieBracketGait(GaitMethod):
         Option("longest", 100_000.0, "s", "longest manoeuvre that is still planned", 1.0),
     )
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        tick_period: float,
-        tolerance: Tolerance,
-        integration_step: float = DEFAULT_INTEGRATION_STEP,
-        *,
-        t1: float = 100.0,
-        n1: int = 10,
-        cycle_period: float = 3.0,
-        cycles: int = 0,
-        loop_area: float = 0.04,
-        a22_ratio: float = 1.0,
-        a31_ratio: float = 1.0,
-        longest: float = 100_000.0,
-    ) -> None:
-        super().__init__(robot, tick_period, tolerance, integration_step)
-        self.t1, self.n1 = t1, n1
-        self.cycles, self.loop_area = cycles, loop_area
-        self.a22_ratio, self.a31_ratio = a22_ratio, a31_ratio
-        self.longest = longest
+    def _prepare(self) -> None:
+        robot, chosen = self.robot, self._settings
+        self.t1: float = chosen["t1"]
+        self.n1: int = chosen["n1"]
+        self.cycles: int = chosen["cycles"]
+        self.loop_area: float = chosen["loop_area"]
+        self.a22_ratio: float = chosen["a22_ratio"]
+        self.a31_ratio: float = chosen["a31_ratio"]
+        self.longest: float = chosen["longest"]
         # Whole ticks a cycle: every cycle is then the same commands and the same rotation.
-        self.ticks_a_cycle = max(round(cycle_period / tick_period), _FEWEST_TICKS_A_CYCLE)
+        self.ticks_a_cycle = max(
+            round(chosen["cycle_period"] / self.tick_period), _FEWEST_TICKS_A_CYCLE
+        )
         self.sliders = sliders_of(robot)
-        self._prediction = BasePrediction(robot, tick_period, integration_step)
+        self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)
 
     @classmethod
     def objection(cls, robot: SpaceRobot) -> str:
@@ -106,19 +96,12 @@ class LieBracketGait(GaitMethod):
         attitudes = self._prediction.attitudes(slide, state.quaternion, state.angular_momentum)
         cycle, n, notes = self._turn(attitudes[-1], z_f, goal, correction)
         turn = np.tile(cycle[1:], (n, 1)) if n else np.empty((0, self.robot.n))
-        return GaitSchedule(
-            method=self.name,
-            joint_names=self.robot.joint_names,
-            tick_period=self.tick_period,
-            positions=np.vstack([slide, turn]),
-            path=self._path(state, slide, attitudes, cycle, n),
-            goal=goal,
-            notes={
-                "zf": [float(z_f[i]) for i in self.sliders],
-                "c": [2 * float((z_f - state.q)[i]) / t1 for i in self.sliders],
-                **notes,
-            },
-        )
+        path = self._path(state, slide, attitudes, cycle, n)
+        symbols: Notes = {
+            "zf": [float(z_f[i]) for i in self.sliders],
+            "c": [2 * float((z_f - state.q)[i]) / t1 for i in self.sliders],
+        }
+        return self._schedule_of(goal, np.vstack([slide, turn]), path, symbols | notes)
 
     def final_shape(self, state: RobotState, goal: Goal) -> Array:
         """Step 1: the shape ``zf`` (n,) that solves eq. (9), nearest to the present one.
@@ -191,7 +174,7 @@ class LieBracketGait(GaitMethod):
 
     def _turn(
         self, quaternion: Array, z_f: Array, goal: Goal, correction: bool
-    ) -> tuple[Array, int, dict[str, list[float] | float | str]]:
+    ) -> tuple[Array, int, Notes]:
         """Step 3: one cycle of shapes (m + 1, n), how many of them, and the paper's symbols."""
         wanted = attitude_error(quaternion, goal.quaternion)
         if np.linalg.norm(wanted) <= _NO_ROTATION:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -12,29 +11,15 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.options import Option, chosen_options
 from spacerobot_ros.planning.goal import POSE, Controlled, Goal, RobotState, Tolerance
-from spacerobot_ros.planning.schedule import GaitSchedule
+from spacerobot_ros.planning.schedule import BasePath, GaitSchedule, Notes
 
 _AT_REST = 1e-9
 """Momenta below this times the mass count as zero, m/s and m^2/s."""
 
 _BEYOND = 1e-9
 """Rounding that a goal shape may be beyond a limit by, m or rad."""
-
-
-@dataclass(frozen=True)
-class Option:
-    """A parameter of a method; the default sets its type, unit and meaning are for people.
-
-    ``minimum`` and ``maximum`` are those of numbers and of the entries of a list.
-    """
-
-    name: str
-    default: float | int | str | list[float]
-    unit: str
-    meaning: str
-    minimum: float = 0.0
-    maximum: float = 1e9
 
 
 class GaitMethod(ABC):
@@ -45,6 +30,24 @@ class GaitMethod(ABC):
 
     ``controls`` names the parts of a goal that the method brings about and is judged by; the others
     come out as they must.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    tick_period
+        How long a command is held, s.
+    tolerance
+        How near is there.
+    integration_step
+        Longest Runge-Kutta step of the predicted attitude, s; the plant's, for equal numbers.
+    options
+        Values of the method's ``options`` by name; those left out have their defaults.
+
+    Raises
+    ------
+    ParameterError
+        There is no such option, or a value does not go with its range, the robot or another option.
     """
 
     name: ClassVar[str]
@@ -57,11 +60,17 @@ class GaitMethod(ABC):
         tick_period: float,
         tolerance: Tolerance,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
+        **options: Any,
     ) -> None:
         self.robot = robot
         self.tick_period = tick_period
         self.tolerance = tolerance
         self.integration_step = integration_step
+        self._settings = chosen_options(self.name, self.options, options)
+        self._prepare()
+
+    def _prepare(self) -> None:  # noqa: B027 - methods that delegate have nothing to set up here
+        """Set up what the method keeps for all its plans, by ``_settings``; called once."""
 
     @classmethod
     def objection(cls, robot: SpaceRobot) -> str:
@@ -80,6 +89,21 @@ class GaitMethod(ABC):
         PlanningError
             The method cannot reach the goal; the sentence says why.
         """
+
+    def _schedule_of(
+        self, goal: Goal, positions: Array, path: BasePath, notes: Notes, *, partial: bool = False
+    ) -> GaitSchedule:
+        """Return shapes (N + 1, n) at the ticks as a schedule of this method."""
+        return GaitSchedule(
+            method=self.name,
+            joint_names=self.robot.joint_names,
+            tick_period=self.tick_period,
+            positions=positions,
+            path=path,
+            goal=goal,
+            notes=notes,
+            partial=partial,
+        )
 
     def _goal_shape(self, goal: Goal) -> Array | None:
         """Return the shape (n,) that the goal asks for, None where it asks for none.

@@ -12,6 +12,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.attitude import quaternion_from_rotvec
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.options import chosen_options
 from spacerobot_ros.planning.goal import Goal, RobotState, Tolerance
 from spacerobot_ros.planning.registry import METHODS, build_method
 from spacerobot_ros.planning.schedule import GaitSchedule
@@ -67,10 +68,8 @@ def plan(
         raise ParameterError(
             f"There is no gait method '{method}'; there are: {', '.join(METHODS)}."
         )
-    unknown = sorted(set(options) - {option.name for option in METHODS[method].options})
-    if unknown:
-        raise ParameterError(f"Method {method} has no option '{unknown[0]}'.")
-    named = {f"{method}.{name}": value for name, value in options.items()}
+    chosen = chosen_options(method, METHODS[method].options, options)
+    named = {f"{method}.{name}": value for name, value in chosen.items()}
     planner = build_method(method, robot, tick_period, tolerance, integration_step, named)
     return planner.plan(_state(robot, start), goal)
 

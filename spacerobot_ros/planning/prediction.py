@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.attitude import matrix_from_quaternion
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.integration import steps_in
 from spacerobot_ros.planning.goal import RobotState
 from spacerobot_ros.planning.schedule import BasePath
 
@@ -27,12 +26,17 @@ class BasePrediction:
         How long a command is held, s.
     integration_step
         Longest Runge-Kutta step of the attitude, s; the plant's, for equal numbers.
+
+    Raises
+    ------
+    ParameterError
+        A duration is not positive.
     """
 
     def __init__(self, robot: SpaceRobot, tick_period: float, integration_step: float) -> None:
         self._robot = robot
         self._tick_period = tick_period
-        self._step = robot.velocity_step(max(1, math.ceil(tick_period / integration_step - 1e-9)))
+        self._step = robot.velocity_step(steps_in(tick_period, integration_step))
         self._step.inputs[3][:] = tick_period
 
     def attitudes(self, positions: Array, quaternion: Array, L_W: Array) -> Array:

@@ -55,9 +55,6 @@ def build_method(
             if entry is not AutoGait
         }
         return AutoGait(robot, tick_period, tolerance, integration_step, candidates=candidates)
-    chosen = {
-        option.name: options[key]
-        for option in method.options
-        if (key := f"{name}.{option.name}") in options
-    }
+    own = f"{name}."
+    chosen = {key.removeprefix(own): value for key, value in options.items() if key.startswith(own)}
     return method(robot, tick_period, tolerance, integration_step, **chosen)

@@ -10,6 +10,9 @@ import numpy as np
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.goal import Goal
 
+Notes = dict[str, list[float] | float | str]
+"""Named results of a method, for reports."""
+
 
 @dataclass(frozen=True)
 class BasePath:
@@ -51,7 +54,7 @@ class GaitSchedule:
     positions: Array
     path: BasePath
     goal: Goal
-    notes: dict[str, list[float] | float | str] = field(default_factory=dict)
+    notes: Notes = field(default_factory=dict)
     partial: bool = False
 
     @property

@@ -13,7 +13,6 @@ geometric phase, which depends on the path alone, is that of the smooth motion e
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -22,15 +21,15 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.attitude import quaternion_inverse, quaternion_multiply
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.options import Option
 from spacerobot_ros.planning.geometric_phase import PlanarPhase
-from spacerobot_ros.planning.goal import Controlled, Goal, PoseError, RobotState, Tolerance
-from spacerobot_ros.planning.method import GaitMethod, Option
+from spacerobot_ros.planning.goal import Controlled, Goal, PoseError, RobotState
+from spacerobot_ros.planning.method import GaitMethod
 from spacerobot_ros.planning.planar import planar_axis
 from spacerobot_ros.planning.prediction import BasePrediction
-from spacerobot_ros.planning.schedule import GaitSchedule
+from spacerobot_ros.planning.schedule import GaitSchedule, Notes
 from spacerobot_ros.planning.square_loop import SquareLoop, SquareSearch
-from spacerobot_ros.planning.straight_legs import shapes_at_ticks, straight_legs, total_duration
+from spacerobot_ros.planning.straight_legs import straight_motion
 
 _WORTHWHILE = 0.1
 """A missing turn below this share of the tolerance is left as it is."""
@@ -59,25 +58,9 @@ class SquarePathGait(GaitMethod):
         Option("longest", 3600.0, "s", "longest manoeuvre that is still planned", 1.0),
     )
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        tick_period: float,
-        tolerance: Tolerance,
-        integration_step: float = DEFAULT_INTEGRATION_STEP,
-        *,
-        t1: float = 8.0,
-        t2: float = 12.0,
-        t3: float = 20.0,
-        t4: float = 24.0,
-        most_loops: int = 20,
-        given_centre: int = 0,
-        centre_1: float = 0.0,
-        centre_2: float = 0.0,
-        check_position: int = 0,
-        longest: float = 3600.0,
-    ) -> None:
-        super().__init__(robot, tick_period, tolerance, integration_step)
+    def _prepare(self) -> None:
+        robot, chosen = self.robot, self._settings
+        t1, t2, t3, t4 = (float(chosen[name]) for name in ("t1", "t2", "t3", "t4"))
         instants = (0.0, t1, t2, t3, t4)
         if not np.all(np.diff(instants) > 0):
             raise ParameterError(
@@ -85,8 +68,6 @@ class SquarePathGait(GaitMethod):
                 "each must be later than the one before."
             )
         self._durations = tuple(float(x) for x in np.diff(instants))
-        self._check_position = bool(check_position)
-        self._longest = longest
         self._refusal: PlanningError | None = None
         try:
             self._phase = PlanarPhase(robot)
@@ -94,9 +75,11 @@ class SquarePathGait(GaitMethod):
             # Planners exist before goals: the robot is refused with the first one.
             self._refusal = refusal
             return
-        centre = np.array([centre_1, centre_2]) if given_centre else None
-        self._search = SquareSearch(robot, self._phase, most_loops, centre)
-        self._prediction = BasePrediction(robot, tick_period, integration_step)
+        centre = np.array([chosen["centre_1"], chosen["centre_2"]])
+        self._search = SquareSearch(
+            robot, self._phase, chosen["most_loops"], centre if chosen["given_centre"] else None
+        )
+        self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)
 
     @classmethod
     def objection(cls, robot: SpaceRobot) -> str:
@@ -122,31 +105,30 @@ class SquarePathGait(GaitMethod):
         loop = None
         if abs(wanted) > max(_NO_ROTATION, _WORTHWHILE * self.tolerance.attitude):
             loop = self._search.loop(psi_e, wanted)
-        positions = self._motion(state.q, self._legs(psi_e, loop))
+        positions = straight_motion(
+            self.robot,
+            state.q,
+            self._legs(psi_e, loop),
+            self.tick_period,
+            self._settings["longest"],
+        )
         path = self._prediction.path(state, positions)
         left = PoseError.between(path.position[-1], path.quaternion[-1], goal)
-        if self._check_position and left.distance > self.tolerance.position:
+        if self._settings["check_position"] and left.distance > self.tolerance.position:
             raise PlanningError(
                 f"The base will be at {np.round(path.position[-1], 4).tolist()} m, "
                 f"{left.distance:.3g} m from the goal position: without thrust, attitude and shape "
                 "decide where the base is; with check_position 0 the goal position is ignored."
             )
-        return GaitSchedule(
-            method=self.name,
-            joint_names=self.robot.joint_names,
-            tick_period=self.tick_period,
-            positions=positions,
-            path=path,
-            goal=goal,
-            notes={
-                "psi_e": psi_e.tolist(),
-                "turn_of_step_1": step_1,
-                "wanted_phase": wanted,
-                **self._loop_notes(loop),
-                "final_position": path.position[-1].tolist(),
-                "predicted_attitude_error": left.angle,
-            },
-        )
+        notes: Notes = {
+            "psi_e": psi_e.tolist(),
+            "turn_of_step_1": step_1,
+            "wanted_phase": wanted,
+            **self._loop_notes(loop),
+            "final_position": path.position[-1].tolist(),
+            "predicted_attitude_error": left.angle,
+        }
+        return self._schedule_of(goal, positions, path, notes)
 
     def _turn(self, state: RobotState, goal: Goal) -> float:
         """Return the angle in [-pi, pi] about the robot's axis from the present attitude."""
@@ -176,27 +158,7 @@ class SquarePathGait(GaitMethod):
             legs.append((psi_e, step_4))
         return legs
 
-    def _motion(self, start: Array, ends: Sequence[tuple[Array, float]]) -> Array:
-        """Return the shapes (N + 1, n) at the ticks, each leg from rest to rest.
-
-        Raises
-        ------
-        PlanningError
-            The manoeuvre takes longer than ``longest``.
-        """
-        legs = straight_legs(self.robot, start, ends)
-        total = total_duration(legs)
-        if total > self._longest:
-            slowest = int(np.argmin(self.robot.velocity_limit))
-            raise PlanningError(
-                f"The manoeuvre of {len(legs)} straight legs would take {total:.4g} s, more than "
-                f"longest = {self._longest:.6g} s; the slowest joint, "
-                f"'{self.robot.joint_names[slowest]}', has "
-                f"{self.robot.velocity_limit[slowest]:.3g} rad/s."
-            )
-        return shapes_at_ticks(start, legs, self.tick_period)
-
-    def _loop_notes(self, loop: SquareLoop | None) -> dict[str, list[float] | float | str]:
+    def _loop_notes(self, loop: SquareLoop | None) -> Notes:
         if loop is None:
             return {"loops": 0.0}
         return {

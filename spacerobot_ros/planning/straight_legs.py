@@ -8,62 +8,63 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, JointKind
 
-NO_MOTION = 1e-9
+_NO_MOTION = 1e-9
 """A joint that is to move less than this, m or rad, rests."""
 
 
-@dataclass(frozen=True)
-class StraightLeg:
-    """From shape ``start`` to ``end`` (n,) in ``duration`` seconds."""
+def straight_motion(
+    robot: SpaceRobot,
+    start: Array,
+    ends: Sequence[tuple[Array, float]],
+    tick_period: float,
+    longest: float,
+) -> Array:
+    """Return the shapes (N + 1, n) at the ticks from ``start`` (n,) through ``ends``.
 
-    start: Array
-    end: Array
-    duration: float
+    The ends are shapes (n,) and how long the legs to them are to take, s. A leg takes longer where
+    a joint is slow, a whole number of ticks, and no time where nothing moves.
 
-
-def straight_legs(
-    robot: SpaceRobot, start: Array, ends: Sequence[tuple[Array, float]]
-) -> list[StraightLeg]:
-    """Return the legs from ``start`` (n,) through shapes (n,) that are to take so many seconds.
-
-    A leg takes longer where a joint is slow, for ever where it has no speed at all, and no time
-    where nothing moves.
+    Raises
+    ------
+    PlanningError
+        All legs together take more than ``longest`` s.
     """
-    legs: list[StraightLeg] = []
-    for end, wanted in ends:
-        legs.append(StraightLeg(start, end, _duration(robot, end - start, wanted)))
-        start = end
-    return legs
-
-
-def total_duration(legs: Sequence[StraightLeg]) -> float:
-    """Return how long legs take together, s."""
-    return sum(leg.duration for leg in legs)
-
-
-def shapes_at_ticks(start: Array, legs: Sequence[StraightLeg], tick_period: float) -> Array:
-    """Return the shapes (N + 1, n) at the ticks, each leg a whole number of them."""
+    starts = [start, *(end for end, _ in ends)]
+    legs = [
+        (before, end, _duration(robot, end - before, wanted))
+        for before, (end, wanted) in zip(starts, ends, strict=False)
+    ]
+    total = sum(duration for _, _, duration in legs)
+    if total > longest:
+        slowest = int(np.argmin(robot.velocity_limit))
+        joint = robot.description.movable_joints[slowest]
+        unit = "m/s" if joint.kind is JointKind.PRISMATIC else "rad/s"
+        raise PlanningError(
+            f"A motion of {len(legs)} straight legs would take {total:.4g} s, more than longest = "
+            f"{longest:.6g} s; the slowest joint is '{joint.name}', which does "
+            f"{robot.velocity_limit[slowest]:.3g} {unit}."
+        )
     pieces = [start[np.newaxis]]
-    for leg in legs:
-        tau = np.linspace(0.0, 1.0, 1 + math.ceil(leg.duration / tick_period - 1e-9))[1:]
+    for before, end, duration in legs:
+        tau = np.linspace(0.0, 1.0, 1 + math.ceil(duration / tick_period - 1e-9))[1:]
         progress = tau - np.sin(2 * math.pi * tau) / (2 * math.pi)
-        pieces.append(leg.start + progress[:, np.newaxis] * (leg.end - leg.start))
-        pieces[-1][-1:] = leg.end
+        pieces.append(before + progress[:, np.newaxis] * (end - before))
+        pieces[-1][-1:] = end
     return np.vstack(pieces)
 
 
 def _duration(robot: SpaceRobot, move: Array, wanted: float) -> float:
-    active = np.abs(move) > NO_MOTION
+    """Return how long a leg takes, s: infinity if a joint without speed is to move."""
+    active = np.abs(move) > _NO_MOTION
     if not active.any():
         return 0.0
-    # A joint without speed takes for ever.
     with np.errstate(divide="ignore"):
         slowest = np.max(2 * np.abs(move[active]) / robot.velocity_limit[active])
     return max(wanted, float(slowest))

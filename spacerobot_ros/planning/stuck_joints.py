@@ -15,7 +15,7 @@ from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.planning.goal import POSE, Controlled, Goal, RobotState, Tolerance
 from spacerobot_ros.planning.method import GaitMethod
-from spacerobot_ros.planning.registry import build_method
+from spacerobot_ros.planning.registry import METHODS, build_method
 from spacerobot_ros.planning.schedule import GaitSchedule
 
 _STUCK_SHARE = 0.05
@@ -29,6 +29,14 @@ _LOOK_EVERY = 16
 
 _LEAST_BAND = 1e-6
 """Errors below this are rounding, m or rad."""
+
+_OF_JOINTS = frozenset(
+    f"{name}.{option.name}"
+    for name, method in METHODS.items()
+    for option in method.options
+    if option.of_joints
+)
+"""Keys of the options that say something of every joint."""
 
 
 class StuckJointWatch:
@@ -250,11 +258,11 @@ def _options_without(
     ones, and names of joints are left to the method if one of them is stuck.
     """
     gone = {name for name, is_stuck in zip(names, stuck, strict=True) if is_stuck}
-    kept: dict[str, Any] = {}
-    for key, value in options.items():
-        if isinstance(value, list) and len(value) == len(names):
-            value = [x for x, is_stuck in zip(value, stuck, strict=True) if not is_stuck]
-        elif isinstance(value, str) and key.endswith(".joints") and gone & set(value.split()):
-            value = ""
-        kept[key] = value
+    kept = dict(options)
+    for key in _OF_JOINTS & kept.keys():
+        value = kept[key]
+        if isinstance(value, str):
+            kept[key] = "" if gone & set(value.split()) else value
+        elif len(value) == len(names):
+            kept[key] = [x for x, is_stuck in zip(value, stuck, strict=True) if not is_stuck]
     return kept

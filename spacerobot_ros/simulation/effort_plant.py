@@ -8,17 +8,16 @@ with its stop (:mod:`spacerobot_ros.simulation.joint_stops`).
 
 from __future__ import annotations
 
-import math
-
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
+from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction, compiled
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.free_flight import repeated, state_slices
+from spacerobot_ros.model.free_flight import state_slices
+from spacerobot_ros.model.integration import repeated, steps_in
 from spacerobot_ros.simulation.initial_state import InitialState
 from spacerobot_ros.simulation.joint_stops import JointStops
 from spacerobot_ros.simulation.plant import Flags
@@ -37,22 +36,13 @@ _DIVERGED = 1e100
 class EffortPlant:
     """A free-flying robot under held joint efforts and a held wrench on its base.
 
-    After :meth:`step`, the attributes are the state that a robot would report:
+    After :meth:`step`, the attributes are the state that a robot would report: those of
+    :class:`Plant`, where ``effort`` is what was realised up to now, without the efforts of stops,
+    and
 
-    ``pose``
-        (7,) position ``r_WB`` in m and quaternion ``R_WB`` (x, y, z, w) of the base link.
-    ``twist``
-        (6,) ``v_WB_B`` in m/s and ``omega_WB_B`` in rad/s.
-    ``q``, ``qdot``
-        (n,) joint positions and velocities.
-    ``effort``, ``wrench``
-        (n,) efforts of the joints' actuators (N or N m), without those of stops, and (6,) force (N)
-        over torque (N m) at the origin of the base link, base components, as realised up to now.
-    ``momentum``
-        (7,) linear momentum (kg m/s), angular momentum about the system's centre of mass
-        (kg m^2/s), both in W, and kinetic energy (J): summed body by body from the state above.
-    ``link_R``, ``link_r``
-        (3, 3 L) and (3, L): pose in B of every link, in the order of ``robot.link_names``.
+    ``wrench``
+        (6,) force (N) over torque (N m) at the origin of the base link, base components, as
+        realised up to now.
 
     Parameters
     ----------
@@ -78,14 +68,11 @@ class EffortPlant:
         initial: InitialState | None = None,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
     ) -> None:
-        for name, value in (("tick period", tick_period), ("integration step", integration_step)):
-            if not (math.isfinite(value) and value > 0):
-                raise ParameterError(f"The {name} must be positive, not {value} s.")
+        substeps = steps_in(tick_period, integration_step)
         self.robot = robot
         self.tick_period = tick_period
         self.initial = initial or InitialState()
         n = robot.n
-        substeps = max(1, math.ceil(tick_period / integration_step - 1e-9))
         self._stops = JointStops(robot, tick_period / substeps)
         self._advance = BufferedFunction(compiled(_tick_function(robot, substeps)))
         self._state, self._command, self._h = self._advance.inputs

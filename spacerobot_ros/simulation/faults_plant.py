@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.simulation.faults import KINDS, WRENCH_AXES, Fault, FaultTimeline, Targets
-from spacerobot_ros.simulation.initial_state import InitialState
-from spacerobot_ros.simulation.plant import Counts, Flags, Plant
+from spacerobot_ros.simulation.plant import Plant, WrappedPlant
 from spacerobot_ros.simulation.thrusters import thrusters_in
 
 _ROUNDING = 1e-6
 """Share of a tick by which the time of a fault may be off by rounding."""
 
 
-class FaultyPlant:
+class FaultyPlant(WrappedPlant):
     """A :class:`Plant` whose actuators have the faults of a timeline.
 
-    Everything a plant reports is that of the plant within, in the same arrays. A tick under no
-    fault costs one comparison more.
+    Everything it reports is that of the plant within, in the same arrays; a reset turns neither
+    time nor faults back. A tick under no fault costs one comparison more.
 
     Bias and noise are added to a joint's command, then a slow joint's is scaled, then a stuck
     joint is held where it is (:meth:`Plant.hold`).
@@ -55,17 +53,12 @@ class FaultyPlant:
         wrench: bool,
         seed: int = 0,
     ) -> None:
-        self.plant = plant
+        super().__init__(plant)
         self._thrusters = thrusters_in(plant)
         nozzles = self._thrusters.table.names if self._thrusters is not None else ()
         self.timeline = FaultTimeline(faults, Targets(plant.robot.joint_names, wrench, nozzles))
         self.tick = 0
-        """Ticks since the beginning; a reset does not turn time back."""
-        self.robot: SpaceRobot = plant.robot
-        self.initial: InitialState = plant.initial
-        self.pose, self.twist, self.q, self.qdot = plant.pose, plant.twist, plant.q, plant.qdot
-        self.effort, self.momentum = plant.effort, plant.momentum
-        self.link_R, self.link_r = plant.link_R, plant.link_r
+        """Ticks since the beginning."""
         self.step: Callable[..., bool] = self._step
         self._tick_period = tick_period
         self._rng = np.random.default_rng(seed)
@@ -86,24 +79,6 @@ class FaultyPlant:
     def active(self) -> tuple[Fault, ...]:
         """The faults that are active now; another tuple whenever they change."""
         return self._seen
-
-    @property
-    def limit_counts(self) -> Mapping[str, Counts]:
-        """Those of the plant within."""
-        return self.plant.limit_counts
-
-    @property
-    def expected_momenta(self) -> Array:
-        """Those of the plant within."""
-        return self.plant.expected_momenta
-
-    def hold(self, joints: Flags) -> None:
-        """Hold joints (n,) of the plant within, until the faults change."""
-        self.plant.hold(joints)
-
-    def reset(self) -> None:
-        """Return to the initial state; time and faults go on."""
-        self.plant.reset()
 
     def inject(self, text: str) -> None:
         """Add faults while the plant runs, one a line; the text ``clear`` repairs everything.

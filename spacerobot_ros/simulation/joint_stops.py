@@ -19,14 +19,12 @@ A joint that is locked where it is (a brake, a jam) is brought to rest by the sa
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.free_flight import state_slices
-
-Flags = npt.NDArray[np.bool_]
+from spacerobot_ros.simulation.plant import Flags
 
 _BISECTIONS = 40
 """They leave 1e-12 of an integration step of the time of arrival."""

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import CommandError
-from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.thrusters import ThrusterTable, load_thrusters, thrusters_of_urdf
-from spacerobot_ros.simulation.plant import Counts, Flags, Plant
+from spacerobot_ros.simulation.plant import Plant, WrappedPlant
 from spacerobot_ros.simulation.thruster_pulses import ThrusterPulses
 
 IN_URDF = "urdf"
@@ -20,7 +19,7 @@ _UNMET = 1e-6
 """Smaller parts of a wrench are not missed, N or N m."""
 
 
-class ThrusterPlant:
+class ThrusterPlant(WrappedPlant):
     """A plant under efforts, its wanted base wrench realised by pulses of thrusters.
 
     Everything of the plant within is as it was; its ledger stays exact because what the thrusters
@@ -64,12 +63,8 @@ class ThrusterPlant:
     def __init__(
         self, plant: Plant, tick_period: float, table: ThrusterTable, excluded: Sequence[str] = ()
     ) -> None:
-        self.plant, self.table = plant, table
-        # Views: the plant within changes them in place.
-        self.robot, self.initial = plant.robot, plant.initial
-        self.pose, self.twist, self.momentum = plant.pose, plant.twist, plant.momentum
-        self.q, self.qdot, self.effort = plant.q, plant.qdot, plant.effort
-        self.link_R, self.link_r = plant.link_R, plant.link_r
+        super().__init__(plant)
+        self.table = table
         self._tick_period = tick_period
         self._pulses = ThrusterPulses(table, tick_period, excluded)
         self._excluded = list(excluded)
@@ -82,16 +77,6 @@ class ThrusterPlant:
         self.unmet, self.unmet_ticks = self._pulses.unmet, 0
         self.thruster_health = np.ones(count)
         self.stuck_on: npt.NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
-
-    @property
-    def limit_counts(self) -> Mapping[str, Counts]:
-        """Ticks in which each joint (n,) was limited, by what limited it."""
-        return self.plant.limit_counts
-
-    @property
-    def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: from the beginning and by the thrusters."""
-        return self.plant.expected_momenta
 
     @property
     def missing(self) -> str:
@@ -109,13 +94,9 @@ class ThrusterPlant:
         self._pulses.exclude(name)
         self._excluded.append(name)
 
-    def hold(self, joints: Flags) -> None:
-        """Hold these joints (n,) where they are from now on, and no others."""
-        self.plant.hold(joints)
-
     def reset(self) -> None:
         """Return to the initial state, thrusters off; what was used and counted goes on."""
-        self.plant.reset()
+        super().reset()
         self._pulses.reset()
         self.wrench[:] = self.duty[:] = self.thrust[:] = 0.0
 
@@ -179,8 +160,7 @@ def with_thrusters(plant: Plant, tick_period: float, source: str, excluded: str 
 
 
 def thrusters_in(plant: Plant) -> ThrusterPlant | None:
-    """Return the thrusters of a plant, which may be wrapped (``plant.plant``); None without."""
-    within: Plant | None = plant
-    while within is not None and not isinstance(within, ThrusterPlant):
-        within = getattr(within, "plant", None)
-    return within
+    """Return the thrusters of a plant, which may be wrapped; None without."""
+    while isinstance(plant, WrappedPlant) and not isinstance(plant, ThrusterPlant):
+        plant = plant.plant
+    return plant if isinstance(plant, ThrusterPlant) else None

@@ -6,8 +6,6 @@ linear and angular momenta are constants of the motion, zero unless the run star
 
 from __future__ import annotations
 
-import math
-
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +14,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction, compiled
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.integration import steps_in
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.simulation.initial_state import InitialState
 from spacerobot_ros.simulation.plant import Flags
@@ -24,21 +23,9 @@ from spacerobot_ros.simulation.plant import Flags
 class VelocityPlant:
     """A free-floating robot whose servos realise held joint velocities.
 
-    After :meth:`step`, the attributes are the state that a robot would report:
-
-    ``pose``
-        (7,) position ``r_WB`` in m and quaternion ``R_WB`` (x, y, z, w) of the base link.
-    ``twist``
-        (6,) ``v_WB_B`` in m/s and ``omega_WB_B`` in rad/s.
-    ``q``, ``qdot``
-        (n,) joint positions, and the velocities held up to now.
-    ``effort``
-        (n,) zero: what the servos need is not modelled.
-    ``momentum``
-        (7,) linear momentum (kg m/s), angular momentum about the system's centre of mass
-        (kg m^2/s), both in W, and kinetic energy (J): summed body by body from the state above.
-    ``link_R``, ``link_r``
-        (3, 3 L) and (3, L): pose in B of every link, in the order of ``robot.link_names``.
+    After :meth:`step`, the attributes are the state that a robot would report: those of
+    :class:`Plant`, where ``qdot`` are the velocities held up to now, and ``effort`` is zero: what
+    the servos need is not modelled.
 
     Parameters
     ----------
@@ -65,12 +52,10 @@ class VelocityPlant:
         initial: InitialState | None = None,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
     ) -> None:
-        if not (math.isfinite(tick_period) and tick_period > 0):
-            raise ParameterError(f"The tick period must be positive, not {tick_period} s.")
+        substeps = steps_in(tick_period, integration_step)
         self.robot = robot
         self.tick_period = tick_period
         self.initial = initial or InitialState()
-        substeps = max(1, math.ceil(tick_period / integration_step - 1e-9))
         self._advance = BufferedFunction(compiled(_tick_function(robot, substeps)))
         inputs, outputs = self._advance.inputs, self._advance.outputs
         self._state, self._command, self._momenta, self._r_cm, self._h = inputs

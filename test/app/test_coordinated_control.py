@@ -17,7 +17,8 @@ from spacerobot_ros.recording import Bag, read_bag
 
 Array = npt.NDArray[np.float64]
 
-LAWS = ("transposed_jacobian", "model_based")
+pytestmark = pytest.mark.usefixtures("own_domain")
+
 GOAL = np.array([0.5, 0.5, np.radians(15.0), 1.5, 1.5])
 # Recomputed at high accuracy with commands that are not held: thruster force in inertial
 # components, thruster torque and joint efforts at t = 0; errors at 5 s, to the digits given.
@@ -78,29 +79,8 @@ class Flight:
         return int(index)
 
 
-@pytest.fixture(autouse=True)
-def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
-
-
-@pytest.fixture(params=LAWS)
-def law(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
-@pytest.fixture(scope="module")
-def flown() -> dict[str, Flight]:
-    """What has been flown: each law flies once, in the domain of the test that asks first."""
-    return {}
-
-
 @pytest.fixture
-def flight(
-    law: str,
-    flown: dict[str, Flight],
-    own_domain: None,
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Flight:
+def flight(law: str, flown: dict[str, Flight], tmp_path_factory: pytest.TempPathFactory) -> Flight:
     if law not in flown:
         flown[law] = fly(tmp_path_factory.mktemp(law) / "run.mcap", law=law)
     return flown[law]

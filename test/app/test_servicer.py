@@ -36,32 +36,14 @@ GAINS: dict[str, dict[str, Any]] = {
         for name, value in (("kp", 1.0), ("kd", 2.0))
     },
 }
-LAWS = tuple(GAINS)
-
-
-@pytest.fixture(autouse=True)
-def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
-
-
-@pytest.fixture(params=LAWS)
-def law(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
-@pytest.fixture(scope="module")
-def flown() -> dict[str, RunResult]:
-    """What has been flown without limits: each law once."""
-    return {}
+pytestmark = pytest.mark.usefixtures("own_domain")
 
 
 @pytest.fixture
 def unlimited(
-    law: str,
-    flown: dict[str, RunResult],
-    own_domain: None,
-    tmp_path_factory: pytest.TempPathFactory,
+    law: str, flown: dict[str, RunResult], tmp_path_factory: pytest.TempPathFactory
 ) -> RunResult:
+    """Return the flight by a law without limits."""
     if law not in flown:
         flown[law] = fly(tmp_path_factory.mktemp(law) / "run.mcap", law)
     return flown[law]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -104,7 +105,7 @@ def test_registry_and_options() -> None:
     robot = load("planar_manipulator")
     for name, law in LAWS.items():
         assert law.name == name
-        options = {option.name: option.default for option in law.options}
+        options: dict[str, Any] = {option.name: option.default for option in law.options}
         built = law(robot, law.default_outputs(robot, END_EFFECTOR), PLANAR_GAINS, **options)
         assert isinstance(built, ControlLaw)
         for option in law.options:

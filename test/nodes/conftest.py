@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 import rclpy
-from support.ros_harness import Harness
+from support.ros_harness import Harness, Probe
 
 
 @pytest.fixture
@@ -15,3 +15,12 @@ def harness(ros_context: rclpy.Context) -> Iterator[Harness]:
     harness = Harness(ros_context)
     yield harness
     harness.close()
+
+
+@pytest.fixture
+def one_plant(harness: Harness) -> Iterator[None]:
+    """Check that a test was not disturbed by another plant in its domain."""
+    yield
+    stranger = Probe({}, context=harness.context, name="stranger")
+    assert stranger.count_publishers("odom") <= 1
+    stranger.destroy_node()

@@ -1,11 +1,10 @@
-"""Byte layouts against rclpy's own serialisation, and against two other readers of CDR."""
+"""Byte layouts against rclpy's own serialisation."""
 
 from __future__ import annotations
 
 import re
 import struct
 from functools import reduce
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -13,23 +12,15 @@ import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.records import Schema
-from mcap_ros2.decoder import DecoderFactory
 from nav_msgs.msg import Odometry, Path
 from rclpy.serialization import deserialize_message, serialize_message
-from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
-from rosidl_parser.definition import (
-    AbstractGenericString,
-    AbstractSequence,
-    Array,
-    BasicType,
-    NamespacedType,
-)
+from rosidl_parser.definition import AbstractSequence, Array, BasicType, NamespacedType
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header, String
+from support.random_messages import few, messages
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -40,9 +31,6 @@ from spacerobot_ros.nodes.cdr import (
     UnreadableError,
     stamp_bytes,
 )
-from spacerobot_ros.nodes.trajectory_message import serialised_trajectory
-from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
-from spacerobot_ros.recording import message_definition
 
 MESSAGES = (
     Clock, DiagnosticArray, DiagnosticStatus, Float64MultiArray, JointState, JointTrajectory,
@@ -53,62 +41,6 @@ FORMATS = {
     "boolean": "?", "octet": "c", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h",
     "uint32": "I", "int32": "i", "uint64": "Q", "int64": "q", "float": "f", "double": "d",
 }  # fmt: skip
-
-TEXTS = ("", "a", "base_link", "µ", "slider_1 ", "Δq > 1 m")
-
-few = settings(
-    derandomize=True,
-    deadline=None,
-    max_examples=25,
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
-)
-
-
-def random_number(rng: np.random.Generator, typename: str) -> Any:
-    if typename == "boolean":
-        return bool(rng.integers(2))
-    if typename == "octet":
-        return rng.bytes(1)
-    if typename == "float":
-        return float(np.float32(rng.normal()))
-    if typename == "double":
-        return float(rng.normal() * 10.0 ** rng.integers(-300, 300))
-    limits = np.iinfo(typename)
-    return int(rng.integers(limits.min, limits.max, endpoint=True, dtype=limits.dtype))
-
-
-def random_field(draw: Any, rng: np.random.Generator, kind: Any, default: Any) -> Any:
-    """Return a random value of a field of a type; what has a length is for hypothesis to choose."""
-    if isinstance(kind, BasicType):
-        return random_number(rng, kind.typename)
-    if isinstance(kind, AbstractGenericString):
-        return draw(st.sampled_from(TEXTS))
-    if isinstance(kind, NamespacedType):
-        return random_message(draw, rng, type(default))
-    assert isinstance(kind, (AbstractSequence, Array))
-    if isinstance(kind, Array):
-        return np.array([random_field(draw, rng, kind.value_type, None) for _ in range(kind.size)])
-    count = draw(st.integers(0, 3))
-    inner = kind.value_type
-    if not isinstance(inner, NamespacedType):
-        return [random_field(draw, rng, inner, None) for _ in range(count)]
-    element = getattr(import_module(".".join(inner.namespaces)), inner.name)
-    return [random_message(draw, rng, element) for _ in range(count)]
-
-
-def random_message(draw: Any, rng: np.random.Generator, message_type: Any) -> Any:
-    """Return a message with a random value in every field."""
-    message = message_type()
-    for name, kind in zip(
-        message.get_fields_and_field_types(), message_type.SLOT_TYPES, strict=True
-    ):
-        setattr(message, name, random_field(draw, rng, kind, getattr(message, name)))
-    return message
-
-
-@st.composite
-def messages(draw: Any, message_type: Any) -> Any:
-    return random_message(draw, np.random.default_rng(draw(st.integers(0, 999))), message_type)
 
 
 def scalars(value: Any, kind: Any, path: str) -> list[tuple[str, str, Any]]:
@@ -237,6 +169,7 @@ def test_what_a_template_has_given_out_does_not_change() -> None:
 
 # -- reading ----------------------------------------------------------------------------------
 
+
 QUANTITIES = ("position", "velocity", "effort")
 
 
@@ -340,85 +273,3 @@ def test_a_reader_refuses_what_is_no_message() -> None:
     message = JointState(name=["a"], position=[1.0], velocity=[2.0], effort=[0.0])
     reader.accept(serialize_message(message))
     check_reads(reader, message)
-
-
-# -- schedules --------------------------------------------------------------------------------
-
-
-@st.composite
-def schedules(draw: Any) -> GaitSchedule:
-    names = draw(st.lists(st.text("abcdefghij", min_size=1, max_size=9), min_size=1, max_size=5))
-    ticks = draw(st.integers(0, 7))
-    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    return schedule_of(
-        tuple(names), rng.normal(size=(ticks + 1, len(names))), draw(st.sampled_from([0.05, 0.7]))
-    )
-
-
-def schedule_of(names: tuple[str, ...], positions: Any, period: float) -> GaitSchedule:
-    still = Goal(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
-    path = BasePath(np.zeros(1), np.zeros((1, 3)), still.quaternion[np.newaxis])
-    return GaitSchedule("test", names, period, positions, path, still)
-
-
-def check_trajectory(message: Any, schedule: GaitSchedule, stamp_ns: int, frame: str) -> None:
-    """Check a decoded trajectory, whoever has decoded it, against the schedule."""
-    assert message.header.frame_id == frame
-    assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp_ns
-    assert tuple(message.joint_names) == schedule.joint_names
-    assert len(message.points) == len(schedule.positions)
-    period_ns = round(schedule.tick_period * 1e9)
-    for k, point in enumerate(message.points):
-        np.testing.assert_array_equal(point.positions, schedule.positions[k])
-        held = np.zeros(len(schedule.joint_names))
-        if k < schedule.ticks:
-            held = (schedule.positions[k + 1] - schedule.positions[k]) / schedule.tick_period
-        np.testing.assert_array_equal(point.velocities, held)
-        assert len(point.accelerations) == len(point.effort) == 0
-        since = point.time_from_start
-        assert since.sec * 10**9 + since.nanosec == k * period_ns
-        assert 0 <= since.nanosec < 10**9
-
-
-THREE = schedule_of(("slider_1", "slider_2", "slider_3"), np.arange(12.0).reshape(4, 3), 0.05)
-
-
-@settings(few, max_examples=80)
-@given(schedules(), st.integers(0, 2**31 * 10**9 - 1), st.text("lmnop", max_size=9))
-@example(THREE, 0, "base_link")
-@example(THREE, 3, "base")
-def test_a_schedule_is_serialised_as_rclpy_would(
-    schedule: GaitSchedule, stamp_ns: int, frame: str
-) -> None:
-    raw = serialised_trajectory(schedule, stamp_ns, frame)
-    message = deserialize_message(raw, JointTrajectory)
-    check_trajectory(message, schedule, stamp_ns, frame)
-
-
-@few
-@given(schedules(), st.integers(0, 2**31 * 10**9 - 1), st.text("lmnop", max_size=9))
-@example(THREE, 0, "base_link")
-def test_other_readers_take_a_serialised_schedule(
-    schedule: GaitSchedule, stamp_ns: int, frame: str
-) -> None:
-    raw = serialised_trajectory(schedule, stamp_ns, frame)
-    kind = "trajectory_msgs/msg/JointTrajectory"
-    by_rosbags = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(raw, kind)
-    check_trajectory(by_rosbags, schedule, stamp_ns, frame)
-    schema = Schema(id=1, name=kind, encoding="ros2msg", data=message_definition(kind).encode())
-    decode = DecoderFactory().decoder_for("cdr", schema)
-    assert decode is not None
-    check_trajectory(decode(raw), schedule, stamp_ns, frame)
-
-
-def test_a_long_schedule_is_whole() -> None:
-    # The gait of paper 1 has 98,001 points.
-    rng = np.random.default_rng(4)
-    schedule = schedule_of(("slider_1", "slider_2", "slider_3"), rng.normal(size=(98_001, 3)), 0.05)
-    raw = serialised_trajectory(schedule, 50_000_000, "base_link")
-    kind = "trajectory_msgs/msg/JointTrajectory"
-    message: Any = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(raw, kind)
-    assert len(message.points) == 98_001
-    np.testing.assert_array_equal([p.positions for p in message.points], schedule.positions)
-    last = message.points[-1].time_from_start
-    assert (last.sec, last.nanosec) == (4900, 0)

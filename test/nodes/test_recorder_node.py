@@ -2,162 +2,26 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
-from geometry_msgs.msg import PoseStamped
 from mcap.reader import make_reader
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import Log
 from rclpy.lifecycle import TransitionCallbackReturn
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
-from support.ros_harness import (
-    LATCHED,
-    Harness,
-    Probe,
-    assert_one_sentence,
-    construction,
-    nanoseconds,
-)
+from support.planner_flight import PLANNER
+from support.recorded_stack import LATCHED_TOPICS, PLANT, STREAMS, BagContent, Stack
+from support.ros_harness import LATCHED, Harness, nanoseconds
 
 from spacerobot_ros import __version__
-from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.nodes import PlannerNode, PlantNode, RecorderNode
+from spacerobot_ros.nodes import PlantNode, RecorderNode
 from spacerobot_ros.nodes.recorder import parameters_of
-from spacerobot_ros.recording import BagWriter, RecordingError
 
 URDF = Path(__file__).parents[2] / "urdf" / "sliding_masses.urdf"
-
-PLANT = {
-    "robot": "sliding_masses",
-    "time_mode": "lockstep",
-    "tick_rate": 20.0,
-    "marker_period": 0.5,
-    "diagnostics_period": 0.5,
-}
-PLANNER = {
-    "robot": "sliding_masses",
-    "tick_rate": 20.0,
-    "lie_bracket.t1": 2.0,
-    "lie_bracket.n1": 1,
-    "lie_bracket.cycle_period": 1.0,
-}
-LATCHED_TOPICS = ("/robot_description", "/gait_schedule", "/planned_path", "/planner/status")
-STREAMS = (
-    "/clock", "/odom", "/base_pose", "/joint_states", "/joint_commands", "/momentum", "/markers",
-    "/diagnostics", "/goal_pose",
-)  # fmt: skip
-ERROR = 40  # of rcl_interfaces/msg/Log
-
-
-def message_class(type_name: str) -> Any:
-    package, _, name = type_name.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), name)
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """One message of a bag: its times in ns, and what it says."""
-
-    log_ns: int
-    publish_ns: int
-    message: Any
-
-
-class BagContent:
-    """A bag, read with nothing of this package."""
-
-    def __init__(self, path: Path) -> None:
-        self.by_topic: dict[str, list[Recorded]] = {}
-        self.log_times: list[int] = []
-        with path.open("rb") as file:
-            reader = make_reader(file)
-            for schema, channel, record in reader.iter_messages(log_time_order=False):
-                assert schema is not None
-                message = deserialize_message(record.data, message_class(schema.name))
-                entry = Recorded(record.log_time, record.publish_time, message)
-                self.by_topic.setdefault(channel.topic, []).append(entry)
-                self.log_times.append(record.log_time)
-            self.metadata = {m.name: dict(m.metadata) for m in reader.iter_metadata()}
-            self.attachments = {a.name: (a.media_type, a.data) for a in reader.iter_attachments()}
-
-    def __getitem__(self, topic: str) -> list[Any]:
-        return [entry.message for entry in self.by_topic.get(topic, [])]
-
-    @property
-    def count(self) -> int:
-        return len(self.log_times)
-
-
-class Stack:
-    """A plant, a planner, a recorder and a probe that listens to whatever is recorded."""
-
-    def __init__(self, harness: Harness, bag: Path, **recorder: Any) -> None:
-        self.harness, self.bag = harness, bag
-        self.plant = harness.make(PlantNode, PLANT, autostart=False)
-        self.planner = harness.make(PlannerNode, PLANNER, autostart=False)
-        self.probe: Probe = harness.probe({"/rosout": Log})
-        self.goals = self.probe.create_publisher(PoseStamped, "goal_pose", 10)
-        for node in (self.plant, self.planner):
-            assert node.trigger_configure() is TransitionCallbackReturn.SUCCESS
-        self.recorder = harness.make(RecorderNode, {"bag": str(bag), **recorder}, autostart=False)
-
-    def configure(self, *topics: str) -> None:
-        """Open the bag, and wait until these are listened to by the recorder and by the probe."""
-        assert self.recorder.trigger_configure() is TransitionCallbackReturn.SUCCESS
-        self.await_topics(*topics)
-        types = dict(self.probe.get_topic_names_and_types())
-        for topic in self.recorder.topics:
-            latched = topic in LATCHED_TOPICS
-            self.probe.watch(topic, message_class(types[topic][0]), latched=latched)
-        self.harness.connect()
-
-    def await_topics(self, *topics: str) -> None:
-        self.harness.spin_until(
-            lambda: set(topics) <= self.recorder.topics, f"subscriptions of {topics}"
-        )
-
-    def fly(self, x: float = 0.05) -> None:
-        """Fly to a goal, and let everything arrive that is on its way."""
-        if not self.planner.is_active:
-            assert self.planner.trigger_activate() is TransitionCallbackReturn.SUCCESS
-        goal = PoseStamped()
-        goal.header.frame_id = "world"
-        goal.pose.position.x, goal.pose.orientation.w = x, 1.0
-        self.goals.publish(goal)
-        if not self.plant.is_active:
-            assert self.plant.trigger_activate() is TransitionCallbackReturn.SUCCESS
-        heard = self.probe.count("/planner/status")
-        self.harness.spin_until(
-            lambda: any(
-                value.value in ("reached", "failed", "refused")
-                for status in self.probe.messages["/planner/status"][heard:]
-                for value in status.values
-                if value.key == "state"
-            ),
-            "the goal is decided",
-        )
-        assert "met" in self.probe.last("/planner/status").message
-
-    def stop(self) -> None:
-        """Stop time, and let everything arrive that is on its way."""
-        self.plant.trigger_deactivate()
-        self.harness.settle(self.probe)
-
-    def close_bag(self) -> BagContent:
-        if self.recorder.is_active:
-            self.recorder.trigger_deactivate()
-        assert self.recorder.trigger_cleanup() is TransitionCallbackReturn.SUCCESS
-        return BagContent(self.bag)
 
 
 @pytest.fixture
@@ -387,73 +251,6 @@ def test_a_recorder_that_is_up_before_the_plant_keeps_one_time(
     # What comes before the first clock message has that one's time, and not wall time.
     assert max(content.log_times) <= plant.time_ns
     assert content.log_times == sorted(content.log_times)
-
-
-# -- what goes wrong --------------------------------------------------------------------------
-
-
-def errors(probe: Probe) -> list[str]:
-    return [m.msg for m in probe.messages["/rosout"] if m.level >= ERROR]
-
-
-def test_a_full_disk_ends_the_recording_with_one_sentence_and_not_the_flight(
-    harness: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole, room = BagWriter.write, 100
-
-    def write(self: BagWriter, *message: Any) -> None:
-        nonlocal room
-        room -= 1
-        if room < 0:
-            raise RecordingError(f"The bag {self.path} cannot be written: no space left.")
-        whole(self, *message)
-
-    monkeypatch.setattr(BagWriter, "write", write)
-    stack = Stack(harness, tmp_path / "flight.mcap")
-    stack.configure(*STREAMS, *LATCHED_TOPICS)
-    stack.recorder.trigger_activate()
-    for x in (0.05, 0.0, 0.05):
-        stack.fly(x)
-    stack.stop()
-    (sentence,) = errors(stack.probe)
-    assert_one_sentence(sentence, "Recording has ended", str(stack.bag), "no space left")
-    assert str(stack.recorder.failure) in sentence
-    assert stack.recorder.messages_recorded == 100
-    assert stack.recorder.trigger_shutdown() is TransitionCallbackReturn.SUCCESS
-    assert BagContent(stack.bag).count == 100
-
-
-def test_a_device_without_room_is_refused_in_a_sentence(harness: Harness) -> None:
-    stack = Stack(harness, Path("/dev/full"))
-    assert stack.recorder.trigger_configure() is not TransitionCallbackReturn.SUCCESS
-    assert_one_sentence(str(stack.recorder.fault), "/dev/full", "space")
-    stack.probe.watch("/planner/status", message_class("diagnostic_msgs/msg/DiagnosticStatus"))
-    harness.connect()
-    stack.fly()
-
-
-def test_a_bag_that_cannot_be_made_is_refused_in_a_sentence(
-    ros_context: rclpy.Context, tmp_path: Path
-) -> None:
-    (tmp_path / "file").touch()
-    for bag in (tmp_path, tmp_path / "file" / "flight.mcap"):
-        with pytest.raises(SpaceRobotError) as refusal:
-            RecorderNode(**construction(ros_context, {"bag": str(bag)}))
-        assert_one_sentence(str(refusal.value), str(bag))
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("compression", "zip"), ("flush_period", 0.0), ("flush_period", "often"), ("topics", 3)],
-)
-def test_a_bad_parameter_is_refused_with_a_sentence_that_names_it(
-    ros_context: rclpy.Context, tmp_path: Path, name: str, value: Any
-) -> None:
-    parameters = {"bag": str(tmp_path / "flight.mcap"), name: value}
-    with pytest.raises(SpaceRobotError) as refusal:
-        RecorderNode(**construction(ros_context, parameters))
-    assert_one_sentence(str(refusal.value), f"'{name}'", str(value))
-    assert not (tmp_path / "flight.mcap").exists()
 
 
 def test_a_recording_in_a_namespace_has_the_topics_of_it(harness: Harness, tmp_path: Path) -> None:

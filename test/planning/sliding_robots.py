@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from support.urdf_text import link, numbers
 
 Array = npt.NDArray[np.float64]
 
@@ -37,13 +38,13 @@ class SlidingRobot:
     @property
     def urdf(self) -> str:
         """The robot as URDF; joints ``s1``, ``s2``, ... in the order of the sliders."""
-        parts = [_link("base_link", self.mass, self.inertia, self.centre)]
+        parts = [link("base_link", self.mass, self.inertia, self.centre)]
         for k, s in enumerate(self.sliders, start=1):
-            parts.append(_link(f"m{k}", s.mass, s.inertia, np.zeros(3)))
+            parts.append(link(f"m{k}", s.mass, s.inertia, np.zeros(3)))
             parts.append(
                 f'<joint name="s{k}" type="prismatic"><parent link="base_link"/>'
-                f'<child link="m{k}"/><origin xyz="{_numbers(s.point)}"/>'
-                f'<axis xyz="{_numbers(s.direction)}"/><limit lower="{s.stroke[0]!r}" '
+                f'<child link="m{k}"/><origin xyz="{numbers(s.point)}"/>'
+                f'<axis xyz="{numbers(s.direction)}"/><limit lower="{s.stroke[0]!r}" '
                 f'upper="{s.stroke[1]!r}" velocity="{s.rate!r}" effort="50"/></joint>'
             )
         return f'<robot name="sliders">{"".join(parts)}</robot>'
@@ -148,17 +149,3 @@ def _random_inertia(rng: np.random.Generator, low: float, high: float) -> Array:
 def _parallel(d: Array) -> Array:
     square = np.sum(d * d, axis=-1)[..., np.newaxis, np.newaxis]
     return square * np.eye(3) - d[..., :, np.newaxis] * d[..., np.newaxis, :]
-
-
-def _link(name: str, mass: float, inertia: Array, centre: Array) -> str:
-    moments = " ".join(
-        f'i{"xyz"[i]}{"xyz"[j]}="{inertia[i, j]:.17g}"' for i in range(3) for j in range(i, 3)
-    )
-    return (
-        f'<link name="{name}"><inertial><origin xyz="{_numbers(centre)}"/><mass value="{mass!r}"/>'
-        f"<inertia {moments}/></inertial></link>"
-    )
-
-
-def _numbers(values: npt.ArrayLike) -> str:
-    return " ".join(f"{value:.17g}" for value in np.asarray(values))

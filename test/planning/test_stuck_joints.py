@@ -169,6 +169,43 @@ def test_an_arm_turns_its_base_without_its_elbow(options: dict[str, Any]) -> Non
     assert "attitude" in method.controls
 
 
+def test_options_of_joints_are_those_of_the_joints_that_are_left() -> None:
+    """Three joints, and directions of three numbers: only what is of joints gets shorter."""
+    start = np.array([0.1, -0.7, 1.5])
+    speeds = np.array([0.5, 0.02, 0.3])
+    method = RemainingJointsGait(
+        robot_of(ARM),
+        TICK,
+        Tolerance(1e-3, 1e-3),
+        stuck=["shoulder_yaw"],
+        method="optimal",
+        options={
+            "optimal.base_attitude": 0,
+            "optimal.base_position": 2,
+            "optimal.max_velocity": speeds.tolist(),
+            "optimal.keep_axis": [1.0, 0.0, 0.0],
+            "optimal.keep_direction": [0.0, 0.0, 1.0],
+            "optimal.keep_angle": 0.5,
+            "optimal.starts": 2,
+            "optimal.answers": 1,
+            "optimal.intervals": 20,
+            "optimal.cache": 0,
+        },
+    )
+    wanted = start + np.array([0.0, 0.05, -0.2])
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), start)
+    schedule = method.plan(state, Goal(np.zeros(3), state.quaternion, wanted))
+    assert schedule.method == "optimal"
+    np.testing.assert_allclose(schedule.positions[-1], wanted, atol=1e-6)
+    fastest = np.abs(schedule.velocities).max(axis=0)
+    assert fastest[0] == 0.0
+    assert np.all(fastest <= speeds * (1 + 1e-6))
+    # The slow joint is the one that takes all its speed.
+    assert fastest[1] > 0.9 * speeds[1]
+    axis = Rotation.from_quat(schedule.path.quaternion).as_matrix()[:, :, 0]
+    assert np.arccos(axis[:, 2]).min() >= 0.5
+
+
 def test_joints_that_do_not_suffice_are_refused_with_the_reason() -> None:
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, -0.7, 1.5]))
     goal = Goal(np.zeros(3), Rotation.from_rotvec([0.05, 0.0, 0.0]).as_quat())

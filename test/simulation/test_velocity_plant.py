@@ -1,81 +1,19 @@
-"""The plant under held joint velocities: conservation, another integration, limits, refusals."""
+"""The plant under held joint velocities: conservation, another integration, start and reset."""
 
 from __future__ import annotations
 
-from functools import cache
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
-import pinocchio as pin
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
-from support.oracles import PinocchioOracle
-from support.random_robots import random_robot_urdf
+from support.velocity_flights import RATE, STROKE, TICK, URDF, Case, sliding_masses
 
-from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import c_compiler
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 
 Array = npt.NDArray[np.float64]
-
-URDF = Path(__file__).parents[2] / "urdf"
-TICK = 0.05
-RATE, STROKE = 2.0, 3.0  # of the joints of random robots
-
-
-@cache
-def robot_of(urdf: str) -> SpaceRobot:
-    """Return the model of a robot, built once: that takes longer than a flight."""
-    return SpaceRobot.from_urdf(urdf)
-
-
-class Case:
-    """A random robot in a random state, and the engine that watches it."""
-
-    def __init__(self, seed: int, *, momentum: bool) -> None:
-        self.rng = rng = np.random.default_rng(seed)
-        self.urdf = random_robot_urdf(rng, int(rng.integers(3, 7)))
-        self.robot = robot_of(self.urdf)
-        self.oracle = PinocchioOracle(self.urdf, self.robot.joint_names)
-        n = self.robot.n
-        quaternion = rng.normal(size=4)
-        self.initial = InitialState(
-            position=rng.uniform(-2.0, 2.0, 3),
-            quaternion=quaternion / np.linalg.norm(quaternion),
-            # Not far from the ends of the strokes.
-            joint_positions=rng.uniform(2.0, 2.9, n) * rng.choice([-1.0, 1.0], n),
-            linear_momentum=rng.normal(size=3) if momentum else np.zeros(3),
-            angular_momentum=rng.normal(size=3) if momentum else np.zeros(3),
-        )
-
-    def plant(self, **options: Any) -> VelocityPlant:
-        return VelocityPlant(self.robot, TICK, self.initial, **options)
-
-    def command(self) -> Array:
-        """Return random rates, many of them more than a joint can do."""
-        return self.rng.uniform(-1.3 * RATE, 1.3 * RATE, self.robot.n)
-
-    def body_momenta(self, plant: VelocityPlant) -> tuple[Array, Array]:
-        """Return linear and angular momentum of every body (L, 3), world, the latter about the
-        system's centre of mass.
-        """
-        oracle = self.oracle
-        oracle.set_configuration(plant.q, plant.pose[3:], plant.pose[:3])
-        u = oracle.base_velocities(plant.twist) + oracle.joint_velocities(plant.qdot)
-        pin.forwardKinematics(oracle.model, oracle.data, oracle.q, u)
-        r_cm = oracle.center_of_mass_W()
-        linear, angular = [], []
-        for index in range(1, oracle.model.njoints):
-            own = oracle.model.inertias[index] * oracle.data.v[index]
-            about_origin = oracle.data.oMi[index].act(own)
-            linear.append(np.array(about_origin.linear))
-            angular.append(about_origin.angular - np.cross(r_cm, about_origin.linear))
-        return np.array(linear), np.array(angular)
-
 
 SEEDS = range(4)
 
@@ -231,62 +169,6 @@ def test_a_body_without_joints_tumbles_as_euler_says() -> None:
         assert plant.momentum[6] == pytest.approx(energy, rel=1e-8)
 
 
-# -- limits -----------------------------------------------------------------------------------
-
-
-def sliding_masses(**initial: Any) -> VelocityPlant:
-    """Return three sliders of 0.7 m/s and 2.5 m either way."""
-    robot = robot_of((URDF / "sliding_masses.urdf").read_text("utf-8"))
-    return VelocityPlant(robot, TICK, InitialState(**initial))
-
-
-def test_a_rate_is_clipped_and_counted_once_a_tick() -> None:
-    plant = sliding_masses()
-    assert plant.step(np.array([0.70001, -0.7, 5.0]))
-    np.testing.assert_array_equal(plant.qdot, [0.7, -0.7, 0.7])
-    np.testing.assert_allclose(plant.q, [0.035, -0.035, 0.035])
-    assert not plant.step(np.array([0.7, 0.0, -0.7]))
-    assert plant.step(np.array([0.0, 0.0, -np.inf]))
-    np.testing.assert_array_equal(plant.velocity_limited, [1, 0, 2])
-    np.testing.assert_array_equal(plant.stroke_limited, [0, 0, 0])
-
-
-def test_a_joint_stops_at_the_end_of_its_stroke_and_comes_back() -> None:
-    plant = sliding_masses(joint_positions=np.array([2.49, -2.5, 0.0]))
-    assert plant.step(np.array([0.7, -0.3, 0.7]))
-    np.testing.assert_allclose(plant.qdot, [0.2, 0.0, 0.7], atol=1e-12)
-    np.testing.assert_allclose(plant.q, [2.5, -2.5, 0.035], rtol=1e-15)
-    np.testing.assert_array_equal(plant.stroke_limited, [1, 1, 0])
-    np.testing.assert_array_equal(plant.velocity_limited, [0, 0, 0])
-    # Too fast and too far at once counts as both.
-    assert plant.step(np.array([1.0, 0.3, 0.0]))
-    np.testing.assert_array_equal(plant.stroke_limited, [2, 1, 0])
-    np.testing.assert_array_equal(plant.velocity_limited, [1, 0, 0])
-    assert plant.qdot[0] == pytest.approx(0.0, abs=1e-12)
-    assert not plant.step(np.array([-0.7, 0.3, 0.0]))
-    np.testing.assert_allclose(plant.q, [2.465, -2.47, 0.035], rtol=1e-14)
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_no_joint_ever_leaves_its_limits(seed: int) -> None:
-    case = Case(seed, momentum=False)
-    plant = case.plant()
-    kinds = [j.kind.value for j in case.robot.description.movable_joints]
-    free = np.array([kind == "continuous" for kind in kinds])
-    push = RATE * np.sign(case.command())
-    for tick in range(200):
-        before = plant.q.copy()
-        plant.step(1.2 * push if tick % 2 else push)
-        assert np.all(np.abs(plant.qdot) <= RATE)
-        assert np.all((np.abs(plant.q) <= STROKE + 1e-14) | free)
-        np.testing.assert_allclose(plant.q, before + TICK * plant.qdot, atol=1e-12)
-    np.testing.assert_allclose(plant.q[~free], (STROKE * np.sign(push))[~free], atol=1e-12)
-    assert np.all(np.abs(plant.q[free]) > STROKE)
-    np.testing.assert_array_equal(plant.velocity_limited, 100)
-    assert np.all(plant.stroke_limited[~free] > 0)
-    assert np.all(plant.stroke_limited[free] == 0)
-
-
 # -- start and reset --------------------------------------------------------------------------
 
 
@@ -362,40 +244,3 @@ def test_compiled_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
             (interpreted.momentum, compiled.momentum),
         ):
             np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
-
-
-# -- refusals ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("period", [0.0, -0.05, np.nan, np.inf])
-def test_a_bad_tick_period_is_refused(period: float) -> None:
-    robot = robot_of((URDF / "sliding_masses.urdf").read_text("utf-8"))
-    with pytest.raises(ParameterError, match="tick period"):
-        VelocityPlant(robot, period)
-
-
-@pytest.mark.parametrize(
-    ("initial", "mentions"),
-    [
-        ({"joint_positions": [0.0, 0.0]}, ["2 numbers", "slider_1, slider_2, slider_3"]),
-        ({"joint_positions": [0.0] * 4}, ["4 numbers", "3 joints"]),
-        ({"joint_positions": [0.0, 2.6, 0.0]}, ["'slider_2'", "2.6", "[-2.5, 2.5]"]),
-        ({"joint_positions": [0.0, 0.0, -2.51]}, ["'slider_3'", "-2.51"]),
-        ({"joint_positions": [np.nan, 0.0, 0.0]}, ["joint positions", "nan"]),
-        ({"quaternion": [0.0] * 4}, ["orientation"]),
-        ({"quaternion": [0.0, np.nan, 0.0, 1.0]}, ["orientation"]),
-        ({"position": [0.0, np.inf, 0.0]}, ["position"]),
-        ({"linear_momentum": [np.nan, 0.0, 0.0]}, ["moment"]),
-        ({"angular_momentum": [0.0, 0.0, np.inf]}, ["moment"]),
-    ],
-)
-def test_a_bad_initial_state_is_refused(
-    initial: dict[str, list[float]], mentions: list[str]
-) -> None:
-    with pytest.raises(ParameterError) as refusal:
-        sliding_masses(**{name: np.array(value) for name, value in initial.items()})
-    text = str(refusal.value)
-    assert text.endswith(".")
-    assert "\n" not in text
-    for mention in mentions:
-        assert mention in text

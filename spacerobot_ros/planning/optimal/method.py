@@ -10,30 +10,28 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.options import Option
 from spacerobot_ros.planning.goal import Goal, PoseError, RobotState, Tolerance
-from spacerobot_ros.planning.method import GaitMethod, Option
+from spacerobot_ros.planning.method import GaitMethod
 from spacerobot_ros.planning.optimal.constraints import PathConstraints
 from spacerobot_ros.planning.optimal.limits import MotionLimits, per_joint
 from spacerobot_ros.planning.optimal.plan_cache import PlanCache, plan_key
 from spacerobot_ros.planning.optimal.search import Effort, Found, ManoeuvreSearch
 from spacerobot_ros.planning.optimal.wishes import Wishes
 from spacerobot_ros.planning.prediction import BasePrediction
-from spacerobot_ros.planning.schedule import BasePath, GaitSchedule
+from spacerobot_ros.planning.schedule import BasePath, GaitSchedule, Notes
 
 _CORRECTION_INTERVALS = 40
 
 _NOTHING_LEFT = 1e-10
 """A goal this near, rad, m and joint coordinates, is where the robot is."""
-
-Notes = dict[str, list[float] | float | str]
 
 
 class OptimalGait(GaitMethod):
@@ -46,10 +44,28 @@ class OptimalGait(GaitMethod):
     name: ClassVar[str] = "optimal"
     options: ClassVar[tuple[Option, ...]] = (
         Option("duration", 0.0, "s", "0: as fast as possible; else least effort in this time"),
-        Option("max_velocity", [], "m/s or rad/s", "of every joint, below the URDF's; []: those"),
-        Option("max_acceleration", [], "m/s^2 or rad/s^2", "of every joint; []: by ramp_time"),
+        Option(
+            "max_velocity",
+            [],
+            "m/s or rad/s",
+            "of every joint, below the URDF's; []: those",
+            of_joints=True,
+        ),
+        Option(
+            "max_acceleration",
+            [],
+            "m/s^2 or rad/s^2",
+            "of every joint; []: by ramp_time",
+            of_joints=True,
+        ),
         Option("ramp_time", 0.5, "s", "from rest to full speed, without max_acceleration", 1e-6),
-        Option("joint_margin", [], "m or rad", "of every joint to its stops; not in corrections"),
+        Option(
+            "joint_margin",
+            [],
+            "m or rad",
+            "of every joint to its stops; not in corrections",
+            of_joints=True,
+        ),
         Option("base_position", 0, "", "0: met if sliders can, 1: met, 2: ignored", 0, 2),
         Option("base_attitude", 1, "", "1: met, 0: ignored", 0, 1),
         Option("final_shape", 0, "", "without one in the goal: 0: any, 1: the present one", 0, 1),
@@ -68,20 +84,8 @@ class OptimalGait(GaitMethod):
         Option("cache", 1, "", "1: manoeuvres are kept on disk", 0, 1),
     )
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        tick_period: float,
-        tolerance: Tolerance,
-        integration_step: float = DEFAULT_INTEGRATION_STEP,
-        **options: Any,
-    ) -> None:
-        super().__init__(robot, tick_period, tolerance, integration_step)
-        unknown = sorted(set(options) - {option.name for option in self.options})
-        if unknown:
-            raise ParameterError(f"optimal has no option '{unknown[0]}'.")
-        chosen = {option.name: option.default for option in self.options} | options
-        self._options = chosen
+    def _prepare(self) -> None:
+        robot, chosen = self.robot, self._settings
         self._wishes = Wishes.of(
             robot, chosen["base_position"], chosen["base_attitude"], chosen["final_shape"]
         )
@@ -98,9 +102,9 @@ class OptimalGait(GaitMethod):
             chosen["keep_angle"],
             chosen["keep_out"],
         )
-        self._prediction = BasePrediction(robot, tick_period, integration_step)
+        self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)
         self._search = ManoeuvreSearch(
-            robot, self._prediction, tick_period, self._wishes.axes, self._constraints
+            robot, self._prediction, self.tick_period, self._wishes.axes, self._constraints
         )
         self._cache = PlanCache() if chosen["cache"] else None
 
@@ -143,11 +147,11 @@ class OptimalGait(GaitMethod):
         return schedule
 
     def _intervals(self, correction: bool) -> int:
-        intervals = int(self._options["intervals"])
+        intervals = int(self._settings["intervals"])
         return min(intervals, _CORRECTION_INTERVALS) if correction else intervals
 
     def _effort(self, correction: bool) -> Effort:
-        chosen = self._options
+        chosen = self._settings
         return Effort(
             duration=0.0 if correction else chosen["duration"],
             longest=chosen["longest"],
@@ -167,21 +171,14 @@ class OptimalGait(GaitMethod):
     ) -> GaitSchedule:
         path = self._prediction.path(state, positions)
         left = PoseError.between(path.position[-1], path.quaternion[-1], goal)
-        return GaitSchedule(
-            method=self.name,
-            joint_names=self.robot.joint_names,
-            tick_period=self.tick_period,
-            positions=positions,
-            path=path,
-            goal=goal,
-            notes={
-                **notes,
-                "final_shape": positions[-1].tolist(),
-                "final_position": path.position[-1].tolist(),
-                "predicted_attitude_error": left.angle,
-                "predicted_position_error": left.distance,
-            },
-        )
+        notes = {
+            **notes,
+            "final_shape": positions[-1].tolist(),
+            "final_position": path.position[-1].tolist(),
+            "predicted_attitude_error": left.angle,
+            "predicted_position_error": left.distance,
+        }
+        return self._schedule_of(goal, positions, path, notes)
 
     def _key(self, state: RobotState, goal: Goal) -> str:
         shape = goal.joint_positions
@@ -193,25 +190,16 @@ class OptimalGait(GaitMethod):
             "tolerance": np.array([self.tolerance.position, self.tolerance.attitude]),
             **vars(self._limits),
         }
-        return plan_key(self.robot, numbers, self._options)
+        return plan_key(self.robot, numbers, self._settings)
 
     def _kept(self, goal: Goal, kept: Mapping[str, Array]) -> GaitSchedule:
-        return GaitSchedule(
-            method=self.name,
-            joint_names=self.robot.joint_names,
-            tick_period=self.tick_period,
-            positions=kept["positions"],
-            path=BasePath(*(kept[f"path_{part}"] for part in _PATH)),
-            goal=goal,
-            notes={
-                **{
-                    name[len(_NOTE) :]: value.tolist()
-                    for name, value in kept.items()
-                    if name.startswith(_NOTE)
-                },
-                "from_cache": 1.0,
-            },
-        )
+        path = BasePath(*(kept[f"path_{part}"] for part in _PATH))
+        notes: Notes = {
+            name.removeprefix(_NOTE): value.tolist()
+            for name, value in kept.items()
+            if name.startswith(_NOTE)
+        }
+        return self._schedule_of(goal, kept["positions"], path, {**notes, "from_cache": 1.0})
 
 
 _PATH = ("time", "position", "quaternion")

@@ -1,0 +1,104 @@
+"""The coordinated-control node while measurements of the base are missing, and after."""
+
+from __future__ import annotations
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from support.control_loop import KP, STATUS, TICK_NS, Loop, pose
+from support.ros_harness import Harness, assert_one_sentence, nanoseconds
+
+
+def test_without_odom_the_base_is_estimated_and_then_the_thrusters_are_off(
+    harness: Harness,
+) -> None:
+    loop = Loop(harness, estimation_time=0.05)
+    loop.aim(base=pose([1.0, 0.0, 0.0]))
+    measured = loop.answer()[0]
+    loop.wait_for("tracking")
+    # The first state without odom is known to be one when the next joints come; those are answered
+    # at once, and so are all that follow.
+    loop.show(odom=False)
+    for _ in range(4):
+        wrench, _ = loop.answer(odom=False)
+        assert nanoseconds(loop.probe.last("base_wrench").header.stamp) == loop.tick * TICK_NS
+        # Hardly anything moves in five ticks, nor does the command.
+        np.testing.assert_allclose(wrench, measured, atol=0.15 * np.abs(measured).max())
+        assert wrench[0] < measured[0]
+        status = loop.wait_for("estimating")
+        assert status.level == DiagnosticStatus.WARN
+    loop.rates = np.array([0.1, -0.2])
+    loop.show(odom=False)
+    harness.spin_until(lambda: loop.status["state"] == "stopped", "the stop")
+    assert loop.probe.last(STATUS).level == DiagnosticStatus.ERROR
+    for _ in range(3):
+        wrench, effort = loop.answer(odom=False)
+        np.testing.assert_array_equal(wrench, np.zeros(6))
+    # The joints are slowed: their efforts take energy out of them.
+    assert effort @ loop.rates < 0.0
+    assert_one_sentence(loop.probe.last(STATUS).message, "thrusters off")
+    loop.rates = np.zeros(2)
+    loop.show(odom=True)
+    harness.spin_until(lambda: loop.status["state"] == "tracking", "the loop again")
+    wrench, _ = loop.answer()
+    np.testing.assert_allclose(wrench[:3], [KP, 0.0, 0.0], atol=1e-12)
+
+
+def test_without_odom_from_the_beginning_nothing_is_thrust(harness: Harness) -> None:
+    loop = Loop(harness)
+    loop.aim(base=pose([1.0, 0.0, 0.0]))
+    loop.show(odom=False)
+    for _ in range(3):
+        np.testing.assert_array_equal(loop.answer(odom=False)[0], np.zeros(6))
+    loop.wait_for("stopped")
+    loop.show(odom=True)
+    loop.wait_for("tracking")
+    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+
+
+def test_a_robot_that_held_still_holds_after_a_gap_in_odom(harness: Harness) -> None:
+    loop = Loop(harness)
+    loop.answer()
+    loop.wait_for("holding")
+    loop.show(odom=False)
+    loop.answer(odom=False)
+    loop.wait_for("estimating")
+    loop.show(odom=True)
+    harness.spin_until(lambda: loop.status["state"] != "estimating", "the loop again")
+    assert loop.status["state"] == "holding"
+
+
+def test_an_aborted_goal_is_not_reached_after_a_gap_in_odom(harness: Harness) -> None:
+    loop = Loop(harness, settle_time=0.0)
+    loop.aim(base=pose([1.0, 0.0, 0.0]))
+    loop.answer()
+    assert loop.abort().success
+    loop.answer()
+    loop.wait_for("aborted")
+    loop.show(odom=False)
+    loop.answer(odom=False)
+    loop.wait_for("estimating")
+    loop.show(odom=True)
+    for _ in range(3):
+        loop.answer()
+    harness.settle(loop.probe)
+    assert loop.status["state"] == "aborted"
+
+
+def test_a_reached_goal_does_not_fail_after_a_gap_in_odom(harness: Harness) -> None:
+    loop = Loop(harness, settle_time=0.01, time_limit=0.1)
+    loop.aim(base=pose([0.0, 0.0, 0.0]))
+    for _ in range(20):
+        loop.answer()
+    loop.wait_for("reached")
+    loop.show(odom=False)
+    loop.answer(odom=False)
+    loop.wait_for("estimating")
+    # It has drifted in the meantime.
+    loop.place = np.array([0.01, 0.0, 0.0])
+    loop.show(odom=True)
+    for _ in range(3):
+        loop.answer()
+    harness.settle(loop.probe)
+    states = [pair.value for m in loop.probe.messages[STATUS] for pair in m.values]
+    assert "failed" not in states
+    assert loop.status["state"] == "reached"

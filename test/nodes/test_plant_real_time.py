@@ -1,0 +1,171 @@
+"""The plant node in real time: its pace, commands that grow old, pauses, a busy machine."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.lifecycle import TransitionCallbackReturn
+from support.bad_commands import BAD_COMMANDS
+from support.plant_rig import TICK, TICK_NS, Rig
+from support.ros_harness import Harness, assert_one_sentence, nanoseconds
+
+REALTIME = {"time_mode": "realtime", "real_time_factor": 10.0, "command_timeout": 1.0}
+
+
+def test_time_runs_at_the_real_time_factor(harness: Harness) -> None:
+    rig = Rig(harness, {**REALTIME, "diagnostics_period": 0.0})
+    rig.wait("/clock", 20)
+    began = rig.probe.count("/clock")
+    rig.wait("/clock", began + 120)
+    clocks = [nanoseconds(m.clock) / 1e9 for m in rig.probe.messages["/clock"][began:]]
+    arrivals = rig.probe.arrivals["/clock"][began:]
+    factor = (clocks[-1] - clocks[0]) / (arrivals[-1] - arrivals[0])
+    assert 5.0 < factor < 13.0
+    np.testing.assert_allclose(np.diff(clocks), TICK)
+
+
+def test_joints_come_to_rest_when_the_commander_falls_silent(harness: Harness) -> None:
+    rig = Rig(harness, REALTIME)
+    stamp = rig.now_ns
+    rig.send([0.3, -0.2, 0.1])
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.3, "motion")
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.0, "rest")
+    rest = nanoseconds(rig.probe.last("joint_states").header.stamp)
+    # A tick carries the command for as long as it is not older than the timeout at its start.
+    assert stamp + 1_000_000_000 < rest <= stamp + 1_000_000_000 + 2 * TICK_NS
+    moving = [m for m in rig.probe.messages["joint_states"] if any(m.velocity)]
+    for message in moving:
+        np.testing.assert_array_equal(message.velocity, [0.3, -0.2, 0.1])
+    at_rest = rig.probe.last("joint_states")
+    np.testing.assert_allclose(
+        at_rest.position, np.array([0.3, -0.2, 0.1]) * TICK * len(moving), rtol=1e-12
+    )
+    rig.wait_for_log("No command on 'joint_commands' for 1 s")
+    assert rig.diagnosed("commands", "timeouts") == 1
+    # It moves again with the next command, and is counted again.
+    rig.send([0.3, 0.0, 0.0])
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.3, "motion again")
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.0, "rest again")
+    assert rig.diagnosed("commands", "timeouts") == 2
+
+
+def test_a_command_without_stamp_means_now(harness: Harness) -> None:
+    rig = Rig(harness, REALTIME)
+    harness.spin_until(lambda: rig.now_ns > 2_000_000_000, "two simulated seconds")
+    rig.send([0.3, 0.0, 0.0], stamp_ns=0)
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.3, "motion")
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.0, "rest")
+    assert rig.diagnosed("commands", "refused") == 0
+
+
+@pytest.mark.parametrize(("offset_s", "word"), [(-2, "old"), (3, "ahead"), (10**9, "ahead")])
+def test_real_time_refuses_commands_from_another_time(
+    harness: Harness, offset_s: int, word: str
+) -> None:
+    rig = Rig(harness, REALTIME)
+    harness.spin_until(lambda: rig.now_ns > 3_000_000_000, "three simulated seconds")
+    rig.send([0.3, 0.3, 0.3], stamp_ns=rig.now_ns + offset_s * 10**9)
+    rig.wait_for_log(word)
+    rig.wait("joint_states", rig.probe.count("joint_states") + 3)
+    assert not any(any(m.velocity) for m in rig.probe.messages["joint_states"])
+
+
+def test_real_time_holds_the_last_good_command(harness: Harness) -> None:
+    rig = Rig(harness, {**REALTIME, "command_timeout": 0.0})
+    rig.send([0.1, 0.0, -0.1])
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.1, "motion")
+    for count, (velocity, names, reason) in enumerate(BAD_COMMANDS.values(), start=1):
+        rig.send(velocity, names)
+        rig.wait_for_refusals(count)
+        warned = [
+            status.message
+            for array in rig.probe.messages["/diagnostics"]
+            for status in array.status
+            if status.name == "/plant: commands" and status.level == DiagnosticStatus.WARN
+        ]
+        assert_one_sentence(warned[-1], "refused", reason)
+    np.testing.assert_array_equal(rig.probe.last("joint_states").velocity, [0.1, 0.0, -0.1])
+
+
+@pytest.mark.parametrize("timeout", [1.0, 0.0])
+def test_reset_brings_moving_joints_to_rest_in_real_time(harness: Harness, timeout: float) -> None:
+    rig = Rig(harness, {**REALTIME, "command_timeout": timeout})
+    rig.send([0.3, 0.0, 0.0])
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.3, "motion")
+    assert rig.trigger("plant/reset").success
+    harness.spin_until(lambda: rig.probe.last("joint_states").position[0] == 0.0, "the start")
+    rig.wait("joint_states", rig.probe.count("joint_states") + 5)
+    assert rig.probe.last("joint_states").position[0] == 0.0
+
+
+@pytest.mark.parametrize("timeout", [1.0, 0.0])
+def test_joints_are_at_rest_after_a_deactivation(harness: Harness, timeout: float) -> None:
+    rig = Rig(harness, {**REALTIME, "command_timeout": timeout})
+    rig.send([0.3, 0.0, 0.0])
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.3, "motion")
+    assert rig.plant.trigger_deactivate() is TransitionCallbackReturn.SUCCESS
+    harness.settle(rig.probe)
+    before = rig.probe.count("joint_states")
+    rig.activate()
+    rig.wait("joint_states", before + 6)
+    # The first state is the one that was left.
+    for message in rig.probe.messages["joint_states"][before + 1 :]:
+        assert list(message.velocity) == [0.0] * 3
+
+
+def test_deactivation_stops_time_and_publication(harness: Harness) -> None:
+    rig = Rig(harness, REALTIME)
+    rig.wait("joint_states", 5)
+    assert rig.plant.trigger_deactivate() is TransitionCallbackReturn.SUCCESS
+    harness.settle(rig.probe)
+    before, stamp = rig.probe.count("joint_states"), rig.now_ns
+    harness.spin_for(0.2)
+    assert rig.probe.count("joint_states") == before
+    rig.activate()
+    rig.wait("joint_states", before + 3)
+    stamps = [nanoseconds(m.header.stamp) for m in rig.probe.messages["joint_states"][before:]]
+    assert stamps[:3] == [stamp, stamp + TICK_NS, stamp + 2 * TICK_NS]
+
+
+def test_pause_stops_real_time_and_nothing_is_made_up_afterwards(harness: Harness) -> None:
+    rig = Rig(harness, REALTIME)
+    rig.wait("joint_states", 5)
+    rig.pause(True)
+    harness.settle(rig.probe)
+    before = rig.probe.count("joint_states")
+    harness.spin_for(0.2)
+    assert rig.probe.count("joint_states") == before
+    rig.pause(False)
+    rig.wait("joint_states", before + 2)
+    assert rig.diagnosed("commands", "deadlines_missed") == 0
+    stamps = [nanoseconds(m.header.stamp) for m in rig.probe.messages["joint_states"]]
+    assert set(np.diff(stamps)) == {TICK_NS}
+
+
+def test_a_busy_machine_misses_deadlines_and_no_tick(harness: Harness) -> None:
+    rig = Rig(harness, {**REALTIME, "real_time_factor": 100.0})
+
+    def hog(_: Any) -> None:
+        del rig.probe.react["odom"]
+        began = time.monotonic()
+        while time.monotonic() - began < 0.05:
+            pass  # 100 ticks of wall time in which no callback runs.
+
+    rig.wait("joint_states", 5)
+    rig.probe.react["odom"] = hog
+    harness.spin_until(
+        lambda: (
+            rig.probe.count("/diagnostics")
+            and any(
+                pair.key == "deadlines_missed" and int(pair.value) >= 50
+                for pair in rig.probe.last("/diagnostics").status[0].values
+            )
+        ),
+        "missed deadlines in the diagnostics",
+    )
+    stamps = [nanoseconds(m.header.stamp) for m in rig.probe.messages["joint_states"]]
+    assert set(np.diff(stamps)) == {TICK_NS}

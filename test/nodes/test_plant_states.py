@@ -1,0 +1,253 @@
+"""What the plant node publishes, against Pinocchio and the laws of conservation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from support.odometry import pose_of, twist_of
+from support.oracles import PinocchioOracle
+from support.plant_rig import SLIDERS, STATE, TICK, TICK_NS, Rig
+from support.ros_harness import Harness, nanoseconds
+from visualization_msgs.msg import Marker, MarkerArray
+
+from spacerobot_ros.nodes import PlantNode
+
+Array = npt.NDArray[np.float64]
+
+URDF = Path(__file__).parents[2] / "urdf"
+MASS = 10 + 3 * 2.0
+
+
+def momentum_by_pinocchio(robot: str, odom: Odometry, joints: JointState) -> tuple[Array, float]:
+    """Return the total momenta (world) and the kinetic energy of a published state."""
+    oracle = PinocchioOracle((URDF / f"{robot}.urdf").read_text("utf-8"), list(joints.name))
+    r, quaternion = pose_of(odom)
+    oracle.set_configuration(np.array(joints.position), quaternion, r)
+    twist = np.concatenate(twist_of(odom))
+    oracle.move(oracle.base_velocities(twist) + oracle.joint_velocities(np.array(joints.velocity)))
+    p, L, energy = oracle.momentum_W()
+    return np.concatenate([p, L]), energy
+
+
+# -- what is published ------------------------------------------------------------------------
+
+
+def test_activation_publishes_the_state_of_tick_0_and_the_clock_first(harness: Harness) -> None:
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_quat()
+    rig = Rig(
+        harness,
+        {
+            "initial_position": [1.0, -2.0, 3.0],
+            "initial_orientation": turn.tolist(),
+            "initial_joint_positions": [0.5, -0.25, 0.125],
+            "world_frame": "map",
+        },
+        activate=False,
+    )
+    harness.settle(rig.probe)
+    assert not set(rig.probe.order) & set(STATE), "published before activation"
+    rig.activate()
+    harness.settle(rig.probe)
+    states = [topic for topic in rig.probe.order if topic in STATE]
+    assert sorted(states) == sorted(STATE), "every topic once"
+    assert states[0] == "/clock"
+    assert nanoseconds(rig.probe.last("/clock").clock) == 0
+
+    odom, base_pose = rig.probe.last("odom"), rig.probe.last("base_pose")
+    assert (odom.header.frame_id, odom.child_frame_id) == ("map", "base_link")
+    assert base_pose.header.frame_id == "map"
+    assert base_pose.pose == odom.pose.pose
+    position, quaternion = pose_of(odom)
+    np.testing.assert_array_equal(position, [1.0, -2.0, 3.0])
+    np.testing.assert_allclose(quaternion, turn, atol=1e-15)
+    np.testing.assert_array_equal(np.concatenate(twist_of(odom)), np.zeros(6))
+
+    joints = rig.probe.last("joint_states")
+    assert list(joints.name) == SLIDERS
+    assert list(joints.position) == [0.5, -0.25, 0.125]
+    assert list(joints.velocity) == [0.0] * 3
+    assert list(joints.effort) == [0.0] * 3
+
+    momentum = rig.probe.last("momentum")
+    (dimension,) = momentum.layout.dim
+    assert dimension.label.split() == [
+        "linear_x", "linear_y", "linear_z", "angular_x", "angular_y", "angular_z", "kinetic_energy",
+    ]  # fmt: skip
+    assert (dimension.size, dimension.stride, momentum.layout.data_offset) == (7, 7, 0)
+    np.testing.assert_array_equal(momentum.data, np.zeros(7))
+    for message in (odom, base_pose, joints):
+        assert nanoseconds(message.header.stamp) == 0
+
+
+def test_the_description_is_there_for_a_late_reader(harness: Harness) -> None:
+    Rig(harness)
+    late = harness.probe({"robot_description": String}, latched=("robot_description",), name="late")
+    harness.spin_until(lambda: late.count("robot_description"), "the robot description")
+    expected = (URDF / "sliding_masses.urdf").read_text("utf-8")
+    assert late.last("robot_description").data == expected
+
+
+def test_states_agree_with_pinocchio_while_everything_moves(harness: Harness) -> None:
+    rig = Rig(
+        harness,
+        {
+            "robot": "planar_manipulator",
+            "linear_momentum": [1.0, -2.0, 0.5],
+            "angular_momentum": [0.2, 0.1, -3.0],
+            "end_effector_frame": "end_effector",
+        },
+        topics={"end_effector_pose": PoseStamped},
+    )
+    names = list(rig.probe.last("joint_states").name)
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        rig.step(rng.uniform(-0.3, 0.3, len(names)).tolist(), names)
+    harness.settle(rig.probe)
+    oracle = PinocchioOracle((URDF / "planar_manipulator.urdf").read_text("utf-8"), names)
+    for k in range(6):
+        odom, joints = (rig.probe.messages[t][k] for t in ("odom", "joint_states"))
+        published = np.array(rig.probe.messages["momentum"][k].data)
+        momenta, energy = momentum_by_pinocchio("planar_manipulator", odom, joints)
+        np.testing.assert_allclose(published[:6], momenta, atol=1e-12)
+        np.testing.assert_allclose(published[:6], [1, -2, 0.5, 0.2, 0.1, -3], atol=1e-12)
+        assert published[6] == pytest.approx(energy, rel=1e-12)
+        r, quaternion = pose_of(odom)
+        oracle.set_configuration(np.array(joints.position), quaternion, r)
+        R_WE, r_WE = oracle.frame_W("end_effector")
+        tip = rig.probe.messages["end_effector_pose"][k]
+        assert tip.header.frame_id == "world"
+        assert tip.header.stamp == odom.header.stamp
+        p, o = tip.pose.position, tip.pose.orientation
+        np.testing.assert_allclose([p.x, p.y, p.z], r_WE, atol=1e-12)
+        np.testing.assert_allclose(
+            Rotation.from_quat([o.x, o.y, o.z, o.w]).as_matrix(), R_WE, atol=1e-12
+        )
+
+
+def test_markers_stand_where_the_links_are(harness: Harness) -> None:
+    rig = Rig(
+        harness,
+        {"marker_period": 2 * TICK, "initial_position": [0.0, 0.0, 1.0]},
+        topics={"markers": MarkerArray},
+    )
+    for _ in range(4):
+        rig.step([0.4, 0.0, 0.0])
+    harness.settle(rig.probe)
+    arrays = rig.probe.messages["markers"]
+    assert [nanoseconds(a.markers[0].header.stamp) // TICK_NS for a in arrays] == [0, 2, 4]
+    spheres = [m for m in arrays[-1].markers if m.type == Marker.SPHERE]
+    assert [m.ns for m in spheres] == ["mass_1", "mass_2", "mass_3"]
+    odom, joints = rig.probe.last("odom"), rig.probe.last("joint_states")
+    r, quaternion = pose_of(odom)
+    for axis, marker in enumerate(spheres):
+        place = r + Rotation.from_quat(quaternion).apply(np.eye(3)[axis] * joints.position[axis])
+        p = marker.pose.position
+        np.testing.assert_allclose([p.x, p.y, p.z], place, atol=1e-14)
+        assert marker.header.frame_id == "world"
+
+
+def test_a_namespace_moves_all_but_the_clock_and_the_diagnostics(harness: Harness) -> None:
+    harness.make(
+        PlantNode,
+        {"robot": "sliding_masses", "time_mode": "lockstep", "diagnostics_period": 0.05},
+        namespace="/craft",
+    )
+    topics = {f"/craft/{name}" if name[0] != "/" else name: kind for name, kind in STATE.items()}
+    probe = harness.probe({**topics, "/diagnostics": DiagnosticArray})
+    # A newcomer is shown the state that waits.
+    harness.spin_until(lambda: set(topics) <= set(probe.order), "the state in the namespace")
+    publisher = harness.matched(probe.create_publisher(JointState, "/craft/joint_commands", 10))
+    publisher.publish(JointState(name=["slider_1"], velocity=[0.5]))
+    harness.spin_until(
+        lambda: probe.last("/craft/joint_states").velocity[0] == 0.5, "a step in the namespace"
+    )
+    harness.spin_until(lambda: probe.count("/diagnostics"), "diagnostics")
+    assert probe.last("/diagnostics").status[0].name == "/craft/plant: commands"
+
+
+# -- momentum ---------------------------------------------------------------------------------
+
+
+def test_a_robot_with_linear_momentum_drifts_at_p_over_m(harness: Harness) -> None:
+    p = np.array([1.6, -3.2, 0.8])
+    rig = Rig(harness, {"linear_momentum": p.tolist(), "initial_position": [5.0, 0.0, 0.0]})
+    for _ in range(20):
+        rig.step([0.0, 0.0, 0.0])
+    harness.settle(rig.probe)
+    for k, odom in enumerate(rig.probe.messages["odom"]):
+        position, quaternion = pose_of(odom)
+        np.testing.assert_allclose(position, [5, 0, 0] + p / MASS * k * TICK, atol=1e-13)
+        np.testing.assert_allclose(quaternion, [0, 0, 0, 1], atol=1e-14)
+        np.testing.assert_allclose(twist_of(odom)[0], p / MASS, rtol=1e-13)
+    for message in rig.probe.messages["momentum"]:
+        np.testing.assert_allclose(message.data[:3], p, rtol=1e-13)
+        assert message.data[6] == pytest.approx(p @ p / (2 * MASS), rel=1e-12)
+
+
+def test_a_robot_with_angular_momentum_turns_about_a_principal_axis(harness: Harness) -> None:
+    # At the shape zero the point masses stand at the origin: I_zz is the base's.
+    rig = Rig(harness, {"angular_momentum": [0.0, 0.0, 0.75]})
+    for _ in range(20):
+        rig.step([0.0, 0.0, 0.0])
+    harness.settle(rig.probe)
+    for k, odom in enumerate(rig.probe.messages["odom"]):
+        _, quaternion = pose_of(odom)
+        turned = Rotation.from_quat(quaternion).as_rotvec()
+        np.testing.assert_allclose(turned, [0, 0, 0.75 / 1.5 * k * TICK], atol=1e-11)
+
+
+def test_published_momentum_is_constant_while_the_shape_moves(harness: Harness) -> None:
+    p, L = [0.5, 1.0, -0.25], [0.1, -0.4, 0.3]
+    rig = Rig(harness, {"linear_momentum": p, "angular_momentum": L})
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        rig.step(rng.uniform(-0.7, 0.7, 3).tolist())
+    harness.settle(rig.probe)
+    for k, message in enumerate(rig.probe.messages["momentum"]):
+        np.testing.assert_allclose(message.data[:6], p + L, atol=1e-13)
+        by_pinocchio, energy = momentum_by_pinocchio(
+            "sliding_masses", rig.probe.messages["odom"][k], rig.probe.messages["joint_states"][k]
+        )
+        np.testing.assert_allclose(by_pinocchio, p + L, atol=1e-12)
+        assert message.data[6] == pytest.approx(energy, rel=1e-11)
+    assert rig.diagnosed("momentum", "linear_change") < 1e-12
+    assert rig.diagnosed("momentum", "angular_change") < 1e-12
+
+
+# -- lockstep with latecomers -----------------------------------------------------------------
+
+
+def test_a_late_reader_gets_the_state_that_waits(harness: Harness) -> None:
+    plant = harness.make(PlantNode, {"robot": "sliding_masses", "time_mode": "lockstep"})
+    assert plant.is_active
+    late = harness.probe(STATE)
+    harness.spin_until(lambda: all(late.count(topic) for topic in STATE), "the waiting state")
+    assert nanoseconds(late.last("joint_states").header.stamp) == 0
+    # It is the same tick still, and goes on from it.
+    publisher = late.create_publisher(JointState, "joint_commands", 10)
+    harness.matched(publisher)
+    publisher.publish(JointState(name=["slider_1"], velocity=[0.2]))
+    harness.spin_until(
+        lambda: nanoseconds(late.last("joint_states").header.stamp) > 0, "the next tick"
+    )
+    assert nanoseconds(late.last("joint_states").header.stamp) == TICK_NS
+
+
+def test_a_reader_that_comes_during_a_pause_gets_the_state_after_it(harness: Harness) -> None:
+    rig = Rig(harness)
+    rig.pause(True)
+    late = harness.probe(STATE, name="late")
+    harness.connect()
+    # Time for the plant to look for newcomers several times.
+    harness.spin_for(0.35)
+    rig.pause(False)
+    harness.spin_until(lambda: late.count("joint_states"), "the waiting state after the pause")

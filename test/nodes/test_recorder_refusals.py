@@ -1,0 +1,82 @@
+"""What the recorder node cannot write, and what it refuses: a sentence, and the flight goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.lifecycle import TransitionCallbackReturn
+from support.recorded_stack import LATCHED_TOPICS, STREAMS, BagContent, Stack, message_class
+from support.ros_harness import Harness, Probe, assert_one_sentence, construction
+
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.nodes import RecorderNode
+from spacerobot_ros.recording import BagWriter, RecordingError
+
+ERROR = 40  # of rcl_interfaces/msg/Log
+
+
+def errors(probe: Probe) -> list[str]:
+    return [m.msg for m in probe.messages["/rosout"] if m.level >= ERROR]
+
+
+def test_a_full_disk_ends_the_recording_with_one_sentence_and_not_the_flight(
+    harness: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, room = BagWriter.write, 100
+
+    def write(self: BagWriter, *message: Any) -> None:
+        nonlocal room
+        room -= 1
+        if room < 0:
+            raise RecordingError(f"The bag {self.path} cannot be written: no space left.")
+        whole(self, *message)
+
+    monkeypatch.setattr(BagWriter, "write", write)
+    stack = Stack(harness, tmp_path / "flight.mcap")
+    stack.configure(*STREAMS, *LATCHED_TOPICS)
+    stack.recorder.trigger_activate()
+    for x in (0.05, 0.0, 0.05):
+        stack.fly(x)
+    stack.stop()
+    (sentence,) = errors(stack.probe)
+    assert_one_sentence(sentence, "Recording has ended", str(stack.bag), "no space left")
+    assert str(stack.recorder.failure) in sentence
+    assert stack.recorder.messages_recorded == 100
+    assert stack.recorder.trigger_shutdown() is TransitionCallbackReturn.SUCCESS
+    assert BagContent(stack.bag).count == 100
+
+
+def test_a_device_without_room_is_refused_in_a_sentence(harness: Harness) -> None:
+    stack = Stack(harness, Path("/dev/full"))
+    assert stack.recorder.trigger_configure() is not TransitionCallbackReturn.SUCCESS
+    assert_one_sentence(str(stack.recorder.fault), "/dev/full", "space")
+    stack.probe.watch("/planner/status", message_class("diagnostic_msgs/msg/DiagnosticStatus"))
+    harness.connect()
+    stack.fly()
+
+
+def test_a_bag_that_cannot_be_made_is_refused_in_a_sentence(
+    ros_context: rclpy.Context, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    for bag in (tmp_path, tmp_path / "file" / "flight.mcap"):
+        with pytest.raises(SpaceRobotError) as refusal:
+            RecorderNode(**construction(ros_context, {"bag": str(bag)}))
+        assert_one_sentence(str(refusal.value), str(bag))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("compression", "zip"), ("flush_period", 0.0), ("flush_period", "often"), ("topics", 3)],
+)
+def test_a_bad_parameter_is_refused_with_a_sentence_that_names_it(
+    ros_context: rclpy.Context, tmp_path: Path, name: str, value: Any
+) -> None:
+    parameters = {"bag": str(tmp_path / "flight.mcap"), name: value}
+    with pytest.raises(SpaceRobotError) as refusal:
+        RecorderNode(**construction(ros_context, parameters))
+    assert_one_sentence(str(refusal.value), f"'{name}'", str(value))
+    assert not (tmp_path / "flight.mcap").exists()

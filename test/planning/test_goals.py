@@ -1,0 +1,66 @@
+"""Goals: what is one, and when it is met."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model.attitude import quaternion_from_rotvec
+from spacerobot_ros.planning import METHODS, Goal, PoseError, Tolerance
+
+
+def test_methods_say_what_they_control() -> None:
+    assert METHODS["square_path"].controls == {"attitude", "shape"}
+    assert METHODS["lie_bracket"].controls == {"position", "attitude"}
+
+
+def test_a_goal_is_judged_by_what_is_controlled() -> None:
+    goal = Goal.checked([1, 0, 0], quaternion_from_rotvec([0, 0, 0.2]), [0.5, -0.5])
+    here = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+    error = PoseError.between(*here, goal, np.array([0.5, -0.4]))
+    assert error.distance == 1.0
+    assert error.angle == pytest.approx(0.2)
+    assert error.farthest_joint == pytest.approx(0.1)
+    for parts in itertools.chain.from_iterable(
+        itertools.combinations(("position", "attitude", "shape"), k) for k in range(4)
+    ):
+        controls: Any = frozenset(parts)
+        loose = {"position": 1.1, "attitude": 0.21, "shape": 0.11}
+        assert Tolerance(**loose).admits(error, controls)
+        for part in parts:
+            assert not Tolerance(**{**loose, part: 0.05}).admits(error, controls)
+    # Without a shape in the goal, or measured, no joint is wrong.
+    assert PoseError.between(*here, goal).farthest_joint == 0.0
+    unshaped = replace(goal, joint_positions=None)
+    assert PoseError.between(*here, unshaped, np.ones(2)).farthest_joint == 0.0
+    assert not Tolerance(0.5, 0.21).admits(error)
+
+
+@pytest.mark.parametrize(
+    ("position", "quaternion", "mention"),
+    [
+        ([np.nan, 0, 0], [0, 0, 0, 1], "position"),
+        ([0, 0, np.inf], [0, 0, 0, 1], "position"),
+        ([0, 0, 0], [0, 0, np.nan, 1], "orientation"),
+        ([0, 0, 0], [0, 0, 0, 0], "zero quaternion"),
+        ([0, 0], [0, 0, 0, 1], "three numbers"),
+        ([0, 0, 0], [0, 0, 1], "four"),
+    ],
+)
+def test_what_is_no_pose_is_refused(
+    position: list[float], quaternion: list[float], mention: str
+) -> None:
+    with pytest.raises(PlanningError, match=mention):
+        Goal.checked(position, quaternion)
+
+
+@pytest.mark.parametrize("shape", [[0.0, np.nan], [[0.0, 1.0]], 0.5])
+def test_what_is_no_shape_is_refused(shape: npt.ArrayLike) -> None:
+    with pytest.raises(PlanningError, match="goal shape"):
+        Goal.checked([0, 0, 0], [0, 0, 0, 1], shape)

@@ -1,0 +1,138 @@
+"""A coordinated-control node, with a probe in the place of the plant."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from nav_msgs.msg import Odometry
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from support.ros_harness import Harness
+
+from spacerobot_ros.nodes import CoordinatedControlNode
+
+Array = npt.NDArray[np.float64]
+
+URDF = Path(__file__).parents[2] / "urdf" / "planar_manipulator.urdf"
+JOINTS = ["shoulder", "elbow"]
+TICK_NS = 10_000_000
+SHAPE = np.array([-1.0, 1.0])
+# The links are a metre long and the shoulder is half a metre from the centre of the base.
+TIP = np.array([0.5 + math.cos(-1.0) + 1.0, math.sin(-1.0), 0.0])
+KP, KD = 30.0, 60.0
+STATUS = "controller/status"
+
+
+def pose(position: npt.ArrayLike, frame: str = "world", w: float = 1.0) -> PoseStamped:
+    message = PoseStamped()
+    message.header.frame_id = frame
+    p = message.pose.position
+    p.x, p.y, p.z = np.asarray(position, dtype=float).tolist()
+    message.pose.orientation.w = w
+    return message
+
+
+class Loop:
+    """The node, and a probe in the place of the plant: a robot that is where it is put.
+
+    Its axes are the world's. At rest the law (29) then commands the force ``Kp`` times the errors
+    of base and end-effector together, since the work of a force on the base moves both.
+    """
+
+    def __init__(self, harness: Harness, *, activate: bool = True, **settings: Any) -> None:
+        self.harness = harness
+        defaults = {"robot": "planar_manipulator", "tick_rate": 100.0, "status_period": 0.01}
+        self.node = harness.make(
+            CoordinatedControlNode, {**defaults, **settings}, name="control", autostart=False
+        )
+        self.probe = harness.probe(
+            {"base_wrench": WrenchStamped, "joint_commands": JointState, STATUS: DiagnosticStatus},
+            latched=(STATUS,),
+        )
+        make = self.probe.create_publisher
+        self.odom = make(Odometry, "odom", 100)
+        self.joints = make(JointState, "joint_states", 100)
+        self.goals = {
+            "base": make(PoseStamped, "goal_pose", 10),
+            "end_effector": make(PoseStamped, "end_effector/goal_pose", 10),
+        }
+        assert self.node.trigger_configure() is TransitionCallbackReturn.SUCCESS
+        harness.connect()
+        if activate:
+            assert self.node.trigger_activate() is TransitionCallbackReturn.SUCCESS
+        self.tick = 0
+        self.place = np.zeros(3)
+        self.velocity = np.zeros(3)
+        self.rates = np.zeros(2)
+
+    def show(self, *, odom: bool = True) -> None:
+        """Publish the state of the next tick."""
+        self.tick += 1
+        state = Odometry(child_frame_id="base_link")
+        state.header.frame_id = "world"
+        p, v = state.pose.pose.position, state.twist.twist.linear
+        p.x, p.y, p.z = self.place.tolist()
+        v.x, v.y, v.z = self.velocity.tolist()
+        state.pose.pose.orientation.w = 1.0
+        joints = JointState(
+            name=JOINTS,
+            position=SHAPE.tolist(),
+            velocity=self.rates.tolist(),
+            effort=[0.0, 0.0],
+        )
+        for message in (state, joints):
+            stamp = divmod(self.tick * TICK_NS, 1_000_000_000)
+            message.header.stamp.sec, message.header.stamp.nanosec = stamp
+        if odom:
+            self.odom.publish(state)
+        self.joints.publish(joints)
+
+    def answer(self, *, odom: bool = True) -> tuple[Array, Array]:
+        """Show a state; return the wrench and the efforts that come for it, or one before."""
+        before = {topic: self.probe.count(topic) for topic in ("base_wrench", "joint_commands")}
+        self.show(odom=odom)
+        self.harness.spin_until(
+            lambda: all(self.probe.count(topic) > n for topic, n in before.items()), "a command"
+        )
+        return self.last_command
+
+    @property
+    def last_command(self) -> tuple[Array, Array]:
+        wrench, joints = self.probe.last("base_wrench"), self.probe.last("joint_commands")
+        assert wrench.header.stamp == joints.header.stamp
+        assert wrench.header.frame_id == "base_link"
+        assert list(joints.name) == JOINTS
+        f, t = wrench.wrench.force, wrench.wrench.torque
+        return np.array([f.x, f.y, f.z, t.x, t.y, t.z]), np.array(joints.effort)
+
+    def aim(self, **goals: PoseStamped) -> None:
+        """Send goals and let them arrive."""
+        for group, message in goals.items():
+            self.goals[group].publish(message)
+        self.harness.settle(self.probe)
+
+    def wait_for(self, state: str) -> DiagnosticStatus:
+        self.harness.spin_until(
+            lambda: self.probe.count(STATUS) and self.status["state"] == state, f"state {state}"
+        )
+        return self.probe.last(STATUS)
+
+    @property
+    def status(self) -> dict[str, str]:
+        return {pair.key: pair.value for pair in self.probe.last(STATUS).values}
+
+    def set(self, name: str, value: Any) -> Any:
+        (result,) = self.node.set_parameters([Parameter(name, value=value)])
+        return result
+
+    def abort(self) -> Any:
+        client = self.probe.create_client(Trigger, "control/abort")
+        return self.harness.call(client, Trigger.Request())
