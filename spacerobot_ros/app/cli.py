@@ -137,13 +137,34 @@ def report_command(
 
 @main.command()
 @click.option("--ticks", default=20_000, show_default=True, type=click.IntRange(min=100))
+@click.option(
+    "--real-time",
+    "seconds",
+    type=click.FloatRange(min=5.0),
+    metavar="S",
+    help="Instead: fly for S s in real time, in separate processes; deadlines, losses, memory.",
+)
+@click.option(
+    "--rate",
+    "rates",
+    multiple=True,
+    type=click.FloatRange(min=1.0, max=1e4),
+    metavar="HZ",
+    help="... with so many commands a second. May be repeated.  [default: 100]",
+)
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures.")
 @sentences
-def bench(ticks: int, json_file: Path | None) -> None:
+def bench(
+    ticks: int, seconds: float | None, rates: tuple[float, ...], json_file: Path | None
+) -> None:
     """Measure the speed of the stack against a bare ping-pong in the same run."""
-    from spacerobot_ros.app.bench import run_benchmark
+    from spacerobot_ros.app import bench, bench_real_time
 
-    for line in run_benchmark(ticks, json_file):
+    if seconds is None:
+        lines = bench.run_benchmark(ticks, json_file)
+    else:
+        lines = bench_real_time.run_benchmark(seconds, rates or (100.0,), json_file)
+    for line in lines:
         click.echo(line)
 
 

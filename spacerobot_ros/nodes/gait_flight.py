@@ -15,6 +15,9 @@ from spacerobot_ros.planning.drift import DriftWatch
 from spacerobot_ros.planning.follower import GaitFollower
 from spacerobot_ros.planning.stuck_joints import StuckJointWatch
 
+ANSWERED = "{:d} commands were published."
+"""What a planner logs when it is deactivated."""
+
 
 class GaitFlight:
     """Follows one schedule after the other, and holds the shape in between.
@@ -34,6 +37,8 @@ class GaitFlight:
     ) -> None:
         self.stuck: list[int] = []
         """Joints that do not follow, and are commanded no more."""
+        self.answers = 0
+        """How many states were answered with a command."""
         self._values = parameters
         # A controller closes its own loop round the reference.
         self._commands_plant = parameters["output"] == "commands"
@@ -117,4 +122,5 @@ class GaitFlight:
                 self._held = q.copy()
             self._command.position[:] = self._held
             self._command.velocity[:] = 0.0
+        self.answers += 1
         return self._command.serialised(stamp_bytes(stamp_ns))

@@ -16,7 +16,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.cdr import NANOSECONDS
 from spacerobot_ros.nodes.flight_node import STREAM, run_node
-from spacerobot_ros.nodes.gait_flight import GaitFlight
+from spacerobot_ros.nodes.gait_flight import ANSWERED, GaitFlight
 from spacerobot_ros.nodes.goal_memory import GoalMemory
 from spacerobot_ros.nodes.goal_messages import goal_of, shape_of
 from spacerobot_ros.nodes.joint_command import JointReader
@@ -98,10 +98,11 @@ class PlannerNode(RobotNode):
 
     def deactivate(self) -> None:
         """Give up the present goal and command nothing any more."""
+        if self._running and self._robot is not None:
+            self.get_logger().info(ANSWERED.format(self._flight.answers))
+            self._flight.drop()
         self._running = False
         self._goal = self._landed = None
-        if self._robot is not None:
-            self._flight.drop()
 
     def _use(self, robot: SpaceRobot) -> None:
         self._robot = robot

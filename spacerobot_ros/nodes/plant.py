@@ -16,6 +16,7 @@ from spacerobot_ros.nodes.cdr import NANOSECONDS
 from spacerobot_ros.nodes.command_channel import CommandChannel
 from spacerobot_ros.nodes.command_gate import CommandGate
 from spacerobot_ros.nodes.command_intake import CommandIntake
+from spacerobot_ros.nodes.deadlines import Deadlines
 from spacerobot_ros.nodes.flight_node import LATCHED, STREAM, FlightNode, run_node
 from spacerobot_ros.nodes.plant_parameters import PLANT_SPECS
 from spacerobot_ros.nodes.plant_report import PlantReport
@@ -98,6 +99,12 @@ class PlantNode(FlightNode):
         self._intake = CommandIntake(
             self, CHANNELS[values["actuation"]](robot), self._gate, self._report, values
         )
+        self._deadlines: Deadlines | None = None
+        if not self._lockstep:
+            self._pace_ns = self._period_ns / values["real_time_factor"]
+            name = f"{self.get_fully_qualified_name()}: timing"
+            self._deadlines = Deadlines(name, self._pace_ns)
+            self._report.others.append(self._deadlines.status)
         # Velocity servos stop at once; motors have to be told how.
         self._brakes = None
         if values["actuation"] == "effort":
@@ -125,11 +132,10 @@ class PlantNode(FlightNode):
                 self.create_timer(_LATE_JOINER_CHECK, self._on_late_joiner_check, clock=steady)
             ]
         else:
-            pace = self._period_ns / float(self.parameters["real_time_factor"])  # type: ignore[arg-type]
-            self._pace_ns, self._steady = pace, steady
-            self._origin_ns = steady.now().nanoseconds - self._tick * pace
+            self._steady = steady
+            self._origin_ns = steady.now().nanoseconds - self._tick * self._pace_ns
             self._own_timers = [
-                self.create_timer(pace / NANOSECONDS, self._on_wall_tick, clock=steady),
+                self.create_timer(self._pace_ns / NANOSECONDS, self._on_wall_tick, clock=steady),
                 self.create_timer(_LATE_JOINER_CHECK, self._intake.count_commanders, clock=steady),
             ]
         self._publish()
@@ -176,11 +182,16 @@ class PlantNode(FlightNode):
     def _on_wall_tick(self) -> None:
         if not self._running or self._paused:
             return
-        due = int((self._steady.now().nanoseconds - self._origin_ns) / self._pace_ns) - self._tick
-        if due > _LONGEST_LAG:
-            self._report.deadlines_missed += due - _LONGEST_LAG
-            self._origin_ns += (due - _LONGEST_LAG) * self._pace_ns
-        for _ in range(min(due, _CATCH_UP)):
+        now = self._steady.now().nanoseconds
+        behind = int((now - self._origin_ns) / self._pace_ns) - self._tick
+        if behind > _LONGEST_LAG:
+            self._report.deadlines_missed += behind - _LONGEST_LAG
+            self._origin_ns += (behind - _LONGEST_LAG) * self._pace_ns
+        for _ in range(min(behind, _CATCH_UP)):
+            assert self._deadlines is not None
+            now = self._steady.now().nanoseconds
+            due = self._origin_ns + (self._tick + 1) * self._pace_ns
+            self._deadlines.tick(now, due, self.time_ns)
             self._intake.drop_old(self.time_ns)
             self._step()
 
@@ -211,6 +222,10 @@ class PlantNode(FlightNode):
             return
         if self._intake.accept(channel, raw, self.time_ns):
             self._step_if_complete()
+        elif self._deadlines is not None and channel is self._intake.channels[0]:
+            now = self._steady.now().nanoseconds
+            due = self._origin_ns + channel.stamp_ns * self._pace_ns / self._period_ns
+            self._deadlines.answer(now, due, channel.stamp_ns)
 
     def _step_if_complete(self) -> None:
         if not self._paused and self._intake.complete:

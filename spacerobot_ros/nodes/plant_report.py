@@ -8,6 +8,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.cdr import NANOSECONDS
 from spacerobot_ros.nodes.command_gate import CommandGate
 from spacerobot_ros.nodes.diagnostics import diagnostic_status
@@ -92,6 +93,10 @@ class PlantReport:
                     f"{what}_limited.{joint}": count
                     for what, counts in plant.limit_counts.items()
                     for joint, count in zip(joints, counts, strict=True)
+                }
+                | {
+                    f"stroke_left.{joint}": f"{margin:.6g}"
+                    for joint, margin in zip(joints, self._stroke_left(), strict=True)
                 },
             ),
             diagnostic_status(
@@ -103,6 +108,7 @@ class PlantReport:
                 {
                     "linear_change": f"{self._drift(0):.3e}",
                     "angular_change": f"{self._drift(3):.3e}",
+                    "kinetic_energy_J": f"{plant.momentum[6]:.6e}",
                 },
             ),
             *(status() for status in self.others),
@@ -135,6 +141,12 @@ class PlantReport:
         if self._gate.fault:
             return f"Nothing moves until '~/rearm' is called: {self._gate.fault}."
         return self.last_refusal if moved and self.last_refusal else "commands arrive"
+
+    def _stroke_left(self) -> Array:
+        """Return how far each joint is from the nearer end of its stroke, m or rad."""
+        robot, q = self._plant.robot, self._plant.q
+        left: Array = np.minimum(q - robot.lower, robot.upper - q)
+        return left
 
     def _leaks(self) -> bool:
         """Whether momentum changes by more than rounding, for bodies that move at up to 1 m/s."""

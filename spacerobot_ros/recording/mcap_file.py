@@ -91,7 +91,7 @@ class McapFile:
         self.end_ns: int | None = None
         self._compression = _COMPRESSIONS[compression]
         self._compress = _compressor(compression)
-        self._chunk_indexes: list[ChunkIndex] = []
+        self._chunk_indexes: list[bytes] = []  # Encoded: a long flight has many.
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
         self._size = 0
@@ -158,7 +158,7 @@ class McapFile:
             uncompressed_size=len(records),
         )
         self._append(b"".join(parts))
-        self._chunk_indexes.append(index)
+        self._chunk_indexes.append(encode(index))
         for channel, entry in entries.items():
             self.message_counts[channel] += len(entry) // 2
         self.start_ns = start if self.start_ns is None else min(start, self.start_ns)
@@ -204,17 +204,17 @@ class McapFile:
         """
         data_end = encode(DataEnd(data_section_crc=0))
         start = self._size + len(data_end)
-        groups: tuple[tuple[Opcode, Iterable[McapRecord]], ...] = (
-            (Opcode.SCHEMA, self.schemas),
-            (Opcode.CHANNEL, self.channels),
-            (Opcode.STATISTICS, [self._statistics()]),
+        groups: tuple[tuple[Opcode, Iterable[bytes]], ...] = (
+            (Opcode.SCHEMA, map(encode, self.schemas)),
+            (Opcode.CHANNEL, map(encode, self.channels)),
+            (Opcode.STATISTICS, [encode(self._statistics())]),
             (Opcode.CHUNK_INDEX, self._chunk_indexes),
-            (Opcode.ATTACHMENT_INDEX, self._attachment_indexes),
-            (Opcode.METADATA_INDEX, self._metadata_indexes),
+            (Opcode.ATTACHMENT_INDEX, map(encode, self._attachment_indexes)),
+            (Opcode.METADATA_INDEX, map(encode, self._metadata_indexes)),
         )
         summary, offsets = bytearray(), bytearray()
         for opcode, records in groups:
-            group = b"".join(map(encode, records))
+            group = b"".join(records)
             if group:
                 offsets += encode(
                     SummaryOffset(

@@ -1,0 +1,190 @@
+"""How well separate processes keep up with real time, and whether anything is lost or grows."""
+
+from __future__ import annotations
+
+import json
+import re
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from spacerobot_ros.app.processes import ProcessStack
+from spacerobot_ros.app.run import ros, stop_on_signals
+from spacerobot_ros.app.scenario import load_scenario
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.nodes.gait_flight import ANSWERED
+from spacerobot_ros.recording import Bag, read_bag
+
+_MEMORY_PERIOD = 1.0
+"""Wall s between two looks at the processes' memory."""
+
+_WARM_UP = 0.25
+"""Part of the time after which memory is to grow no more."""
+
+_ANSWERED = re.escape(ANSWERED).replace(r"\{:d\}", r"(\d+)")
+_STATES = ("/clock", "/odom", "/joint_states", "/momentum")
+
+
+@dataclass(frozen=True)
+class RealTimeFigures:
+    """What a flight in real time came to.
+
+    Deadlines are those of :class:`~spacerobot_ros.nodes.deadlines.Deadlines`: one a tick for the
+    plant and one a state for its commander. Lost are messages that were published and are not in
+    the bag; memory is the resident set of all processes.
+    """
+
+    rate: float
+    duration_s: float
+    ticks: int
+    ticks_late: int
+    ticks_skipped: int
+    worst_tick_ms: float
+    commands_late: int
+    commands_missing: int
+    worst_command_ms: float
+    states_lost: int
+    commands_lost: int
+    memory_MiB: float
+    memory_growth_MiB: float
+
+    @property
+    def missed(self) -> float:
+        """Part of all deadlines that was missed."""
+        late = self.ticks_late + self.ticks_skipped + self.commands_late + self.commands_missing
+        return late / (2 * self.ticks)
+
+    def lines(self) -> Iterator[str]:
+        """Say it."""
+        worst = max(self.worst_tick_ms, self.worst_command_ms)
+        yield (
+            f"{self.rate:g} commands a second for {self.duration_s:.0f} s: "
+            f"{100 * self.missed:.3f} % of the deadlines missed, by {worst:.1f} ms at most"
+        )
+        yield (
+            f"  ticks late {self.ticks_late}, skipped {self.ticks_skipped}; commands late "
+            f"{self.commands_late}, missing {self.commands_missing}, of {self.ticks} each"
+        )
+        yield (
+            f"  lost in the bag: {self.states_lost} states, {self.commands_lost} commands; "
+            f"memory {self.memory_MiB:.0f} MiB, grown by {self.memory_growth_MiB:.2f} MiB"
+        )
+
+    def figures(self) -> dict[str, float]:
+        """Return all numbers by name, with the rate in it."""
+        return {
+            f"real_time_{self.rate:g}_{each.name}": getattr(self, each.name)
+            for each in fields(self)
+            if each.name != "rate"
+        }
+
+
+def run_benchmark(duration: float, rates: Sequence[float], json_file: Path | None) -> Iterator[str]:
+    """Fly for ``duration`` s at each rate, yielding lines to show.
+
+    ``json_file`` receives the figures.
+    """
+    figures: dict[str, float] = {}
+    for rate in rates:
+        measured = real_time_flight(rate, duration)
+        figures |= measured.figures()
+        yield from measured.lines()
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+
+
+def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
+    """Fly sliding masses in real time for ``duration`` s at ``rate`` commands a second.
+
+    Plant, planner and recorder are processes of their own.
+
+    Raises
+    ------
+    SpaceRobotError
+        A node has ended by itself, or the flight was interrupted.
+    """
+    scenario = (
+        load_scenario("sliding_masses")
+        .with_overrides("plant", {"time_mode": "realtime", "tick_rate": rate})
+        .with_overrides("planner", {"method": "lie_bracket", "tick_rate": rate})
+    )
+    memory: list[float] = []
+    with (
+        ros(private=False),
+        tempfile.TemporaryDirectory(prefix="spacerobot_") as folder,
+        stop_on_signals() as stopped,
+    ):
+        bag = Path(folder, "flight.mcap")
+        stack = ProcessStack(scenario, bag)
+        try:
+            stack.start(scenario.goal)
+            began = looked = time.monotonic()
+
+            def look() -> bool:
+                nonlocal looked
+                now = time.monotonic()
+                if now - looked >= _MEMORY_PERIOD:
+                    looked = now
+                    memory.append(_resident(stack))
+                return stopped() or now - began >= duration
+
+            stack.spin(look)
+            stack.finish()
+            said = stack.said("planner")
+        finally:
+            stack.close()
+        if stopped():
+            raise SpaceRobotError("The flight in real time was interrupted.")
+        return _figures(rate, read_bag(bag), said, memory)
+
+
+def _figures(rate: float, bag: Bag, said: str, memory: list[float]) -> RealTimeFigures:
+    timing: dict[str, str] = {}
+    skipped = 0
+    for _, array in bag["/diagnostics"].messages():
+        for status in array.status:
+            values = {pair.key: pair.value for pair in status.values}
+            if status.name.endswith(": timing"):
+                timing = values
+            skipped = int(values.get("deadlines_missed", skipped))
+    published = re.search(_ANSWERED, said)
+    if published is None or not timing:
+        raise SpaceRobotError(f"The flight ended badly: {said.strip()[-300:]}")
+    ticks = int(timing["ticks"])
+    # Every tick publishes each state once, and the first one comes before the first tick.
+    stamps = bag["/joint_states"].stamp
+    states = round((stamps[-1] - stamps[0]) * rate) + 1
+    lost = max(states - bag.message_count(topic) for topic in _STATES)
+    settled = memory[int(_WARM_UP * len(memory)) :]
+    third = max(len(settled) // 3, 1)
+    return RealTimeFigures(
+        rate=rate,
+        duration_s=float(np.ptp(stamps)),
+        ticks=ticks,
+        ticks_late=int(timing["ticks_late"]),
+        ticks_skipped=skipped,
+        worst_tick_ms=float(timing["worst_tick_ms"]),
+        commands_late=int(timing["commands_late"]),
+        commands_missing=max(ticks - 1 - int(timing["commands"]), 0),
+        worst_command_ms=float(timing["worst_command_ms"]),
+        states_lost=lost,
+        commands_lost=int(published[1]) - bag.message_count("/joint_commands"),
+        memory_MiB=memory[-1],
+        memory_growth_MiB=statistics.median(settled[-third:]) - statistics.median(settled[:third]),
+    )
+
+
+def _resident(stack: ProcessStack) -> float:
+    """Return the resident memory of the stack's processes, MiB."""
+    return sum(
+        int(line.split()[1]) / 1024
+        for process in stack.processes.values()
+        for line in Path(f"/proc/{process.pid}/status").read_text("utf-8").splitlines()
+        if line.startswith("VmRSS:")
+    )
