@@ -50,6 +50,11 @@ test-slow: $(STAMP)/test ## run the slow tests: long flights, builds with pip an
 fuzz: $(STAMP)/test ## try more than ten thousand inputs that nobody would send, and count them
 	SPACEROBOT_FUZZ=long $(BIN)/python3 -m pytest -q test/fuzz
 
+.PHONY: real-time
+real-time: $(STAMP)/demo ## fly ten minutes in real time in separate processes, at 100, then 200 and 500 Hz
+	$(BIN)/spacerobot bench --real-time 600 --rate 100
+	$(BIN)/spacerobot bench --real-time 60 --rate 200 --rate 500
+
 # Short flights, so that the bags of all scenarios stay small. A goal not met in time is no failure.
 REFERENCE := --set plant.marker_period=5 --set plant.diagnostics_period=5
 FLY = @fly() { echo "bags/$$1.mcap"; $(BIN)/spacerobot run "$$@" --bag "bags/$$1.mcap" $(REFERENCE) \

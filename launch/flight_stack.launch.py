@@ -41,8 +41,15 @@ def nodes(context: LaunchContext) -> list[Node]:
         condition=IfCondition(LaunchConfiguration("record")),
         **common,
     )
+    plant = (sections.get("plant") or {}).get("ros__parameters") or {}
+    # In real time states are answered while the planner plans; the file may say otherwise.
+    live = plant.get("time_mode", "realtime") == "realtime"
+    own = {"planner": [{"plan_in_background": live}]}
     return [
-        *(Node(executable=name, name=name, parameters=parameters, **common) for name in wanted),
+        *(
+            Node(executable=name, name=name, parameters=own.get(name, []) + parameters, **common)
+            for name in wanted
+        ),
         recorder,
     ]
 

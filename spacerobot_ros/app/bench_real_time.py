@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import statistics
 import tempfile
@@ -17,7 +18,9 @@ from spacerobot_ros.app.processes import ProcessStack
 from spacerobot_ros.app.run import ros, stop_on_signals
 from spacerobot_ros.app.scenario import load_scenario
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.model.attitude import quaternion_from_rotvec
 from spacerobot_ros.nodes.gait_flight import ANSWERED
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.recording import Bag, read_bag
 
 _MEMORY_PERIOD = 1.0
@@ -27,6 +30,10 @@ _WARM_UP = 0.25
 """Part of the time after which memory is to grow no more."""
 
 _ANSWERED = re.escape(ANSWERED).replace(r"\{:d\}", r"(\d+)")
+_GOAL = Goal.checked([0.2, -0.15, 0.05], quaternion_from_rotvec([0.1, -0.05, 0.02]))
+_FEWEST_CYCLES = 170
+"""Fewer have too large loops for the turn."""
+
 _STATES = ("/clock", "/odom", "/joint_states", "/momentum")
 
 
@@ -111,8 +118,9 @@ def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
     """
     scenario = (
         load_scenario("sliding_masses")
-        .with_overrides("plant", {"time_mode": "realtime", "tick_rate": rate})
-        .with_overrides("planner", {"method": "lie_bracket", "tick_rate": rate})
+        .in_real_time(1.0)
+        .with_overrides("plant", {"tick_rate": rate, "diagnostics_period": 1.0})
+        .with_overrides("planner", {"tick_rate": rate, **_gait(duration)})
     )
     memory: list[float] = []
     with (
@@ -123,7 +131,7 @@ def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
         bag = Path(folder, "flight.mcap")
         stack = ProcessStack(scenario, bag)
         try:
-            stack.start(scenario.goal)
+            stack.start(_GOAL)
             began = looked = time.monotonic()
 
             def look() -> bool:
@@ -142,6 +150,12 @@ def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
         if stopped():
             raise SpaceRobotError("The flight in real time was interrupted.")
         return _figures(rate, read_bag(bag), said, memory)
+
+
+def _gait(duration: float) -> dict[str, object]:
+    """Return the planner's parameters for a gait that lasts longer: 100 s, and cycles of 3 s."""
+    cycles = max(_FEWEST_CYCLES, math.ceil((duration - 100.0) / 3.0) + 1)
+    return {"method": "lie_bracket", "lie_bracket.cycles": cycles}
 
 
 def _figures(rate: float, bag: Bag, said: str, memory: list[float]) -> RealTimeFigures:

@@ -182,15 +182,14 @@ def _chosen(
         # Published figures belong to the published goal.
         other = changed_goal(scenario.goal, goal, goal_rotvec)
         scenario = replace(scenario, goal=other, published=())
+    if realtime is not None:
+        scenario = scenario.in_real_time(realtime)
     scenario = scenario.with_settings(settings)
     if method is not None:
         node, parameter = (
             ("planner", "method") if method in METHODS else ("coordinated_control", "law")
         )
         scenario = scenario.with_overrides(node, {parameter: method})
-    if realtime is not None:
-        pace = {"time_mode": "realtime", "real_time_factor": realtime}
-        scenario = scenario.with_overrides("plant", pace)
     return scenario
 
 

@@ -30,8 +30,7 @@ def up(
     scenario: str, settings: tuple[str, ...], bag: Path | None, rate: float, processes: bool
 ) -> None:
     """Run the nodes of SCENARIO in real time until Ctrl-C; send goals by topic."""
-    pace = {"time_mode": "realtime", "real_time_factor": rate}
-    chosen = load_scenario(scenario).with_overrides("plant", pace).with_settings(settings)
+    chosen = load_scenario(scenario).in_real_time(rate).with_settings(settings)
     from spacerobot_ros.app.live import keep_up
 
     keep_up(chosen, bag, click.echo, processes=processes)

@@ -28,7 +28,7 @@ from spacerobot_ros.app.scenario import Scenario
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.flight_node import spin_until
-from spacerobot_ros.nodes.planner import PLANNED
+from spacerobot_ros.nodes.plan_work import PLANNED
 from spacerobot_ros.nodes.robot_source import robot_of
 from spacerobot_ros.planning import Goal
 
@@ -37,6 +37,9 @@ _START = 60.0
 
 _END = 10.0
 """Wall s that a node has to end after a signal before it is killed."""
+
+_WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+"""Fast DDS may go on writing into what a killed node has left behind, and not to its successor."""
 
 _COMMANDS = ("joint_commands", "base_wrench", "joint_reference")
 """What commanders publish for every state: nothing of it may be missed."""
@@ -125,6 +128,7 @@ class ProcessStack:
                     *("-m", f"spacerobot_ros.nodes.{name}", "--ros-args", "-r", f"__node:={name}"),
                     *("--params-file", str(self.scenario.path), "--params-file", str(file)),
                 ],
+                env={**_WITHOUT_SHARED_MEMORY, **os.environ},
                 stdout=said,
                 stderr=said,
                 start_new_session=True,

@@ -92,6 +92,14 @@ class Scenario:
         merged = {**self.overrides, node: {**self.overrides.get(node, {}), **values}}
         return replace(self, overrides=merged)
 
+    def in_real_time(self, factor: float) -> Scenario:
+        """Return the scenario on the wall clock times a factor, planned beside the flight."""
+        pace = {"time_mode": "realtime", "real_time_factor": factor}
+        scenario = self.with_overrides("plant", pace)
+        if "planner" in self.commanders:
+            scenario = scenario.with_overrides("planner", {"plan_in_background": True})
+        return scenario
+
     def with_settings(self, texts: Sequence[str]) -> Scenario:
         """Return the scenario with ``node.parameter=value`` set, each as :func:`parse_setting`.
 

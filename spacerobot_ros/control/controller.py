@@ -81,7 +81,7 @@ class CoordinatedController:
         self.mode = Mode.MEASURED
         self._profile: ReferenceProfile | None = None
         self._began = 0.0
-        self._goal = Reference()
+        self._given = Reference()
         self._sent: Actuation | None = None
         self._estimator: DeadReckoning | None = None
         self._known = False
@@ -89,7 +89,7 @@ class CoordinatedController:
 
     def forget(self) -> None:
         """Forget goals and what was measured; the next state is the first."""
-        self._profile, self._goal = None, Reference()
+        self._profile, self._given = None, Reference()
         self._sent = self._estimator = self._brake = None
         self._known, self.mode = False, Mode.MEASURED
 
@@ -121,7 +121,7 @@ class CoordinatedController:
 
     def follow(self, reference: Reference) -> None:
         """Take this instant's reference from outside; what it lacks is held by the profile."""
-        self._goal = reference
+        self._given = reference
 
     def command(
         self, time: float, measured: ControlState | None, q: Array, qdot: Array
@@ -149,6 +149,11 @@ class CoordinatedController:
         result = self._limits.apply(commanded)
         self._sent = result.realised
         return result
+
+    @property
+    def goal(self) -> Reference:
+        """Where references come to rest, of all that was given or is held; empty at first."""
+        return Reference() if self._profile is None else self._profile.goal
 
     @property
     def estimated_for(self) -> float:
@@ -183,7 +188,7 @@ class CoordinatedController:
 
     def _reference(self, time: float) -> Reference:
         assert self._profile is not None
-        own, given = self._profile.at(time - self._began), self._goal
+        own, given = self._profile.at(time - self._began), self._given
         if given.base is None and given.joints is None and given.end_effector is None:
             return own
         return Reference(

@@ -13,6 +13,9 @@ from spacerobot_ros.nodes.command_channel import NEVER, CommandChannel, Refused
 from spacerobot_ros.nodes.command_gate import CommandGate, Reason
 from spacerobot_ros.nodes.plant_report import PlantReport
 
+_START = 1.0
+"""How long a stamp of zero is that of the first state where commands never grow old, s."""
+
 
 class CommandIntake:
     """The command channels of one plant behind their gate.
@@ -122,7 +125,8 @@ class CommandIntake:
                 self._refuse(channel, _not_this_tick(stamp, now_ns))
                 return False
         else:
-            stamp = stamp or now_ns  # An unset stamp means now, as everywhere in ROS.
+            if not stamp and now_ns > (self._timeout or _START) * NANOSECONDS:
+                stamp = now_ns  # An unset stamp means now; at the start it is the first state's.
             refused = self._untimely(channel, stamp, now_ns) or refused
         if refused is None and self._gate.fault:
             refused = Reason.LATCHED, self._gate.fault

@@ -59,6 +59,9 @@ CONTROL_SPECS = (
         "time_limit", 0.0, "s", "a goal not met after this long has failed; 0: never", 0.0
     ),
     ParameterSpec("status_period", 1.0, "s", "simulated time between status messages", 0.01),
+    ParameterSpec(
+        "resume_file", "", "", "keeps the present goals for one that starts again; '': none"
+    ),
     *_GAIN_SPECS,
     *option_specs(LAWS),
 )

@@ -70,29 +70,34 @@ class ControllerStatus:
         self._state, self._started = state, -1.0
         self._publish(state, sentence)
 
-    def update(self, now: float, controller: CoordinatedController, result: Saturated) -> None:
-        """Judge the errors after a command, and publish what is due."""
-        before = self._state
+    def update(self, now: float, controller: CoordinatedController, result: Saturated) -> bool:
+        """Judge the errors after a command, and publish what is due.
+
+        Returns whether a goal was decided: met, or not in time.
+        """
+        before, decided = self._state, False
         if before not in _BLIND:
             self._seen = before
         if controller.mode is Mode.MEASURED:
             # After a gap in the measurements everything is as it was before.
             self._state = self._seen
-            self._judge(now, controller)
+            decided = self._judge(now, controller)
         else:
             estimated = controller.mode is Mode.ESTIMATED
             self._state = ControllerState.ESTIMATING if estimated else ControllerState.STOPPED
         if self._state is before and result.limited == self._limited and now < self._next:
-            return
+            return decided
         values: Mapping[str, Any] = self._node.parameters
         self._next = now + values["status_period"]
         self._limited = result.limited
         self._values = self._describe(controller, result)
         self._publish(self._state, self._sentence(controller))
+        return decided
 
-    def _judge(self, now: float, controller: CoordinatedController) -> None:
+    def _judge(self, now: float, controller: CoordinatedController) -> bool:
+        """Judge a goal that is flown to; return whether it is decided now."""
         if self._state is not ControllerState.TRACKING or self._started < 0:
-            return
+            return False
         values: Mapping[str, Any] = self._node.parameters
         errors = controller.errors()
         within = controller.arrived(now) and (
@@ -109,6 +114,7 @@ class ControllerStatus:
             self._state, self._next = ControllerState.REACHED, now
         elif limit and now - self._started >= limit - 1e-9:
             self._state, self._next = ControllerState.FAILED, now
+        return self._state is not ControllerState.TRACKING
 
     def _sentence(self, controller: CoordinatedController) -> str:
         errors = controller.errors()

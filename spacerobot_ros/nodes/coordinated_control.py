@@ -25,7 +25,7 @@ from spacerobot_ros.control import (
 )
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.errors import NotFiniteError
-from spacerobot_ros.errors import CommandError, PlanningError
+from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.attitude import matrix_from_quaternion
 from spacerobot_ros.nodes.cdr import (
@@ -34,9 +34,11 @@ from spacerobot_ros.nodes.cdr import (
     TemplateReader,
     stamp_bytes,
 )
+from spacerobot_ros.nodes.control_goals import END_EFFECTOR, ControlGoals, require_controlled
 from spacerobot_ros.nodes.control_parameters import CONTROL_SPECS, gains_of
 from spacerobot_ros.nodes.controller_status import ControllerState, ControllerStatus
 from spacerobot_ros.nodes.flight_node import STREAM, run_node
+from spacerobot_ros.nodes.goal_memory import BASE
 from spacerobot_ros.nodes.goal_messages import goal_of
 from spacerobot_ros.nodes.joint_command import JointReader
 from spacerobot_ros.nodes.plant_topics import DEFAULT_END_EFFECTOR
@@ -66,7 +68,7 @@ class CoordinatedControlNode(RobotNode):
         self._odom_fresh = self._joints_fresh = self._hold = False
         self._blind = False
         """Whether odom has failed to come: states are answered without it until it does."""
-        self._goals: dict[str, PoseReference] = {}
+        self._goals = ControlGoals(str(self.parameters["resume_file"]))
         self._odom = TemplateReader(
             Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
         )
@@ -92,7 +94,9 @@ class CoordinatedControlNode(RobotNode):
         self.create_service(Trigger, "~/abort", self._on_abort)
 
     def activate(self) -> None:
-        """Answer states with commands from now on."""
+        """Answer states with commands from now on; go on to goals that an earlier end cut off."""
+        if self._goals.recall(None if self._robot is None else self.controller.law):
+            self.get_logger().info("Going on to an earlier goal.")
         self._running = True
         self._joints_driven = self.count_publishers("joint_reference") > 0
         self._base_driven = self.count_publishers("base_reference") > 0
@@ -101,9 +105,9 @@ class CoordinatedControlNode(RobotNode):
         self._on_part()
 
     def deactivate(self) -> None:
-        """Command nothing any more; goals are forgotten."""
+        """Command nothing any more; goals are forgotten, but for the file."""
         self._running = False
-        self._goals = {}
+        self._goals.drop()
         if self._robot is not None:
             self.controller.forget()
 
@@ -160,6 +164,10 @@ class CoordinatedControlNode(RobotNode):
         wrench.header.frame_id = robot.base_link
         self._wrench_message = MessageTemplate(wrench)
         self._wrench_message.feed("wrench.force.x", self._wrench)
+        try:
+            self._goals.require_suited(law)
+        except PlanningError as error:
+            self._status.refused(str(error))
 
     def parameters_changed(self) -> None:
         """Take over new gains."""
@@ -169,10 +177,10 @@ class CoordinatedControlNode(RobotNode):
     # -- topics -------------------------------------------------------------------------------
 
     def _on_base_goal(self, message: PoseStamped) -> None:
-        self._on_goal("base", message)
+        self._on_goal(BASE, message)
 
     def _on_end_effector_goal(self, message: PoseStamped) -> None:
-        self._on_goal("end_effector", message)
+        self._on_goal(END_EFFECTOR, message)
 
     def _on_goal(self, group: str, message: PoseStamped) -> None:
         if not self._running:
@@ -180,18 +188,12 @@ class CoordinatedControlNode(RobotNode):
         try:
             frame = str(self.parameters["world_frame"])
             goal = goal_of(message, frame, f"The goal of the {group.replace('_', '-')}")
-            if self._robot is not None and not getattr(
-                self.controller.law.outputs.selection, group
-            ):
-                raise PlanningError(
-                    f"The law '{self.controller.law.name}' does not control the "
-                    f"{group.replace('_', '-')} of this robot; its outputs are "
-                    f"{', '.join(self.controller.law.outputs.labels)}."
-                )
+            if self._robot is not None:
+                require_controlled(self.controller.law, group)
         except PlanningError as error:
             self._status.refused(str(error))
             return
-        self._goals[group] = PoseReference(goal.position, goal.quaternion)
+        self._goals.give(group, goal)
 
     def _on_odom(self, raw: bytes) -> None:
         self._odom_raw = raw
@@ -240,6 +242,8 @@ class CoordinatedControlNode(RobotNode):
         response.message = "The robot holds where it is."
         if response.success:
             self._hold = True
+            self._goals.drop()
+            self._goals.forget()
         return response
 
     # -- flying -------------------------------------------------------------------------------
@@ -268,7 +272,8 @@ class CoordinatedControlNode(RobotNode):
             self._base_wrench.take(self._wrench_message.serialised(stamped))
             self._joint_commands.take(self._joint_message.serialised(stamped))
         self._joints_fresh = False
-        self._status.update(now, self.controller, result)
+        if self._status.update(now, self.controller, result):
+            self._goals.forget()
 
     def _measured(self, q: Any, qdot: Any) -> ControlState:
         self._odom.accept(self._odom_raw)
@@ -279,7 +284,6 @@ class CoordinatedControlNode(RobotNode):
     def _take_goals(self, now: float, state: ControlState) -> None:
         if self._hold:
             self._hold = False
-            self._goals = {}
             link = self.controller.law.outputs.selection.end_effector_link
             assert self._robot is not None
             here = Reference.present(self._robot, state, link)
@@ -287,15 +291,12 @@ class CoordinatedControlNode(RobotNode):
                 now, state, base=here.base, end_effector=here.end_effector, joints=state.q.copy()
             )
             self._status.state(ControllerState.ABORTED, "Aborted on request; the robot holds.")
-        if self._goals:
-            self.controller.set_goals(
-                now,
-                state,
-                base=self._goals.get("base"),
-                end_effector=self._goals.get("end_effector"),
-            )
-            self._goals = {}
+        if self._goals.take(self.controller, now, state):
             self._status.started(now)
+            try:
+                self._goals.keep(self.controller)
+            except ParameterError as error:
+                self.get_logger().error(f"{error} The goal is flown, but would not be resumed.")
 
     def _given_joints(self) -> JointReference | None:
         """Return the joint reference of this tick, whose velocities are held over it."""

@@ -84,8 +84,9 @@ class GaitFlight:
         """
         if self._follower is None:
             return None
+        braked = isinstance(self._follower, BrakingFollower)
         schedule, self._follower = self._follower.schedule, None
-        self._held = schedule.positions[-1] if at_last_shape else None
+        self._held = schedule.positions[-1] if at_last_shape and not braked else None
         return schedule
 
     def drop(self) -> None:

@@ -62,6 +62,12 @@ PLANNER_SPECS: tuple[ParameterSpec, ...] = (
         1e6,
     ),
     ParameterSpec(
+        "plan_in_background",
+        False,
+        "",
+        "plan in a thread from a robot at rest and go on answering; false: states wait (lockstep)",
+    ),
+    ParameterSpec(
         "resume_file", "", "", "keeps the present goal for a planner that starts again; '': none"
     ),
     *option_specs(METHODS),

@@ -93,10 +93,15 @@ class PlantReport:
                     f"{what}_limited.{joint}": count
                     for what, counts in plant.limit_counts.items()
                     for joint, count in zip(joints, counts, strict=True)
-                }
-                | {
-                    f"stroke_left.{joint}": f"{margin:.6g}"
-                    for joint, margin in zip(joints, self._stroke_left(), strict=True)
+                },
+            ),
+            diagnostic_status(
+                f"{name}: strokes",
+                DiagnosticStatus.OK,
+                "how far each joint is from the nearer end of its stroke, m or rad",
+                {
+                    joint: f"{left:.6g}"
+                    for joint, left in zip(joints, self._stroke_left(), strict=True)
                 },
             ),
             diagnostic_status(
@@ -143,7 +148,7 @@ class PlantReport:
         return self.last_refusal if moved and self.last_refusal else "commands arrive"
 
     def _stroke_left(self) -> Array:
-        """Return how far each joint is from the nearer end of its stroke, m or rad."""
+        """Return how far each joint (n,) is from the nearer end of its stroke, m or rad."""
         robot, q = self._plant.robot, self._plant.q
         left: Array = np.minimum(q - robot.lower, robot.upper - q)
         return left

@@ -57,6 +57,10 @@ def open_bag(path: Path) -> Iterator[BinaryIO]:
         raise RecordingError(f"There is no bag at {path}.") from error
     except OSError as error:
         raise RecordingError(f"Cannot read the bag {path}: {error.strerror or error}.") from error
+    except MemoryError as error:
+        raise RecordingError(
+            f"The bag {path} is damaged: a record claims to be larger than the memory."
+        ) from error
     # The decompressors and the MCAP library have no error in common.
     except (McapError, ValueError, RuntimeError, struct.error, zstandard.ZstdError) as error:
         reason = str(error) or type(error).__name__

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
 from support.ros_harness import assert_one_sentence
 
 from spacerobot_ros.app.scenario import goal_from_rotvec, load_scenario
@@ -22,8 +25,10 @@ from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.cdr import TemplateReader, UnreadableError
 from spacerobot_ros.nodes.parameters import ParameterSpec
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.recording import BagWriter, RecordingError, read_bag
 from spacerobot_ros.resources import robot_file
 
+CHUNK = 6
 ORIGIN, NO_TURN = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
 
 
@@ -91,3 +96,22 @@ def test_a_size_that_is_no_size_is_refused(number: str) -> None:
     with pytest.raises(RobotDescriptionError) as caught:
         parse_robot(text[:start] + f"{number} 1 1" + text[text.index('"', start) :])
     assert_one_sentence(str(caught.value), "geometry of link")
+
+
+def test_a_chunk_that_claims_to_be_larger_than_the_memory_is_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with BagWriter(path) as writer:
+        channel = writer.add_topic("/a", "std_msgs/msg/Float64")
+        writer.write(channel, serialize_message(Float64(data=1.0)), 0, 0)
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    data = bytearray(path.read_bytes())
+    # Opcode and length, start, end, uncompressed size, checksum, "zstd": then the data's length.
+    start = summary.chunk_indexes[0].chunk_start_offset
+    assert data[start] == CHUNK
+    struct.pack_into("<Q", data, start + 9 + 8 + 8 + 8 + 4 + 4 + len("zstd"), 2**45)
+    path.write_bytes(data)
+    with pytest.raises(RecordingError) as caught:
+        read_bag(path)["/a"]
+    assert_one_sentence(str(caught.value), str(path), "damaged")

@@ -11,6 +11,7 @@ import numpy as np
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.interruption import still_wanted
 from spacerobot_ros.planning.optimal.constraints import PathConstraints
 from spacerobot_ros.planning.optimal.limits import MotionLimits
 from spacerobot_ros.planning.optimal.trajectory import Task, Trajectory
@@ -172,7 +173,7 @@ def _packed(step: float, *knots: Array) -> Array:
 
 
 class _Watch(ca.Callback):
-    """Sees every iterate: keeps the best feasible one, and stops at the deadline."""
+    """Sees every iterate: keeps the best feasible one; stops at the deadline, or unwanted."""
 
     def __init__(self, problem: dict[str, ca.MX], lower: Array, upper: Array) -> None:
         ca.Callback.__init__(self)
@@ -208,4 +209,4 @@ class _Watch(ca.Callback):
             if worst <= _FEASIBLE:
                 self.best, self._least = arguments[0].full().ravel(), f
         stop = self._last_call if self.best is None else self._deadline
-        return [float(time.monotonic() > stop)]
+        return [float(time.monotonic() > stop or not still_wanted())]

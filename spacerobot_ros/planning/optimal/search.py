@@ -12,6 +12,7 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.attitude import quaternion_multiply
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.interruption import require_wanted
 from spacerobot_ros.planning.optimal.constraints import PathConstraints
 from spacerobot_ros.planning.optimal.held_commands import CommandHolder, HeldCommands
 from spacerobot_ros.planning.optimal.initial_guesses import InitialGuesses
@@ -102,7 +103,7 @@ class ManoeuvreSearch:
         Raises
         ------
         PlanningError
-            None was found.
+            None was found, or nobody waits for it any more.
         """
         began = time.monotonic()
         deadline = began + effort.time_budget
@@ -115,6 +116,7 @@ class ManoeuvreSearch:
             # Until something is found the search may go on beyond its time.
             last_call = deadline if found else began + _LAST_CALL * effort.time_budget
             trajectory = self._solved(problem, task, limits, guess, deadline, last_call, effort)
+            require_wanted()
             answer = self._checked(trajectory, task, limits, quaternion, effort)
             now = time.monotonic()
             _LOG.info(

@@ -1,0 +1,313 @@
+"""A coordinated-control node that ends in mid-flight, and the one that is started after it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from std_msgs.msg import String
+from support.control_loop import KP, SHAPE, STATUS, TIP, URDF, Loop, pose
+from support.ros_harness import (
+    LATCHED,
+    Harness,
+    Probe,
+    assert_one_sentence,
+    construction,
+    nanoseconds,
+)
+
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.nodes import CoordinatedControlNode, FlightNode, PlannerNode, PlantNode
+
+AIM = np.array([0.5, 0.25, 0.0])
+CONTROL = {"robot": "planar_manipulator", "tick_rate": 50.0, "settle_time": 0.5}
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "goals.json"
+
+
+def kill(harness: Harness, probe: Probe, node: FlightNode) -> None:
+    """Destroy a node without any of its cleanup, when it hears nothing any more."""
+    harness.executor.remove_node(node)
+    harness.settle(probe)
+    harness.remove(node)
+
+
+def replaced(loop: Loop, file: Path, **settings: Any) -> None:
+    """Kill the node of a loop, and start another in its place."""
+    kill(loop.harness, loop.probe, loop.node)
+    defaults = {"robot": "planar_manipulator", "tick_rate": 100.0, "status_period": 0.01}
+    loop.node = loop.harness.make(
+        CoordinatedControlNode,
+        {**defaults, "resume_file": str(file), **settings},
+        name="control",
+    )
+    loop.harness.connect()
+
+
+# -- going on ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("profile", ["step", "quintic"])
+def test_the_goals_are_met_by_the_next_controller(
+    harness: Harness, file: Path, profile: str
+) -> None:
+    plant = {
+        "robot": "planar_manipulator",
+        "actuation": "effort",
+        "time_mode": "lockstep",
+        "tick_rate": 50.0,
+        "initial_joint_positions": SHAPE.tolist(),
+    }
+    control = {**CONTROL, "profile": profile, "motion.speed": 0.3, "motion.acceleration": 0.1}
+    harness.make(PlantNode, plant, name="plant")
+    probe = harness.probe(
+        {"odom": Odometry, "end_effector_pose": PoseStamped, STATUS: DiagnosticStatus},
+        latched=(STATUS,),
+    )
+    make = probe.create_publisher
+    tip_goal = TIP + np.array([0.1, 0.4, 0.0])
+    goals = {
+        make(PoseStamped, "goal_pose", 10): pose([0.3, 0.2, 0.0]),
+        make(PoseStamped, "end_effector/goal_pose", 10): pose(tip_goal),
+    }
+
+    def start() -> CoordinatedControlNode:
+        return harness.make(CoordinatedControlNode, {**control, "resume_file": str(file)})
+
+    def pass_time(seconds: float) -> None:
+        end = nanoseconds(probe.last("odom").header.stamp) + seconds * 1e9
+        harness.spin_until(
+            lambda: nanoseconds(probe.last("odom").header.stamp) >= end, f"{seconds} s", 30.0
+        )
+
+    def states() -> list[str]:
+        return [
+            pair.value for m in probe.messages[STATUS] for pair in m.values if pair.key == "state"
+        ]
+
+    node = start()
+    harness.spin_until(lambda: probe.count(STATUS), "the robot is held")
+    assert not file.exists()
+    for publisher, message in goals.items():
+        harness.matched(publisher).publish(message)
+    harness.spin_until(lambda: file.exists() and len(json.loads(file.read_text())) == 2, "the file")
+    for seconds in (0.5, 1.5):
+        pass_time(seconds)
+        assert "reached" not in states(), "in mid-flight"
+        kill(harness, probe, node)
+        before = probe.count("odom")
+        harness.spin_for(0.5)
+        assert probe.count("odom") == before, "a plant in lockstep waits"
+        assert file.exists()
+        node = start()
+    harness.spin_until(lambda: states()[-1] == "reached", "the goal is met", 60.0)
+    assert not file.exists()
+    base, tip = probe.last("odom").pose.pose.position, probe.last("end_effector_pose").pose.position
+    np.testing.assert_allclose([base.x, base.y, base.z], [0.3, 0.2, 0.0], atol=1e-3)
+    np.testing.assert_allclose([tip.x, tip.y, tip.z], tip_goal, atol=1e-3)
+
+
+def test_it_is_flown_on_from_where_the_robot_is_and_what_was_held_is_still_held(
+    harness: Harness, file: Path
+) -> None:
+    loop = Loop(harness, resume_file=str(file))
+    loop.answer()
+    loop.aim(base=pose(AIM))
+    loop.answer()
+    replaced(loop, file)
+    # Meanwhile all of it has drifted: the base, that has a goal, and the tip, that had none.
+    loop.place = np.array([0.125, -0.25, 0.0])
+    wrench, _ = loop.answer()
+    np.testing.assert_allclose(wrench[:3], KP * ((AIM - loop.place) - loop.place), atol=1e-12)
+    assert loop.wait_for("tracking").level == DiagnosticStatus.OK
+
+
+def test_a_law_that_holds_the_shape_goes_on_to_the_shape(harness: Harness, file: Path) -> None:
+    outputs: dict[str, Any] = {"base_outputs": "x y rz", "joint_outputs": "shoulder elbow"}
+    loop = Loop(harness, resume_file=str(file), **outputs)
+    loop.aim(base=pose(AIM))
+    loop.answer()
+    assert json.loads(file.read_text())["base"]["joint_positions"] == SHAPE.tolist()
+    replaced(loop, file, **outputs)
+    loop.answer()
+    kept = json.loads(file.read_text())["base"]
+    assert (kept["position"], kept["joint_positions"]) == (AIM.tolist(), SHAPE.tolist())
+
+
+def test_a_goal_that_comes_at_once_replaces_the_kept_one(harness: Harness, file: Path) -> None:
+    loop = Loop(harness, resume_file=str(file))
+    far = TIP + np.array([0.0, 1.0, 0.0])
+    loop.aim(base=pose(AIM), end_effector=pose(far))
+    loop.answer()
+    replaced(loop, file)
+    loop.aim(base=pose([-0.5, 0.0, 0.0]))
+    wrench, _ = loop.answer()
+    np.testing.assert_allclose(wrench[:3], KP * np.array([-0.5, 1.0, 0.0]), atol=1e-12)
+    kept = json.loads(file.read_text())
+    assert kept["base"]["position"] == [-0.5, 0.0, 0.0]
+    assert kept["end_effector"]["position"] == far.tolist()
+
+
+def test_a_node_that_is_activated_again_goes_on(harness: Harness, file: Path) -> None:
+    loop = Loop(harness, resume_file=str(file))
+    loop.aim(base=pose(AIM))
+    before, _ = loop.answer()
+    loop.node.trigger_deactivate()
+    loop.node.trigger_activate()
+    np.testing.assert_allclose(loop.answer()[0], before, atol=1e-12)
+
+
+def test_the_robot_may_be_told_later(harness: Harness, file: Path) -> None:
+    loop = Loop(harness, resume_file=str(file))
+    loop.aim(base=pose(AIM))
+    before, _ = loop.answer()
+    replaced(loop, file, robot="")
+    loop.show()
+    description = loop.probe.create_publisher(String, "robot_description", LATCHED)
+    harness.connect()
+    count = loop.probe.count("joint_commands")
+    description.publish(String(data=URDF.read_text("utf-8")))
+    harness.spin_until(lambda: loop.probe.count("joint_commands") > count, "the answer")
+    harness.settle(loop.probe)
+    np.testing.assert_allclose(loop.last_command[0], before, atol=1e-12)
+
+
+# -- nothing to go on to ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("end", ["abort", "reached", "failed"])
+def test_a_goal_that_is_decided_is_not_kept(harness: Harness, file: Path, end: str) -> None:
+    loop = Loop(harness, resume_file=str(file), settle_time=0.02, time_limit=0.2)
+    loop.aim(base=pose(AIM))
+    loop.answer()
+    assert file.exists()
+    if end == "abort":
+        assert loop.abort().success
+        assert not file.exists()
+    # The tip is to stay where it was: at the goal of the base the robot would not be at rest.
+    if end == "reached":
+        loop.aim(base=pose(np.zeros(3)))
+    for _ in range(4 if end == "reached" else 25):
+        loop.answer()
+    loop.wait_for("aborted" if end == "abort" else end)
+    harness.settle(loop.probe)
+    assert not file.exists()
+    replaced(loop, file)
+    np.testing.assert_allclose(loop.answer()[0], 0.0, atol=1e-12)
+    loop.wait_for("holding")
+
+
+def test_a_goal_before_an_abort_is_dropped_and_one_after_it_is_flown(
+    harness: Harness, file: Path
+) -> None:
+    loop = Loop(harness, resume_file=str(file))
+    loop.answer()
+    loop.aim(base=pose(AIM))
+    assert loop.abort().success
+    loop.aim(base=pose([-0.5, 0.0, 0.0]))
+    np.testing.assert_allclose(loop.answer()[0][:3], [-0.5 * KP, 0.0, 0.0], atol=1e-12)
+    assert json.loads(file.read_text())["base"]["position"] == [-0.5, 0.0, 0.0]
+
+
+# -- files that are refused -------------------------------------------------------------------
+
+
+def written(name: str = "base", **values: Any) -> str:
+    goal = {"position": [0, 0, 0], "quaternion": [0, 0, 0, 1], "joint_positions": None}
+    return json.dumps({name: {**goal, **values}})
+
+
+FOREIGN = {
+    "empty": b"",
+    "cut": written().encode()[:-5],
+    "no text": b"\xff\xfe\x00",
+    "no object": b"[1, 2]",
+    "no goal": b"{}",
+    "another name": written("tail").encode(),
+    "no position": b'{"base": {"quaternion": [0, 0, 0, 1], "joint_positions": null}}',
+    "a number": b'{"base": 1}',
+    "not finite": written(position=[0, float("nan"), 0]).encode(),
+    "no rotation": written(quaternion=[0, 0, 0, 0]).encode(),
+    "deep": b"[" * 100_000,
+}
+
+
+@pytest.mark.parametrize("node", [CoordinatedControlNode, PlannerNode])
+@pytest.mark.parametrize("content", FOREIGN.values(), ids=FOREIGN)
+def test_a_file_that_holds_no_goal_is_refused(
+    harness: Harness, file: Path, node: type[FlightNode], content: bytes
+) -> None:
+    file.write_bytes(content)
+    parameters = {"robot": "planar_manipulator", "resume_file": str(file)}
+    with pytest.raises(ParameterError) as refusal:
+        node(**construction(harness.context, parameters))
+    assert_one_sentence(str(refusal.value), "resume_file", str(file), "no goal")
+    assert file.read_bytes() == content
+
+
+@pytest.mark.parametrize(
+    ("content", "settings", "mentions"),
+    [
+        (written("end_effector"), {"law": "computed_torque"}, ("computed_torque", "end-effector")),
+        (written(joint_positions=[0.0] * 3), {}, ("3 joints", "planar_manipulator", "2")),
+    ],
+)
+def test_goals_of_another_robot_or_law_are_refused(
+    harness: Harness,
+    file: Path,
+    content: str,
+    settings: dict[str, str],
+    mentions: tuple[str, ...],
+) -> None:
+    file.write_text(content)
+    parameters = {"robot": "planar_manipulator", "resume_file": str(file), **settings}
+    with pytest.raises(ParameterError) as refusal:
+        CoordinatedControlNode(**construction(harness.context, parameters))
+    assert_one_sentence(str(refusal.value), "resume_file", *mentions)
+
+
+def test_a_robot_that_comes_later_and_cannot_go_on_says_so_and_holds(
+    harness: Harness, file: Path
+) -> None:
+    file.write_text(written("end_effector"))
+    loop = Loop(harness, robot="", resume_file=str(file), law="computed_torque")
+    description = loop.probe.create_publisher(String, "robot_description", LATCHED)
+    harness.connect()
+    description.publish(String(data=URDF.read_text("utf-8")))
+    assert_one_sentence(loop.wait_for("refused").message, "computed_torque", "end-effector")
+    np.testing.assert_allclose(loop.answer()[0], 0.0, atol=1e-12)
+
+
+def test_where_nothing_can_be_written_the_goal_is_flown(harness: Harness, file: Path) -> None:
+    loop = Loop(harness, resume_file=str(file.parent / "nowhere" / "goals.json"))
+    loop.aim(base=pose(AIM))
+    np.testing.assert_allclose(loop.answer()[0][:3], KP * AIM, atol=1e-12)
+    loop.wait_for("tracking")
+
+
+def test_a_process_with_a_broken_file_ends_with_one_sentence(file: Path, ros_domain: int) -> None:
+    file.write_text("{")
+    ended = subprocess.run(
+        [
+            *(sys.executable, "-m", "spacerobot_ros.nodes.coordinated_control", "--ros-args"),
+            *("-p", "robot:=planar_manipulator", "-p", f"resume_file:={file}"),
+        ],
+        env={**os.environ, "ROS_DOMAIN_ID": str(ros_domain)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert ended.returncode == 2
+    assert_one_sentence(ended.stderr.strip().splitlines()[-1], "resume_file", str(file), "no goal")
