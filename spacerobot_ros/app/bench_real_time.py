@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import multiprocessing
 import re
 import statistics
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,8 @@ from spacerobot_ros.recording import Bag, read_bag
 
 _MEMORY_PERIOD = 1.0
 """Wall s between two looks at the processes' memory."""
+
+_LONGEST_IDLE_END = 5.0
 
 _WARM_UP = 0.25
 """Part of the time after which memory is to grow no more."""
@@ -43,7 +47,8 @@ class RealTimeFigures:
 
     Deadlines are those of :class:`~spacerobot_ros.nodes.deadlines.Deadlines`: one a tick for the
     plant and one a state for its commander. Lost are messages that were published and are not in
-    the bag; memory is the resident set of all processes.
+    the bag; memory is the resident set of all processes. The idle process does nothing but wait for
+    the same ticks: when it is late, the machine was.
     """
 
     rate: float
@@ -59,6 +64,8 @@ class RealTimeFigures:
     commands_lost: int
     memory_MiB: float
     memory_growth_MiB: float
+    idle_late: int
+    idle_worst_ms: float
 
     @property
     def missed(self) -> float:
@@ -80,6 +87,10 @@ class RealTimeFigures:
         yield (
             f"  lost in the bag: {self.states_lost} states, {self.commands_lost} commands; "
             f"memory {self.memory_MiB:.0f} MiB, grown by {self.memory_growth_MiB:.2f} MiB"
+        )
+        yield (
+            f"  beside it an idle process was late {self.idle_late} times, by "
+            f"{self.idle_worst_ms:.1f} ms at most"
         )
 
     def figures(self) -> dict[str, float]:
@@ -130,6 +141,7 @@ def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
     ):
         bag = Path(folder, "flight.mcap")
         stack = ProcessStack(scenario, bag)
+        idle = _IdleProcess(1.0 / rate, duration)
         try:
             stack.start(_GOAL)
             began = looked = time.monotonic()
@@ -147,9 +159,10 @@ def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
             said = stack.said("planner")
         finally:
             stack.close()
+            late = idle.end()
         if stopped():
             raise SpaceRobotError("The flight in real time was interrupted.")
-        return _figures(rate, read_bag(bag), said, memory)
+        return _figures(rate, read_bag(bag), said, memory, late)
 
 
 def _gait(duration: float) -> dict[str, object]:
@@ -158,7 +171,9 @@ def _gait(duration: float) -> dict[str, object]:
     return {"method": "lie_bracket", "lie_bracket.cycles": cycles}
 
 
-def _figures(rate: float, bag: Bag, said: str, memory: list[float]) -> RealTimeFigures:
+def _figures(
+    rate: float, bag: Bag, said: str, memory: list[float], idle: tuple[int, float]
+) -> RealTimeFigures:
     timing: dict[str, str] = {}
     skipped = 0
     for _, array in bag["/diagnostics"].messages():
@@ -191,7 +206,51 @@ def _figures(rate: float, bag: Bag, said: str, memory: list[float]) -> RealTimeF
         commands_lost=int(published[1]) - bag.message_count("/joint_commands"),
         memory_MiB=memory[-1],
         memory_growth_MiB=statistics.median(settled[-third:]) - statistics.median(settled[:third]),
+        idle_late=idle[0],
+        idle_worst_ms=idle[1],
     )
+
+
+class _IdleProcess:
+    """Waits for ticks and does nothing at them, to tell what the machine is to blame for.
+
+    Parameters
+    ----------
+    period
+        s.
+    duration
+        s.
+    """
+
+    def __init__(self, period: float, duration: float) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._receiver, sender = context.Pipe(duplex=False)
+        self._process = context.Process(
+            target=_wait_for_ticks, args=(period, duration, sender), daemon=True
+        )
+        self._process.start()
+        sender.close()
+
+    def end(self) -> tuple[int, float]:
+        """Return how often it was late by more than a period, and beyond that at most, in ms."""
+        counts: tuple[int, float] = 0, math.nan
+        if self._receiver.poll(_LONGEST_IDLE_END):
+            counts = self._receiver.recv()
+        self._process.kill()
+        self._process.join()
+        return counts
+
+
+def _wait_for_ticks(period: float, duration: float, sender: Connection) -> None:
+    began = time.perf_counter()
+    late, worst = 0, 0.0
+    for tick in range(1, round(duration / period)):
+        due = began + tick * period
+        time.sleep(max(due - time.perf_counter(), 0.0))
+        beyond = time.perf_counter() - due - period
+        late += beyond > 0
+        worst = max(worst, 1e3 * beyond)
+    sender.send((late, worst))
 
 
 def _resident(stack: ProcessStack) -> float:

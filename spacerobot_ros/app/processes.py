@@ -23,10 +23,12 @@ from rclpy.experimental import EventsExecutor
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from spacerobot_ros.app.description import parameter_records, scenario_record
+from spacerobot_ros.app.kills import NEEDS_PROCESSES, KillTimeline
 from spacerobot_ros.app.operator import Operator
-from spacerobot_ros.app.scenario import Scenario
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.app.scenario import COMMANDERS, Scenario
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.nodes import NODE_TYPES
+from spacerobot_ros.nodes.cdr import NANOSECONDS
 from spacerobot_ros.nodes.flight_node import spin_until
 from spacerobot_ros.nodes.plan_work import PLANNED
 from spacerobot_ros.nodes.robot_source import robot_of
@@ -73,7 +75,10 @@ class ProcessStack:
     def __init__(self, scenario: Scenario, bag: Path | None, *, plant_waits: bool = True) -> None:
         if "time_mode" not in scenario.overrides.get("plant", {}):
             scenario = scenario.with_overrides("plant", {"time_mode": "lockstep"})
+        if scenario.kills and scenario.lockstep:
+            raise ParameterError(NEEDS_PROCESSES.format(scenario.name))
         self.scenario = scenario
+        self._timeline = KillTimeline(scenario.kills)
         self.time_ns = 0
         self._bag = bag
         self._folder = tempfile.TemporaryDirectory(prefix="spacerobot_")
@@ -117,6 +122,8 @@ class ProcessStack:
             record = Path(self._folder.name, "scenario.json")
             record.write_text(json.dumps(self._records()), "utf-8")
             overrides["describe"] = str(record)
+        elif self.scenario.kills and name in COMMANDERS:
+            overrides.setdefault("resume_file", str(Path(self._folder.name, f"{name}_goal.json")))
         overrides |= parameters
         file = Path(self._folder.name, f"{name}.yaml")
         file.write_text(yaml.safe_dump({name: {"ros__parameters": overrides}}), "utf-8")
@@ -170,6 +177,7 @@ class ProcessStack:
 
         def on_look() -> None:
             try:
+                self._kill_and_restart()
                 self.require_alive()
                 stop = look()
             except SpaceRobotError as error:
@@ -193,11 +201,14 @@ class ProcessStack:
         SpaceRobotError
             A node did not end well.
         """
-        self._transit(Transition.TRANSITION_DEACTIVATE)
+        if "plant" not in self._timeline.away:
+            self._transit(Transition.TRANSITION_DEACTIVATE)
         end = time.monotonic() + _SETTLING
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.05)
         for name in self._nodes:
+            if name in self._timeline.away:
+                continue
             code = self._end(name)
             if code != 0:
                 raise SpaceRobotError(
@@ -223,11 +234,25 @@ class ProcessStack:
             There is one.
         """
         for name, process in self.processes.items():
-            if process.poll() is not None:
+            if process.poll() is not None and name not in self._timeline.away:
                 raise SpaceRobotError(
                     f"Node '{name}' has ended (code {process.returncode}): "
                     f"{_last_line(self.said(name))}"
                 )
+
+    def kill(self, name: str) -> None:
+        """Have a node end as it would by a crash."""
+        os.killpg(self.processes[name].pid, signal.SIGKILL)
+        self.processes[name].wait()
+
+    def _kill_and_restart(self) -> None:
+        """Do to the nodes what the scenario says for this time."""
+        killed, started = self._timeline.due(self.time_ns / NANOSECONDS)
+        for name in killed:
+            self.kill(name)
+        for name in started:
+            again = {"resume_bag": str(self._bag or ""), "autostart": True}
+            self.launch(name, **(again if name == "plant" else {}))
 
     def _end(self, name: str) -> int:
         process = self.processes[name]
@@ -244,7 +269,7 @@ class ProcessStack:
             return process.wait()
 
     def _on_clock(self, message: ClockMessage) -> None:
-        self.time_ns = message.clock.sec * 1_000_000_000 + message.clock.nanosec
+        self.time_ns = message.clock.sec * NANOSECONDS + message.clock.nanosec
 
     def _met(self) -> bool:
         """Whether commanders and recorder hear the plant and the operator, and are heard."""

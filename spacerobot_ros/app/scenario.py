@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from spacerobot_ros.app.kills import Kill, parse_kills
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model.attitude import quaternion_from_rotvec
 from spacerobot_ros.planning import Goal
@@ -29,6 +30,7 @@ _KEYS = (
     "description",
     "published",
     "published_method",
+    "kills",
     "goal_joint_positions",
     *(f"{goal}_{part}" for goal in _GOALS for part in ("position", "orientation", "rotvec")),
 )
@@ -54,7 +56,7 @@ class Scenario:
 
     ``published_method`` is the gait method that the published figures are of, empty: any.
     ``goal`` is of the base, ``end_effector_goal`` of the end-effector; ``commanders`` are the nodes
-    that fly there.
+    that fly there, ``kills`` what happens to nodes on the way.
     """
 
     name: str
@@ -65,6 +67,7 @@ class Scenario:
     commanders: tuple[str, ...]
     published: tuple[Published, ...]
     published_method: str
+    kills: tuple[Kill, ...]
     in_file: Mapping[str, Mapping[str, Any]]
     overrides: Mapping[str, Mapping[str, Any]]
 
@@ -98,7 +101,7 @@ class Scenario:
         scenario = self.with_overrides("plant", pace)
         if "planner" in self.commanders:
             scenario = scenario.with_overrides("planner", {"plan_in_background": True})
-        return scenario
+        return scenario.with_overrides("recorder", {"diagnostics_period": 1.0})
 
     def with_settings(self, texts: Sequence[str]) -> Scenario:
         """Return the scenario with ``node.parameter=value`` set, each as :func:`parse_setting`.
@@ -170,6 +173,7 @@ def load_scenario(name: str) -> Scenario:
         commanders=tuple(name for name in COMMANDERS if name in content) or ("planner",),
         published=_published(values.get("published", {}), path),
         published_method=str(values.get("published_method", "")),
+        kills=parse_kills(values.get("kills", []), ("plant", *COMMANDERS), f"the file {path}"),
         in_file={
             node: content[node].get("ros__parameters", {}) for node in NODES if content.get(node)
         },

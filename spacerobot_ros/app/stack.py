@@ -15,6 +15,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from spacerobot_ros.app.description import scenario_record
+from spacerobot_ros.app.kills import NEEDS_PROCESSES
 from spacerobot_ros.app.operator import Operator
 from spacerobot_ros.app.scenario import NODES, Scenario
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
@@ -58,6 +59,8 @@ class FlightStack:
     def __init__(
         self, scenario: Scenario, bag: Path | None, context: rclpy.Context | None = None
     ) -> None:
+        if scenario.kills:
+            raise ParameterError(NEEDS_PROCESSES.format(scenario.name))
         self.scenario = scenario
         self.executor = EventsExecutor(context=context) if context else EventsExecutor()
         self._nodes: list[Node] = []

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from spacerobot_ros.nodes.cdr import NANOSECONDS
+from spacerobot_ros.nodes.diagnostics import diagnostic_status
 from spacerobot_ros.nodes.flight_node import STREAM
 
 _LOG_PERIOD = 5.0
@@ -44,22 +45,22 @@ class MessageLoss:
         return SubscriptionEventCallbacks(message_lost=on_loss)
 
     def report(self, time_ns: int) -> None:
-        """Log and publish as diagnostics what was lost; nothing as long as nothing was.
-
-        A publisher that is there without need would be one more thing to wait for and to record.
-        """
+        """Log and publish as diagnostics what was lost; nothing as long as nothing was."""
         if not self.counts:
             return
         sentence = f"{self.total} messages were lost on their way to the recorder."
         self._node.get_logger().warning(sentence, throttle_duration_sec=_LOG_PERIOD)
+        counts = dict(sorted(self.counts.items()))
+        name = f"{self._node.get_fully_qualified_name()}: lost messages"
+        self.publish(time_ns, diagnostic_status(name, DiagnosticStatus.WARN, sentence, counts))
+
+    def publish(self, time_ns: int, status: DiagnosticStatus) -> None:
+        """Publish diagnostics of the recorder.
+
+        A publisher that is there without need would be one more thing to wait for and to record.
+        """
         if self._publisher is None:
             self._publisher = self._node.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
-        status = DiagnosticStatus(
-            level=DiagnosticStatus.WARN,
-            name=f"{self._node.get_fully_qualified_name()}: lost messages",
-            message=sentence,
-            values=[KeyValue(key=topic, value=str(n)) for topic, n in sorted(self.counts.items())],
-        )
         array = DiagnosticArray(status=[status])
         array.header.stamp.sec, array.header.stamp.nanosec = divmod(time_ns, NANOSECONDS)
         self._publisher.publish(array)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, ClassVar
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock as RosClock
 from rclpy.clock import ClockType
 from rclpy.experimental import EventsExecutor
@@ -20,6 +21,7 @@ from std_msgs.msg import String
 from spacerobot_ros import __version__
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.nodes.cdr import NANOSECONDS, first_time_ns
+from spacerobot_ros.nodes.diagnostics import diagnostic_status
 from spacerobot_ros.nodes.flight_node import FlightNode, run_node
 from spacerobot_ros.nodes.message_loss import MessageLoss
 from spacerobot_ros.nodes.message_types import message_class
@@ -68,6 +70,9 @@ class RecorderNode(FlightNode):
         ParameterSpec(
             "describe", "", "", "JSON file of named objects to put into the bag as metadata"
         ),
+        ParameterSpec(
+            "diagnostics_period", 0.0, "s", "wall time between diagnostics; 0: losses only", 0.0
+        ),
         ParameterSpec("flush_period", 0.5, "s", "wall time that a kill can lose at most", 0.01),
         ParameterSpec(
             "max_size", 0.0, "MB", "begin the next file (NAME_0, NAME_1, ...) at; 0: never", 0.0
@@ -111,6 +116,8 @@ class RecorderNode(FlightNode):
         self.create_timer(_SCAN_PERIOD, self.scan, clock=steady)
         flush_period = float(self.parameters["flush_period"])  # type: ignore[arg-type]
         self.create_timer(flush_period, self._flush, clock=steady)
+        if values["diagnostics_period"]:
+            self.create_timer(values["diagnostics_period"], self._report, clock=steady)
         self.describe("spacerobot", {"version": __version__})
         for title, values in _descriptions(str(self.parameters["describe"])):
             self.describe(title, values)
@@ -325,6 +332,24 @@ class RecorderNode(FlightNode):
                 self._release_early(None)
         self._guarded(lambda writer: writer.flush())
         self.loss.report(self._now)
+
+    def _report(self) -> None:
+        if self._writer is None:
+            return
+        lost = self.loss.total
+        status = diagnostic_status(
+            f"{self.get_fully_qualified_name()}: bag",
+            DiagnosticStatus.ERROR if self.failure else DiagnosticStatus.OK,
+            str(self.failure) if self.failure else "recording" if self._active else "paused",
+            {
+                "messages": self.messages_recorded,
+                "messages_lost": lost,
+                "topics": len(self._recorded),
+                "bytes_written": self._writer.bytes_written,
+                "bytes_waiting": self._writer.bytes_waiting,
+            },
+        )
+        self.loss.publish(self._now, status)
 
     def _guarded(self, act: Callable[[BagWriter], None]) -> None:
         if self._writer is None or self.failure is not None:

@@ -103,6 +103,16 @@ class BagWriter:
         }
 
     @property
+    def bytes_written(self) -> int:
+        """How large the present file is, compressed."""
+        return self._file.size
+
+    @property
+    def bytes_waiting(self) -> int:
+        """How much of the chunk in progress is not handed to the operating system yet."""
+        return len(self._chunk)
+
+    @property
     def messages_written(self) -> int:
         """How many messages are in the bag or in the chunk in progress."""
         return sum(self.message_counts.values())

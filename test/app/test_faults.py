@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.ros_harness import assert_one_sentence
 
+from spacerobot_ros.app.kills import KillTimeline, parse_kills
 from spacerobot_ros.app.run import run_scenario
 from spacerobot_ros.app.scenario import load_scenario
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.recording import read_bag
 from spacerobot_ros.recording.verification import verify_bag
 from spacerobot_ros.resources import share_directory
@@ -21,8 +24,12 @@ EXPECTED: dict[str, tuple[bool, float | None, float | None]] = {
     "stuck_elbow": (True, None, 1e-3),
     "stuck_slider": (False, None, None),
     "broken_thrusters": (True, 4e-3, 4e-3),
+    "weak_motors": (True, 2e-3, 2e-3),
+    "late_poses": (True, 2e-3, 2e-3),
+    "biased_pose": (True, 0.11, 2e-3),
 }
 FAST = ("noisy_sensors", "wrong_masses")
+KILLED = "killed_nodes"
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +39,7 @@ def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_every_scenario_is_here() -> None:
     files = {path.stem for path in (share_directory() / "config" / "faults").glob("*.yaml")}
-    assert files == set(EXPECTED)
+    assert files == {*EXPECTED, KILLED}
 
 
 @pytest.mark.parametrize(
@@ -53,9 +60,62 @@ def test_a_scenario_ends_as_documented_and_can_be_flown_again(name: str, tmp_pat
         assert left <= distance
     if angle is not None:
         assert turn.magnitude() <= angle
+    if name == "biased_pose":
+        assert left >= 0.09, "it is believed"
     if not met:
         assert "stuck" in result.sentence
     # The summary is of the truth.
     assert result.summary["position_error_m"] == pytest.approx(left, abs=1e-12)
     verification = verify_bag(tmp_path / "run.mcap")
     assert verification.difference is None, str(verification.difference)
+
+
+@pytest.mark.slow
+def test_killed_nodes_go_on_to_the_goal(tmp_path: Path) -> None:
+    scenario = load_scenario(f"faults/{KILLED}").in_real_time(4.0)
+    result = run_scenario(scenario, tmp_path / "run.mcap", processes=True)
+    assert result.succeeded, result.sentence
+    bag = read_bag(tmp_path / "run.mcap")
+    end = [bag["/odom"].field(f"pose.pose.position.{x}")[-1] for x in "xyz"]
+    assert np.linalg.norm(end - scenario.goal.position) <= 1e-3
+    # They were away: for the planner's time joints rest, for the plant's the clock stands still.
+    states, commands = bag["/joint_states"], bag["/joint_commands"]
+    silent = (states.stamp > 12.0) & (states.stamp <= 14.0)
+    assert silent.sum() > 20
+    assert not np.asarray(states.field("velocity"))[silent].any()
+    assert not ((commands.stamp > 12.0) & (commands.stamp <= 14.0)).any()
+    assert np.diff(states.stamp).max() <= 0.5
+
+
+def test_kills_need_processes_in_real_time(tmp_path: Path) -> None:
+    scenario = load_scenario(f"faults/{KILLED}")
+    for processes in (False, True):
+        with pytest.raises(ParameterError) as caught:
+            run_scenario(scenario, tmp_path / "run.mcap", processes=processes)
+        assert_one_sentence(str(caught.value), "--processes", "--realtime")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "planner", "planner at", "planner at x", "planner at nan", "planner at 3 until 2",
+        "planner at -1", "recorder at 5", "gremlin at 5", "", None, 5, "planner until 5",
+    ],
+)  # fmt: skip
+def test_a_kill_that_is_none_is_refused(line: object) -> None:
+    with pytest.raises(ParameterError) as caught:
+        parse_kills([line], ("plant", "planner"), "the file x.yaml")
+    assert_one_sentence(str(caught.value), "the file x.yaml")
+
+
+def test_kills_come_in_their_order() -> None:
+    lines = ["plant at 5 until 6", "planner  at 1 until 4.5", "planner at 7"]
+    kills = parse_kills(lines, ("plant", "planner"), "x.yaml")
+    timeline = KillTimeline(kills)
+    assert timeline.due(0.5) == ([], [])
+    assert timeline.due(1.0) == (["planner"], [])
+    assert timeline.away == {"planner"}
+    assert timeline.due(5.5) == (["plant"], ["planner"])
+    assert timeline.due(100.0) == (["planner"], ["plant"])
+    assert timeline.due(200.0) == ([], [])
+    assert timeline.away == {"planner"}

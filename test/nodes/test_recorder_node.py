@@ -266,3 +266,29 @@ def test_a_recording_in_a_namespace_has_the_topics_of_it(harness: Harness, tmp_p
     content = BagContent(bag)
     assert set(content.by_topic) == {"/craft/odom", "/clock"}
     np.testing.assert_array_equal([e.log_ns for e in content.by_topic["/craft/odom"]], 0)
+
+
+def test_the_recorder_tells_of_its_bag(harness: Harness, tmp_path: Path) -> None:
+    stack = Stack(harness, tmp_path / "flight.mcap", diagnostics_period=0.05, flush_period=0.05)
+    stack.configure(*STREAMS, *LATCHED_TOPICS)
+    stack.recorder.trigger_activate()
+    stack.fly()
+    stack.stop()
+
+    def told() -> list[dict[str, str]]:
+        return [
+            {pair.key: pair.value for pair in status.values}
+            for array in stack.probe.messages["/diagnostics"]
+            for status in array.status
+            if status.name == "/recorder: bag"
+        ]
+
+    before = len(told())
+    harness.spin_until(lambda: len(told()) > before + 2, "diagnostics of the recorder")
+    said = told()[-1]
+    assert said["messages_lost"] == "0"
+    assert int(said["topics"]) == len(stack.recorder.topics)
+    assert int(said["bytes_written"]) == pytest.approx(stack.bag.stat().st_size, rel=0.2)
+    bag = stack.close_bag()
+    # It records what it says, and so is a few messages further by now.
+    assert bag.count - 20 <= int(said["messages"]) <= bag.count

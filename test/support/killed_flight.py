@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -41,10 +39,6 @@ class Flight:
         )
         self.stack = ProcessStack(scenario, self.bags[0])
 
-    def kill(self, name: str) -> None:
-        os.killpg(self.stack.processes[name].pid, signal.SIGKILL)
-        self.stack.processes[name].wait()
-
     def restart(self, name: str) -> None:
         if name == "recorder":
             self.bags.append(self.folder / f"flight_{len(self.bags)}.mcap")
@@ -56,7 +50,7 @@ class Flight:
 
     def leave(self, name: str, timeouts: int = 2) -> tuple[float, float]:
         """Kill a node, start it again after some timeouts, and return when it was away."""
-        self.kill(name)
+        self.stack.kill(name)
         killed = self.stack.time_ns / 1e9
         self.pass_time(timeouts * TIMEOUT / PACE)
         started = self.stack.time_ns / 1e9
