@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import signal
@@ -80,6 +81,7 @@ class ProcessStack:
         self.scenario = scenario
         self._timeline = KillTimeline(scenario.kills)
         self.time_ns = 0
+        self._clock_seen = math.inf
         self._bag = bag
         self._folder = tempfile.TemporaryDirectory(prefix="spacerobot_")
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -247,7 +249,10 @@ class ProcessStack:
 
     def _kill_and_restart(self) -> None:
         """Do to the nodes what the scenario says for this time."""
-        killed, started = self._timeline.due(self.time_ns / NANOSECONDS)
+        # A killed plant has no clock: the wall's goes on for it.
+        factor = float(self.scenario.parameter("plant", "real_time_factor", 1.0))
+        since = factor * (time.monotonic() - self._clock_seen)
+        killed, started = self._timeline.due(self.time_ns / NANOSECONDS + since)
         for name in killed:
             self.kill(name)
         for name in started:
@@ -270,6 +275,7 @@ class ProcessStack:
 
     def _on_clock(self, message: ClockMessage) -> None:
         self.time_ns = message.clock.sec * NANOSECONDS + message.clock.nanosec
+        self._clock_seen = time.monotonic()
 
     def _met(self) -> bool:
         """Whether commanders and recorder hear the plant and the operator, and are heard."""
