@@ -82,7 +82,7 @@ def test_a_controller_killed_at_random_moments_goes_on(flight: Flight, tmp_path:
     starts = [0.0]
     for _ in range(KILLS):
         flight.pass_time(rng.uniform(0.1, 2.0))
-        assert not flight.decided, "in mid-manoeuvre"
+        assert not flight.decided, f"in mid-manoeuvre: {stack.operator.sentence}"
         starts.append(flight.leave("coordinated_control", timeouts=4)[1])
         flight.spin(lambda: commanded[0] / 1e9 > starts[-1], "it commands again")
     flight.spin(lambda: flight.decided, "the goal is decided")

@@ -65,7 +65,7 @@ def test_a_node_killed_at_random_moments_joins_in_again(flight: Flight, name: st
     away: Away = []
     for _ in range(KILLS):
         flight.pass_time(rng.uniform(0.1, 2.0))
-        assert not flight.decided, "in mid-manoeuvre"
+        assert not flight.decided, f"in mid-manoeuvre: {stack.operator.sentence}"
         away.append(flight.leave(name))
         if name == "plant":
             flight.spin(after(stack, away[-1][1]), "time goes on")
