@@ -24,6 +24,9 @@ _STUCK_SHARE = 0.05
 _FOLLOWS_SHARE = 0.5
 """... and one that goes more than this follows. In between it is slow, or noise hides it."""
 
+_PATIENCE = 8
+"""Windows that are waited for commands to arrive when no joint moves."""
+
 _LOOK_EVERY = 16
 """Ticks between two looks at joints that have all followed so far: a look takes time."""
 
@@ -45,7 +48,8 @@ class StuckJointWatch:
     Since it was last seen to follow, every joint has gone over some range and was commanded to go
     over another; a joint is stuck when it was commanded to move in N ticks or more and the first
     range is a small part of the second. So joints that are not commanded to move, slow ones, and
-    ones whose measurements are noisy are not taken for stuck.
+    ones whose measurements are noisy are not taken for stuck. Where no joint moves at all they are
+    watched for longer: a plant that starts again takes a while to hear its commander.
 
     Parameters
     ----------
@@ -62,7 +66,7 @@ class StuckJointWatch:
     def __init__(self, joints: int, ticks: int, tick_period: float, band: float = 0.0) -> None:
         self._ticks, self._tick_period = ticks, tick_period
         self._band = max(band, _LEAST_BAND)
-        self._joints = joints
+        self._joints, self._longest = joints, _PATIENCE * ticks
         self.restart()
 
     def restart(self) -> None:
@@ -97,6 +101,11 @@ class StuckJointWatch:
             return []
         asked, gone = np.diff(self._asked, axis=0)[0], np.diff(self._gone, axis=0)[0]
         stuck = due & (gone <= _STUCK_SHARE * asked) & (asked > self._band)
+        moved = asked > self._band
+        still = gone[moved] <= _STUCK_SHARE * asked[moved]
+        if np.count_nonzero(moved) > 1 and still.all() and self._window[due].max() < self._longest:
+            # Joints do not all jam at once: commands do not arrive, perhaps not for long.
+            stuck[:] = False
         follows = due & (gone >= _FOLLOWS_SHARE * asked)
         # Those in between are looked at for longer.
         self._window[due] *= 2

@@ -260,3 +260,22 @@ def test_a_method_that_leaves_the_position_does_not_stand_in_for_one_that_does_n
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(2))
     with pytest.raises(PlanningError, match="optimal would leave the position as it comes"):
         method.plan(state, goal)
+
+
+@pytest.mark.parametrize("gait", [ramp, swing])
+def test_commands_that_do_not_arrive_for_a_while_jam_no_joint(
+    gait: Callable[[float], Array],
+) -> None:
+    def away(time: float) -> float:
+        return 0.0 if 10.0 <= time < 10.0 + 4 * NEEDED * TICK else 1.0
+
+    assert not watched(gait, away)
+
+
+@pytest.mark.parametrize("gait", [ramp, swing])
+def test_joints_that_never_follow_again_are_found_in_the_end(
+    gait: Callable[[float], Array],
+) -> None:
+    found = watched(gait, lambda time: 0.0 if time >= 10.0 else 1.0)
+    assert set(found) == {0, 1}
+    assert 10.0 + 4 * NEEDED * TICK < min(found.values()) < 10.0 + 20 * NEEDED * TICK
