@@ -25,6 +25,8 @@ class RobotNode(FlightNode):
         SpaceRobotError
             The robot is refused.
         """
+        # What was built for the robot before belongs to topics that are gone.
+        self._robot = None
         robot = robot_of(self.parameters)
         if robot is None:
             self.create_subscription(String, "robot_description", self._on_description, LATCHED)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
-from support.planner_flight import NEAR, PLANNER, TURNED, Flight, values_of
+from support.planner_flight import HERE, NEAR, PLANNER, TURNED, Flight, values_of
 from support.ros_harness import Harness, assert_one_sentence, construction
 
 from spacerobot_ros.errors import SpaceRobotError
@@ -80,3 +80,15 @@ def test_a_bad_parameter_is_refused_with_a_sentence_that_names_it(
     with pytest.raises(SpaceRobotError) as refusal:
         PlannerNode(**construction(ros_context, {**PLANNER, **parameters}))
     assert_one_sentence(str(refusal.value), *mentions)
+
+
+def test_a_planner_that_is_configured_again_finds_its_robot_again(harness: Harness) -> None:
+    flight = Flight(harness, {"robot": ""})
+    assert values_of(flight.decide(NEAR))["state"] == "reached"
+    flight.plant.trigger_deactivate()
+    for step in ("deactivate", "cleanup", "configure"):
+        assert getattr(flight.planner, f"trigger_{step}")() is TransitionCallbackReturn.SUCCESS
+    harness.connect()
+    assert flight.planner.trigger_activate() is TransitionCallbackReturn.SUCCESS
+    assert values_of(flight.decide(HERE))["state"] == "reached"
+    assert flight.error_to(HERE)[0] < 1e-3
