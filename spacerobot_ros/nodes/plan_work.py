@@ -127,10 +127,11 @@ class PlanWork:
                 return partial(refuse, reason), time.perf_counter() - began
             return partial(fly, schedule), time.perf_counter() - began
 
+        self._dropped = False
         if not self.background:
             self._hand_on(work())
             return
-        self._future, self._dropped = Future(), False
+        self._future = Future()
         self._thread = Thread(target=_fulfil, args=(self._future, work), daemon=True)
         self._thread.start()
 

@@ -336,14 +336,13 @@ class RecorderNode(FlightNode):
     def _report(self) -> None:
         if self._writer is None:
             return
-        lost = self.loss.total
         status = diagnostic_status(
             f"{self.get_fully_qualified_name()}: bag",
             DiagnosticStatus.ERROR if self.failure else DiagnosticStatus.OK,
             str(self.failure) if self.failure else "recording" if self._active else "paused",
             {
                 "messages": self.messages_recorded,
-                "messages_lost": lost,
+                "messages_lost": self.loss.total,
                 "topics": len(self._recorded),
                 "bytes_written": self._writer.bytes_written,
                 "bytes_waiting": self._writer.bytes_waiting,

@@ -14,6 +14,7 @@ from support.planner_flight import HERE, NEAR, TURNED, Flight, values_of
 from support.ros_harness import Harness
 
 from spacerobot_ros.planning import METHODS, GaitSchedule
+from spacerobot_ros.planning.interruption import require_wanted
 from spacerobot_ros.planning.lie_bracket import LieBracketGait
 
 FAR = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
@@ -158,3 +159,23 @@ def test_a_node_that_ends_has_its_search_given_up(harness: Harness) -> None:
     flight.planner.trigger_deactivate()
     assert time.monotonic() - began < 1.6
     flight.harness.spin_until(lambda: threading.active_count() <= before, "the thread is gone")
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_a_plan_after_an_abort_is_wanted_again(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch, background: bool
+) -> None:
+    plan = LieBracketGait.plan
+
+    def searching(*args: Any, **options: Any) -> GaitSchedule:
+        require_wanted()
+        return plan(*args, **options)
+
+    monkeypatch.setattr(LieBracketGait, "plan", searching)
+    flight = Flight(harness, {"plan_in_background": background, "abort_time": 0.5})
+    client = flight.probe.create_client(Trigger, "/planner/abort")
+    flight.send(NEAR)
+    flight.start()
+    flight.wait("executing")
+    assert harness.call(client, Trigger.Request()).success
+    assert values_of(flight.decide(NEAR))["state"] == "reached"
