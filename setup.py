@@ -37,7 +37,7 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=find_packages(include=["spacerobot_ros*"]),
-    package_data={NAME: ["py.typed", "app/report/*.js"]},
+    package_data={NAME: ["py.typed", "report/*.js"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -52,7 +52,7 @@ setup(
         # files they are in lib/spacerobot_ros/ with pip and with colcon.
         (f"lib/{NAME}", files("scripts/*")),
     ],
-    entry_points={"console_scripts": ["spacerobot = spacerobot_ros.app.cli:main"]},
+    entry_points={"console_scripts": ["spacerobot = spacerobot_ros.cli.main:main"]},
     # rclpy and the messages are no requirement: where ROS 2 is installed they are the system's;
     # elsewhere the extra `jazzy` brings them.
     install_requires=[

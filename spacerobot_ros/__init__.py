@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from spacerobot_ros.bag import read_bag
     from spacerobot_ros.planning import plan
-    from spacerobot_ros.recording import read_bag
 
 __version__ = "0.1.0"
 
@@ -20,7 +20,7 @@ def __getattr__(name: str) -> Any:
 
         return plan
     if name == "read_bag":
-        from spacerobot_ros.recording import read_bag
+        from spacerobot_ros.bag import read_bag
 
         return read_bag
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

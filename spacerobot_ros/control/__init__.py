@@ -3,7 +3,8 @@
 from spacerobot_ros.control.errors import NotFiniteError, TargetNotSetError
 from spacerobot_ros.control.estimator import DeadReckoning
 from spacerobot_ros.control.gains import GainPair, Gains
-from spacerobot_ros.control.law import ControlLaw, LawStatus
+from spacerobot_ros.control.laws.law import ControlLaw, LawStatus
+from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.reference import (
     PROFILES,
     MotionLimits,
@@ -11,7 +12,6 @@ from spacerobot_ros.control.reference import (
     ReferenceProfile,
     StepReference,
 )
-from spacerobot_ros.control.registry import LAWS
 from spacerobot_ros.control.saturation import ActuatorLimits, Saturated
 from spacerobot_ros.control.selection import OutputSelection, default_selection, plane_normal
 from spacerobot_ros.control.state import (

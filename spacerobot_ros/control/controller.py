@@ -8,10 +8,10 @@ from enum import Enum
 
 import numpy as np
 
-from spacerobot_ros.control.computed_torque import ComputedTorqueLaw
 from spacerobot_ros.control.estimator import DeadReckoning
 from spacerobot_ros.control.gains import Gains
-from spacerobot_ros.control.law import ControlLaw
+from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
+from spacerobot_ros.control.laws.law import ControlLaw
 from spacerobot_ros.control.pacing import within_thrust
 from spacerobot_ros.control.reference import MotionLimits, ReferenceProfile, StepReference
 from spacerobot_ros.control.saturation import ActuatorLimits, Saturated

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import casadi as ca
 
-from spacerobot_ros.model.attitude import quaternion_from_matrix
 from spacerobot_ros.model.description import Array, JointKind, RobotDescription
+from spacerobot_ros.model.rotations import quaternion_from_matrix
 
 
 def multiply(a: ca.SX, b: ca.SX) -> ca.SX:

@@ -16,12 +16,12 @@ import numpy as np
 from spacerobot_ros.control.errors import TargetNotSetError
 from spacerobot_ros.control.state import JointReference, PoseReference, Reference
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model.attitude import (
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import (
     attitude_error,
     matrix_from_quaternion,
     quaternion_multiply,
 )
-from spacerobot_ros.model.description import Array
 
 _PEAK_RATE = 15 / 8
 """Largest ds/dt of the quintic over one second."""

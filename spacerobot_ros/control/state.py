@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from spacerobot_ros.model.attitude import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.model.space_robot import SpaceRobot
 
 _ZERO = np.zeros(3)

@@ -12,7 +12,6 @@ import numpy as np
 from urdf_parser_py.urdf import URDF
 
 from spacerobot_ros.errors import RobotDescriptionError
-from spacerobot_ros.model.attitude import matrix_from_rpy
 from spacerobot_ros.model.description import (
     Array,
     Inertia,
@@ -25,6 +24,7 @@ from spacerobot_ros.model.description import (
     Shape,
     weld,
 )
+from spacerobot_ros.model.rotations import matrix_from_rpy
 
 _LARGEST = 1e12
 """Larger numbers (kg, m, kg m^2) are slips, and their squares soon overflow."""

@@ -1,11 +1,11 @@
 """The nodes: thin ROS 2 wrappers, parameters in, topics out."""
 
-from spacerobot_ros.nodes.coordinated_control import CoordinatedControlNode
-from spacerobot_ros.nodes.flight_node import FlightNode
-from spacerobot_ros.nodes.planner import PlannerNode
-from spacerobot_ros.nodes.plant import PlantNode
-from spacerobot_ros.nodes.recorder import RecorderNode
-from spacerobot_ros.nodes.replay import ReplayNode
+from spacerobot_ros.nodes.common.node import FlightNode
+from spacerobot_ros.nodes.controller.node import CoordinatedControlNode
+from spacerobot_ros.nodes.planner.node import PlannerNode
+from spacerobot_ros.nodes.plant.node import PlantNode
+from spacerobot_ros.nodes.recorder.node import RecorderNode
+from spacerobot_ros.nodes.replay.node import ReplayNode
 
 NODE_TYPES: dict[str, type[FlightNode]] = {
     "plant": PlantNode,

@@ -1,10 +1,10 @@
 """Goal to gait: one module a method, one common type."""
 
-from spacerobot_ros.planning.goal import Goal, PoseError, RobotState, Tolerance
-from spacerobot_ros.planning.method import GaitMethod
-from spacerobot_ros.planning.one_call import plan
-from spacerobot_ros.planning.registry import METHODS, build_method
-from spacerobot_ros.planning.schedule import BasePath, GaitSchedule
+from spacerobot_ros.planning.api import plan
+from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
+from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
+from spacerobot_ros.planning.methods.registry import METHODS, build_method
 
 __all__ = [
     "METHODS",

@@ -8,8 +8,8 @@ import numpy as np
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.attitude import matrix_from_quaternion, unit_quaternion
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import matrix_from_quaternion, unit_quaternion
 
 
 @dataclass(frozen=True)

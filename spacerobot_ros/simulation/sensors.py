@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model.attitude import quaternion_from_rotvec, quaternion_multiply
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
 from spacerobot_ros.simulation.faults import GROUPS, KINDS, POSE_AXES, Fault
 from spacerobot_ros.simulation.faults_plant import FaultyPlant
 

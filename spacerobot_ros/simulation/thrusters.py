@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from spacerobot_ros.control.thrusters.pulses import ThrusterPulses
+from spacerobot_ros.control.thrusters.table import ThrusterTable, load_thrusters, thrusters_of_urdf
 from spacerobot_ros.errors import CommandError
-from spacerobot_ros.model.thrusters import ThrusterTable, load_thrusters, thrusters_of_urdf
 from spacerobot_ros.simulation.plant import Plant, WrappedPlant
-from spacerobot_ros.simulation.thruster_pulses import ThrusterPulses
 
 IN_URDF = "urdf"
 """Where a table of thrusters is that is in no file of its own."""

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.app.run import run_scenario
-from spacerobot_ros.app.scenario import load_scenario
-from spacerobot_ros.recording import read_bag
+from spacerobot_ros.bag import read_bag
+from spacerobot_ros.session.run import run_scenario
+from spacerobot_ros.session.scenario import load_scenario
 
 
 @pytest.fixture(autouse=True)

@@ -6,19 +6,19 @@ import sys
 
 import pytest
 
-from spacerobot_ros.app import bench_dynamics
+from spacerobot_ros.benchmarks import dynamics
 from spacerobot_ros.model.compilation import c_compiler
 
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_dynamics, "_ROUNDS", 3)
-    monkeypatch.setattr(bench_dynamics, "_STEPS", 100)
+    monkeypatch.setattr(dynamics, "_ROUNDS", 3)
+    monkeypatch.setattr(dynamics, "_STEPS", 100)
 
 
 @pytest.mark.slow
 def test_figures() -> None:
-    figures = bench_dynamics.dynamics_benchmark()
+    figures = dynamics.dynamics_benchmark()
     with_compiler = c_compiler() is not None
     assert ("step_us" in figures) == ("ratio_to_mujoco" in figures) == with_compiler
     for ratio, name in (
@@ -34,7 +34,7 @@ def test_figures() -> None:
 def test_without_mujoco_and_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    figures = bench_dynamics.dynamics_benchmark()
+    figures = dynamics.dynamics_benchmark()
     assert set(figures) == {"compiler", "mujoco", "step_without_compiler_us"}
     assert "not installed" in str(figures["mujoco"])
     assert "none" in str(figures["compiler"])

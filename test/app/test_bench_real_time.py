@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from spacerobot_ros.app.bench_real_time import real_time_flight
+from spacerobot_ros.benchmarks.real_time import real_time_flight
 
 pytestmark = pytest.mark.slow
 

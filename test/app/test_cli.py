@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from spacerobot_ros.app.cli import main
-from spacerobot_ros.app.scenario import load_scenario, parse_setting, scenario_names
+from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.session.scenario import load_scenario, parse_setting, scenario_names
 
 QUICK = [
     "--method",

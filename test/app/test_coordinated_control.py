@@ -11,9 +11,9 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.app.run import RunResult, run_scenario
-from spacerobot_ros.app.scenario import load_scenario
-from spacerobot_ros.recording import Bag, read_bag
+from spacerobot_ros.bag import Bag, read_bag
+from spacerobot_ros.session.run import RunResult, run_scenario
+from spacerobot_ros.session.scenario import load_scenario
 
 Array = npt.NDArray[np.float64]
 

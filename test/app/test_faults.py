@@ -9,13 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.ros_harness import assert_one_sentence
 
-from spacerobot_ros.app.kills import KillTimeline, parse_kills
-from spacerobot_ros.app.run import run_scenario
-from spacerobot_ros.app.scenario import load_scenario
+from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.recording import read_bag
-from spacerobot_ros.recording.verification import verify_bag
 from spacerobot_ros.resources import share_directory
+from spacerobot_ros.session.kills import KillTimeline, parse_kills
+from spacerobot_ros.session.run import run_scenario
+from spacerobot_ros.session.scenario import load_scenario
+from spacerobot_ros.verification.comparison import verify_bag
 
 # Whether the goal is met, and to how many m and rad of the truth; None: not the method's to meet.
 EXPECTED: dict[str, tuple[bool, float | None, float | None]] = {

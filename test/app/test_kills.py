@@ -16,10 +16,10 @@ from support.killed_flight import (
     whole,
 )
 
-from spacerobot_ros.app.processes import ProcessStack
-from spacerobot_ros.app.run import ros
-from spacerobot_ros.app.scenario import Scenario, load_scenario
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.session.processes import ProcessStack
+from spacerobot_ros.session.run import ros
+from spacerobot_ros.session.scenario import Scenario, load_scenario
 
 pytestmark = pytest.mark.slow
 

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spacerobot_ros.recording import read_bag
+from spacerobot_ros.bag import read_bag
 
 ROOT = Path(__file__).parents[2]
-COMMAND = (sys.executable, "-m", "spacerobot_ros.app.cli")
+COMMAND = (sys.executable, "-m", "spacerobot_ros.cli.main")
 GAIT = (
     *("--set", "planner.method=lie_bracket"),
     *("--set", "planner.lie_bracket.t1=4", "--set", "planner.lie_bracket.cycles=0"),

@@ -10,9 +10,9 @@ import pytest
 from click.testing import CliRunner, Result
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.app.cli import main
-from spacerobot_ros.app.plan import problem
-from spacerobot_ros.app.plan_random import fly_goals, random_goals
+from spacerobot_ros.cli.main import main
+from spacerobot_ros.session.plan import problem
+from spacerobot_ros.session.plan_random import fly_goals, random_goals
 
 URDF = Path(__file__).parents[2] / "urdf"
 QUICK = ("--set", "planner.optimal.answers=1", "--set", "planner.optimal.intervals=30")

@@ -10,7 +10,7 @@ from sensor_msgs.msg import JointState
 from support.altered_bags import altered
 from support.ros_harness import assert_one_sentence
 
-from spacerobot_ros.app.cli import main
+from spacerobot_ros.cli.main import main
 from spacerobot_ros.resources import share_directory
 
 BAG = share_directory() / "bags" / "sliding_masses.mcap"

@@ -31,12 +31,12 @@ from support.flight_bags import (
 )
 from support.html_page import Page, leave_blank
 
-from spacerobot_ros.app.report import figures_scene, write_picture, write_report
-from spacerobot_ros.app.report.figures import shape_plate
-from spacerobot_ros.app.report.reading import read_flight
-from spacerobot_ros.app.report.style import Plate, paper_style
+from spacerobot_ros.bag import RecordingError
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.recording import RecordingError
+from spacerobot_ros.report import figures_scene, write_picture, write_report
+from spacerobot_ros.report.figures import shape_plate
+from spacerobot_ros.report.reading import read_flight
+from spacerobot_ros.report.style import Plate, paper_style
 
 FIGURES = [
     "configurations",

@@ -13,15 +13,15 @@ from support.chromium import Browser, browser, chromium
 from support.flight_bags import FINAL, GOAL, Story, cyclic_shapes, tell, urdf_of
 from support.html_page import leave_blank
 
-from spacerobot_ros.app.report import animation, write_report
-from spacerobot_ros.app.report.flight import Flight
-from spacerobot_ros.app.report.keyframes import key_frames
-from spacerobot_ros.app.report.meshcat import Command
-from spacerobot_ros.app.report.reading import read_flight
-from spacerobot_ros.app.report.scene import Scene, scene_of
-from spacerobot_ros.app.report.signals import Cycles, Signal
-from spacerobot_ros.model.attitude import matrix_from_quaternion, quaternion_from_rotvec
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
+from spacerobot_ros.report import animation, write_report
+from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.keyframes import key_frames
+from spacerobot_ros.report.meshcat import Command
+from spacerobot_ros.report.reading import read_flight
+from spacerobot_ros.report.scene import Scene, scene_of
+from spacerobot_ros.report.signals import Cycles, Signal
 
 N = 6
 

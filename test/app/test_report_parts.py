@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from support.flight_bags import TICK, cyclic_shapes, rates_of
 
-from spacerobot_ros.app.report.render import Canvas, Edge, Face, View
-from spacerobot_ros.app.report.signals import Signal, envelope, find_cycles, rotvecs
-from spacerobot_ros.model.attitude import quaternion_from_rotvec
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import quaternion_from_rotvec
+from spacerobot_ros.report.render import Canvas, Edge, Face, View
+from spacerobot_ros.report.signals import Signal, envelope, find_cycles, rotvecs
 
 
 def test_what_is_behind_is_hidden() -> None:

@@ -17,10 +17,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.app.run import RunResult, run_scenario
-from spacerobot_ros.app.scenario import Scenario, goal_from_rotvec, load_scenario
+from spacerobot_ros.bag import iterate_raw, read_bag
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.recording import iterate_raw, read_bag
+from spacerobot_ros.session.run import RunResult, run_scenario
+from spacerobot_ros.session.scenario import Scenario, goal_from_rotvec, load_scenario
 
 SHORT = {
     "method": "lie_bracket",

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.app.run import run_scenario
-from spacerobot_ros.app.scenario import load_scenario
+from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.recording import Bag, read_bag
-from spacerobot_ros.recording.verification import verify_bag
+from spacerobot_ros.session.run import run_scenario
+from spacerobot_ros.session.scenario import load_scenario
+from spacerobot_ros.verification.comparison import verify_bag
 
 MILLIMETRE = 1e-3
 TENTH_OF_A_DEGREE = np.radians(0.1)

@@ -33,9 +33,9 @@ from spacerobot_ros.control import (
     OutputSelection,
     Reference,
 )
-from spacerobot_ros.control.model_based import ModelBasedLaw
+from spacerobot_ros.control.laws.model_based import ModelBasedLaw
+from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
 from spacerobot_ros.control.selection import AXES
-from spacerobot_ros.control.transposed_jacobian import TransposedJacobianLaw
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -14,13 +14,13 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from support.fuzzing import NUMBERS, VALUES, attempt, damaged, fuzz
 
-from spacerobot_ros.app.report import write_report
-from spacerobot_ros.nodes.plant_parameters import PLANT_SPECS
-from spacerobot_ros.recording import Playback, iterate_raw, read_bag
-from spacerobot_ros.recording.last_state import last_state
-from spacerobot_ros.recording.salvage import salvage_bag
-from spacerobot_ros.recording.verification import verify_bag
+from spacerobot_ros.bag import Playback, iterate_raw, read_bag
+from spacerobot_ros.bag.last_state import last_state
+from spacerobot_ros.bag.salvage import salvage_bag
+from spacerobot_ros.nodes.plant.parameters import PLANT_SPECS
+from spacerobot_ros.report import write_report
 from spacerobot_ros.resources import share_directory
+from spacerobot_ros.verification.comparison import verify_bag
 
 WHOLE = (share_directory() / "bags" / "sliding_masses.mcap").read_bytes()
 _MESSAGES = 120

@@ -12,8 +12,8 @@ from sensor_msgs.msg import JointState
 from support.fuzzing import NUMBERS, TEXTS, damaged, fuzz
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.nodes.cdr import UnreadableError
-from spacerobot_ros.nodes.command_channel import CommandChannel, JointChannel, WrenchChannel
+from spacerobot_ros.nodes.common.cdr import UnreadableError
+from spacerobot_ros.nodes.plant.command_channel import CommandChannel, JointChannel, WrenchChannel
 from spacerobot_ros.resources import robot_file
 
 NAMES = st.one_of(

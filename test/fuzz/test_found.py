@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 from support.ros_harness import assert_one_sentence
 
-from spacerobot_ros.app.scenario import goal_from_rotvec, load_scenario
+from spacerobot_ros.bag import BagWriter, RecordingError, read_bag
 from spacerobot_ros.errors import (
     ParameterError,
     PlanningError,
@@ -22,11 +22,11 @@ from spacerobot_ros.errors import (
     SpaceRobotError,
 )
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.nodes.cdr import TemplateReader, UnreadableError
-from spacerobot_ros.nodes.parameters import ParameterSpec
+from spacerobot_ros.nodes.common.cdr import TemplateReader, UnreadableError
+from spacerobot_ros.nodes.common.parameters import ParameterSpec
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.recording import BagWriter, RecordingError, read_bag
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.session.scenario import goal_from_rotvec, load_scenario
 
 CHUNK = 6
 ORIGIN, NO_TURN = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]

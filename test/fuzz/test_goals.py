@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from sensor_msgs.msg import JointState
 from support.fuzzing import NUMBERS, TEXTS, VALUES, attempt, fuzz
 
-from spacerobot_ros.app.scenario import goal_from_rotvec
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.nodes.goal_messages import goal_of, shape_of
+from spacerobot_ros.nodes.common.goal_messages import goal_of, shape_of
 from spacerobot_ros.planning import Goal, RobotState, Tolerance
-from spacerobot_ros.planning.registry import build_method
+from spacerobot_ros.planning.methods.registry import build_method
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.session.scenario import goal_from_rotvec
 
 ROBOTS = {
     "lie_bracket": "sliding_masses",

@@ -13,8 +13,8 @@ from support.fuzzing import FINITE, MODEST, NUMBERS, TEXTS, VALUES, attempt, fuz
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import NODE_TYPES, ReplayNode
-from spacerobot_ros.nodes.flight_node import AUTOSTART, FlightNode
-from spacerobot_ros.nodes.parameters import ParameterSpec
+from spacerobot_ros.nodes.common.node import AUTOSTART, FlightNode
+from spacerobot_ros.nodes.common.parameters import ParameterSpec
 
 KINDS: list[type[FlightNode]] = [*NODE_TYPES.values(), ReplayNode]
 SPECS = [AUTOSTART, *(spec for kind in KINDS for spec in kind.SPECS)]

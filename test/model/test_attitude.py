@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.oracles import Array
 
-from spacerobot_ros.model.attitude import (
+from spacerobot_ros.model.rotations import (
     attitude_error,
     hat,
     matrix_from_quaternion,

@@ -12,9 +12,9 @@ from support.oracles import ENGINES, Array, Motion, assert_agrees, random_motion
 from support.random_robots import random_chain_urdf, random_robot_urdf
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.attitude import matrix_from_quaternion
 from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.free_flight import state_slices
+from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.resources import share_directory
 
 SEEDS = range(10)

@@ -24,7 +24,7 @@ from support.random_messages import few, messages
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
-from spacerobot_ros.nodes.cdr import (
+from spacerobot_ros.nodes.common.cdr import (
     Layout,
     MessageTemplate,
     TemplateReader,

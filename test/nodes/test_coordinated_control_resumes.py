@@ -301,7 +301,7 @@ def test_a_process_with_a_broken_file_ends_with_one_sentence(file: Path, ros_dom
     file.write_text("{")
     ended = subprocess.run(
         [
-            *(sys.executable, "-m", "spacerobot_ros.nodes.coordinated_control", "--ros-args"),
+            *(sys.executable, "-m", "spacerobot_ros.nodes.controller.node", "--ros-args"),
             *("-p", "robot:=planar_manipulator", "-p", f"resume_file:={file}"),
         ],
         env={**os.environ, "ROS_DOMAIN_ID": str(ros_domain)},

@@ -11,7 +11,7 @@ from sensor_msgs.msg import JointState
 from support.ros_harness import DEEP, Harness
 
 from spacerobot_ros.nodes import PlantNode
-from spacerobot_ros.nodes.deadlines import Deadlines
+from spacerobot_ros.nodes.plant.deadlines import Deadlines
 
 MS = 1_000_000
 

@@ -14,8 +14,8 @@ from support.planner_flight import HERE, NEAR, TURNED, Flight, values_of
 from support.ros_harness import Harness
 
 from spacerobot_ros.planning import METHODS, GaitSchedule
-from spacerobot_ros.planning.interruption import require_wanted
-from spacerobot_ros.planning.lie_bracket import LieBracketGait
+from spacerobot_ros.planning.core.cancellation import require_wanted
+from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 FAR = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 

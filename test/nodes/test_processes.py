@@ -28,6 +28,8 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from support.ros_harness import Harness, Probe, assert_one_sentence, nanoseconds
 
+from spacerobot_ros.nodes import NODE_TYPES
+
 ROOT = Path(__file__).parents[2]
 START = 60.0
 """Wall s in which a process is up, or has ended, on a machine with other things to do."""
@@ -60,7 +62,7 @@ class Process:
                 # runpy warns that the package has imported the module before.
                 [
                     *(sys.executable, "-W", "ignore::RuntimeWarning:runpy"),
-                    *("-m", f"spacerobot_ros.nodes.{node}", *words),
+                    *("-m", NODE_TYPES[node].__module__, *words),
                 ],
                 cwd=ROOT,
                 env={**os.environ, "ROS_DOMAIN_ID": str(domain)},

@@ -20,9 +20,9 @@ from mcap.reader import make_reader
 from std_msgs.msg import String
 from support.ros_harness import Harness
 
+from spacerobot_ros.bag import RecordingError, read_bag
+from spacerobot_ros.bag.salvage import salvage_bag
 from spacerobot_ros.nodes import RecorderNode
-from spacerobot_ros.recording import RecordingError, read_bag
-from spacerobot_ros.recording.salvage import salvage_bag
 
 ROOT = Path(__file__).parents[2]
 
@@ -96,7 +96,7 @@ def test_a_kill_at_any_moment_leaves_all_but_the_last_second(
         bag = tmp_path / f"{turn}.mcap"
         parameters = ["-p", f"bag:={bag}", "-p", "clock_wait:=0.0", "-p", f"topics:=/talk_{turn}"]
         with subprocess.Popen(
-            [sys.executable, "-m", "spacerobot_ros.nodes.recorder", "--ros-args", *parameters],
+            [sys.executable, "-m", "spacerobot_ros.nodes.recorder.node", "--ros-args", *parameters],
             cwd=ROOT,
             env={**os.environ, "ROS_DOMAIN_ID": str(ros_domain)},
             stderr=subprocess.DEVNULL,

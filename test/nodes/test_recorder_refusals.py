@@ -11,9 +11,9 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from support.recorded_stack import LATCHED_TOPICS, STREAMS, BagContent, Stack, message_class
 from support.ros_harness import Harness, Probe, assert_one_sentence, construction
 
+from spacerobot_ros.bag import BagWriter, RecordingError
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import RecorderNode
-from spacerobot_ros.recording import BagWriter, RecordingError
 
 ERROR = 40  # of rcl_interfaces/msg/Log
 

@@ -23,9 +23,9 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from support.ros_harness import Harness, Probe, assert_one_sentence, construction, nanoseconds
 
+from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import ReplayNode
-from spacerobot_ros.recording import LATCHED, BagWriter, QosProfile
 
 ROOT = Path(__file__).parents[2]
 STRING = "std_msgs/msg/String"
@@ -233,7 +233,7 @@ def test_a_type_that_is_not_installed_is_left_out(harness: Harness, tmp_path: Pa
 def command(bag: Path, domain: int, *options: str) -> Iterator[subprocess.Popen[str]]:
     """Run `spacerobot replay`; nothing of it outlives the context."""
     with subprocess.Popen(
-        [sys.executable, "-m", "spacerobot_ros.app.cli", "replay", str(bag), *options],
+        [sys.executable, "-m", "spacerobot_ros.cli.main", "replay", str(bag), *options],
         cwd=ROOT,
         env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
         stderr=subprocess.PIPE,

@@ -14,9 +14,9 @@ from rosbags.typesys import Stores, get_typestore
 from support.random_messages import few
 from trajectory_msgs.msg import JointTrajectory
 
-from spacerobot_ros.nodes.trajectory_message import serialised_trajectory
+from spacerobot_ros.bag import message_definition
+from spacerobot_ros.nodes.planner.trajectory_message import serialised_trajectory
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
-from spacerobot_ros.recording import message_definition
 
 
 @st.composite

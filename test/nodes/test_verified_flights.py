@@ -15,10 +15,10 @@ from std_srvs.srv import Trigger
 from support.altered_bags import altered
 from support.ros_harness import Harness
 
+from spacerobot_ros.bag import RecordingError
 from spacerobot_ros.nodes import PlantNode, RecorderNode
-from spacerobot_ros.nodes.recorder import parameters_of
-from spacerobot_ros.recording import RecordingError
-from spacerobot_ros.recording.verification import verify_bag
+from spacerobot_ros.nodes.recorder.node import parameters_of
+from spacerobot_ros.verification.comparison import verify_bag
 
 SLIDERS = ["slider_1", "slider_2", "slider_3"]
 VELOCITY = {

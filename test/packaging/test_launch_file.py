@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 import yaml
 
-from spacerobot_ros.app.scenario import scenario_names
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.resources import share_directory
+from spacerobot_ros.session.scenario import scenario_names
 
 FILE = Path(__file__).parents[2] / "launch" / "flight_stack.launch.py"
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from spacerobot_ros.recording import Bag, read_bag
+from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.resources import resource_names, share_directory
 
 SHARE = share_directory()

@@ -61,6 +61,12 @@ def new_environment(prefix: Path) -> Path:
     return prefix / "bin" / "python3"
 
 
+def module_of(node: str) -> str:
+    """Return the module that an executable runs."""
+    folder = {"coordinated_control": "controller"}.get(node, node)
+    return f"spacerobot_ros.nodes.{folder}.node"
+
+
 @pytest.fixture
 def manifest() -> Package:
     return parse_package(ROOT / "package.xml", warnings=[])
@@ -79,12 +85,15 @@ def project(tmp_path: Path) -> Path:
     for folder in ("urdf/meshes", "config"):
         (project / folder).mkdir(parents=True, exist_ok=True)
         (project / folder / "packaging_test.txt").touch()
-    for module in ("__init__", "app/__init__", "app/cli", "nodes/__init__"):
+    for module in ("__init__", "cli/__init__", "cli/main", "nodes/__init__"):
         source = project / "spacerobot_ros" / f"{module}.py"
         source.parent.mkdir(parents=True, exist_ok=True)
         source.write_text(STUB)
     for node in NODES:
-        (project / "spacerobot_ros" / "nodes" / f"{node}.py").write_text(STUB)
+        source = project / f"{module_of(node).replace('.', '/')}.py"
+        source.parent.mkdir()
+        (source.parent / "__init__.py").touch()
+        source.write_text(STUB)
     return project
 
 
@@ -129,7 +138,7 @@ def test_a_node_has_a_script_that_runs_its_module() -> None:
     for node in NODES:
         script = ROOT / "scripts" / node
         assert os.access(script, os.X_OK)
-        assert f"from spacerobot_ros.nodes.{node} import main\n" in script.read_text()
+        assert f"from {module_of(node)} import main\n" in script.read_text()
 
 
 @pytest.mark.slow
@@ -147,7 +156,7 @@ def test_pip_installs_nodes_that_run_outside_an_active_environment(
         assert not (prefix / "bin" / node).exists()
         called = json.loads(run([prefix / "lib" / "spacerobot_ros" / node, "-r", "a:=b c"]))
         assert called == {
-            "module": f"spacerobot_ros.nodes.{node}",
+            "module": module_of(node),
             "prefix": str(prefix),
             "arguments": ["-r", "a:=b c"],
         }
@@ -187,5 +196,5 @@ def test_colcon_builds_a_package_in_which_ros2_run_finds_the_nodes(
             ["sh", "-c", script], cwd=install, path=str(Path(sys.executable).parent)
         ).splitlines()
         assert str(prefix) in prefixes.split(os.pathsep)
-        assert json.loads(called)["module"] == f"spacerobot_ros.nodes.{node}"
+        assert json.loads(called)["module"] == module_of(node)
         assert json.loads(called)["arguments"] == ["a"]

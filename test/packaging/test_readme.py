@@ -14,7 +14,7 @@ from spacerobot_ros.nodes import (
     RecorderNode,
     ReplayNode,
 )
-from spacerobot_ros.nodes.flight_node import AUTOSTART
+from spacerobot_ros.nodes.common.node import AUTOSTART
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 

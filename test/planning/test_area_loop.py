@@ -17,8 +17,8 @@ from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import METHODS, GaitMethod, Goal, RobotState, Tolerance
-from spacerobot_ros.planning.edge_path import edge_path
-from spacerobot_ros.planning.nominal_shape import NominalShape, best_nominal, given_nominal
+from spacerobot_ros.planning.methods.edge_path import edge_path
+from spacerobot_ros.planning.methods.nominal_shape import NominalShape, best_nominal, given_nominal
 
 Array = npt.NDArray[np.float64]
 

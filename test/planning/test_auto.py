@@ -23,7 +23,7 @@ from spacerobot_ros.planning import (
     Tolerance,
     build_method,
 )
-from spacerobot_ros.planning.auto import AutoGait, Candidate
+from spacerobot_ros.planning.methods.auto import AutoGait, Candidate
 
 FOLDER = Path(__file__).parents[2] / "urdf"
 PERIOD = 0.25

@@ -9,7 +9,7 @@ from support.effort_flights import robot_of
 from support.oracles import PinocchioOracle
 
 from spacerobot_ros.errors import PlanningError
-from spacerobot_ros.planning.averaging import StateAverage
+from spacerobot_ros.planning.execution.state_average import StateAverage
 from spacerobot_ros.resources import share_directory
 
 URDF = (share_directory() / "urdf" / "three_joint_arm.urdf").read_text("utf-8")

@@ -15,7 +15,7 @@ from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import METHODS
-from spacerobot_ros.planning.controllability import (
+from spacerobot_ros.planning.core.controllability import (
     best_triple,
     brackets_anywhere,
     brackets_at,

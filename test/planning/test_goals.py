@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 
 from spacerobot_ros.errors import PlanningError
-from spacerobot_ros.model.attitude import quaternion_from_rotvec
+from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.planning import METHODS, Goal, PoseError, Tolerance
 
 

@@ -24,7 +24,7 @@ from support.slides_and_turns import (
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal, Tolerance
-from spacerobot_ros.planning.lie_bracket import LieBracketGait
+from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 Array = npt.NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from support.slides_and_turns import PERIOD, URDF, goal_at, misses, note, origin
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import METHODS, GaitSchedule, Tolerance
-from spacerobot_ros.planning.lie_bracket import LieBracketGait
+from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 PAPER_GOAL = goal_at([0.3, -0.25, 0.1], Rotation.from_rotvec([0.5, -0.15, 0.1]))
 # a22 = 0.8 and a31 = 8.125, as ratios to the balanced amplitudes at the paper's alpha.

@@ -14,7 +14,7 @@ from support.oracles import PinocchioOracle
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, plan
-from spacerobot_ros.planning.optimal import OptimalGait
+from spacerobot_ros.planning.methods.optimal import OptimalGait
 
 Array = npt.NDArray[np.float64]
 

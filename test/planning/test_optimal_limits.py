@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, RobotState, plan
-from spacerobot_ros.planning.optimal.constraints import PathConstraints
-from spacerobot_ros.planning.optimal.search import ManoeuvreSearch
-from spacerobot_ros.planning.optimal.transcription import Transcription
+from spacerobot_ros.planning.methods.optimal.constraints import PathConstraints
+from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
+from spacerobot_ros.planning.methods.optimal.transcription import Transcription
 
 Array = npt.NDArray[np.float64]
 

@@ -28,8 +28,8 @@ from support.planar_trees import random_tree
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import METHODS, Tolerance
-from spacerobot_ros.planning.geometric_phase import PlanarPhase
-from spacerobot_ros.planning.planar import planar_axis
+from spacerobot_ros.planning.core.planar import planar_axis
+from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase
 
 
 @pytest.mark.parametrize("branched", [False, True])

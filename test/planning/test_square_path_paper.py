@@ -22,7 +22,7 @@ from support.planar_manoeuvres import (
 )
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning.geometric_phase import PlanarPhase
+from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase
 
 RIGHT = {"given_centre": 1, "centre_1": 5 * np.pi / 6, "centre_2": 2 * np.pi / 3}
 SWAPPED = {"given_centre": 1, "centre_1": 2 * np.pi / 3, "centre_2": 5 * np.pi / 6}

@@ -14,7 +14,7 @@ from support.ros_harness import assert_one_sentence
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.planning import Goal, RobotState, Tolerance
-from spacerobot_ros.planning.stuck_joints import RemainingJointsGait, StuckJointWatch
+from spacerobot_ros.planning.execution.stuck_joints import RemainingJointsGait, StuckJointWatch
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 from spacerobot_ros.simulation.faults_plant import FaultyPlant

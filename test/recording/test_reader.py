@@ -18,7 +18,7 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 import spacerobot_ros
-from spacerobot_ros.recording import (
+from spacerobot_ros.bag import (
     BagWriter,
     iterate_raw,
     read_bag,
@@ -238,4 +238,4 @@ assert not hasattr(spacerobot_ros, "write_bag")
         capture_output=True,
         text=True,
     )
-    assert (done.stdout, done.stderr) == ("spacerobot_ros.recording.reader\n", "")
+    assert (done.stdout, done.stderr) == ("spacerobot_ros.bag.reader\n", "")

@@ -10,7 +10,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from spacerobot_ros.recording import (
+from spacerobot_ros.bag import (
     BagWriter,
     RecordingError,
     iterate_raw,

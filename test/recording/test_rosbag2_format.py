@@ -25,7 +25,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-from spacerobot_ros.recording import LATCHED, BagWriter, QosProfile, RecordingError
+from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, RecordingError
 
 Sample = tuple[str, str, Any]
 AssertSame = Callable[[Any, Any], None]

@@ -16,9 +16,9 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
-from spacerobot_ros.app.cli import main
-from spacerobot_ros.recording import LATCHED, BagWriter, RecordingError, read_bag
-from spacerobot_ros.recording.salvage import salvage_bag
+from spacerobot_ros.bag import LATCHED, BagWriter, RecordingError, read_bag
+from spacerobot_ros.bag.salvage import salvage_bag
+from spacerobot_ros.cli.main import main
 
 STRING = "std_msgs/msg/String"
 COUNT = 900

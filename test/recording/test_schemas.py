@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from spacerobot_ros.recording import RecordingError, message_definition, type_hash
+from spacerobot_ros.bag import RecordingError, message_definition, type_hash
 
 TYPES = [
     "diagnostic_msgs/msg/DiagnosticArray",

@@ -13,10 +13,10 @@ from std_msgs.msg import Float64MultiArray
 from support.altered_bags import altered
 from support.ros_harness import assert_one_sentence
 
+from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.recording import read_bag
-from spacerobot_ros.recording.verification import verify_bag
 from spacerobot_ros.resources import share_directory
+from spacerobot_ros.verification.comparison import verify_bag
 
 BAG = share_directory() / "bags" / "sliding_masses.mcap"
 TICK = 0.1

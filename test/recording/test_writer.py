@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from spacerobot_ros.recording import BagWriter, RecordingError
+from spacerobot_ros.bag import BagWriter, RecordingError
 
 STRING = "std_msgs/msg/String"
 

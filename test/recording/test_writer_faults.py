@@ -19,7 +19,7 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 
 import spacerobot_ros
-from spacerobot_ros.recording import BagWriter, RecordingError
+from spacerobot_ros.bag import BagWriter, RecordingError
 
 STRING = "std_msgs/msg/String"
 
@@ -60,7 +60,7 @@ class Disk:
             assert buffering == 0
             return File(path, mode)
 
-        monkeypatch.setattr("spacerobot_ros.recording.mcap_file.open", fake_open, raising=False)
+        monkeypatch.setattr("spacerobot_ros.bag.mcap_file.open", fake_open, raising=False)
 
 
 def fill(writer: BagWriter, channel: int) -> int:
@@ -145,7 +145,7 @@ def test_the_limit_of_a_real_file(tmp_path: Path) -> None:
     program = """
 import resource, sys
 import spacerobot_ros
-from spacerobot_ros.recording import BagWriter, RecordingError
+from spacerobot_ros.bag import BagWriter, RecordingError
 resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, 500_000))
 writer = BagWriter(sys.argv[1], compression="none")
 channel = writer.add_topic("/a", "std_msgs/msg/String")
@@ -179,7 +179,7 @@ def test_a_kill_loses_nothing_before_a_flush(tmp_path: Path) -> None:
     program = """
 import sys
 import spacerobot_ros
-from spacerobot_ros.recording import BagWriter
+from spacerobot_ros.bag import BagWriter
 writer = BagWriter(sys.argv[1])
 channel = writer.add_topic("/a", "std_msgs/msg/String")
 for n in range(777):
@@ -201,7 +201,7 @@ def test_a_kill_in_mid_write_loses_the_chunk_in_progress_only(tmp_path: Path) ->
     program = """
 import sys
 import spacerobot_ros
-from spacerobot_ros.recording import BagWriter
+from spacerobot_ros.bag import BagWriter
 writer = BagWriter(sys.argv[1])
 channel = writer.add_topic("/a", "std_msgs/msg/String")
 n = 0

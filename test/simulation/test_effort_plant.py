@@ -16,10 +16,10 @@ from support.oracles import Array, assert_agrees
 from support.random_robots import random_chain_urdf
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.attitude import matrix_from_quaternion
 from spacerobot_ros.model.compilation import BufferedFunction, c_compiler
 from spacerobot_ros.model.free_flight import state_slices
 from spacerobot_ros.model.integration import repeated
+from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.simulation import EffortPlant, InitialState
 from spacerobot_ros.simulation.effort_plant import DEFAULT_INTEGRATION_STEP
 

@@ -13,7 +13,7 @@ from support.oracles import Array
 
 from spacerobot_ros.errors import CommandError, ParameterError, RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.attitude import matrix_from_quaternion
+from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.simulation import EffortPlant, InitialState
 from spacerobot_ros.simulation.faults_plant import FaultyPlant
 from spacerobot_ros.simulation.thrusters import ThrusterPlant, thrusters_in, with_thrusters

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.oracles import Array
 
+from spacerobot_ros.control.thrusters.pulses import ThrusterPulses
+from spacerobot_ros.control.thrusters.table import ThrusterTable, thrusters_of_urdf
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model.thrusters import ThrusterTable, thrusters_of_urdf
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.resources import share_directory
-from spacerobot_ros.simulation.thruster_pulses import ThrusterPulses
 
 SERVICER = thrusters_of_urdf(load_robot(share_directory() / "urdf" / "servicer.urdf"))
 TICK = 0.01

@@ -16,9 +16,9 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from spacerobot_ros.model.attitude import quaternion_from_rotvec
+from spacerobot_ros.bag import BagWriter
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.recording import BagWriter
+from spacerobot_ros.model.rotations import quaternion_from_rotvec
 
 TICK = 0.05
 GOAL = ([0.3, -0.25, 0.1], [0.5, -0.15, 0.1])

@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 import pytest
 from matplotlib.figure import Figure
 
-from spacerobot_ros.app.report import figures_scene
+from spacerobot_ros.report import figures_scene
 
 
 def leave_blank(patch: pytest.MonkeyPatch) -> None:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.app.processes import ProcessStack
-from spacerobot_ros.app.scenario import Scenario
-from spacerobot_ros.recording import Bag, RecordingError, read_bag
-from spacerobot_ros.recording.salvage import salvage_bag
+from spacerobot_ros.bag import Bag, RecordingError, read_bag
+from spacerobot_ros.bag.salvage import salvage_bag
+from spacerobot_ros.session.processes import ProcessStack
+from spacerobot_ros.session.scenario import Scenario
 
 KILLS = 20
 TIMEOUT = 0.5

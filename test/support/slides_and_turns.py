@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance
-from spacerobot_ros.planning.lie_bracket import LieBracketGait
+from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 Array = npt.NDArray[np.float64]
 

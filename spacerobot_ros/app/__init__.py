@@ -1,1 +1,0 @@
-"""Command line, scenario runner and reports; composes the nodes in one process."""

@@ -1,5 +1,0 @@
-"""Picture report of a bag: one HTML file that works offline, from what the bag holds alone."""
-
-from spacerobot_ros.app.report.writing import write_picture, write_report
-
-__all__ = ["write_picture", "write_report"]

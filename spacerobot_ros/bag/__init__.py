@@ -1,0 +1,26 @@
+"""MCAP bags that any ROS 2 tool opens: writing, reading, replaying and verifying them."""
+
+from spacerobot_ros.bag.errors import RecordingError
+from spacerobot_ros.bag.qos import LATCHED, QosProfile
+from spacerobot_ros.bag.reader import Bag, iterate_raw, read_bag
+from spacerobot_ros.bag.replay import Playback, ReplayMessage, ReplayTopic, Timeline
+from spacerobot_ros.bag.schemas import message_definition, type_hash
+from spacerobot_ros.bag.series import TopicSeries
+from spacerobot_ros.bag.writer import BagWriter
+
+__all__ = [
+    "LATCHED",
+    "Bag",
+    "BagWriter",
+    "Playback",
+    "QosProfile",
+    "RecordingError",
+    "ReplayMessage",
+    "ReplayTopic",
+    "Timeline",
+    "TopicSeries",
+    "iterate_raw",
+    "message_definition",
+    "read_bag",
+    "type_hash",
+]

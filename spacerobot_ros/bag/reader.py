@@ -1,0 +1,241 @@
+"""Reads a bag as time series."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import SeekingReader
+from mcap.records import Channel
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
+from spacerobot_ros.bag.errors import RecordingError
+from spacerobot_ros.bag.mcap_reading import messages_in_file_order, open_bag, read_summary
+from spacerobot_ros.bag.ordered import messages_in_time_order
+from spacerobot_ros.bag.qos import QosProfile
+from spacerobot_ros.bag.series import TopicSeries
+
+
+def read_bag(path: str | os.PathLike[str]) -> Bag:
+    """Open a bag for reading.
+
+    Args:
+        path: an MCAP file, or a folder that holds one, as `ros2 bag record` makes it.
+
+    Returns:
+        The bag. Nothing but its summary is read until asked for.
+
+    Raises:
+        RecordingError: there is no such bag, it is not MCAP, was cut short or is damaged.
+    """
+    return Bag(_bag_file(path))
+
+
+def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, int, bytes]]:
+    """Go through all messages of a bag, still serialised, in the order they were written.
+
+    Args:
+        path: as for `read_bag`.
+
+    Yields:
+        Topic, type, log time and publish time in nanoseconds, serialised message.
+
+    Raises:
+        RecordingError: as for `read_bag`, when the first message is asked for or a damaged one met.
+    """
+    file_path = _bag_file(path)
+    with open_bag(file_path) as file:
+        summary = read_summary(file_path, file)
+        names = {
+            channel.id: (channel.topic, _type_name(summary.schemas, channel))
+            for channel in summary.channels.values()
+        }
+        file.seek(0)
+        for channel_id, log_time_ns, publish_time_ns, data in messages_in_file_order(file):
+            if channel_id not in names:
+                raise ValueError(f"its summary lacks channel {channel_id}")
+            topic, type_name = names[channel_id]
+            yield topic, type_name, log_time_ns, publish_time_ns, data
+
+
+class Bag:
+    """A bag as time series: `bag["/odom"].field("pose.pose.position.x")`.
+
+    A topic is read when it is first asked for and kept. The file is not held open.
+
+    Args:
+        path: the MCAP file.
+
+    Raises:
+        RecordingError: there is no such file, it is not MCAP, was cut short or is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with open_bag(path) as file:
+            self._summary = read_summary(path, file)
+        self._typestore = get_typestore(Stores.EMPTY)
+        self._series: dict[str, TopicSeries] = {}
+
+    @cached_property
+    def topics(self) -> dict[str, str]:
+        """Name and type of every topic, with messages or without."""
+        channels = self._summary.channels.values()
+        return {c.topic: _type_name(self._summary.schemas, c) for c in channels}
+
+    @cached_property
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Keys and values of every metadata record by its name; the last of several of one name."""
+        with open_bag(self.path) as file:
+            return {m.name: m.metadata for m in SeekingReader(file).iter_metadata()}
+
+    @cached_property
+    def attachments(self) -> dict[str, bytes]:
+        """Content of every attachment by its name; the last of several of one name."""
+        with open_bag(self.path) as file:
+            return {a.name: a.data for a in SeekingReader(file).iter_attachments()}
+
+    @property
+    def start_time(self) -> float:
+        """Log time of the earliest message in seconds; nan without messages."""
+        return self._statistics.message_start_time / 1e9 if self.message_count() else float("nan")
+
+    @property
+    def end_time(self) -> float:
+        """Log time of the latest message in seconds; nan without messages."""
+        return self._statistics.message_end_time / 1e9 if self.message_count() else float("nan")
+
+    @property
+    def start_time_ns(self) -> int:
+        """Log time of the earliest message in nanoseconds; 0 without messages."""
+        return int(self._statistics.message_start_time)
+
+    @property
+    def end_time_ns(self) -> int:
+        """Log time of the latest message in nanoseconds; 0 without messages."""
+        return int(self._statistics.message_end_time)
+
+    def message_count(self, topic: str | None = None) -> int:
+        """Say how many messages a topic has, or the whole bag.
+
+        Raises:
+            RecordingError: there is no such topic.
+        """
+        if topic is None:
+            return int(self._statistics.message_count)
+        counts = self._statistics.channel_message_counts
+        return sum(counts.get(channel.id, 0) for channel in self._channels(topic))
+
+    def channel_ids(self, topic: str) -> set[int]:
+        """Give the numbers under which a topic's messages are in the file.
+
+        Raises:
+            RecordingError: there is no such topic.
+        """
+        return {channel.id for channel in self._channels(topic)}
+
+    def qos(self, topic: str) -> list[QosProfile]:
+        """Give what the publishers of a topic offered, as far as the bag says it.
+
+        Raises:
+            RecordingError: there is no such topic, or what the bag says cannot be read.
+        """
+        texts = [c.metadata.get("offered_qos_profiles", "") for c in self._channels(topic)]
+        return [profile for text in texts for profile in QosProfile.from_yaml(text)]
+
+    def times(self, topic: str) -> NDArray[np.float64]:
+        """Give the log times of a topic in seconds, shape (N,).
+
+        Raises:
+            RecordingError: there is no such topic, or the bag is damaged.
+        """
+        return self[topic].time
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Go through the decoded messages of a topic by log time.
+
+        Yields:
+            Log time in nanoseconds, message.
+
+        Raises:
+            RecordingError: there is no such topic, or the bag is damaged.
+        """
+        return self[topic].messages()
+
+    def __getitem__(self, topic: str) -> TopicSeries:
+        if topic not in self._series:
+            channels = self._channels(topic)
+            decode = self._decoder(channels[0])
+            times, data = self._read(self.channel_ids(topic))
+            self._series[topic] = TopicSeries(
+                topic, self.topics[topic], times, data, self._typestore.fielddefs, decode
+            )
+        return self._series[topic]
+
+    @property
+    def _statistics(self) -> Any:
+        return self._summary.statistics
+
+    def _channels(self, topic: str) -> list[Channel]:
+        channels = [c for c in self._summary.channels.values() if c.topic == topic]
+        if not channels:
+            raise RecordingError(
+                f"The bag {self.path} has no topic {topic}: it has {', '.join(self.topics)}."
+            )
+        if len({channel.schema_id for channel in channels}) > 1:
+            raise RecordingError(f"The topic {topic} of the bag {self.path} has several types.")
+        return channels
+
+    def _decoder(self, channel: Channel) -> Callable[[bytes], Any]:
+        type_name = self.topics[channel.topic]
+        schema = self._summary.schemas.get(channel.schema_id)
+        if schema is None or (channel.message_encoding, schema.encoding) != ("cdr", "ros2msg"):
+            raise RecordingError(
+                f"The topic {channel.topic} of the bag {self.path} is not in ROS 2's encoding "
+                "('cdr' defined by 'ros2msg')."
+            )
+        try:
+            self._typestore.register(get_types_from_msg(schema.data.decode(), type_name))
+        except (TypesysError, UnicodeDecodeError) as error:
+            raise RecordingError(
+                f"The definition of {type_name} in the bag {self.path} cannot be read: {error}."
+            ) from error
+        definition = self._typestore.get_msgdef(type_name)
+        little, big = definition.deserialize_cdr_le, definition.deserialize_cdr_be
+
+        def decode(data: bytes) -> Any:
+            # Not `Typestore.deserialize_cdr`: that one refuses what rclpy serialises with an empty
+            # list of float64, which has some meaningless bytes at its end.
+            deserialise = little if data[1] & 1 else big
+            return deserialise(data[4:], 0, definition.cls, self._typestore)[0]
+
+        return decode
+
+    def _read(self, channel_ids: set[int]) -> tuple[NDArray[np.int64], list[bytes]]:
+        """Read some channels: log times in nanoseconds in order, serialised messages."""
+        times: list[int] = []
+        data: list[bytes] = []
+        for _, log_time_ns, _, message in messages_in_time_order(self.path, channel_ids):
+            times.append(log_time_ns)
+            data.append(message)
+        return np.array(times, np.int64), data
+
+
+def _type_name(schemas: dict[int, Any], channel: Channel) -> str:
+    schema = schemas.get(channel.schema_id)
+    return "" if schema is None else schema.name
+
+
+def _bag_file(path: str | os.PathLike[str]) -> Path:
+    given = Path(path)
+    if not given.is_dir():
+        return given
+    files = sorted(given.glob("*.mcap"))
+    if len(files) != 1:
+        raise RecordingError(f"The folder {given} holds {len(files)} MCAP files: name one of them.")
+    return files[0]

@@ -1,0 +1,224 @@
+"""Which message of a bag is due when: the time of a replay, without a clock or a publisher."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Generator, Iterator
+from dataclasses import dataclass, replace
+
+from spacerobot_ros.bag.errors import RecordingError
+from spacerobot_ros.bag.ordered import messages_in_time_order
+from spacerobot_ros.bag.qos import QosProfile
+from spacerobot_ros.bag.reader import Bag
+
+_SECOND = 10**9
+_END_OF_TIME = 2**63 - 1
+
+
+@dataclass(frozen=True)
+class ReplayTopic:
+    """A topic to publish on: its name and type in the bag, and what its publisher offered."""
+
+    name: str
+    type_name: str
+    qos: QosProfile
+
+    @property
+    def latched(self) -> bool:
+        """Whether a late subscriber gets the last message."""
+        return self.qos.durability == "transient_local"
+
+
+@dataclass(frozen=True)
+class ReplayMessage:
+    """One message to publish: its topic in the bag, log time in nanoseconds, serialised form."""
+
+    topic: str
+    log_time_ns: int
+    data: bytes
+
+
+class Timeline:
+    """The time of a bag against a clock that only goes on.
+
+    Args:
+        rate: seconds of the bag in a second of the clock, positive.
+        bag_ns: where in the bag to begin, in nanoseconds; it stands there until `run`.
+    """
+
+    def __init__(self, rate: float, bag_ns: int) -> None:
+        self._rate = rate
+        self._bag_ns = bag_ns
+        self._clock_ns = 0
+        self._running = False
+
+    @property
+    def running(self) -> bool:
+        """Whether time goes on."""
+        return self._running
+
+    def run(self, clock_ns: int) -> None:
+        """Go on, `clock_ns` being the clock's time now."""
+        if not self._running:
+            self._clock_ns, self._running = clock_ns, True
+
+    def stop(self, clock_ns: int) -> None:
+        """Stand still from now on."""
+        self._bag_ns = self.bag_time(clock_ns)
+        self._running = False
+
+    def seek(self, bag_ns: int, clock_ns: int) -> None:
+        """Be at `bag_ns` in the bag when the clock is at `clock_ns`."""
+        self._bag_ns, self._clock_ns = bag_ns, clock_ns
+
+    def bag_time(self, clock_ns: int) -> int:
+        """Give the time in the bag, in nanoseconds."""
+        if not self._running:
+            return self._bag_ns
+        return self._bag_ns + math.floor((clock_ns - self._clock_ns) * self._rate)
+
+    def clock_time(self, bag_ns: int) -> int:
+        """Give the clock's time at which `bag_ns` is reached if nothing stops before."""
+        return self._clock_ns + math.ceil((bag_ns - self._bag_ns) / self._rate)
+
+
+class Playback:
+    """The messages of a bag in the rhythm of their log times.
+
+    What was latched before the start is due at once, because who listens to such a topic expects
+    its last message whenever it comes.
+
+    Args:
+        bag: what to play.
+        topics: names to play; empty for all.
+        rate: seconds of the bag in a second of the clock.
+        start: where to begin, in seconds from the first message.
+        duration: how much to play, in seconds of the bag; 0 for all.
+        loop: whether to begin again at the end.
+
+    Raises:
+        RecordingError: the bag has no such topic, or no message there.
+    """
+
+    def __init__(
+        self,
+        bag: Bag,
+        *,
+        topics: Collection[str] = (),
+        rate: float = 1.0,
+        start: float = 0.0,
+        duration: float = 0.0,
+        loop: bool = False,
+    ) -> None:
+        if not bag.message_count():
+            raise RecordingError(f"The bag {bag.path} has no messages to replay.")
+        self._bag = bag
+        self._loop = loop
+        self._start_ns = bag.start_time_ns + round(start * _SECOND)
+        self._end_ns = self._start_ns + round(duration * _SECOND) if duration else _END_OF_TIME
+        self.topics = [_topic(bag, name) for name in topics or bag.topics]
+        self._names = {
+            number: topic.name for topic in self.topics for number in bag.channel_ids(topic.name)
+        }
+        self._timeline = Timeline(rate, self._start_ns)
+        self._turn = self._messages()
+        self._next = next(self._turn, None)
+        if self._next is None:
+            raise RecordingError(
+                f"The bag {bag.path} has no message to replay from {start:g} s on"
+                + (f" for {duration:g} s" if duration else "")
+                + f": it lasts {(bag.end_time_ns - bag.start_time_ns) / _SECOND:g} s."
+            )
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing is left."""
+        return self._next is None
+
+    @property
+    def running(self) -> bool:
+        """Whether time goes on."""
+        return self._timeline.running
+
+    def bag_time(self, clock_ns: int) -> int:
+        """Give the time in the bag, in nanoseconds, when the clock is at `clock_ns`."""
+        now = self._timeline.bag_time(clock_ns)
+        # Not past what is still to come: that is late.
+        return now if self._next is None else min(now, max(self._next.log_time_ns, self._start_ns))
+
+    def run(self, clock_ns: int) -> None:
+        """Go on, `clock_ns` being the clock's time now."""
+        self._timeline.run(clock_ns)
+
+    def pause(self, clock_ns: int) -> None:
+        """Stand still from now on."""
+        self._timeline.stop(clock_ns)
+
+    def due(self, clock_ns: int, most: int) -> list[ReplayMessage]:
+        """Take what is due by now, at most so many messages.
+
+        Raises:
+            RecordingError: the bag turns out damaged.
+        """
+        taken: list[ReplayMessage] = []
+        while self._next is not None and self._timeline.running and len(taken) < most:
+            if self._next.log_time_ns > self._timeline.bag_time(clock_ns):
+                break
+            taken.append(self._take())
+        return taken
+
+    def next_due(self) -> int | None:
+        """Give the clock's time of the next message; None when there is none, or time stands."""
+        if self._next is None or not self._timeline.running:
+            return None
+        return self._timeline.clock_time(self._next.log_time_ns)
+
+    def step(self, clock_ns: int) -> ReplayMessage | None:
+        """Take the next message now, whenever it is due; None at the end."""
+        if self._next is None:
+            return None
+        self._timeline.seek(max(self._next.log_time_ns, self._start_ns), clock_ns)
+        return self._take()
+
+    def close(self) -> None:
+        """Let go of the bag; nothing is left to play."""
+        self._turn.close()
+        self._next = None
+
+    def _take(self) -> ReplayMessage:
+        message = self._next
+        assert message is not None
+        self._next = next(self._turn, None)
+        if self._next is None and self._loop:
+            # The next turn begins at the very time of the last message.
+            last = max(message.log_time_ns, self._start_ns)
+            self._timeline.seek(self._start_ns, self._timeline.clock_time(last))
+            self._turn = self._messages()
+            self._next = next(self._turn, None)
+        return message
+
+    def _messages(self) -> Generator[ReplayMessage, None, None]:
+        earlier: dict[str, ReplayMessage] = {}
+        latched = {n for t in self.topics if t.latched for n in self._bag.channel_ids(t.name)}
+        if latched and self._start_ns > self._bag.start_time_ns:
+            for message in self._between(latched, 0, self._start_ns - 1):
+                earlier[message.topic] = message
+        in_time = self._between(set(self._names), self._start_ns, self._end_ns)
+        first = next(in_time, None)
+        if first is None:
+            return
+        yield from (replace(m, log_time_ns=self._start_ns) for m in earlier.values())
+        yield first
+        yield from in_time
+
+    def _between(
+        self, channel_ids: set[int], start_ns: int, end_ns: int
+    ) -> Iterator[ReplayMessage]:
+        found = messages_in_time_order(self._bag.path, channel_ids, start_ns, end_ns)
+        for channel_id, log_time_ns, _, data in found:
+            yield ReplayMessage(self._names[channel_id], log_time_ns, data)
+
+
+def _topic(bag: Bag, name: str) -> ReplayTopic:
+    profiles = bag.qos(name)
+    return ReplayTopic(name, bag.topics[name], profiles[0] if profiles else QosProfile())

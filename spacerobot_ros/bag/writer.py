@@ -1,0 +1,368 @@
+"""Writes a bag: an MCAP file as rosbag2's storage plugin writes it."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata, Schema
+
+from spacerobot_ros.bag import rosbag2_metadata
+from spacerobot_ros.bag.errors import RecordingError
+from spacerobot_ros.bag.mcap_file import McapFile, encode
+from spacerobot_ros.bag.qos import QosProfile
+from spacerobot_ros.bag.rosbag2_metadata import RecordedTopic
+from spacerobot_ros.bag.schemas import message_definition, type_hash
+
+_MESSAGE_HEADER = struct.Struct("<BQHIQQ")
+"""Opcode, length of the rest, channel, sequence, log time, publish time."""
+
+_pack_header = _MESSAGE_HEADER.pack
+_LENGTH_WITHOUT_DATA = _MESSAGE_HEADER.size - 9
+_MESSAGE = int(Opcode.MESSAGE)
+
+
+class BagWriter:
+    """Writes serialised ROS 2 messages into a bag that any ROS 2 tool opens.
+
+    Messages gather in a chunk in memory. A chunk that is full goes to the operating system as one
+    piece: a process that is killed loses the chunk in progress and nothing before it (a computer
+    that loses power may lose more). A bag is complete, with its summary, once it is closed; use the
+    writer as a context manager. One thread at a time may use it.
+
+    When the disk refuses a chunk, that chunk is lost, the call that met it and every later one that
+    would add something raise RecordingError, and closing still completes the file where there is
+    room.
+
+    Args:
+        path: the bag, usually `*.mcap`; its folders are made.
+        compression: of the chunks: `zstd`, `lz4` or `none`.
+        chunk_size: how large a chunk grows, in bytes before compression.
+        overwrite: whether a file that is there is replaced.
+        max_size: how large a file grows, in bytes, before the next one is begun; 0 for ever. The
+            files of a bag that may be split are `NAME_0.mcap`, `NAME_1.mcap`, ..., each complete,
+            with all attachments and metadata.
+        max_duration_ns: how much log time a file spans, in nanoseconds, likewise. Both are looked
+            at after every chunk.
+
+    Raises:
+        RecordingError: the file cannot be made, or is there and is not to be replaced.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        compression: str = "zstd",
+        chunk_size: int = 65536,
+        overwrite: bool = True,
+        max_size: int = 0,
+        max_duration_ns: int = 0,
+    ) -> None:
+        self._whole_path = Path(path)
+        self._limits = max_size, max_duration_ns
+        self._number = 0
+        self._compression, self._overwrite = compression, overwrite
+        self._earlier: Counter[str] = Counter()
+        self._context: list[Attachment | Metadata] = []
+        self._file = self._new_file()
+        self._chunk_size = chunk_size
+        self._chunk = bytearray()
+        # Of each channel, log time and offset in the chunk of each message. Empty as soon as
+        # nothing more can be written, so that `write` needs no test of its own for that.
+        self._entries: dict[int, list[int]] = {}
+        self._topics: dict[str, tuple[int, str, QosProfile]] = {}
+        self._schema_ids: dict[str, int] = {}
+        self._refusal: str | None = None
+        self._closed = False
+        try:
+            # rosbag2 writes this record at both ends. The first tells the readers of a cut file
+            # that its QoS policies are words.
+            self._append_rosbag2_metadata()
+        except RecordingError:
+            self._file.close()
+            raise
+
+    @property
+    def path(self) -> Path:
+        """Where the bag is, or the file of it that is being written."""
+        return self._file.path
+
+    @property
+    def message_counts(self) -> dict[str, int]:
+        """How many messages of each topic are in the bag or in the chunk in progress."""
+        return {
+            name: self._earlier[name] + self._count(channel)
+            for name, (channel, _, _) in self._topics.items()
+        }
+
+    @property
+    def bytes_written(self) -> int:
+        """How large the present file is, compressed."""
+        return self._file.size
+
+    @property
+    def bytes_waiting(self) -> int:
+        """How much of the chunk in progress is not handed to the operating system yet."""
+        return len(self._chunk)
+
+    @property
+    def messages_written(self) -> int:
+        """How many messages are in the bag or in the chunk in progress."""
+        return sum(self.message_counts.values())
+
+    def add_topic(self, name: str, type_name: str, qos: QosProfile | None = None) -> int:
+        """Make a topic known, before its first message.
+
+        Args:
+            name: full name of the topic, such as `/odom`.
+            type_name: such as `nav_msgs/msg/Odometry`.
+            qos: what its publisher offers; reliable, volatile and depth 10 unless given.
+
+        Returns:
+            The channel that `write` takes. A topic that is known already keeps its channel and QoS.
+
+        Raises:
+            RecordingError: the type is not installed, the topic is known with another type, or
+                nothing more can be written.
+        """
+        self._require_open()
+        if name in self._topics:
+            channel_id, known_type, _ = self._topics[name]
+            if type_name != known_type:
+                raise RecordingError(
+                    f"The topic {name} has the type {known_type} in the bag {self.path} and cannot "
+                    f"have {type_name} too."
+                )
+            return channel_id
+        profile = QosProfile() if qos is None else qos
+        hash_string = type_hash(type_name)
+        schema_id = self._schema_ids.get(type_name) or self._add_schema(type_name)
+        channel = Channel(
+            id=len(self._file.channels) + 1,
+            topic=name,
+            message_encoding="cdr",
+            metadata={"offered_qos_profiles": profile.to_yaml(), "topic_type_hash": hash_string},
+            schema_id=schema_id,
+        )
+        self._chunk += encode(channel)
+        self._file.channels.append(channel)
+        self._topics[name] = channel.id, type_name, profile
+        self._entries[channel.id] = []
+        return channel.id
+
+    def write(self, channel_id: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
+        """Add one message.
+
+        Args:
+            channel_id: from `add_topic`.
+            data: the serialised message (CDR with its header), as a raw subscription receives it.
+            log_time_ns: when it was recorded, in nanoseconds, not negative.
+            publish_time_ns: when it was published, in nanoseconds, not negative.
+
+        Raises:
+            RecordingError: the disk refused it, nothing more can be written, the channel is
+                unknown, or a time is not a whole number of at least 0.
+        """
+        chunk = self._chunk
+        try:
+            header = _pack_header(
+                _MESSAGE,
+                _LENGTH_WITHOUT_DATA + len(data),
+                channel_id,
+                0,
+                log_time_ns,
+                publish_time_ns,
+            )
+            entries = self._entries[channel_id]
+        except (KeyError, struct.error):
+            raise self._explain_refusal(channel_id) from None
+        record = header + data
+        entries += log_time_ns, len(chunk)
+        chunk += record
+        if len(chunk) >= self._chunk_size:
+            self._finish_chunk()
+
+    def add_attachment(self, name: str, data: bytes, media_type: str, log_time_ns: int) -> None:
+        """Put a whole file into the bag.
+
+        Args:
+            name: such as `robot.urdf`.
+            data: its content.
+            media_type: such as `application/xml`.
+            log_time_ns: when it was recorded, in nanoseconds.
+
+        Raises:
+            RecordingError: the disk refused it, or nothing more can be written.
+        """
+        self._require_open()
+        attachment = Attachment(
+            create_time=0, log_time=log_time_ns, name=name, media_type=media_type, data=data
+        )
+        self._context.append(attachment)
+        with self._refusing_after_failure():
+            self._file.append_attachment(attachment)
+
+    def add_metadata(self, name: str, data: dict[str, str]) -> None:
+        """Put named words into the bag.
+
+        Args:
+            name: of the record.
+            data: its keys and values.
+
+        Raises:
+            RecordingError: the disk refused it, or nothing more can be written.
+        """
+        self._require_open()
+        metadata = Metadata(name=name, metadata=data)
+        self._context.append(metadata)
+        with self._refusing_after_failure():
+            self._file.append_metadata(metadata)
+
+    def flush(self) -> None:
+        """Hand the chunk in progress to the operating system, so that a kill loses nothing of it.
+
+        Raises:
+            RecordingError: the disk refused it, or nothing more can be written.
+        """
+        self._require_open()
+        self._finish_chunk()
+
+    def close(self) -> None:
+        """Write what is left and the summary, and let go of the file; a second call does nothing.
+
+        Raises:
+            RecordingError: the disk refused something, and no earlier call has said so.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        failed_before = self._refusal is not None
+        failure: RecordingError | None = None
+        # Each step is worth trying when the one before failed: a summary is smaller than a chunk.
+        for step in (self._finish_chunk, self._append_rosbag2_metadata, self._file.finish):
+            try:
+                step()
+            except RecordingError as error:
+                failure = failure or error
+        self._file.close()
+        self._refuse_everything(self._refusal or f"The bag {self.path} is closed.")
+        if failure is not None and not failed_before:
+            raise failure
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _add_schema(self, type_name: str) -> int:
+        schema = Schema(
+            id=len(self._file.schemas) + 1,
+            data=message_definition(type_name).encode(),
+            encoding="ros2msg",
+            name=type_name,
+        )
+        self._chunk += encode(schema)
+        self._file.schemas.append(schema)
+        self._schema_ids[type_name] = schema.id
+        return schema.id
+
+    def _finish_chunk(self) -> None:
+        if not any(self._entries.values()):
+            return
+        with self._refusing_after_failure():
+            self._file.append_chunk(self._chunk, self._entries)
+        self._chunk = bytearray()
+        for entries in self._entries.values():
+            entries.clear()
+        if not self._closed and self._is_full():
+            with self._refusing_after_failure():
+                self._begin_next_file()
+
+    def _is_full(self) -> bool:
+        max_size, max_duration_ns = self._limits
+        span = (self._file.end_ns or 0) - (self._file.start_ns or 0)
+        return 0 < max_size <= self._file.size or 0 < max_duration_ns <= span
+
+    def _new_file(self) -> McapFile:
+        path = self._whole_path
+        if any(self._limits):
+            path = path.with_name(f"{path.stem}_{self._number}{path.suffix}")
+        return McapFile(path, compression=self._compression, overwrite=self._overwrite)
+
+    def _begin_next_file(self) -> None:
+        """Complete a file and go on in the next, with the same schemas and channels."""
+        self._append_rosbag2_metadata()
+        self._file.finish()
+        self._file.close()
+        for name, (channel, _, _) in self._topics.items():
+            self._earlier[name] += self._count(channel)
+        self._number += 1
+        schemas, channels = self._file.schemas, self._file.channels
+        self._file = self._new_file()
+        self._append_rosbag2_metadata()
+        for record in self._context:
+            if isinstance(record, Attachment):
+                self._file.append_attachment(record)
+            else:
+                self._file.append_metadata(record)
+        self._file.schemas += schemas
+        self._file.channels += channels
+        for known in (*schemas, *channels):
+            self._chunk += encode(known)
+
+    def _append_rosbag2_metadata(self) -> None:
+        topics = [
+            RecordedTopic(name, type_name, type_hash(type_name), qos, self._count(channel_id))
+            for name, (channel_id, type_name, qos) in self._topics.items()
+        ]
+        text = rosbag2_metadata.serialize(
+            self.path.name, topics, self._file.start_ns, self._file.end_ns
+        )
+        self._file.append_metadata(
+            Metadata(name=rosbag2_metadata.NAME, metadata={rosbag2_metadata.KEY: text})
+        )
+
+    def _count(self, channel_id: int) -> int:
+        in_progress = len(self._entries.get(channel_id, ())) // 2
+        return self._file.message_counts.get(channel_id, 0) + in_progress
+
+    def _require_open(self) -> None:
+        if self._refusal is not None:
+            raise RecordingError(self._refusal)
+
+    @contextmanager
+    def _refusing_after_failure(self) -> Iterator[None]:
+        try:
+            yield
+        except RecordingError as error:
+            self._refuse_everything(str(error))
+            raise
+
+    def _refuse_everything(self, reason: str) -> None:
+        self._refusal = reason
+        self._chunk = bytearray()
+        self._entries = {}
+
+    def _explain_refusal(self, channel_id: int) -> RecordingError:
+        if self._refusal is not None:
+            return RecordingError(self._refusal)
+        if channel_id not in self._entries:
+            return RecordingError(
+                f"The bag {self.path} has no channel {channel_id}: add_topic gives the channels."
+            )
+        return RecordingError(
+            f"The bag {self.path} takes times as whole numbers of nanoseconds, not negative."
+        )

@@ -1,0 +1,1 @@
+"""The command `spacerobot`: one module a command."""

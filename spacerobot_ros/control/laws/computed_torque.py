@@ -1,0 +1,66 @@
+"""The shape alone, driven by joint efforts; the base floats free."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.control.gains import Gains
+from spacerobot_ros.control.laws.law import ControlLaw
+from spacerobot_ros.control.selection import OutputSelection
+from spacerobot_ros.control.state import Actuation, Reference
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model.connection import solve_positive_definite
+from spacerobot_ros.model.space_robot import SpaceRobot
+
+
+class ComputedTorqueLaw(ControlLaw):
+    """Paper 3, eqs (2) and (6-9): ``tau = Js(q) u + Fs``, which makes the shape ``qddot = u``.
+
+    Here ``u = qddot_ref + Kd (qdot_ref - qdot) + Kp (q_ref - q)`` (Kp in 1/s^2, Kd in 1/s). The
+    base answers by ``omegadot = -D^-1 (D_q u + C_omega)``, the rows of eq. (19) of paper 4 without
+    a wrench; put into its rows of the joints that leaves ``Js = D_qq - D_q' D^-1 D_q`` and
+    ``Fs = C_q - D_q' D^-1 C_omega``. Written so it holds for any tree in space and any momentum;
+    the paper's case is a planar chain without angular momentum. No wrench is commanded, so that
+    both momenta stay what they are.
+
+    Raises
+    ------
+    ParameterError
+        The outputs are anything but all the joints: with free joints, or an aim for the base, the
+        shape is not this law's to command.
+    """
+
+    name: ClassVar[str] = "computed_torque"
+
+    def __init__(
+        self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
+    ) -> None:
+        if outputs.base or outputs.end_effector or set(outputs.joints) != set(robot.joint_names):
+            raise ParameterError(
+                f"The law '{self.name}' drives all joints and nothing else; its outputs are the "
+                f"joints {', '.join(robot.joint_names)}."
+            )
+        # In the order of q, whatever order they were named in.
+        in_order = OutputSelection(joints=robot.joint_names)
+        super().__init__(robot, in_order, gains, **options)
+
+    @classmethod
+    def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:
+        """Return all the joints."""
+        return OutputSelection(joints=robot.joint_names)
+
+    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+        z1 = self.outputs
+        H = self.robot.function("inertia_matrix", compile=False)(z1.q)
+        C = self.robot.function("bias", compile=False)(z1.q, z1.v_cm, z1.omega, z1.qdot)
+        u = z1.acceleration + symbols["kd"] * z1.error_rate + symbols["kp"] * z1.error
+        D, D_q, D_qq = H[3:6, 3:6], H[3:6, 6:], H[6:, 6:]
+        omega_dot = -solve_positive_definite(D, D_q @ u + C[3:6])
+        return {"tau": D_qq @ u + D_q.T @ omega_dot + C[6:]}
+
+    def _actuation(self, reference: Reference) -> Actuation:
+        self._function.evaluate()
+        return Actuation(np.zeros(6), self._out["tau"].copy())

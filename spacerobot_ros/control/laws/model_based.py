@@ -1,0 +1,143 @@
+"""Feedback linearisation of the outputs: every output error obeys its own linear equation."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.control.gains import Gains
+from spacerobot_ros.control.laws.law import ControlLaw
+from spacerobot_ros.control.selection import OutputSelection
+from spacerobot_ros.control.state import Actuation, Reference
+from spacerobot_ros.model.connection import solve_positive_definite
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.options import Option
+
+
+class ModelBasedLaw(ControlLaw):
+    """Paper 4, eq. (27), which gives the error dynamics ``eddot + Kd edot + Kp e = 0`` (eq. 28).
+
+    Written with the acceleration ``a = z1ddot_des + Kd edot + Kp e`` and the mobility of the
+    outputs ``J_z H+^-1 J_z'``, whose inverse is the paper's ``Htilde`` (eq. 25) for a square J_z::
+
+        Q = J_z' F + H+ xi + C+,    (J_z H+^-1 J_z') F = a - Jdot_z z0dot - J_z xi
+
+    This also serves fewer outputs than degrees of freedom: the motion that is left over moves no
+    output, and ``xi`` is the acceleration wanted of it: damping of all velocities and, where
+    asked for, a pull of the joints to the joint reference. For a square J_z it cancels.
+
+    Near a singularity of J_z (smallest singular value ``s`` below the threshold ``t``) no bounded
+    force accelerates the singular direction ``u`` of the outputs. There the law is damped:
+
+    * The mobility along u, ``s^2 v' H+^-1 v`` with ``J_z' u = s v``, is raised to what it would be
+      with ``t`` for ``s``: damping ``d = sqrt(t^2 - s^2)``, which sets in from zero at the
+      threshold. Accelerations along v stay bounded; the other directions are not touched.
+    * What velocity along v no longer shows in the outputs, and so escapes their Kd, is damped
+      directly, with the largest Kd.
+
+    Eq. (28) then holds for the other directions only, and :attr:`status` says so.
+
+    Parameters
+    ----------
+    robot, outputs, gains, options
+        See :class:`ControlLaw`; Kp in 1/s^2, Kd in 1/s. ``posture_stiffness`` acts when a
+        reference has joints.
+    """
+
+    name: ClassVar[str] = "model_based"
+    options: ClassVar[tuple[Option, ...]] = (
+        *ControlLaw.options,
+        Option(
+            "null_space_damping", 1.0, "1/s", "rate at which motion that moves no output dies out"
+        ),
+        Option(
+            "posture_stiffness",
+            0.0,
+            "1/s^2",
+            "pull of joints that are no outputs to the joint reference, as far as it moves no "
+            "output",
+        ),
+    )
+
+    def __init__(
+        self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
+    ) -> None:
+        super().__init__(robot, outputs, gains, **options)
+        self._in["null_space"][:] = (
+            self._settings["posture_stiffness"],
+            self._settings["null_space_damping"],
+        )
+
+    def _damping(self, singular_value: float) -> float:
+        return math.sqrt(max(0.0, self.singular_value_threshold**2 - singular_value**2))
+
+    def _parameters(self) -> dict[str, ca.SX]:
+        return {
+            "null_space": ca.SX.sym("null_space", 2),
+            "posture": ca.SX.sym("posture", self.robot.n),
+            "singular_damping": ca.SX.sym("singular_damping", self.outputs.N),
+        }
+
+    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+        z1 = self.outputs
+        H = self.robot.function("inertia_matrix", compile=False)(z1.q)
+        C = self.robot.function("bias", compile=False)(z1.q, z1.v_cm, z1.omega, z1.qdot)
+        # The translation of the centre of mass decouples (eq. 15).
+        mobility = ca.vertcat(
+            z1.J_z[:, :3].T / self.robot.total_mass,
+            solve_positive_definite(H[3:, 3:], z1.J_z[:, 3:].T),
+        )
+        stiffness, damping = ca.vertsplit(symbols["null_space"])
+        pull = ca.vertcat(ca.SX(6, 1), stiffness * (symbols["posture"] - z1.q))
+        xi = pull - damping * z1.z0dot + symbols["singular_damping"]
+        a = z1.acceleration + symbols["kd"] * z1.error_rate + symbols["kp"] * z1.error
+        acceleration = a - z1.bias - z1.J_z @ xi
+        mobility = z1.J_z @ mobility
+        J_actuators = z1.J_z @ z1.J_q_inverse
+        other = z1.J_q_inverse.T @ (H @ xi + C)
+        force = solve_positive_definite(mobility, acceleration)
+        # 1 / sqrt(sum of 1/s^2 over the singular values s), not above the smallest of them. Where
+        # J_z is singular this is not a number, and neither is the undamped command.
+        inverse = ca.solve(ca.chol(z1.J_z @ z1.J_z.T).T, ca.SX.eye(z1.m))
+        return {
+            "actuation": other + J_actuators.T @ force,
+            "margin": 1 / ca.norm_fro(inverse),
+            "mobility": mobility,
+            "acceleration": acceleration,
+            "J_actuators": J_actuators,
+            "other": other,
+            "z0dot": z1.z0dot,
+        }
+
+    def _actuation(self, reference: Reference) -> Actuation:
+        # Without a joint reference the posture is the present one, and pulls at nothing.
+        q = self._in["state"][13 : 13 + self.robot.n]
+        self._in["posture"][:] = q if reference.joints is None else reference.joints.q
+        self._in["singular_damping"][:] = 0.0
+        self._function.evaluate()
+        if self._out["margin"][0] >= self.singular_value_threshold:
+            actuation = self._out["actuation"]
+        else:
+            actuation = self._damped_actuation(q)
+        return Actuation(actuation[:6].copy(), actuation[6:].copy())
+
+    def _damped_actuation(self, q: Array) -> Array:
+        out = self._out
+        U, singular_values, V = np.linalg.svd(out["J_z"], full_matrices=False)
+        mobility = out["mobility"].copy()
+        H = self.robot.inertia_matrix(q)
+        z0dot, largest_kd = out["z0dot"], self._in["kd"].max()
+        for u, s, v in zip(U.T, singular_values, V, strict=True):
+            damping = self._damping(float(s))
+            if damping > 0:
+                along = np.linalg.solve(H, v)
+                mobility += damping**2 * (v @ along) * np.outer(u, u)
+                rate = (v @ z0dot) / (v @ along)
+                self._in["singular_damping"][:] -= largest_kd * rate * along
+        self._function.evaluate()
+        force = np.linalg.solve(mobility, out["acceleration"])
+        return out["other"] + force @ out["J_actuators"]

@@ -1,0 +1,64 @@
+"""A PD law of the outputs through the transpose of J_z: no inertia, no inverse."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import casadi as ca
+
+from spacerobot_ros.control.gains import Gains
+from spacerobot_ros.control.laws.law import ControlLaw
+from spacerobot_ros.control.selection import OutputSelection
+from spacerobot_ros.control.state import Actuation, Reference
+from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.options import Option
+
+
+class TransposedJacobianLaw(ControlLaw):
+    """Paper 4, eqs (29) and (30): ``[f; n; tau] = J_q^-T J_z' (Kp e + Kd edot)``.
+
+    The product ``J_z J_q^-1`` maps the base twist and the joint rates to the output rates: the
+    masses cancel, and the law knows the robot's geometry alone. Nothing is inverted that can be
+    singular, so where ``J_z`` is, the command stays as bounded as the errors are. It has no
+    acceleration feedforward.
+
+    With fewer outputs than degrees of freedom eq. (29) leaves the other motion alone: arms go on
+    swinging. ``joint_damping`` subtracts ``joint_damping * qdot`` from the joint efforts.
+
+    Parameters
+    ----------
+    robot, outputs, gains, options
+        See :class:`ControlLaw`; Kp in N/m (N m/rad), Kd in N s/m (N m s/rad).
+    """
+
+    name: ClassVar[str] = "transposed_jacobian"
+    options: ClassVar[tuple[Option, ...]] = (
+        *ControlLaw.options,
+        # N s/m of prismatic joints.
+        Option(
+            "joint_damping",
+            0.0,
+            "N m s/rad",
+            "friction that the joint efforts imitate; brings to rest what moves no output",
+        ),
+    )
+
+    def __init__(
+        self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
+    ) -> None:
+        super().__init__(robot, outputs, gains, **options)
+        self._in["joint_damping"][:] = self._settings["joint_damping"]
+
+    def _parameters(self) -> dict[str, ca.SX]:
+        return {"joint_damping": ca.SX.sym("joint_damping")}
+
+    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+        z1 = self.outputs
+        effort = symbols["kp"] * z1.error + symbols["kd"] * z1.error_rate
+        friction = ca.vertcat(ca.SX(6, 1), symbols["joint_damping"] * z1.qdot)
+        return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ effort - friction}
+
+    def _actuation(self, reference: Reference) -> Actuation:
+        self._function.evaluate()
+        actuation = self._out["actuation"]
+        return Actuation(actuation[:6].copy(), actuation[6:].copy())

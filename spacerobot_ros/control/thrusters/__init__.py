@@ -1,0 +1,1 @@
+"""Thrusters: their table, allocation of a wrench, pulse modulation."""

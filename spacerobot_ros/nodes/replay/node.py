@@ -1,0 +1,300 @@
+"""The replay node: an MCAP bag back onto its topics, in the rhythm in which it was recorded."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.timer import Timer
+from rosgraph_msgs.msg import Clock as ClockMessage
+from std_srvs.srv import SetBool, Trigger
+
+from spacerobot_ros.bag import Playback, QosProfile, RecordingError, ReplayMessage, read_bag
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.nodes.common.cdr import NANOSECONDS, raw_publish
+from spacerobot_ros.nodes.common.message_types import message_class
+from spacerobot_ros.nodes.common.node import STREAM, FlightNode, run_node
+from spacerobot_ros.nodes.common.parameters import ParameterSpec
+
+_READER_CHECK = 0.05
+"""Wall s between two looks for readers."""
+
+_SETTLED = 0.3
+"""Wall s without a new reader after which all are taken to be there."""
+
+_BURST = 500
+"""Messages that are sent without a look at services and signals."""
+
+_ACKNOWLEDGED = Duration(seconds=2)
+"""How long a reader may take for the last messages."""
+
+_CLOCK = "/clock"
+_BAD_BAG = 2
+
+
+class ReplayNode(FlightNode):
+    """Publishes what a bag holds, as bytes, with the quality of service that was recorded.
+
+    It waits for readers to be matched, keeps the spacing of the log times divided by ``rate``, and
+    has its process end with the bag. Services: ``~/pause`` (SetBool), ``~/resume`` and, while
+    paused, ``~/step`` (Trigger): the next message.
+    """
+
+    SPECS: ClassVar = (
+        ParameterSpec("bag", "", "", "MCAP file to replay, or a folder with one"),
+        ParameterSpec("rate", 1.0, "", "bag time over wall time", 1e-3, 1e6),
+        ParameterSpec("start", 0.0, "s", "where to begin, from the first message", 0.0),
+        ParameterSpec("duration", 0.0, "s", "how much of the bag to replay; 0: all", 0.0),
+        ParameterSpec("loop", False, "", "begin again at the end"),
+        ParameterSpec("topics", "", "", "names to replay, separated by spaces; '': all"),
+        ParameterSpec("remap", "", "", "other names for topics: 'old:=new', separated by spaces"),
+        ParameterSpec(
+            "clock", 0.0, "Hz", "publish bag time on /clock so often; 0: what the bag has", 0.0, 1e4
+        ),
+        ParameterSpec("paused", False, "", "begin paused"),
+        ParameterSpec("wait", 3.0, "s", "longest wall time to wait for readers", 0.0),
+    )
+
+    def __init__(self, name: str = "replay", **kwargs: Any) -> None:
+        self._sends: dict[str, Callable[[bytes], None]] = {}
+        self._timers: list[Timer] = []
+        self._close_bag: Callable[[], None] = lambda: None
+        super().__init__(name, **kwargs)
+
+    # -- life ---------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Open the bag and make its publishers and the services."""
+        values: dict[str, Any] = self.parameters
+        if not values["bag"]:
+            raise ParameterError("Parameter 'bag' is empty; name the MCAP file to replay.")
+        self.messages_replayed = 0
+        self._playback = Playback(
+            read_bag(values["bag"]),
+            topics=values["topics"].split(),
+            rate=values["rate"],
+            start=values["start"],
+            duration=values["duration"],
+            loop=values["loop"],
+        )
+        self._close_bag = self._playback.close
+        self._outputs: list[Publisher] = []
+        self._sends = {}
+        self._create_publishers(self._new_names(values["remap"]))
+        self._paused = bool(values["paused"])
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_service(SetBool, "~/pause", self._on_pause)
+        self.create_service(Trigger, "~/resume", self._on_resume)
+        self.create_service(Trigger, "~/step", self._on_step)
+
+    def activate(self) -> None:
+        """Wait for readers, then go on from where the replay is."""
+        self._begun = False
+        self._readers, self._waited, self._quiet = 0, 0.0, 0.0
+        # One timer for the next message, always set anew: half the load of looking every
+        # millisecond. Its first period is never waited for.
+        self._timer = self.create_timer(1.0, self._play, clock=self._steady)
+        self._timer.cancel()
+        self._waiting = self.create_timer(_READER_CHECK, self._on_reader_check, clock=self._steady)
+        self._timers = [self._timer, self._waiting]
+        rate = float(self.parameters["clock"])  # type: ignore[arg-type]
+        if rate:
+            self._timers.append(self.create_timer(1.0 / rate, self._on_clock, clock=self._steady))
+        if not self.parameters["wait"]:
+            self._begin()
+
+    def deactivate(self) -> None:
+        """Stand still; what was sent stays sent."""
+        if self._timers:
+            self._playback.pause(self._now())
+        for timer in self._timers:
+            self.destroy_timer(timer)
+        self._timers = []
+
+    def cleanup(self) -> None:
+        """Let go of the bag."""
+        self._close_bag()
+
+    # -- publishers ---------------------------------------------------------------------------
+
+    def _new_names(self, remap: str) -> dict[str, str]:
+        """Return the new name of each topic that gets one."""
+        known = {topic.name for topic in self._playback.topics}
+        names = {}
+        for rule in remap.split():
+            old, separator, new = rule.partition(":=")
+            if not (old and separator and new):
+                raise ParameterError(
+                    f"Parameter 'remap' has '{rule}'; write it as 'old:=new', such as "
+                    "'/odom:=/replayed/odom'."
+                )
+            if old not in known:
+                raise ParameterError(
+                    f"Parameter 'remap' renames '{old}', which is not replayed: "
+                    f"{', '.join(sorted(known))} are."
+                )
+            names[old] = new
+        return names
+
+    def _create_publishers(self, new_names: dict[str, str]) -> None:
+        own_clock = bool(self.parameters["clock"])
+        if own_clock:
+            self._clock_publisher = self.create_publisher(ClockMessage, _CLOCK, STREAM)
+            self._last_clock = -1
+        for topic in self._playback.topics:
+            if own_clock and topic.name == _CLOCK:
+                continue
+            name = new_names.get(topic.name, topic.name)
+            try:
+                publisher = self.create_publisher(
+                    message_class(topic.type_name), name, _profile(topic.qos)
+                )
+            except InvalidTopicNameException:
+                raise ParameterError(
+                    f"Topic '{topic.name}' cannot be replayed as '{name}': that is no topic name."
+                ) from None
+            except SpaceRobotError as error:
+                self.get_logger().warning(f"Topic '{topic.name}' is not replayed: {error}")
+                continue
+            self._outputs.append(publisher)
+            self._sends[topic.name] = raw_publish(publisher)
+        if not self._outputs and not own_clock:
+            raise SpaceRobotError("None of the bag's message types is installed here.")
+
+    def _on_reader_check(self) -> None:
+        """Begin as soon as every reader that is known is matched and no more come."""
+        counts = [p.get_subscription_count() for p in self._outputs]
+        known = [self.count_subscribers(p.topic_name) for p in self._outputs]
+        readers = sum(counts)
+        self._waited += _READER_CHECK
+        self._quiet = self._quiet + _READER_CHECK if readers == self._readers else 0.0
+        self._readers = readers
+        settled = readers > 0 and self._quiet >= _SETTLED and counts == known
+        if settled or self._waited >= float(self.parameters["wait"]):  # type: ignore[arg-type]
+            self._begin()
+
+    # -- time ---------------------------------------------------------------------------------
+
+    def _now(self) -> int:
+        return int(self._steady.now().nanoseconds)
+
+    def _begin(self) -> None:
+        self._begun = True
+        self._waiting.cancel()
+        if not self._paused:
+            self._playback.run(self._now())
+        self._set_timer()
+
+    def _set_timer(self) -> None:
+        due = self._playback.next_due()
+        if due is None:
+            self._timer.cancel()
+            return
+        self._timer.timer_period_ns = max(due - self._now(), 1)
+        self._timer.reset()
+
+    def _play(self) -> None:
+        """Send what is due, and come back for the next."""
+        try:
+            for message in self._playback.due(self._now(), _BURST):
+                self._send(message)
+        except RecordingError as error:
+            self._timer.cancel()
+            self.get_logger().error(f"The replay has ended: {error}")
+            self.on_end(_BAD_BAG)
+            return
+        self._set_timer()
+        self._end_if_done()
+
+    def _send(self, message: ReplayMessage) -> None:
+        if self.parameters["clock"]:
+            self._publish_clock(message.log_time_ns)
+        send = self._sends.get(message.topic)
+        if send is not None:
+            send(message.data)
+            self.messages_replayed += 1
+
+    def _on_clock(self) -> None:
+        if self._begun:
+            self._publish_clock(self._playback.bag_time(self._now()))
+
+    def _publish_clock(self, time_ns: int) -> None:
+        if time_ns == self._last_clock:
+            return
+        self._last_clock = time_ns
+        message = ClockMessage()
+        message.clock.sec, message.clock.nanosec = divmod(time_ns, NANOSECONDS)
+        self._clock_publisher.publish(message)
+
+    def _end_if_done(self) -> None:
+        if not self._playback.ended:
+            return
+        self._timer.cancel()
+        for publisher in self._outputs:
+            publisher.wait_for_all_acked(_ACKNOWLEDGED)
+        self.get_logger().info(f"The replay has ended: {self.messages_replayed} messages.")
+        self.on_end(0)
+
+    # -- services -----------------------------------------------------------------------------
+
+    def _set_paused(self, paused: bool) -> str:
+        self._paused = paused
+        if self._begun:
+            if paused:
+                self._playback.pause(self._now())
+            else:
+                self._playback.run(self._now())
+            self._set_timer()
+        return "paused" if paused else "running"
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        response.success, response.message = True, self._set_paused(bool(request.data))
+        return response
+
+    def _on_resume(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = True, self._set_paused(False)
+        return response
+
+    def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if not (self._paused and self._begun):
+            response.message = "Only a paused replay goes step by step; call ~/pause first."
+            return response
+        try:
+            message = self._playback.step(self._now())
+        except RecordingError as error:
+            response.message = str(error)
+            return response
+        if message is None:
+            response.message = "The replay has ended."
+            return response
+        self._send(message)
+        response.success = True
+        response.message = f"{message.topic} at {message.log_time_ns / NANOSECONDS:.9f} s"
+        self._end_if_done()
+        return response
+
+
+def _profile(qos: QosProfile) -> QoSProfile:
+    """Return what a publisher offers; depths are not always in a bag, and then like the stack's."""
+    latched = qos.durability == "transient_local"
+    best_effort = qos.reliability == "best_effort"
+    return QoSProfile(
+        depth=qos.depth or (1 if latched else STREAM.depth),
+        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def main() -> None:
+    """Replay a bag until its end, SIGINT or SIGTERM."""
+    sys.exit(run_node(ReplayNode))
+
+
+if __name__ == "__main__":
+    main()

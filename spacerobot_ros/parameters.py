@@ -1,0 +1,244 @@
+"""Parameters: declared once, as the fields of a configuration, and checked where they arrive.
+
+A configuration is a frozen dataclass whose fields are made by :func:`parameter`, :func:`group` and
+:func:`registered`. Everything else follows from it: ROS parameters, the checks of the command line
+and of :func:`spacerobot_ros.plan`, and the tables in the documentation.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from spacerobot_ros.errors import ParameterError
+
+Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
+"""What a parameter holds."""
+
+C = TypeVar("C")
+
+_PARAMETER, _GROUP, _REGISTERED = "parameter", "group", "registered"
+"""Keys of the metadata of a dataclass field: how it was made."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """The declaration of one parameter; the type of ``default`` is the type of the parameter.
+
+    Attributes
+    ----------
+    name
+        Full name, with the groups that it is in: ``sensors.joint_noise``.
+    default
+        Its value where none is given.
+    unit, description
+        For people.
+    minimum, maximum
+        Bounds of a number, or of every entry of an array.
+    choices
+        The texts that are allowed; empty: any.
+    length
+        Entries of an array that is not empty; None: any number of them.
+    read_only
+        Whether it keeps its value as long as the node lives.
+    texts
+        An array of texts, also taken as one text with its parts on lines of their own or between
+        semicolons.
+    of_joints
+        An array has an entry for every joint of the robot; a text names some of its joints.
+    """
+
+    name: str
+    default: Value
+    unit: str = ""
+    description: str = ""
+    minimum: float = -math.inf
+    maximum: float = math.inf
+    choices: tuple[str, ...] = ()
+    length: int | None = None
+    read_only: bool = True
+    texts: bool = False
+    of_joints: bool = False
+
+    def checked(self, value: Any) -> Value:
+        """Return the value in the parameter's own type.
+
+        Raises
+        ------
+        ParameterError
+            It has another type, is out of range, or is not one of the choices.
+        """
+        wanted = self.default
+        if isinstance(wanted, bool):
+            if not isinstance(value, bool):
+                raise self._refusal(value, "true or false")
+            return value
+        if isinstance(wanted, (int, float)):
+            return self._number(value, isinstance(wanted, int))
+        if isinstance(wanted, str):
+            if not isinstance(value, str):
+                raise self._refusal(value, "a text")
+            if self.choices and value not in self.choices:
+                raise self._refusal(value, f"one of {', '.join(self.choices)}")
+            return value
+        return self._lines(value) if self.texts else self._numbers(value)
+
+    def _number(self, value: Any, whole: bool) -> int | float:
+        if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+            raise self._refusal(value, "a number")
+        if not -sys.float_info.max <= value <= sys.float_info.max:  # Whole numbers are larger.
+            raise self._refusal(value, "a finite number")
+        if whole and value != int(value):
+            raise self._refusal(value, "a whole number")
+        if not self.minimum <= value <= self.maximum:
+            raise self._refusal(value, f"a number{self._range()}")
+        return int(value) if whole else float(value)
+
+    def _numbers(self, value: Any) -> tuple[float, ...]:
+        try:
+            numbers = tuple(float(x) for x in value)
+        except (TypeError, ValueError, OverflowError):
+            raise self._refusal(value, "a list of numbers") from None
+        if self.length is not None and len(numbers) not in (0, self.length):
+            raise self._refusal(value, f"a list of {self.length} numbers")
+        if not all(math.isfinite(x) and self.minimum <= x <= self.maximum for x in numbers):
+            raise self._refusal(value, f"finite numbers{self._range()}")
+        return numbers
+
+    def _lines(self, value: Any) -> tuple[str, ...]:
+        if isinstance(value, str):
+            value = value.replace("\n", ";").split(";")
+        if not isinstance(value, Sequence) or not all(isinstance(line, str) for line in value):
+            raise self._refusal(value, "a list of texts")
+        return tuple(line.strip() for line in value if line.strip())
+
+    def _range(self) -> str:
+        if math.isinf(self.maximum):
+            return "" if math.isinf(self.minimum) else f" of at least {self.minimum:g}"
+        return f" from {self.minimum:g} to {self.maximum:g}"
+
+    def _refusal(self, value: Any, wanted: str) -> ParameterError:
+        unit = f" ({self.unit})" if self.unit else ""
+        shown = value if not isinstance(value, str) else f"'{value[:60]}'"
+        return ParameterError(f"Parameter '{self.name}' is {shown}; it must be {wanted}{unit}.")
+
+
+def parameter(
+    default: Value,
+    description: str,
+    *,
+    unit: str = "",
+    minimum: float = -math.inf,
+    maximum: float = math.inf,
+    choices: Sequence[str] = (),
+    length: int | None = None,
+    read_only: bool = True,
+    texts: bool = False,
+    of_joints: bool = False,
+) -> Any:
+    """Return a field of a configuration; see :class:`Parameter` for what the arguments mean."""
+    declaration = Parameter(
+        "", default, unit, description, minimum, maximum, tuple(choices), length, read_only, texts,
+        of_joints,
+    )  # fmt: skip
+    return field(default=default, metadata={_PARAMETER: declaration})
+
+
+def group(default: Any) -> Any:
+    """Return a field that holds a configuration: its parameters are ``<field>.<parameter>``.
+
+    ``default`` is an instance, whose values are the defaults of the group.
+    """
+    return field(default=default, metadata={_GROUP: True})
+
+
+def registered(registry: Mapping[str, Any]) -> Any:
+    """Return a field that maps each name of a registry to the options of its entry.
+
+    Every entry has a configuration ``Options``, whose parameters are ``<entry>.<parameter>``.
+    """
+    return field(
+        default_factory=lambda: {name: entry.Options() for name, entry in registry.items()},
+        metadata={_REGISTERED: registry},
+    )
+
+
+def declared(config: type[Any] | Any, prefix: str = "") -> tuple[Parameter, ...]:
+    """Return the parameters of a configuration, in the order of their declaration.
+
+    ``config`` is the class, or an instance whose values are the defaults; ``prefix`` comes before
+    every name.
+    """
+    return tuple(parameter for parameter, _ in _leaves(config, prefix))
+
+
+def configured(kind: type[C], values: Mapping[str, Any], prefix: str = "") -> C:
+    """Return a configuration with ``values`` by full name; those left out have their defaults.
+
+    Values of other names are left alone; see :func:`require_known`.
+
+    Raises
+    ------
+    ParameterError
+        A value is refused; the sentence names the parameter.
+    """
+    return _configured(kind, kind(), values, prefix)
+
+
+def values_of(config: Any, prefix: str = "") -> dict[str, Value]:
+    """Return the value of every parameter of a configuration by full name."""
+    return {parameter.name: value for parameter, value in _leaves(config, prefix)}
+
+
+def require_known(owner: str, config: type[Any], names: Iterator[str] | Sequence[str]) -> None:
+    """Refuse names that are no parameter of a configuration.
+
+    Raises
+    ------
+    ParameterError
+        There is one; ``owner`` has no such option.
+    """
+    unknown = sorted(set(names) - {parameter.name for parameter in declared(config)})
+    if unknown:
+        raise ParameterError(f"{owner} has no option '{unknown[0]}'.")
+
+
+def _configured(kind: type[C], defaults: Any, values: Mapping[str, Any], prefix: str) -> C:
+    chosen: dict[str, Any] = {}
+    for each in fields(kind):  # type: ignore[arg-type]
+        name, default = f"{prefix}{each.name}", getattr(defaults, each.name)
+        if _PARAMETER in each.metadata:
+            declaration = _named(each.metadata[_PARAMETER], name, default)
+            chosen[each.name] = declaration.checked(values[name]) if name in values else default
+        elif _GROUP in each.metadata:
+            chosen[each.name] = _configured(type(default), default, values, f"{name}.")
+        elif _REGISTERED in each.metadata:
+            chosen[each.name] = {
+                entry: _configured(type(options), options, values, f"{prefix}{entry}.")
+                for entry, options in default.items()
+            }
+    return kind(**chosen)
+
+
+def _leaves(config: type[Any] | Any, prefix: str) -> Iterator[tuple[Parameter, Value]]:
+    """Yield every parameter with its value in a configuration."""
+    assert is_dataclass(config)
+    instance = config() if isinstance(config, type) else config
+    for each in fields(instance):
+        name, value = f"{prefix}{each.name}", getattr(instance, each.name)
+        if _PARAMETER in each.metadata:
+            yield _named(each.metadata[_PARAMETER], name, value), value
+        elif _GROUP in each.metadata:
+            yield from _leaves(value, f"{name}.")
+        elif _REGISTERED in each.metadata:
+            for entry, options in value.items():
+                yield from _leaves(options, f"{prefix}{entry}.")
+
+
+def _named(declaration: Parameter, name: str, default: Value) -> Parameter:
+    return replace(declaration, name=name, default=default)

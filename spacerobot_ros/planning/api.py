@@ -1,0 +1,88 @@
+"""One call from a robot and a goal to a gait."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.model.rotations import quaternion_from_rotvec
+from spacerobot_ros.options import chosen_options
+from spacerobot_ros.planning.core.goal import Goal, RobotState, Tolerance
+from spacerobot_ros.planning.core.schedule import GaitSchedule
+from spacerobot_ros.planning.methods.registry import METHODS, build_method
+from spacerobot_ros.resources import robot_file
+
+_TOLERANCE = Tolerance(1e-6, 1e-6, 1e-6)
+
+
+def plan(
+    robot: SpaceRobot | str | Path,
+    goal: Goal | None = None,
+    *,
+    position: npt.ArrayLike = (0.0, 0.0, 0.0),
+    rotvec: npt.ArrayLike = (0.0, 0.0, 0.0),
+    joint_positions: npt.ArrayLike | None = None,
+    start: RobotState | npt.ArrayLike | None = None,
+    method: str = "optimal",
+    tick_period: float = 0.05,
+    tolerance: Tolerance = _TOLERANCE,
+    integration_step: float = DEFAULT_INTEGRATION_STEP,
+    **options: Any,
+) -> GaitSchedule:
+    """Plan a gait: ``plan("sliding_masses", position=(0.3, 0, 0.1), rotvec=(0.5, 0, 0))``.
+
+    Parameters
+    ----------
+    robot
+        The model, a URDF file, or the name of a robot of this package.
+    goal
+        Where the base is to be; or ``position`` (3,) in m, ``rotvec`` (3,) in rad (exponential
+        coordinates), and ``joint_positions`` (n,) to end in, in m or rad.
+    start
+        From where: a state, or the shape (n,) alone with the base at the origin of W; None is the
+        shape zero, or as near to it as the strokes are.
+    method
+        Name of a gait method; ``options`` are its own.
+    tick_period, tolerance, integration_step
+        How long a command is held (s), how near is there, and the longest step of the prediction
+        (s): the plant's, for a flight that ends where the plan does.
+
+    Raises
+    ------
+    PlanningError
+        The goal is refused or cannot be reached; the sentence says why.
+    ParameterError
+        There is no such robot, method or option, or one is refused.
+    """
+    if not isinstance(robot, SpaceRobot):
+        robot = SpaceRobot.from_file(robot_file(str(robot)))
+    if goal is None:
+        goal = Goal.checked(position, quaternion_from_rotvec(rotvec), joint_positions)
+    if method not in METHODS:
+        raise ParameterError(
+            f"There is no gait method '{method}'; there are: {', '.join(METHODS)}."
+        )
+    chosen = chosen_options(method, METHODS[method].options, options)
+    named = {f"{method}.{name}": value for name, value in chosen.items()}
+    planner = build_method(method, robot, tick_period, tolerance, integration_step, named)
+    return planner.plan(_state(robot, start), goal)
+
+
+def _state(robot: SpaceRobot, start: RobotState | npt.ArrayLike | None) -> RobotState:
+    if isinstance(start, RobotState):
+        return start
+    q = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
+    if start is not None:
+        q = np.asarray(start, dtype=float)
+    if q.shape != (robot.n,):
+        raise ParameterError(
+            f"The start has {q.size} joint position(s); robot '{robot.description.name}' has "
+            f"{robot.n} joints."
+        )
+    return RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)

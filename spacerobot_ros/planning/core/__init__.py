@@ -1,0 +1,1 @@
+"""What every gait method shares: goals, states, schedules, predictions."""

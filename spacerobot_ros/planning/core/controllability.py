@@ -1,0 +1,248 @@
+"""Which rotations of the base closed motions of the joints bring about: rank and conditioning.
+
+A small loop in the plane of two joints turns the base by curvature times area (papers 1 and 2).
+Three such first-order brackets that span the three axes of rotation satisfy the Lie algebra rank
+condition, and attitude and shape are controllable (paper 1, proposition 1); brackets are analytic,
+so what they span at one shape they span at almost all (proposition 2). The position follows from
+attitude and shape; it is controllable with them where three sliders have independent slots.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.planning.methods.curvature_peak import curvature_peaks
+from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase
+
+WORST_CONDITION = 1e6
+"""Brackets that are worse conditioned do not span: rounding decides on their directions."""
+
+_NO_TURN = 1e-12
+"""Singular values of brackets below this, rad per unit area, are rounding."""
+
+_SAMPLES = 24
+"""Shapes at which a robot is asked; brackets that span anywhere span at almost all of them."""
+
+_UNLIMITED = {JointKind.PRISMATIC: 1.0}
+"""Half the range that is looked at of a joint without limits, m; pi for joints that turn."""
+
+
+@dataclass(frozen=True)
+class Controllability:
+    """What was found, at one shape.
+
+    Attributes
+    ----------
+    rank, wanted
+        Axes of rotation that the brackets span, and how many there are to span.
+    singular_values
+        (3,) of the best three brackets, rad per unit area (rad^2, rad m or m^2), descending.
+    joints
+        The joints whose brackets they are.
+    shape
+        (n,) where.
+    sentence
+        The finding for people; where ``controllable`` is false, the reason.
+    """
+
+    rank: int
+    wanted: int
+    singular_values: Array
+    joints: tuple[str, ...]
+    shape: Array
+    sentence: str
+
+    @property
+    def controllable(self) -> bool:
+        """Whether the brackets span what there is to span."""
+        return self.rank >= self.wanted
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the best three brackets; infinite where they do not span."""
+        largest, _, smallest = self.singular_values
+        return float(largest / smallest) if smallest > _NO_TURN else np.inf
+
+
+def shape_box(robot: SpaceRobot) -> tuple[Array, Array]:
+    """Return finite lower and upper bounds (n,) of the shape space: one turn where it is free."""
+    joints = robot.description.movable_joints
+    half = np.array([_UNLIMITED.get(joint.kind, np.pi) for joint in joints])
+    lower = np.where(
+        np.isfinite(robot.lower), robot.lower, np.minimum(robot.upper, half) - 2 * half
+    )
+    upper = np.where(np.isfinite(robot.upper), robot.upper, lower + 2 * half)
+    return lower, upper
+
+
+def sample_shapes(robot: SpaceRobot, count: int) -> Array:
+    """Return shapes (count, n) all over the shape space, always the same ones."""
+    lower, upper = shape_box(robot)
+    # Multiples of independent irrational numbers are evenly spread.
+    fractions = np.outer(np.arange(1, count + 1), np.sqrt(_primes(robot.n))) % 1.0
+    return np.asarray(lower + fractions * (upper - lower))
+
+
+def curvatures(robot: SpaceRobot, shapes: Array) -> Array:
+    """Return the angular curvature (N, 3, n, n) at shapes (N, n); see `SpaceRobot.curvature`."""
+    n = robot.n
+    stacked = robot.function("curvature")(shapes.T).full()
+    # Columns: shape by shape, in each the second joint by the second, the first fastest.
+    K = stacked.reshape(6, len(shapes), n, n)[3:]
+    return np.asarray(K.transpose(1, 0, 3, 2))
+
+
+def curvature_matrices(K: Array, joints: Sequence[int]) -> Array:
+    """Return ``M`` (..., 3, 3) of three joints from curvature (..., 3, n, n): paper 2.
+
+    Its columns are the turns per area of the pairs (1, 2), (2, 3), (3, 1).
+    """
+    i, j, k = joints
+    return K[..., [i, j, k], [j, k, i]]
+
+
+def best_triple(K: Array, among: Sequence[int]) -> tuple[tuple[int, int, int], Array]:
+    """Return the three joints of best conditioned ``M`` (3, 3), from curvature (3, n, n)."""
+    triples = list(itertools.combinations(among, 3))
+    matrices = np.array([curvature_matrices(K, triple) for triple in triples])
+    values = np.linalg.svd(matrices, compute_uv=False)
+    best = int(np.argmax(values[:, 2] / np.maximum(values[:, 0], _NO_TURN)))
+    return triples[best], matrices[best]
+
+
+def brackets_at(
+    robot: SpaceRobot, shape: Array, among: Sequence[int] | None = None
+) -> Controllability:
+    """Return what the first-order brackets span at a shape (n,), of joints with these indices."""
+    return _brackets(robot, shape[np.newaxis], among)
+
+
+def brackets_anywhere(robot: SpaceRobot, among: Sequence[int] | None = None) -> Controllability:
+    """Return what the first-order brackets span at the best of shapes all over the shape space."""
+    return _brackets(robot, sample_shapes(robot, _SAMPLES), among)
+
+
+def sliders_of(robot: SpaceRobot) -> list[int]:
+    """Return the indices of the joints that slide."""
+    joints = robot.description.movable_joints
+    return [i for i, joint in enumerate(joints) if joint.kind is JointKind.PRISMATIC]
+
+
+def slot_matrix(robot: SpaceRobot, shape: Array, sliders: Sequence[int]) -> Array:
+    """Return (3, s): how far the centre of mass moves in the base with each slider, m/m.
+
+    It is linear in a slider, so a unit step is exact.
+    """
+    c = robot.center_of_mass(shape)
+    steps = [robot.center_of_mass(shape + np.eye(robot.n)[i]) - c for i in sliders]
+    return np.column_stack(steps) if steps else np.zeros((3, 0))
+
+
+def slot_objection(robot: SpaceRobot, slots: Array) -> str:
+    """Return why slots (3, s) cannot move the base anywhere; "" if they can (paper 1, 4.1)."""
+    rank = int(np.linalg.matrix_rank(slots, tol=1e-9 * np.abs(slots).max(initial=0.0)))
+    if rank == 3:
+        return ""
+    return (
+        "lie_bracket needs three sliders with linearly independent slots (paper 1, section 4.1); "
+        f"robot '{robot.description.name}' has {slots.shape[1]} slider(s) of rank {rank}."
+    )
+
+
+def sliding_masses(robot: SpaceRobot) -> Controllability:
+    """Return the test of paper 1: three independent slots and spanning brackets of sliders."""
+    sliders = sliders_of(robot)
+    objection = slot_objection(
+        robot, slot_matrix(robot, np.mean(shape_box(robot), axis=0), sliders)
+    )
+    if objection:
+        nothing = tuple(robot.joint_names[i] for i in sliders)
+        return Controllability(0, 3, np.zeros(3), nothing, np.zeros(robot.n), objection)
+    return brackets_anywhere(robot, sliders)
+
+
+def planar_chain(robot: SpaceRobot) -> Controllability:
+    """Return the test of paper 3: a planar robot of three or more links, with curvature."""
+    names, rest = robot.joint_names, np.zeros(robot.n)
+    try:
+        phase = PlanarPhase(robot)
+    except PlanningError as refusal:
+        return Controllability(0, 1, np.zeros(3), names, rest, str(refusal))
+    box = np.stack(shape_box(robot))
+    middle = box.mean(axis=0)
+    tops = []
+    for i, j in itertools.combinations(range(robot.n), 2):
+        plane, shape = phase.plane(middle, i, j), middle.copy()
+        shape[[i, j]] = curvature_peaks(plane, middle[[i, j]], box[np.newaxis, :, [i, j]])[0]
+        tops.append((abs(float(plane.curvature(shape[[i, j]]))), (names[i], names[j]), shape))
+    largest, pair, shape = max(tops, key=lambda top: top[0])
+    sentence = (
+        f"{robot.n + 1} links in a plane: loops of joints '{pair[0]}' and '{pair[1]}' turn the "
+        f"base by up to {largest:.3g} rad a unit of area, round {np.round(shape, 3).tolist()} "
+        "(paper 3)."
+    )
+    if largest <= _NO_TURN:
+        sentence = f"Loops of the joints of robot '{robot.description.name}' do not turn its base."
+    values = np.array([largest, 0.0, 0.0])
+    return Controllability(int(largest > _NO_TURN), 1, values, pair, shape, sentence)
+
+
+def _brackets(robot: SpaceRobot, shapes: Array, among: Sequence[int] | None) -> Controllability:
+    """Return what the brackets span at the shape of shapes (N, n) where three are best."""
+    joints = list(range(robot.n)) if among is None else list(among)
+    name = robot.description.name
+    if len(joints) < 2:
+        sentence = f"Robot '{name}' has {len(joints)} joint(s): no loop encloses an area."
+        return Controllability(0, 3, np.zeros(3), (), shapes[0], sentence)
+    K = curvatures(robot, shapes)
+    pairs = np.array(list(itertools.combinations(joints, 2)))
+    values = np.linalg.svd(K[:, :, pairs[:, 0], pairs[:, 1]], compute_uv=False)
+    rank = int(max(_rank(row) for row in values))
+    where, names = f"at the best of {len(shapes)} shapes", robot.joint_names
+    if len(joints) < 3:
+        sentence = f"Loops of two joints of robot '{name}' turn its base about one axis at a time."
+        chosen = tuple(names[i] for i in joints)
+        return Controllability(
+            min(rank, 1), 3, np.pad(values[0], (0, 2)), chosen, shapes[0], sentence
+        )
+    found = [best_triple(at, joints) for at in K]
+    singular = np.linalg.svd(np.array([M for _, M in found]), compute_uv=False)
+    best = int(np.argmax(singular[:, 2] / np.maximum(singular[:, 0], _NO_TURN)))
+    triple = tuple(names[i] for i in found[best][0])
+    rank = min(rank, _rank(singular[best]))
+    if len(shapes) == 1:
+        where = f"at the shape {np.round(shapes[0], 4).tolist()}"
+    if rank == 3:
+        condition = singular[best, 0] / singular[best, 2]
+        sentence = (
+            f"First-order brackets of joints {', '.join(triple)} span the three axes of rotation "
+            f"(condition number {condition:.3g} {where})."
+        )
+    else:
+        sentence = (
+            f"First-order brackets of the joints of robot '{name}' span {rank} of the three axes "
+            f"of rotation {where}: small loops turn the base about no other."
+        )
+    return Controllability(rank, 3, singular[best], triple, shapes[best], sentence)
+
+
+def _rank(values: Array) -> int:
+    """Return how many of descending singular values count."""
+    return int(np.sum(values > max(_NO_TURN, float(values[0]) / WORST_CONDITION)))
+
+
+def _primes(count: int) -> Array:
+    found: list[int] = []
+    candidate = 2
+    while len(found) < count:
+        if all(candidate % prime for prime in found):
+            found.append(candidate)
+        candidate += 1
+    return np.array(found, dtype=float)

@@ -1,0 +1,151 @@
+"""What a planner is asked for, and from where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import attitude_error, unit_quaternion
+
+Controlled = Literal["position", "attitude", "shape"]
+"""A part of a goal: where the base is, how it is turned, how the joints stand."""
+
+POSE: frozenset[Controlled] = frozenset({"position", "attitude"})
+"""The parts of a goal that are the pose of the base."""
+
+
+_FARTHEST = 1e12
+"""Beyond it a float64 does not tell a millimetre any more, m or rad."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A pose of the base link in the world, and the shape to end in where it matters.
+
+    ``position`` (3,) in m, ``quaternion`` (x, y, z, w); ``joint_positions`` (n,) in m or rad, in
+    the order of the robot's joints, None: the shape is the method's to choose.
+    """
+
+    position: Array
+    quaternion: Array
+    joint_positions: Array | None = None
+
+    @classmethod
+    def checked(
+        cls,
+        position: npt.ArrayLike,
+        quaternion: npt.ArrayLike,
+        joint_positions: npt.ArrayLike | None = None,
+    ) -> Goal:
+        """Return a goal with a unit quaternion.
+
+        Raises
+        ------
+        PlanningError
+            They are no lists of finite numbers, absurdly large, or the quaternion is zero.
+        """
+        r = _numbers(position, "position")
+        q = _numbers(quaternion, "orientation")
+        if r.shape != (3,) or q.shape != (4,):
+            raise PlanningError("A goal has three numbers of position and four of orientation.")
+        if not np.all(np.isfinite(r)):
+            raise PlanningError(f"The goal position {r.tolist()} is not finite.")
+        if np.abs(r).max() > _FARTHEST:
+            raise PlanningError(
+                f"The goal position {r.tolist()} is farther than {_FARTHEST:g} m away."
+            )
+        if not np.all(np.isfinite(q)):
+            raise PlanningError(f"The goal orientation {q.tolist()} is not finite.")
+        shape = None if joint_positions is None else _numbers(joint_positions, "shape")
+        if shape is not None and not (
+            shape.ndim == 1 and np.all(np.isfinite(shape)) and np.all(np.abs(shape) <= _FARTHEST)
+        ):
+            raise PlanningError(
+                f"The goal shape {shape.tolist()} is not a list of finite joint positions "
+                f"of at most {_FARTHEST:g} m or rad."
+            )
+        try:
+            return cls(r, unit_quaternion(q), shape)
+        except ValueError:
+            raise PlanningError(
+                f"The goal orientation {q.tolist()} is a zero quaternion, not a rotation; "
+                "no rotation is (0, 0, 0, 1)."
+            ) from None
+
+
+def _numbers(given: npt.ArrayLike, what: str) -> Array:
+    try:
+        return np.asarray(given, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise PlanningError(f"The goal {what} {given!r} is not a list of numbers.") from None
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """Where the robot is: base pose in W, shape, total momenta in W (about the centre of mass)."""
+
+    position: Array
+    quaternion: Array
+    q: Array
+    linear_momentum: Array = field(default_factory=lambda: np.zeros(3))
+    angular_momentum: Array = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """What is left to a goal: ``position`` (3,) in W, m, and ``rotvec`` (3,) in B, rad.
+
+    ``shape`` (n,) in m or rad is what the joints still have to go; empty where no shape is asked
+    for.
+    """
+
+    position: Array
+    rotvec: Array
+    shape: Array = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def between(
+        cls, position: Array, quaternion: Array, goal: Goal, q: Array | None = None
+    ) -> PoseError:
+        """Return what is left from a pose, and from the shape ``q`` (n,) if given, to the goal."""
+        shape = np.zeros(0)
+        if q is not None and goal.joint_positions is not None:
+            shape = goal.joint_positions - q
+        return cls(goal.position - position, attitude_error(quaternion, goal.quaternion), shape)
+
+    @property
+    def distance(self) -> float:
+        """Length of the position error, m."""
+        return float(np.linalg.norm(self.position))
+
+    @property
+    def angle(self) -> float:
+        """Angle of the attitude error, rad."""
+        return float(np.linalg.norm(self.rotvec))
+
+    @property
+    def farthest_joint(self) -> float:
+        """Largest joint error, m or rad; zero where no shape is asked for."""
+        return float(np.abs(self.shape).max(initial=0.0))
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """How near is there: ``position`` in m, ``attitude`` in rad, ``shape`` in m or rad a joint."""
+
+    position: float
+    attitude: float
+    shape: float = 1e-3
+
+    def admits(self, error: PoseError, controls: frozenset[Controlled] = POSE) -> bool:
+        """Whether the goal is met, in the parts that are controlled."""
+        return (
+            ("position" not in controls or error.distance <= self.position)
+            and ("attitude" not in controls or error.angle <= self.attitude)
+            and ("shape" not in controls or error.farthest_joint <= self.shape)
+        )

@@ -1,0 +1,83 @@
+"""The base motion that a piece of a gait will cause, as the plant integrates it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.integration import steps_in
+from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.planning.core.goal import RobotState
+from spacerobot_ros.planning.core.schedule import BasePath
+
+_KNOTS = 200
+"""A predicted path has this many poses of the base, or up to twice as many."""
+
+
+class BasePrediction:
+    """Attitude under held joint velocities, and the position that follows from it.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    tick_period
+        How long a command is held, s.
+    integration_step
+        Longest Runge-Kutta step of the attitude, s; the plant's, for equal numbers.
+
+    Raises
+    ------
+    ParameterError
+        A duration is not positive.
+    """
+
+    def __init__(self, robot: SpaceRobot, tick_period: float, integration_step: float) -> None:
+        self._robot = robot
+        self._tick_period = tick_period
+        self._step = robot.velocity_step(steps_in(tick_period, integration_step))
+        self._step.inputs[3][:] = tick_period
+
+    def attitudes(self, positions: Array, quaternion: Array, L_W: Array) -> Array:
+        """Return the attitude (N + 1, 4) at every tick of the shapes ``positions`` (N + 1, n)."""
+        state, qdot, momentum, h = self._step.inputs
+        result = self._step.outputs[0]
+        momentum[:] = L_W
+        n = self._robot.n
+        attitudes = np.empty((len(positions), 4))
+        attitudes[0] = quaternion
+        state[n:] = quaternion
+        rates = np.diff(positions, axis=0) / h[0]
+        for k, rate in enumerate(rates):
+            state[:n] = positions[k]
+            qdot[:] = rate
+            self._step.evaluate()
+            state[n:] = attitudes[k + 1] = result[n:]
+        return attitudes
+
+    def positions(self, state: RobotState, time: Array, shapes: Array, quaternions: Array) -> Array:
+        """Return the base position (K, 3) in W: off the coasting centre of mass by c(q)."""
+        robot = self._robot
+        start = matrix_from_quaternion(state.quaternion) @ robot.center_of_mass(state.q)
+        r_cm = state.position + start
+        drift = state.linear_momentum / robot.total_mass
+        return np.array(
+            [
+                r_cm + t * drift - matrix_from_quaternion(quaternion) @ robot.center_of_mass(q)
+                for t, q, quaternion in zip(time, shapes, quaternions, strict=True)
+            ]
+        )
+
+    def path(self, state: RobotState, positions: Array, attitudes: Array | None = None) -> BasePath:
+        """Return the base path of the shapes ``positions`` (N + 1, n), at some of the ticks.
+
+        ``attitudes`` (N + 1, 4) at the ticks, where they are known already.
+        """
+        if attitudes is None:
+            attitudes = self.attitudes(positions, state.quaternion, state.angular_momentum)
+        last = len(positions) - 1
+        chosen = np.unique(np.append(np.arange(0, last, max(1, last // _KNOTS)), last))
+        time, quaternions = chosen * self._tick_period, attitudes[chosen]
+        positions_W = self.positions(state, time, positions[chosen], quaternions)
+        return BasePath(time, positions_W, quaternions)

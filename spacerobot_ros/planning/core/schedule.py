@@ -1,0 +1,73 @@
+"""What a planner answers: the shape at every tick, and the base path that it predicts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.goal import Goal
+
+Notes = dict[str, list[float] | float | str]
+"""Named results of a method, for reports."""
+
+
+@dataclass(frozen=True)
+class BasePath:
+    """Predicted base: ``time`` (K,) from the start, ``position`` (K, 3), ``quaternion`` (K, 4)."""
+
+    time: Array
+    position: Array
+    quaternion: Array
+
+
+@dataclass(frozen=True)
+class GaitSchedule:
+    """A gait as held commands: the shape at each tick, joint velocities constant in between.
+
+    Attributes
+    ----------
+    method
+        Registry name of the method that made it.
+    joint_names
+        Names of the joints, the columns of ``positions``.
+    tick_period
+        s.
+    positions
+        (N + 1, n) shape at the ticks 0..N, m or rad.
+    path
+        Predicted base path at instants of the method's choice, the first and the last included.
+    goal
+        What it was planned for.
+    notes
+        Named results of the method, for reports (a paper's symbols where it has them).
+    partial
+        It ends short of the goal on purpose: the measured pose at its end decides on the next
+        piece.
+    """
+
+    method: str
+    joint_names: tuple[str, ...]
+    tick_period: float
+    positions: Array
+    path: BasePath
+    goal: Goal
+    notes: Notes = field(default_factory=dict)
+    partial: bool = False
+
+    @property
+    def ticks(self) -> int:
+        """Number of held commands N."""
+        return len(self.positions) - 1
+
+    @property
+    def duration(self) -> float:
+        """Time the gait takes, s."""
+        return self.ticks * self.tick_period
+
+    @cached_property
+    def velocities(self) -> Array:
+        """Held joint velocities (N, n), m/s or rad/s; they carry the shape from tick to tick."""
+        return np.diff(self.positions, axis=0) / self.tick_period

@@ -1,0 +1,1 @@
+"""Flying schedules: tracking, corrections, and the parts of them that need no ROS."""

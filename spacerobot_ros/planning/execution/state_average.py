@@ -1,0 +1,91 @@
+"""Where a robot at rest is, from several measurements of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    quaternion_from_rotvec,
+    quaternion_multiply,
+)
+from spacerobot_ros.planning.core.goal import RobotState
+
+_AT_REST = 1e-9
+"""Joint rates below which the joints rest, m/s or rad/s."""
+
+
+class StateAverage:
+    """Averages measured states and judges the momenta that they show.
+
+    While joints move, the momentum of a robot whose masses are not quite known is uncertain; at
+    rest the base alone shows it, and without thrust it stays. So the momenta of a state are those
+    that were measured last at rest.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    count
+        States to average.
+    rest_tolerance
+        Averaged rates of base and joints up to this are noise about rest, m/s or rad/s; the
+        momentum is then zero. With 0 every measured momentum counts.
+    """
+
+    def __init__(self, robot: SpaceRobot, count: int = 1, rest_tolerance: float = 0.0) -> None:
+        self._robot, self._wanted, self._tolerance = robot, count, rest_tolerance
+        self._poses: list[Array] = []
+        self._rates: list[Array] = []
+        self._shapes: list[Array] = []
+        self._momenta = np.zeros(3), np.zeros(3)
+
+    @property
+    def count(self) -> int:
+        """States since the last restart."""
+        return len(self._poses)
+
+    @property
+    def complete(self) -> bool:
+        """Whether there are as many as wanted."""
+        return self.count >= self._wanted
+
+    def restart(self) -> None:
+        """Forget the states, not the momenta."""
+        self._poses, self._rates, self._shapes = [], [], []
+
+    def add(self, pose: Array, twist: Array, q: Array, qdot: Array) -> None:
+        """Add a state: pose (7,), twist (6,), shape and its rates (n,), as plants report them."""
+        self._poses.append(pose.copy())
+        self._rates.append(np.concatenate([twist, qdot]))
+        self._shapes.append(q.copy())
+
+    def state(self) -> RobotState:
+        """Return the average of at least one state.
+
+        Raises
+        ------
+        PlanningError
+            It is not finite.
+        """
+        poses, q = np.array(self._poses), np.mean(self._shapes, axis=0)
+        rates = np.mean(self._rates, axis=0)
+        if not (np.all(np.isfinite(poses)) and np.all(np.isfinite(np.concatenate([q, rates])))):
+            raise PlanningError("The measured state is not finite; see odom and joint_states.")
+        # Attitudes lie within noise of each other: the mean of what separates them from the first.
+        first = poses[0, 3:]
+        quaternion = first
+        if len(poses) > 1:
+            turn = np.mean([attitude_error(first, pose[3:]) for pose in poses], axis=0)
+            quaternion = quaternion_multiply(first, quaternion_from_rotvec(turn))
+        twist, qdot = rates[:6], rates[6:]
+        if np.abs(qdot).max(initial=0.0) <= max(_AT_REST, self._tolerance):
+            if self._tolerance and np.abs(twist).max() <= self._tolerance:
+                self._momenta = np.zeros(3), np.zeros(3)
+            else:
+                p, L, _ = self._robot.momentum(quaternion, q, twist[:3], twist[3:], qdot)
+                self._momenta = p, L
+        return RobotState(poses[:, :3].mean(axis=0), quaternion, q, *self._momenta)

@@ -1,0 +1,1 @@
+"""The gait methods: one module each, and their registry."""

@@ -1,0 +1,254 @@
+"""Closed motions of three joints turn a spacecraft about three axes: paper 2.
+
+Small loops round a nominal shape turn the base by ``dTheta = M S``: M (3, 3) the curvature of the
+connection for the joint pairs (1, 2), (2, 3), (3, 1), S the areas that the loop encloses in their
+planes. Each cycle makes up for the share k of the turn that is left, ``S = k M^-1 dTheta``; what
+the first order misses is left for the next, which begins from the attitude that was measured.
+
+All edges are straight lines of the shape from rest to rest: what they turn the base by depends on
+the path alone, and held commands move along it.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import attitude_error, quaternion_inverse, quaternion_multiply
+from spacerobot_ros.options import Option
+from spacerobot_ros.planning.core.controllability import brackets_anywhere
+from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState
+from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
+from spacerobot_ros.planning.methods.edge_path import EdgePath, edge_path
+from spacerobot_ros.planning.methods.nominal_choice import NominalChoice
+from spacerobot_ros.planning.methods.nominal_shape import NominalShape
+from spacerobot_ros.planning.methods.straight_legs import straight_motion
+
+_TRIALS = 6
+"""A cycle that would not bring the base nearer is tried this often, each time half as large."""
+
+_ALL = 1.0 - 1e-9
+"""A share k of the missing turn above this leaves nothing for the next cycle, but rounding."""
+
+_IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+
+Ends = list[tuple[Array, float]]
+"""Shapes (n,) that straight legs lead to, and how long each leg is to take, s."""
+
+
+class AreaLoopGait(GaitMethod):
+    """Attitude of a base with three or more joints of any kind, and the shape to end in.
+
+    The base's position follows from both (the centre of mass rests) and cannot be chosen. A
+    schedule is one cycle, or ``cycles_per_plan`` of them as predicted.
+    """
+
+    name: ClassVar[str] = "area_loop"
+    controls: frozenset[Controlled] = frozenset({"attitude", "shape"})
+    options: ClassVar[tuple[Option, ...]] = (
+        Option("k", 0.15, "", "share of the missing turn that one cycle makes up for", 1e-3, 1.0),
+        Option("edge_time", 4.0, "s", "duration of an edge; slow joints take longer", 1e-3),
+        Option("largest_edge", 1.0, "m or rad", "longest edge of a loop", 1e-3, 10.0),
+        Option(
+            "nominal",
+            [],
+            "m or rad",
+            "nominal shape, all joints; []: the best",
+            -1e6,
+            1e6,
+            of_joints=True,
+        ),
+        Option(
+            "joints",
+            "",
+            "",
+            "the three joints, separated by spaces; '': the best three",
+            of_joints=True,
+        ),
+        Option("cycles_per_plan", 1, "", "cycles before the attitude is measured again", 1, 10_000),
+        Option("most_cycles", 1000, "", "cycles that a goal may take", 1, 1_000_000),
+        Option("longest", 100_000.0, "s", "longest manoeuvre that is still planned", 1.0),
+    )
+
+    def _prepare(self) -> None:
+        robot, chosen = self.robot, self._settings
+        self._k: float = chosen["k"]
+        self._edge_time: float = chosen["edge_time"]
+        self._longest: float = chosen["longest"]
+        self._goal: Goal | None = None
+        self._flown = 0
+        # Planners exist before goals: an unsuitable robot is refused with the first one.
+        self._refusal = self.objection(robot)
+        self._nominal = NominalChoice(
+            robot, chosen["largest_edge"], chosen["joints"], chosen["nominal"]
+        )
+        self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)
+        if not self._refusal and robot.n == 3:
+            # No other joints rest anywhere: the choice need not wait for a shape.
+            with suppress(PlanningError):
+                self._nominal.at(np.zeros(3))
+
+    @classmethod
+    def objection(cls, robot: SpaceRobot) -> str:
+        """Return why loops of three joints cannot turn the robot about three axes."""
+        if robot.n < 3:
+            return (
+                f"area_loop needs three joints (paper 2); robot '{robot.description.name}' has "
+                f"{robot.n}."
+            )
+        found = brackets_anywhere(robot)
+        return "" if found.controllable else found.sentence
+
+    def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
+        """Plan the way to the nominal shape and the next cycle; see :meth:`GaitMethod.plan`.
+
+        The schedule is ``partial`` unless its own prediction meets the goal. ``most_cycles`` and
+        ``longest`` bound what the same goal object takes, whatever ``correction`` says.
+        """
+        if self._refusal:
+            raise PlanningError(self._refusal)
+        self._require_rest(state)
+        final = self._goal_shape(goal)
+        gait = _Gait(state.q[np.newaxis], state.quaternion[np.newaxis])
+        notes: Notes = {"cycles": 0.0}
+        error = PoseError.between(state.position, state.quaternion, goal, state.q)
+        if self.tolerance.admits(error, self.controls):
+            return self._schedule(gait, state, goal, notes)
+        nominal = self._nominal.at(state.q)
+        if goal is not self._goal:
+            self._goal, self._flown = goal, 0
+        gait = self._moved(gait, [(nominal.shape, self._edge_time)])
+        # The way from the nominal to the final shape turns the base too: aim that far beside.
+        aside = self._turn(nominal, final)
+        target = quaternion_multiply(goal.quaternion, quaternion_inverse(aside))
+        cycles_per_plan: int = self._settings["cycles_per_plan"]
+        for planned in range(cycles_per_plan + 1):
+            left = attitude_error(gait.attitudes[-1], target)
+            if np.linalg.norm(left) <= self.tolerance.attitude:
+                if final is not None:
+                    gait = self._moved(gait, [(final, self._edge_time)])
+                break
+            if planned < cycles_per_plan:
+                gait, cycle_notes = self._cycle(gait, target, left, nominal)
+                self._flown += 1
+                notes = {**cycle_notes, "cycles": float(planned + 1)}
+        return self._schedule(gait, state, goal, notes)
+
+    def _cycle(
+        self, gait: _Gait, target: Array, left: Array, nominal: NominalShape
+    ) -> tuple[_Gait, Notes]:
+        """Add one cycle for the turn ``left`` (3,), rad; return the paper's symbols as well."""
+        S = self._k * np.linalg.solve(nominal.M, left).astype(float)
+        # Edges go as the root of areas.
+        share = min(1.0, edge_path(S, nominal.longest).excess ** -2)
+        missing = float(np.linalg.norm(left))
+        cycles = self._flown + self._cycles_left(missing, share)
+        self._require_few(cycles)
+        for _ in range(_TRIALS):
+            path = edge_path(share * S, nominal.longest)
+            after = self._moved(gait, self._ends(path, nominal))
+            if np.linalg.norm(attitude_error(after.attitudes[-1], target)) < missing:
+                break
+            share /= 2
+        else:
+            raise PlanningError(
+                "No cycle of area_loop round the nominal shape "
+                f"{np.round(nominal.shape, 4).tolist()}, however small, brings the base nearer to "
+                f"its goal than {missing:.3g} rad."
+            )
+        duration = (len(after.positions) - len(gait.positions)) * self.tick_period
+        if cycles * duration > self._longest:
+            raise PlanningError(
+                f"The manoeuvre would take about {cycles:.4g} cycles of {duration:.4g} s, more "
+                f"than longest = {self._longest:.6g} s."
+            )
+        return after, {
+            "joints": ", ".join(self.robot.joint_names[i] for i in nominal.joints),
+            "nominal": nominal.shape.tolist(),
+            "condition": nominal.condition,
+            "S": (share * S).tolist(),
+            "path": path.kind,
+            "edges": np.ptp(np.vstack(path.loops), axis=0).tolist(),
+            "expected_cycles": cycles,
+        }
+
+    def _cycles_left(self, missing: float, share: float) -> float:
+        """Return how many cycles a turn (rad) takes to first order, the first by a share of k.
+
+        While edges are as long as they may be, every cycle turns the base as far; then the
+        missing turn shrinks by the factor 1 - k.
+        """
+        unbounded = missing * share
+        many = (1.0 / share - 1.0) / self._k
+        if unbounded <= self.tolerance.attitude:
+            return max(1.0, (missing - self.tolerance.attitude) / (self._k * unbounded))
+        if self.tolerance.attitude <= 0.0:
+            return math.inf
+        factor = -math.log1p(-min(self._k, _ALL))
+        return many + max(1.0, math.log(unbounded / self.tolerance.attitude) / factor)
+
+    def _require_few(self, cycles: float) -> None:
+        most = self._settings["most_cycles"]
+        if cycles > most:
+            raise PlanningError(
+                f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
+                f"{self._flown} are flown."
+            )
+
+    def _ends(self, path: EdgePath, nominal: NominalShape) -> Ends:
+        """Return where the edges of a path end, from the nominal shape and back to it."""
+        chosen = list(nominal.joints)
+        lower, upper = self.robot.lower[chosen], self.robot.upper[chosen]
+        ends: Ends = []
+        for loop in path.loops:
+            half = np.abs(loop).max(axis=0)
+            # A box that does not fit round the nominal shape is moved into the limits.
+            centre = np.maximum(np.minimum(nominal.shape[chosen], upper - half), lower + half)
+            corners = np.tile(nominal.shape, (len(loop), 1))
+            corners[:, chosen] = np.clip(centre + loop, lower, upper)
+            # From the middle of the box to a corner is half as far as an edge.
+            ends.append((corners[0], self._edge_time / 2))
+            ends += [(corner, self._edge_time) for corner in corners[1:]]
+            ends.append((nominal.shape, self._edge_time / 2))
+        return ends
+
+    def _turn(self, nominal: NominalShape, final: Array | None) -> Array:
+        """Return the turn (4,) of the base on the straight way from nominal to final shape."""
+        start = _Gait(nominal.shape[np.newaxis], _IDENTITY[np.newaxis])
+        ends = [] if final is None else [(final, self._edge_time)]
+        return self._moved(start, ends).attitudes[-1]
+
+    def _moved(self, gait: _Gait, ends: Ends) -> _Gait:
+        """Return the gait with straight legs added."""
+        shapes = straight_motion(
+            self.robot, gait.positions[-1], ends, self.tick_period, self._longest
+        )
+        # At rest there is no momentum: the attitudes depend on the shapes alone.
+        attitudes = self._prediction.attitudes(shapes, gait.attitudes[-1], np.zeros(3))
+        return _Gait(
+            np.vstack([gait.positions, shapes[1:]]), np.vstack([gait.attitudes, attitudes[1:]])
+        )
+
+    def _schedule(self, gait: _Gait, state: RobotState, goal: Goal, notes: Notes) -> GaitSchedule:
+        path = self._prediction.path(state, gait.positions, gait.attitudes)
+        left = PoseError.between(path.position[-1], path.quaternion[-1], goal, gait.positions[-1])
+        notes = {**notes, "predicted_attitude_error": left.angle}
+        partial = not self.tolerance.admits(left, self.controls)
+        return self._schedule_of(goal, gait.positions, path, notes, partial=partial)
+
+
+@dataclass(frozen=True)
+class _Gait:
+    """Shapes (N + 1, n) at the ticks so far, and the attitudes (N + 1, 4) of the base."""
+
+    positions: Array
+    attitudes: Array

@@ -1,0 +1,339 @@
+"""Sliding masses, first-order Lie brackets: the manoeuvre of paper 1, section 5.
+
+Step 1 finds the final shape ``zf`` that puts the base where it is to be (eq. 9). Step 2 slides
+the masses there (eq. 10). Step 3 turns the base by n equal cycles of three frequencies whose
+brackets add up to the attitude that is missing.
+
+The plant holds each command for a tick, so the sliders trace polygons inside the smooth curves.
+Their area is smaller by ``sin(x)/x``, ``x`` the phase per tick; the amplitudes allow for it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    matrix_from_quaternion,
+    quaternion_from_rotvec,
+    quaternion_multiply,
+    rotvec_from_quaternion,
+)
+from spacerobot_ros.options import Option
+from spacerobot_ros.planning.core.controllability import (
+    WORST_CONDITION,
+    best_triple,
+    sliders_of,
+    sliding_masses,
+    slot_matrix,
+    slot_objection,
+)
+from spacerobot_ros.planning.core.goal import Goal, RobotState
+from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
+
+_FEWEST_TICKS_A_CYCLE = 12
+_MOST_REFINEMENTS = 20
+_KNOTS = 100
+"""Poses of the predicted path in each step, up to twice as many."""
+
+_NO_ROTATION = 1e-9
+_NO_MOTION = 1e-9
+
+
+class LieBracketGait(GaitMethod):
+    """Position and attitude of a base with three or more sliders, whose slots may be offset."""
+
+    name: ClassVar[str] = "lie_bracket"
+    options: ClassVar[tuple[Option, ...]] = (
+        Option("t1", 100.0, "s", "duration of step 2, the slide to the final shape", 1e-3),
+        Option("n1", 10, "", "periods of the sin^2 velocity profile in step 2", 1, 10_000),
+        Option("cycle_period", 3.0, "s", "duration of one cycle of step 3, (tf - t1) / n", 1e-3),
+        Option("cycles", 0, "", "n, the number of cycles of step 3; 0: by loop_area", 0, 1e8),
+        Option("loop_area", 0.04, "m^2", "|alpha| / n when cycles is 0", 1e-9),
+        Option("a22_ratio", 1.0, "", "free amplitude a22 over sqrt(|a22 b12|); 1: balanced", 1e-3),
+        Option("a31_ratio", 1.0, "", "a31 over sqrt(|a31 (b21, b11)|); 1: balanced", 1e-3),
+        Option("longest", 100_000.0, "s", "longest manoeuvre that is still planned", 1.0),
+    )
+
+    def _prepare(self) -> None:
+        robot, chosen = self.robot, self._settings
+        self.t1: float = chosen["t1"]
+        self.n1: int = chosen["n1"]
+        self.cycles: int = chosen["cycles"]
+        self.loop_area: float = chosen["loop_area"]
+        self.a22_ratio: float = chosen["a22_ratio"]
+        self.a31_ratio: float = chosen["a31_ratio"]
+        self.longest: float = chosen["longest"]
+        # Whole ticks a cycle: every cycle is then the same commands and the same rotation.
+        self.ticks_a_cycle = max(
+            round(chosen["cycle_period"] / self.tick_period), _FEWEST_TICKS_A_CYCLE
+        )
+        self.sliders = sliders_of(robot)
+        self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)
+
+    @classmethod
+    def objection(cls, robot: SpaceRobot) -> str:
+        """Return which of the conditions of paper 1 the sliders do not meet."""
+        found = sliding_masses(robot)
+        return "" if found.controllable else found.sentence
+
+    def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
+        """Plan steps 1 to 3; see :meth:`GaitMethod.plan`."""
+        self._require_rest(state)
+        z_f = self.final_shape(state, goal)
+        slide = self._slide(state.q, z_f)
+        t1 = (len(slide) - 1) * self.tick_period or self.t1
+        attitudes = self._prediction.attitudes(slide, state.quaternion, state.angular_momentum)
+        cycle, n, notes = self._turn(attitudes[-1], z_f, goal, correction)
+        turn = np.tile(cycle[1:], (n, 1)) if n else np.empty((0, self.robot.n))
+        path = self._path(state, slide, attitudes, cycle, n)
+        symbols: Notes = {
+            "zf": [float(z_f[i]) for i in self.sliders],
+            "c": [2 * float((z_f - state.q)[i]) / t1 for i in self.sliders],
+        }
+        return self._schedule_of(goal, np.vstack([slide, turn]), path, symbols | notes)
+
+    def final_shape(self, state: RobotState, goal: Goal) -> Array:
+        """Step 1: the shape ``zf`` (n,) that solves eq. (9), nearest to the present one.
+
+        Raises
+        ------
+        PlanningError
+            There are no three independent slots, or ``zf`` is beyond a stroke.
+        """
+        robot = self.robot
+        R0, Rf = matrix_from_quaternion(state.quaternion), matrix_from_quaternion(goal.quaternion)
+        c0 = robot.center_of_mass(state.q)
+        # The system's mass centre stays: r_f + R_f c(zf) = r_0 + R_0 c(z0).
+        shift = Rf.T @ (state.position + R0 @ c0 - goal.position) - c0
+        P = slot_matrix(robot, state.q, self.sliders)
+        if objection := slot_objection(robot, P):
+            raise PlanningError(objection)
+        z0, lower, upper = (x[self.sliders] for x in (state.q, robot.lower, robot.upper))
+        dz: Array = np.linalg.lstsq(P, shift, rcond=None)[0].astype(float)
+        if np.any(z0 + dz < lower) or np.any(z0 + dz > upper):
+            dz = self._within_strokes(P, shift, z0, dz, lower, upper)
+        z_f = state.q.copy()
+        z_f[self.sliders] = np.clip(z0 + dz, lower, upper)
+        return z_f
+
+    def _within_strokes(
+        self, P: Array, shift: Array, z0: Array, dz: Array, lower: Array, upper: Array
+    ) -> Array:
+        """Spread the displacement over more than three sliders, or name the stroke too short."""
+        # Bounds must differ for the solver; a slider at its end gets a hair of room.
+        room = 1e-12 * (1.0 + np.abs(upper - lower))
+        bounded = lsq_linear(P, shift, (lower - z0 - room, upper - z0 + room), method="bvls")
+        if np.linalg.norm(P @ bounded.x - shift) <= 1e-9 * max(1.0, float(np.linalg.norm(shift))):
+            return np.asarray(bounded.x, dtype=float)
+        z = z0 + dz
+        worst = int(np.argmax(np.maximum(lower - z, z - upper)))
+        name = self.robot.joint_names[self.sliders[worst]]
+        raise PlanningError(
+            f"The goal is beyond stroke: it needs joint '{name}' at {z[worst]:.4g} m, and its "
+            f"stroke is [{lower[worst]:.4g}, {upper[worst]:.4g}] m."
+        )
+
+    def _slide(self, z0: Array, z_f: Array) -> Array:
+        """Step 2: shapes (N + 1, n) under ``v_i = c_i sin^2(2 pi n1 t / t1)``, eq. (10)."""
+        displacement = z_f - z0
+        if np.abs(displacement).max() <= _NO_MOTION:
+            return z_f[np.newaxis].copy()
+        t1 = self._slide_time(displacement)
+        ticks = max(math.ceil(t1 / self.tick_period - 1e-9), 4 * self.n1)
+        phase = np.linspace(0.0, 1.0, ticks + 1)[:, np.newaxis]
+        progress = phase - np.sin(4 * np.pi * self.n1 * phase) / (4 * np.pi * self.n1)
+        shapes = z0 + progress * displacement
+        shapes[-1] = z_f
+        return shapes
+
+    def _slide_time(self, displacement: Array) -> float:
+        """Return t1 (s), longer where a servo is slow: the peak speed is twice the mean."""
+        slowest = self.t1
+        for name, distance, rate in zip(
+            self.robot.joint_names, np.abs(displacement), self.robot.velocity_limit, strict=True
+        ):
+            if distance > _NO_MOTION and 2 * distance > rate * self.longest:
+                raise PlanningError(
+                    f"The slide would take more than {self.longest:.6g} s: joint '{name}' is to "
+                    f"move {distance:.4g} m at no more than {rate:.4g} m/s."
+                )
+            if distance > _NO_MOTION:
+                slowest = max(slowest, 2 * distance / rate)
+        return float(slowest)
+
+    def _turn(
+        self, quaternion: Array, z_f: Array, goal: Goal, correction: bool
+    ) -> tuple[Array, int, Notes]:
+        """Step 3: one cycle of shapes (m + 1, n), how many of them, and the paper's symbols."""
+        wanted = attitude_error(quaternion, goal.quaternion)
+        if np.linalg.norm(wanted) <= _NO_ROTATION:
+            return z_f[np.newaxis].copy(), 0, {"cycles": 0.0}
+        triple, brackets = self._best_triple(z_f)
+        least = 0 if correction else self.cycles
+        best = self._refine(wanted, brackets, triple, z_f, least)
+        while (
+            best.miss > self.tolerance.attitude
+            and 2 * best.cycles * self.ticks_a_cycle * self.tick_period <= self.longest
+        ):
+            # The error of the first order goes as 1/sqrt(n).
+            best = self._refine(wanted, brackets, triple, z_f, 2 * best.cycles)
+        names = [self.robot.joint_names[i] for i in triple]
+        return (
+            best.shapes,
+            best.cycles,
+            {
+                "sliders": ", ".join(names),
+                "omega_d": [float(x) for x in wanted],
+                "alpha": [float(x) for x in best.alpha],
+                "cycles": float(best.cycles),
+                "amplitudes": [float(x) for x in best.amplitudes],
+                "predicted_attitude_error": best.miss,
+            },
+        )
+
+    def _refine(
+        self,
+        wanted: Array,
+        brackets: Array,
+        triple: tuple[int, int, int],
+        z_f: Array,
+        least: int,
+    ) -> _Turn:
+        """Ask for what the first order misses as well, until the turn is within tolerance.
+
+        The number of cycles is chosen once, from ``least`` up, so that the answer is smooth.
+        """
+        omega_d, best = wanted, None
+        target = quaternion_from_rotvec(wanted)
+        for _ in range(_MOST_REFINEMENTS):
+            alpha = np.linalg.solve(brackets, omega_d).astype(float)
+            turn = self._fit(alpha, triple, z_f, least)
+            least = turn.cycles
+            reached = turn.cycles * self._rotation(turn.shapes)
+            miss = attitude_error(quaternion_from_rotvec(reached), target)
+            turn = replace(turn, miss=float(np.linalg.norm(miss)))
+            if best is None or turn.miss < best.miss:
+                best = turn
+            omega_d = omega_d + wanted - reached
+            if turn.miss <= self.tolerance.attitude or np.linalg.norm(omega_d) > 4 * np.pi:
+                break
+        assert best is not None
+        return best
+
+    def _best_triple(self, z_f: Array) -> tuple[tuple[int, int, int], Array]:
+        """The three sliders whose brackets ``[w12, w23, w13]`` at zf are best conditioned."""
+        triple, M = best_triple(self.robot.curvature(z_f)[3:], self.sliders)
+        # M holds the curvature of the pairs 12, 23 and 31, which brackets are the negative of.
+        brackets = M * np.array([-1.0, -1.0, 1.0])
+        condition = float(np.linalg.cond(brackets))
+        if not condition < WORST_CONDITION:
+            raise PlanningError(
+                "The first-order Lie brackets of the sliders do not span the three axes of "
+                f"rotation at the final shape {np.round(z_f, 4).tolist()} (condition number "
+                f"{condition:.2g}): the attitude cannot be controlled there by lie_bracket."
+            )
+        return triple, brackets
+
+    def _fit(self, alpha: Array, triple: tuple[int, int, int], z_f: Array, least: int) -> _Turn:
+        """Choose n, from ``least`` up, so that the cycle keeps rates and strokes; more cycles are
+        smaller ones. With ``least`` 0 it is what ``loop_area`` gives.
+        """
+        n = least or max(1, math.ceil(float(np.linalg.norm(alpha)) / self.loop_area))
+        amplitudes = self._amplitudes(alpha)
+        robot = self.robot
+        room = np.minimum(z_f - robot.lower, robot.upper - z_f)
+        while True:
+            if n * self.ticks_a_cycle * self.tick_period > self.longest:
+                raise PlanningError(
+                    f"The turn would take more than {self.longest:.6g} s within the strokes and "
+                    f"rates of the sliders at the final shape {np.round(z_f, 4).tolist()}; "
+                    "a goal that leaves the sliders more room takes less."
+                )
+            shapes = self._cycle(amplitudes, n, triple, z_f)
+            swing = np.abs(shapes - z_f).max(axis=0)
+            rate = np.abs(np.diff(shapes, axis=0)).max(axis=0) / self.tick_period
+            active = swing > 0
+            with np.errstate(divide="ignore"):
+                excess = max(
+                    float(np.max((swing / np.maximum(room, 1e-300))[active], initial=0.0)),
+                    float(np.max((rate / robot.velocity_limit)[active], initial=0.0)),
+                )
+            if excess <= 1.0:
+                return _Turn(shapes, n, alpha, amplitudes)
+            # Amplitudes go as 1/sqrt(n).
+            n = math.ceil(min(n * min(excess, 1e6) ** 2 * 1.001, 1e12)) + 1
+
+    def _amplitudes(self, alpha: Array) -> Array:
+        """Return (b11, b12, b21, a22, a31): ``a22 b12 = 2 alpha1/pi``, ``a31 b21 = alpha2/pi``,
+        ``a31 b11 = alpha3/pi``, each product raised by what the polygons lose.
+        """
+        p12, p23, p13 = 2 * alpha[0] / np.pi, alpha[1] / np.pi, alpha[2] / np.pi
+        a22 = self.a22_ratio * math.sqrt(abs(p12))
+        a31 = self.a31_ratio * math.sqrt(math.hypot(p23, p13))
+        step = 2 * np.pi / self.ticks_a_cycle
+        first, second = np.sinc(step / np.pi), np.sinc(2 * step / np.pi)
+        b12 = p12 / (second * a22) if a22 else 0.0
+        b21, b11 = (p23 / (first * a31), p13 / (first * a31)) if a31 else (0.0, 0.0)
+        return np.array([b11, b12, b21, a22, a31])
+
+    def _cycle(self, amplitudes: Array, n: int, triple: tuple[int, int, int], z_f: Array) -> Array:
+        """One cycle at its ticks: the integrals of v1, v2, v3 of step 3, from ``zf`` back to it."""
+        b11, b12, b21, a22, a31 = amplitudes / math.sqrt(n)
+        phi = np.linspace(0.0, 2 * np.pi, self.ticks_a_cycle + 1)
+        z1 = b11 * (1 - np.cos(phi)) + b12 * (1 - np.cos(2 * phi)) / 2
+        z2 = b21 * (1 - np.cos(phi)) + a22 * (np.sin(2 * phi) / 2 - np.sin(3 * phi) / 3)
+        z3 = a31 * (np.sin(phi) - np.sin(3 * phi) / 3)
+        shapes = np.tile(z_f, (len(phi), 1))
+        for index, z in zip(triple, (z1, z2, z3), strict=True):
+            shapes[:, index] += z
+        shapes[-1] = z_f
+        return shapes
+
+    def _rotation(self, cycle: Array) -> Array:
+        """Rotation vector (3,) of the base over one cycle."""
+        identity = np.array([0.0, 0.0, 0.0, 1.0])
+        return rotvec_from_quaternion(self._prediction.attitudes(cycle, identity, np.zeros(3))[-1])
+
+    def _path(
+        self, state: RobotState, slide: Array, attitudes: Array, cycle: Array, n: int
+    ) -> BasePath:
+        """Base path: step 2 as it goes, step 3 at the ends of some cycles."""
+        stride = max(1, len(slide) // _KNOTS)
+        chosen = np.unique(np.append(np.arange(0, len(slide), stride), len(slide) - 1))
+        time, shapes, quaternions = chosen * self.tick_period, slide[chosen], attitudes[chosen]
+        if n:
+            done = np.unique(np.append(np.arange(0, n, max(1, n // _KNOTS))[1:], n))
+            rotation = self._rotation(cycle)
+            turned = [
+                quaternion_multiply(attitudes[-1], quaternion_from_rotvec(k * rotation))
+                for k in done
+            ]
+            seconds = (len(slide) - 1 + done * self.ticks_a_cycle) * self.tick_period
+            time = np.append(time, seconds)
+            shapes = np.vstack([shapes, np.tile(cycle[-1], (len(done), 1))])
+            quaternions = np.vstack([quaternions, turned])
+        return BasePath(
+            time, self._prediction.positions(state, time, shapes, quaternions), quaternions
+        )
+
+
+@dataclass(frozen=True)
+class _Turn:
+    """Step 3 as chosen; ``miss`` is the angle (rad) that its n cycles leave to the wanted turn."""
+
+    shapes: Array
+    cycles: int
+    alpha: Array
+    amplitudes: Array
+    miss: float = math.inf

@@ -1,0 +1,158 @@
+"""From a smooth trajectory to commands that are held for a tick, and end on the goal exactly.
+
+The shapes at the ticks are points of the trajectory; between them the shape moves along chords,
+with velocities that are means over a tick. So strokes, velocities and accelerations keep their
+limits, but the areas of the chords' loops are not quite those of the curves, nor is the solution's
+attitude that of the plant's integration. Newton's method bends the path by a few smooth waves until
+the plant's own prediction ends on the goal. The first variation of the final attitude is
+
+``eta = R_f' sum_k R_k K(q_k)(dq_k, q_k' dt)``,  K the curvature of the connection,
+
+for a bend ``dq`` that vanishes at both ends. Where a bend needs more speed or acceleration than
+there is, the manoeuvre takes a few ticks longer.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import attitude_error, matrix_from_quaternion
+from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.methods.optimal.limits import MotionLimits
+from spacerobot_ros.planning.methods.optimal.trajectory import Task, Trajectory
+
+_WAVES = 6
+"""Waves of a joint that a path is bent by."""
+
+_MET = 1e-11
+"""Attitude error that is as good as none, rad."""
+
+_MOST_STEPS = 25
+_MOST_STRETCHES = 40
+_LONGEST_STRETCH = 1.25
+"""A manoeuvre is not made longer than this to keep its limits: another start does better."""
+
+_WITHIN = 1e-9
+"""Rounding that a limit may be exceeded by, relative."""
+
+_SHYNESS = 0.02
+"""Share of the half stroke, off its ends, within which a path is bent less."""
+
+
+@dataclass(frozen=True)
+class HeldCommands:
+    """Shapes ``positions`` (N + 1, n) at the ticks, attitudes ``quaternions`` (N + 1, 4) that they
+    cause, from the starting one, and the angle ``miss`` (rad) that is left to the goal.
+    """
+
+    positions: Array
+    quaternions: Array
+    miss: float
+
+
+class CommandHolder:
+    """Turns trajectories of one robot into held commands.
+
+    ``axes`` (m, 3) are the directions in the base along which the attitude is met.
+    """
+
+    def __init__(
+        self, robot: SpaceRobot, prediction: BasePrediction, tick_period: float, axes: Array
+    ) -> None:
+        self._prediction = prediction
+        self._period = tick_period
+        self._axes = axes
+        self._curvature = robot.function("curvature", compile=False)
+        self._n = robot.n
+
+    def hold(
+        self,
+        trajectory: Trajectory,
+        task: Task,
+        final: Array,
+        limits: MotionLimits,
+        *,
+        fewest_ticks: int = 1,
+        fixed: bool = False,
+    ) -> HeldCommands | None:
+        """Return the commands of a trajectory that end in ``final`` (n,) and the task's attitude.
+
+        They take the trajectory's time, rounded up to ticks, or as much longer as it takes to keep
+        the limits (``fixed``: not longer); None where that is not found.
+        """
+        ticks = max(fewest_ticks, math.ceil(trajectory.duration / self._period - 1e-6))
+        most = ticks if fixed else math.ceil(_LONGEST_STRETCH * ticks) + 4
+        for _ in range(_MOST_STRETCHES):
+            held = self._bent(trajectory.at_ticks(ticks), task, final, limits)
+            if held is None:
+                return None
+            factor, overrun = limits.excess(held.positions, self._period)
+            if overrun > _WITHIN:
+                return None
+            if factor <= 1 + _WITHIN:
+                return held
+            ticks = max(ticks + 1, math.ceil(ticks * factor - 1e-9))
+            if ticks > most:
+                return None
+        return None
+
+    def _bent(
+        self, positions: Array, task: Task, final: Array, limits: MotionLimits
+    ) -> HeldCommands | None:
+        """Bend shapes (N + 1, n) until they end in the task's attitude; None if they do not."""
+        s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
+        # The solver's last shape is the wanted one to its own precision.
+        positions = positions + s**3 * (10 - 15 * s + 6 * s**2) * (final - positions[-1])
+        positions = np.clip(positions, limits.lower, limits.upper)
+        positions[0], positions[-1] = task.start, final
+        waves, best = self._waves(positions, limits), math.inf
+        for _ in range(_MOST_STEPS):
+            quaternions = self._prediction.attitudes(
+                positions, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
+            )
+            error = self._axes @ attitude_error(quaternions[-1], task.turn)
+            miss = float(np.linalg.norm(error))
+            if miss <= _MET or (miss <= 1e3 * _MET and miss > best / 2):
+                return HeldCommands(positions, quaternions, miss)
+            if miss > 2 * best:
+                return None
+            best = min(best, miss)
+            J = self._axes @ self._first_variation(positions, quaternions, waves)
+            amplitudes = np.linalg.lstsq(J, error, rcond=1e-10)[0]
+            positions = positions + np.einsum("kin,i->kn", waves, amplitudes)
+        return None
+
+    def _waves(self, positions: Array, limits: MotionLimits) -> Array:
+        """Return bends (N + 1, waves, n) of one joint each, in proportion to its speed."""
+        s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
+        order = np.arange(1, _WAVES + 1)
+        shape = np.sin(math.pi * s) * np.sin(math.pi * s * order) / order
+        half = limits.span(positions[0])[1]
+        room = np.minimum(positions - limits.lower, limits.upper - positions)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shy = np.clip(np.nan_to_num(room / (_SHYNESS * half), nan=0.0), 0.0, 1.0)
+        # Smooth where it begins, so that accelerations stay small.
+        shy = shy**2 * (3 - 2 * shy)
+        speed = np.where(np.isfinite(limits.velocity), limits.velocity, half)
+        joints = np.eye(self._n) * speed
+        bends = shape[:, :, np.newaxis, np.newaxis] * (shy[:, np.newaxis] * joints)[:, np.newaxis]
+        return np.asarray(bends.reshape(len(positions), -1, self._n))
+
+    def _first_variation(self, positions: Array, quaternions: Array, waves: Array) -> Array:
+        """Return how waves (N + 1, w, n) turn the final attitude: (3, w), base components."""
+        # A few hundred points of a smooth integrand are plenty for Newton's direction.
+        stride = max(1, len(positions) // 200)
+        chosen = np.arange(stride // 2, len(positions), stride)
+        shapes = positions[chosen]
+        moved = np.gradient(positions, axis=0)[chosen] * stride
+        K = self._curvature(shapes.T).full().reshape(6, len(chosen), self._n, self._n)[3:]
+        # The columns of one shape run over i fastest: K[axis, shape, j, i].
+        twists = np.einsum("akji,kj,kwi->kaw", K, moved, waves[chosen])
+        R = np.array([matrix_from_quaternion(x) for x in quaternions[chosen]])
+        R_f = matrix_from_quaternion(quaternions[-1])
+        return np.asarray(R_f.T @ np.einsum("kab,kbw->aw", R, twists))

@@ -1,0 +1,147 @@
+"""Where the search for a manoeuvre begins.
+
+A path that only goes from one shape to the other is a saddle: to first order no small change of it
+turns the base elsewhere. So guesses go round: the direct way with loops upon it, whose size is such
+that their areas, times the curvature, are about the turn that is wanted. The loops are those of the
+papers, a cycle of three frequencies (paper 1, section 5) and a square (paper 3, section III), and
+random trigonometric ones.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    quaternion_from_rotvec,
+    quaternion_multiply,
+)
+from spacerobot_ros.planning.methods.optimal.limits import MotionLimits
+from spacerobot_ros.planning.methods.optimal.trajectory import Task, Trajectory
+
+_CANDIDATES = 24
+"""Loops of one kind from which the one that ends nearest to the goal is taken."""
+
+_WIDEST = 0.85
+"""Share of the half strokes that a guess uses at most."""
+
+Loop = Callable[[np.random.Generator, Array, int], Array]
+"""A closed path (N + 1, n) of order one at instants (N + 1,) from 0 to 1."""
+
+
+class InitialGuesses:
+    """Guesses for one task, endlessly many, the same ones every time.
+
+    Parameters
+    ----------
+    turn
+        Function ``(q, u, u+) -> Omega`` of a step (:func:`turn_function`).
+    curvature
+        Function ``q -> K`` of the model.
+    """
+
+    def __init__(self, turn: ca.Function, curvature: ca.Function, intervals: int) -> None:
+        self._turn, self._curvature = turn, curvature
+        self._instants = np.linspace(0.0, 1.0, intervals + 1)
+
+    def of(self, task: Task, limits: MotionLimits, final: Array) -> Iterator[Trajectory]:
+        """Yield guesses that end in the shape ``final`` (n,)."""
+        rng = np.random.default_rng(1)
+        half = limits.span(task.start)[1]
+        direct = self._trajectory(self._direct(task.start, final), limits)
+        missing = attitude_error(direct.quaternions[-1], task.turn)
+        size = min(1.0, self._size(final, half, float(np.linalg.norm(missing))))
+        for number in itertools.count():
+            loop = _LOOPS[number % len(_LOOPS)]
+            found: list[tuple[float, Trajectory]] = []
+            for _ in range(_CANDIDATES):
+                rounds = size * rng.uniform(0.3, 1.5) * loop(rng, self._instants, len(half))
+                shapes = self._path(rounds, task.start, final, limits)
+                trajectory = self._trajectory(shapes, limits)
+                left = attitude_error(trajectory.quaternions[-1], task.turn)
+                found.append((float(np.linalg.norm(left)), trajectory))
+            yield min(found, key=lambda entry: entry[0])[1]
+
+    def _direct(self, start: Array, final: Array) -> Array:
+        s = self._instants
+        return start + np.outer(s**3 * (10 - 15 * s + 6 * s**2), final - start)
+
+    def _path(self, rounds: Array, start: Array, final: Array, limits: MotionLimits) -> Array:
+        """Return shapes (N + 1, n) that go round, in half strokes, on the direct way."""
+        direct = self._direct(start, final)
+        middle, half = limits.span(start)
+        # Within most of the strokes, or as far out as the direct way is.
+        room = np.maximum(_WIDEST * half, np.abs(direct - middle))
+        shapes = np.clip(direct + half * rounds, middle - room, middle + room)
+        return np.clip(shapes, limits.lower, limits.upper)
+
+    def _size(self, q: Array, half: Array, angle: float) -> float:
+        """Return how much of the half strokes a loop takes that turns the base by ``angle``."""
+        n = len(q)
+        K = np.abs(self._curvature(q).full()[3:]).sum(axis=0).reshape(n, n)
+        largest = float((K * np.outer(half, half)).max())
+        return math.sqrt(angle / (math.pi * largest)) if largest > 0 else 1.0
+
+    def _trajectory(self, shapes: Array, limits: MotionLimits) -> Trajectory:
+        u = np.gradient(shapes, axis=0)
+        u[0] = u[-1] = 0.0
+        speed = float((np.abs(u) / limits.velocity).max())
+        change = float((np.abs(np.diff(u, axis=0)) / limits.acceleration).max())
+        h = max(speed, math.sqrt(change), 1e-6)
+        Omega = self._turn(shapes[:-1].T, u[:-1].T, u[1:].T).full().T
+        quaternions = [np.array([0.0, 0.0, 0.0, 1.0])]
+        for rotation in Omega:
+            quaternions.append(
+                quaternion_multiply(quaternions[-1], quaternion_from_rotvec(rotation))
+            )
+        return Trajectory(h, shapes, u / h, np.array(quaternions))
+
+
+def _trigonometric(rng: np.random.Generator, s: Array, n: int) -> Array:
+    """Random harmonics under an envelope that is zero at both ends."""
+    rounds = rng.integers(1, 4)
+    path = np.zeros((len(s), n))
+    for harmonic in range(rounds, rounds + 3):
+        phase = 2 * math.pi * harmonic * s[:, np.newaxis]
+        a, b = rng.normal(size=(2, n)) / (harmonic - rounds + 1)
+        path += a * np.sin(phase) + b * np.cos(phase)
+    return np.asarray(path * np.sin(math.pi * s)[:, np.newaxis] ** 2)
+
+
+def _three_frequencies(rng: np.random.Generator, s: Array, n: int) -> Array:
+    """A cycle of step 3 of paper 1, among any three joints (two, where there are no three)."""
+    phi = 2 * math.pi * s
+    b11, b12, b21, a22, a31 = rng.normal(size=5)
+    cycle = (
+        b11 * (1 - np.cos(phi)) + b12 * (1 - np.cos(2 * phi)) / 2,
+        b21 * (1 - np.cos(phi)) + a22 * (np.sin(2 * phi) / 2 - np.sin(3 * phi) / 3),
+        a31 * (np.sin(phi) - np.sin(3 * phi) / 3),
+    )
+    path = np.zeros((len(s), n))
+    for joint, motion in zip(rng.permutation(n)[:3], cycle, strict=False):
+        path[:, joint] = motion
+    return path
+
+
+def _squares(rng: np.random.Generator, s: Array, n: int) -> Array:
+    """Out to squares in the plane of two joints, round once or twice, and back (paper 3)."""
+    path = np.zeros((len(s), n))
+    pair = rng.permutation(n)[:2]
+    corner = rng.uniform(-1, 1, len(pair))
+    side = rng.uniform(0.5, 1.5, len(pair)) * rng.choice([-1.0, 1.0], len(pair))
+    rounds = int(rng.integers(1, 3))
+    legs = np.tile([[0, 0], [1, 0], [1, 1], [0, 1]], (rounds, 1))[:, : len(pair)]
+    knots = np.vstack([np.zeros(len(pair)), corner + side * legs, corner, np.zeros(len(pair))])
+    at = np.linspace(0.0, 1.0, len(knots))
+    for column, joint in enumerate(pair):
+        path[:, joint] = np.interp(s, at, knots[:, column])
+    return path
+
+
+_LOOPS: tuple[Loop, ...] = (_trigonometric, _three_frequencies, _trigonometric, _squares)

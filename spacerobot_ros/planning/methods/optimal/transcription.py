@@ -1,0 +1,261 @@
+"""The optimal control problem as a nonlinear program, with its derivatives.
+
+Knots k = 0..N carry shape q, velocity v, step ``u = h v`` and attitude X; between them the
+acceleration is constant, and all steps take the same time h, which is free:
+
+``q+ = q + (u + u+)/2``, ``|v+ - v| <= h a_max``, ``X+ = X exp(Omega)``.
+
+Omega is the Magnus expansion, order four, of the rates at two Gauss points of the step, where
+momentum is zero: ``D(q) w + D_q(q) u = 0`` (paper 1, eq. 3). So the attitude follows from the path
+of the shape, however fast it is travelled, and the base's position needs no state: the centre of
+mass rests, and the last shape and attitude tell where the base is.
+
+All of the robot is in the momentum, at shapes and steps that are linear in the variables. Its
+derivatives are made once for one point, with shared subexpressions, and put in their places;
+differentiating the whole program by sweeps takes four times as long for a six-joint arm.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.connection import solve_positive_definite
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.methods.optimal.constraints import PathConstraints
+
+GAUSS = (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6)
+"""Gauss points of a step, from 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """Functions of variables x and parameters p, as IPOPT takes them.
+
+    ``variables`` and ``parameters`` are the sizes of their parts, in order; ``lower`` and ``upper``
+    bound g.
+    """
+
+    problem: dict[str, ca.MX]
+    jac_g: ca.Function
+    hess_lag: ca.Function
+    lower: Array
+    upper: Array
+
+
+class Transcription:
+    """Builds the program of one robot.
+
+    Parameters
+    ----------
+    robot, intervals
+        The model, and the number of steps N.
+    axes
+        (m, 3) directions in the base along which the attitude is to be met.
+    position
+        Whether the centre of mass is to end at ``center`` in the base.
+    constraints
+        What the path must keep.
+    """
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        intervals: int,
+        axes: Array,
+        position: bool,
+        constraints: PathConstraints,
+    ) -> None:
+        self._robot, self._axes, self._position = robot, axes, position
+        self._constraints = constraints
+        n, N = robot.n, intervals
+        self._N = N
+        self._h = ca.MX.sym("h")
+        self._q, self._v, self._u = (ca.MX.sym(name, n, N + 1) for name in ("q", "v", "u"))
+        self._X = ca.MX.sym("X", 4, N + 1)
+        self._w = [ca.MX.sym(f"w_{i}", 3, N) for i in range(len(GAUSS))]
+        parts = (self._h, self._q, self._v, self._u, self._X, *self._w)
+        self._x = ca.vertcat(*(ca.vec(part) for part in parts))
+        self._a_max, self._turn = ca.MX.sym("a_max", n), ca.MX.sym("turn", 4)
+        self._direction, self._center = ca.MX.sym("direction", 3), ca.MX.sym("center", 3)
+        self._typical = ca.MX.sym("typical", n)
+        self._weights = ca.MX.sym("weights", 2)
+        self._lower, self._upper = ca.MX.sym("lower", n), ca.MX.sym("upper", n)
+        self._p = ca.vertcat(
+            self._a_max,
+            self._turn,
+            self._direction,
+            self._center,
+            self._lower,
+            self._upper,
+            self._typical,
+            self._weights,
+        )
+
+    def program(self) -> Program:
+        """Return the program."""
+        x, p = self._x, self._p
+        f = self._objective()
+        zero, positive = self._zero(), self._positive()
+        # Shape, step and rate at all Gauss points, points one after the other: linear in x.
+        at_points = self._at_points()
+        select = _constant_jacobian(at_points, x)
+        size = 2 * self._robot.n + 3
+        points = ca.reshape(at_points, size, -1)
+        momentum, momentum_jac, momentum_hess = self._momentum()
+        count = points.shape[1]
+        left = momentum.map(count)(points)
+        g = ca.vertcat(zero, ca.vec(left), positive)
+
+        jac_blocks = ca.horzsplit(momentum_jac.map(count)(points), size)
+        jac = ca.vertcat(
+            ca.jacobian(zero, x), ca.diagcat(*jac_blocks) @ select, ca.jacobian(positive, x)
+        )
+        lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.shape[0])
+        splits = [0, zero.shape[0], zero.shape[0] + 3 * count, g.shape[0]]
+        lam_zero, lam_model, lam_positive = ca.vertsplit(lam_g, splits)
+        plain = lam_f * f + ca.dot(lam_zero, zero) + ca.dot(lam_positive, positive)
+        hess_blocks = ca.horzsplit(
+            momentum_hess.map(count)(points, ca.reshape(lam_model, 3, count)), size
+        )
+        hessian = ca.hessian(plain, x)[0] + select.T @ ca.diagcat(*hess_blocks) @ select
+        lower = np.zeros(g.shape[0])
+        upper = np.where(np.arange(len(lower)) < splits[2], 0.0, np.inf)
+        return Program(
+            {"x": x, "p": p, "f": f, "g": g},
+            ca.Function("jac_g", [x, p], [g, jac]),
+            ca.Function("hess_lag", [x, p, lam_f, lam_g], [ca.triu(hessian)]),
+            lower,
+            upper,
+        )
+
+    def _objective(self) -> ca.MX:
+        change = self._v[:, 1:] - self._v[:, :-1]
+        work = ca.sumsqr(change / ca.repmat(self._typical, 1, self._N)) / (self._N * self._h**2)
+        return self._weights[0] * self._N * self._h + self._weights[1] * work
+
+    def _zero(self) -> ca.MX:
+        q, u, X = self._q, self._u, self._X
+        X_next = _step().map(self._N)(X[:, :-1], *self._w)
+        parts = [
+            q[:, 1:] - q[:, :-1] - (u[:, :-1] + u[:, 1:]) / 2,
+            u[:, 1:-1] - self._h * self._v[:, 1:-1],
+            X[:, 1:] - X_next,
+            ca.DM(self._axes) @ _relative_vector(self._turn, X[:, -1]),
+        ]
+        if self._position:
+            center_of_mass = self._robot.function("center_of_mass", compile=False)
+            parts.append(center_of_mass(q[:, -1]) - self._center)
+        return ca.vertcat(*(ca.vec(part) for part in parts))
+
+    def _positive(self) -> ca.MX:
+        q, v, X, N = self._q, self._v, self._X, self._N
+        change, bound = v[:, 1:] - v[:, :-1], ca.repmat(self._a_max * self._h, 1, N)
+        # With the knots, the control points of the parabolas: these run within the strokes too.
+        control = q[:, :-1] + self._u[:, :-1] / 2
+        below, above = (
+            np.flatnonzero(np.isfinite(ends)).tolist()
+            for ends in (self._robot.lower, self._robot.upper)
+        )
+        parts = [
+            bound - change,
+            bound + change,
+            control[below, :] - ca.repmat(self._lower[below, :], 1, N),
+            ca.repmat(self._upper[above, :], 1, N) - control[above, :],
+        ]
+        if self._constraints.on_knots:
+            kept = self._keeps().map(N - 1)
+            parts.append(kept(q[:, 1:-1], X[:, 1:-1], ca.repmat(self._direction, 1, N - 1)))
+        if self._constraints.base_rate > 0:
+            # Rates change steadily within a step and are largest at its ends.
+            fastest = self._h * self._constraints.imposed_base_rate
+            first, second = self._w
+            for end in (0.0, 1.0):
+                w = first + (end - GAUSS[0]) / (GAUSS[1] - GAUSS[0]) * (second - first)
+                parts.append(1 - ca.sum1((w / fastest) ** 2))
+        return ca.vertcat(*(ca.vec(part) for part in parts))
+
+    def _at_points(self) -> ca.MX:
+        q, now, later = self._q[:, :-1], self._u[:, :-1], self._u[:, 1:]
+        points = [
+            ca.vertcat(q + tau * now + tau**2 / 2 * (later - now), now + tau * (later - now), w)
+            for tau, w in zip(GAUSS, self._w, strict=True)
+        ]
+        return ca.vec(ca.horzcat(*points))
+
+    def _momentum(self) -> tuple[ca.Function, ca.Function, ca.Function]:
+        """Return the momentum (3,) of ``[q; u; w]``, its Jacobian, and a multiplier's Hessian."""
+        locked_inertia = self._robot.function("locked_inertia", compile=False)
+        n = self._robot.n
+        point, multiplier = ca.SX.sym("point", 2 * n + 3), ca.SX.sym("multiplier", 3)
+        D, D_q = locked_inertia(point[:n])
+        # About one, whatever the robot's size.
+        typical = float(np.trace(locked_inertia(np.zeros(n))[0].full())) / 3
+        momentum = ca.cse((D @ point[2 * n :] + D_q @ point[n : 2 * n]) / typical)
+        jacobian = ca.cse(ca.densify(ca.jacobian(momentum, point)))
+        hessian = ca.hessian(ca.dot(multiplier, momentum), point)[0]
+        return (
+            ca.Function("momentum", [point], [momentum]),
+            ca.Function("momentum_jac", [point], [jacobian]),
+            ca.Function("momentum_hess", [point, multiplier], [ca.cse(ca.densify(hessian))]),
+        )
+
+    def _keeps(self) -> ca.Function:
+        q, X, direction = ca.SX.sym("q", self._robot.n), ca.SX.sym("X", 4), ca.SX.sym("d", 3)
+        return ca.Function(
+            "keeps", [q, X, direction], [self._constraints.symbolic(q, X, direction)]
+        )
+
+
+def magnus(first: ca.SX, second: ca.SX) -> ca.SX:
+    """Return the rotation vector (3,) of a step from its rotations at the two Gauss points."""
+    return (first + second) / 2 + math.sqrt(3) / 12 * ca.cross(first, second)
+
+
+def _step() -> ca.Function:
+    """Return ``(X, w_1, w_2) -> X+``."""
+    X, first, second = ca.SX.sym("X", 4), ca.SX.sym("w_1", 3), ca.SX.sym("w_2", 3)
+    X_next = _product(X, _exponential(magnus(first, second)))
+    return ca.Function("step", [X, first, second], [ca.cse(X_next)])
+
+
+def _constant_jacobian(expression: ca.MX, x: ca.MX) -> ca.DM:
+    """Return the Jacobian of an expression that is linear in x."""
+    return ca.Function("linear", [x], [ca.jacobian(expression, x)])(0)
+
+
+def _product(a: ca.SX, b: ca.SX) -> ca.SX:
+    """Quaternion (x, y, z, w) of the rotation b followed by a."""
+    return ca.vertcat(
+        a[3] * b[:3] + b[3] * a[:3] + ca.cross(a[:3], b[:3]), a[3] * b[3] - ca.dot(a[:3], b[:3])
+    )
+
+
+def _relative_vector(turn: ca.MX, X: ca.MX) -> ca.MX:
+    """Vector part (3,) of the rotation from the goal to X: zero at either sign of X."""
+    return turn[3] * X[:3] - X[3] * turn[:3] - ca.cross(turn[:3], X[:3])
+
+
+def _exponential(Omega: ca.SX) -> ca.SX:
+    """Quaternion of a rotation vector of well under a radian: smooth at zero, order five."""
+    square = ca.sumsqr(Omega)
+    return ca.vertcat(
+        Omega * (1 / 2 - square / 48 + square**2 / 3840),
+        1 - square / 8 + square**2 / 384 - square**3 / 46080,
+    )
+
+
+def turn_function(robot: SpaceRobot) -> ca.Function:
+    """Return ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step, base components."""
+    locked_inertia = robot.function("locked_inertia", compile=False)
+    q, u, u_next = (ca.SX.sym(name, robot.n) for name in ("q", "u", "u_next"))
+
+    def rotation(tau: float) -> ca.SX:
+        D, D_q = locked_inertia(q + tau * u + tau**2 / 2 * (u_next - u))
+        return -solve_positive_definite(D, D_q @ (u + tau * (u_next - u)))
+
+    return ca.Function("turn", [q, u, u_next], [ca.cse(magnus(*map(rotation, GAUSS)))])

@@ -1,5 +1,0 @@
-"""Time-optimal manoeuvres by direct optimal control."""
-
-from spacerobot_ros.planning.optimal.method import OptimalGait
-
-__all__ = ["OptimalGait"]

@@ -1,0 +1,227 @@
+"""Maps of the curvature over the shape space: paper 3, figures 2 and 3; paper 2, figures 6 to 8."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, Normalize, TwoSlopeNorm
+from matplotlib.figure import Figure
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.planning.core.controllability import (
+    curvature_matrices,
+    curvatures,
+    shape_box,
+)
+from spacerobot_ros.planning.methods.curvature_peak import curvature_peaks
+from spacerobot_ros.planning.methods.edge_path import PLANES
+from spacerobot_ros.planning.methods.geometric_phase import PhasePlane, PlanarPhase
+from spacerobot_ros.report.style import (
+    FAINT,
+    INK,
+    MUTED,
+    PALETTE,
+    WIDTH,
+    new_figure,
+    panel,
+    paper_style,
+    png_of,
+)
+from spacerobot_ros.session.analyze import Analysis
+
+_PIXELS = 1600
+_FINE, _COARSE = 61, 37
+"""Points a side of a map, of robots with up to three joints and with more."""
+
+_LEVELS = 16
+_CONDITIONS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 50.0, 100.0)
+_POOR = 300.0
+"""Condition numbers above are drawn as this one: singular shapes are lines between grid points."""
+
+_LEAST_ROOM = 0.25
+"""Squares are drawn round a centre that is as far from the joint limits, rad."""
+
+_SIDES = 60
+_AXES = ("x", "y", "z")
+
+
+def draw(found: Analysis) -> bytes | None:
+    """Return the picture (PNG) that suits the robot; None where no loop turns its base."""
+    with paper_style():
+        if found.planar.controllable:
+            figure = _planar(found)
+        elif found.nominal is not None:
+            figure = _spatial(found)
+        else:
+            return None
+        return png_of(figure, _PIXELS)
+
+
+# -- planar robots ------------------------------------------------------------------------------
+
+
+def _planar(found: Analysis) -> Figure:
+    """Draw H over the plane of two joints, and the phase of squares round its peak."""
+    robot = found.robot
+    i, j = sorted(robot.joint_names.index(name) for name in found.planar.joints)
+    plane = PlanarPhase(robot).plane(found.shape, i, j)
+    lower, upper = (bound[[i, j]] for bound in shape_box(robot))
+    centre = curvature_peaks(plane, np.zeros(2), np.array([[lower, upper]]))[0]
+    figure = new_figure(4.6)
+    left = panel(figure, 0.75, 0.6, 3.55, 3.55)
+    bar = panel(figure, 4.4, 0.6, 0.12, 3.55)
+    x, y = (np.linspace(low, high, 121) for low, high in zip(lower, upper, strict=True))
+    H = -plane.curvature(np.stack(np.meshgrid(x, y), axis=-1))
+    norm = _signed(np.abs(H).max())
+    _map(left, x, y, H, norm)
+    left.plot(*centre, marker="+", color=INK, ms=9, mew=1.4)
+    left.set_xlim(lower[0], upper[0])
+    left.set_ylim(lower[1], upper[1])
+    left.set_xlabel(f"{robot.joint_names[i]} (rad)")
+    left.set_ylabel(f"{robot.joint_names[j]} (rad)")
+    left.set_title("H: turn by small clockwise loops over area (1/rad)")
+    _bar(figure, bar, norm, "RdBu_r")
+    right = panel(figure, 5.9, 0.6, WIDTH - 6.2, 3.55)
+
+    def room(point: Array) -> float:
+        return float(np.minimum(robot.upper[[i, j]] - point, point - robot.lower[[i, j]]).min())
+
+    if room(centre) < _LEAST_ROOM:
+        # The peak is on a joint limit: squares need one that is not.
+        quarter = (upper - lower) / 4
+        inner = np.array([[lower + quarter, upper - quarter]])
+        centre = curvature_peaks(plane, np.zeros(2), inner)[0]
+    _phases(right, plane, centre, 2 * room(centre))
+    return figure
+
+
+def _phases(axes: Axes, plane: PhasePlane, centre: Array, room: float) -> None:
+    """Draw the turn by a square round a centre against its side (paper 3, figure 3)."""
+    sides = np.linspace(0.0, min(np.pi, room), _SIDES)
+    turns = np.abs(plane.squares(np.tile(centre, (_SIDES, 1)), sides))
+    small = abs(float(plane.curvature(centre))) * sides**2
+    axes.plot(sides, turns, color=PALETTE[0], label="round the best centre")
+    axes.plot(sides, small, color=MUTED, dashes=(4, 3), lw=0.9, label="|H| z², small squares")
+    axes.set_xlabel("side z of the square (rad)")
+    axes.set_title("turn of the base by one square loop (rad)")
+    axes.set_xlim(0.0, None)
+    axes.set_ylim(0.0, 1.35 * turns.max())
+    axes.legend(loc="upper left")
+
+
+# -- spatial robots -----------------------------------------------------------------------------
+
+
+def _spatial(found: Analysis) -> Figure:
+    """Draw the entries of M where joints turn, and the condition number of M in any case."""
+    assert found.nominal is not None
+    joints = found.nominal.joints
+    kinds = [found.robot.description.movable_joints[k].kind for k in joints]
+    sliding = all(kind is JointKind.PRISMATIC for kind in kinds)
+    rows = 1 if sliding else 4
+    high, gap = (2.35, 0.75) if sliding else (1.95, 0.72)
+    figure = new_figure(0.35 + rows * (high + gap) + (2.1 if sliding else 0.0))
+    width, across = 2.2, 0.62
+    maps = [_over_plane(found, pair) for pair in PLANES]
+    bottom = float(figure.get_size_inches()[1]) - 0.35
+    for row, (pair, (x, y, K, _)) in enumerate(zip(PLANES, maps, strict=True)):
+        if sliding:
+            break
+        bottom -= high + (gap if row else 0.0)
+        norm = _signed(np.abs(K).max())
+        for column, values in enumerate(K):
+            axes = panel(figure, 0.7 + column * (width + across), bottom, width, high)
+            _map(axes, x, y, values, norm)
+            _mark(axes, found, pair)
+            first, second = (_symbol(pair, k) for k in (0, 1))
+            axes.set_title(f"turn about {_AXES[column]} by loops of {first}, {second}")
+        _bar(figure, panel(figure, WIDTH - 0.62, bottom, 0.12, high), norm, "RdBu_r")
+    bottom -= high + (0.0 if sliding else gap)
+    poor = BoundaryNorm(_CONDITIONS, 256, extend="max")
+    for column, (pair, (x, y, _, condition)) in enumerate(zip(PLANES, maps, strict=True)):
+        axes = panel(figure, 0.7 + column * (width + across), bottom, width, high)
+        axes.contourf(x, y, condition, _CONDITIONS, norm=poor, cmap="viridis_r", extend="max")
+        _mark(axes, found, pair)
+        axes.set_title("condition number of M")
+    _bar(figure, panel(figure, WIDTH - 0.62, bottom, 0.12, high), poor, "viridis_r")
+    if sliding:
+        _distribution(panel(figure, 0.7, 0.55, WIDTH - 1.0, 1.5), found.conditions)
+    return figure
+
+
+def _over_plane(found: Analysis, pair: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
+    """Return grids x and y (P,), the curvature (3, P, P) of two of the three joints over their
+    plane, and the condition number (P, P) of M there.
+    """
+    assert found.nominal is not None
+    robot, joints = found.robot, found.nominal.joints
+    i, j = (joints[k] for k in pair)
+    count = _FINE if robot.n <= 3 else _COARSE
+    lower, upper = shape_box(robot)
+    x, y = (np.linspace(lower[k], upper[k], count) for k in (i, j))
+    shapes = np.tile(found.shape, (count * count, 1))
+    shapes[:, i], shapes[:, j] = (grid.ravel() for grid in np.meshgrid(x, y))
+    K = curvatures(robot, shapes)
+    values = np.linalg.svd(curvature_matrices(K, joints), compute_uv=False)
+    condition = values[:, 0] / np.maximum(values[:, 2], values[:, 0] / _POOR)
+    grid = (count, count)
+    return x, y, K[:, :, i, j].T.reshape(3, *grid), condition.reshape(grid)
+
+
+def _mark(axes: Axes, found: Analysis, pair: tuple[int, int]) -> None:
+    """Mark the shape that is looked at, and name the joints of the plane."""
+    assert found.nominal is not None
+    i, j = (found.nominal.joints[k] for k in pair)
+    axes.plot(found.shape[i], found.shape[j], marker="+", color=INK, ms=8, mew=1.3)
+    for k, index, label in ((i, 0, axes.set_xlabel), (j, 1, axes.set_ylabel)):
+        label(f"{_symbol(pair, index)}: {found.robot.joint_names[k]} ({_unit(found.robot, k)})")
+
+
+def _distribution(axes: Axes, conditions: Array) -> None:
+    finite = np.sort(conditions[np.isfinite(conditions)])
+    share = np.arange(1, len(finite) + 1) / len(conditions)
+    axes.step(finite, share, where="post", color=PALETTE[0])
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.set_xlim(1.0, None)
+    axes.set_ylim(0.0, 1.05)
+    axes.set_xlabel("condition number of the best three brackets")
+    axes.set_title(f"share of {len(conditions)} shapes all over the shape space that are as good")
+
+
+# -- parts --------------------------------------------------------------------------------------
+
+
+def _map(axes: Axes, x: Array, y: Array, values: Array, norm: Normalize) -> None:
+    levels = np.linspace(norm.vmin or 0.0, norm.vmax or 1.0, _LEVELS + 1)
+    axes.contourf(x, y, values, levels, norm=norm, cmap="RdBu_r")
+    axes.contour(x, y, values, levels, colors=MUTED, linewidths=0.35)
+    axes.contour(x, y, values, [0.0], colors=INK, linewidths=0.8)
+    axes.grid(False)
+    for spine in axes.spines.values():
+        spine.set_visible(True)
+        spine.set_color(FAINT)
+
+
+def _signed(peak: float) -> Normalize:
+    return TwoSlopeNorm(0.0, -peak, peak)
+
+
+def _bar(figure: Figure, axes: Axes, norm: Any, colours: str) -> None:
+    bar = figure.colorbar(ScalarMappable(norm, colours), cax=axes)
+    bar.outline.set_linewidth(0.0)
+    axes.grid(False)
+
+
+def _symbol(pair: Sequence[int], index: int) -> str:
+    return f"φ{'₁₂₃'[pair[index]]}"
+
+
+def _unit(robot: SpaceRobot, index: int) -> str:
+    sliding = robot.description.movable_joints[index].kind is JointKind.PRISMATIC
+    return "m" if sliding else "rad"

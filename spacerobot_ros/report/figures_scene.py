@@ -1,0 +1,146 @@
+"""Pictures of the robot at instants of its flight."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from spacerobot_ros.model.description import Array, Pose
+from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.report.figures import DASHES
+from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.render import Canvas, View
+from spacerobot_ros.report.solids import Solids, base_outlines
+from spacerobot_ros.report.style import (
+    COLUMNS,
+    GHOST,
+    INK,
+    MUTED,
+    Plate,
+    key,
+    legend_above,
+    sheet,
+    svg_of,
+)
+
+PIXELS = 420
+"""Across the picture of a robot."""
+_INSTANTS = 6
+
+
+def configurations_plate(flight: Flight) -> Plate | str:
+    """The robot at several instants from the first state to the last, and the goal."""
+    if flight.robot is None:
+        return "The bag holds no robot description, so there is no picture of the robot."
+    if flight.drawn is None:
+        return "The bag does not hold base pose and joint positions for a picture of the robot."
+    indices = _instants(flight)
+    scenes = [flight.drawn.at(flight.joints[index], flight.base_at(index)) for index in indices]
+    across = min(len(indices), 3)
+    rows = [[1.0] * across for _ in range(0, len(indices), across)]
+    sizes = {"bottom": 0.15, "left": 0.2, "gap": 0.42}
+    figure, panels = sheet(rows, [2.9 if across > 2 else 3.9] * len(rows), **sizes)
+    points = np.concatenate([scene.points() for scene in scenes])
+    view = view_of(flight)
+    places = [axes for row in panels for axes in row]
+    for axes in places[len(indices) :]:
+        axes.set_visible(False)
+    places = places[: len(indices)]
+    for axes, scene, index in zip(places, scenes, indices, strict=True):
+        draw_robot(axes, scene, points, view)
+        axes.set_title(f"t = {flight.position.time[index]:.5g} s")
+    legend_above(places[-1], draw_goal_and_path(places[-1], flight, view))
+    caption = (
+        "The robot at instants from the first recorded state to the last, to one scale, from the "
+        "shapes of its URDF; each moving link in the color that its joint has in the other figures."
+    )
+    if flight.goal is not None:
+        caption += " Dashed in the last, the base link at the goal."
+    if any(shape.kind == "mesh" for link in flight.robot.links for shape in link.shapes):
+        caption += " Meshes are not drawn."
+    return Plate("configurations", "Configurations", caption, svg_of(figure))
+
+
+def view_of(flight: Flight) -> View:
+    """Return the direction to look from: above where all moves in a plane."""
+    return View(-90.0, 90.0) if flight.flat else View()
+
+
+def _instants(flight: Flight) -> list[int]:
+    """Up to six recorded states, about as much motion from one to the next.
+
+    Where a gait ends with equal cycles, three are spread over what comes before, and three over the
+    cycles, at one phase.
+    """
+    time, cycles = flight.position.time, flight.cycles
+    if cycles is not None and cycles.start > 0.0:
+        places = [0.0, 0.5 * cycles.start, cycles.start]
+        places += [cycles.start + cycles.period * (cycles.count * k // 3) for k in (1, 2, 3)]
+        found = np.searchsorted(time, np.array(places) - 1e-9)
+        return np.unique([*np.minimum(found, len(time) - 1), len(time) - 1]).tolist()
+    moved = np.column_stack([flight.position.values, flight.attitude.values, flight.joints])
+    extent = np.maximum(np.ptp(moved, axis=0), 1e-3)
+    steps = np.linalg.norm(np.diff(moved, axis=0) / extent, axis=1)
+    progress = np.append(0.0, np.cumsum(steps))
+    wanted = np.linspace(0.0, progress[-1], _INSTANTS) if progress[-1] > 0 else np.zeros(1)
+    found = np.minimum(np.searchsorted(progress, wanted), len(time) - 1)
+    return np.unique([*found, len(time) - 1]).tolist()
+
+
+def draw_robot(axes: Axes, solids: Solids, points: Array, view: View) -> None:
+    """Draw a robot to scale in axes that hold ``points`` (k, 3), with directions and a scale."""
+    box = axes.get_window_extent()
+    size = np.array([box.width, box.height])
+    flat = view(points)
+    middle = (flat.max(axis=0) + flat.min(axis=0)) / 2
+    span = 1.06 * max(float((np.ptp(flat, axis=0) / size).max()), 1e-6) * size
+    low, high = middle - span / 2, middle + span / 2
+    canvas = Canvas(view, low, high, PIXELS)
+    canvas.draw(solids.faces, solids.edges)
+    axes.imshow(canvas.image(), extent=(low[0], high[0], low[1], high[1]), aspect="auto")
+    axes.axis("off")
+    across = float(span[0])
+    corner = low + 0.08 * across
+    for direction, name in zip(np.eye(3), "xyz", strict=True):
+        if float(np.linalg.norm(view(direction))) < 0.1:
+            continue
+        tip = corner + 0.1 * across * view(direction)
+        arrow = {"arrowstyle": "-|>", "color": MUTED, "lw": 0.9, "shrinkA": 0, "shrinkB": 0}
+        axes.annotate("", tip, corner, arrowprops=arrow)
+        end = corner + 0.135 * across * view(direction)
+        axes.text(end[0], end[1], name, color=MUTED, ha="center", va="center")
+    length = _round_length(0.25 * across)
+    x, y = low[0] + 0.99 * across, low[1] + 0.02 * across
+    axes.plot([x - length, x], [y, y], color=MUTED, lw=1.6)
+    axes.text(x - length / 2, y + 0.015 * across, f"{length:g} m", color=MUTED, ha="center")
+
+
+def draw_goal_and_path(axes: Axes, flight: Flight, view: View) -> list[Line2D]:
+    """Draw the ghost of the base at the goal and the path of the base; return legend entries."""
+    keys = []
+    path = flight.position.values
+    limits = axes.axis()
+    if float(np.ptp(path, axis=0).max()) > 0.0:
+        flat = view(path)
+        dense = len(path) > 2 * COLUMNS
+        axes.plot(flat[:, 0], flat[:, 1], color=INK, lw=0.8, zorder=5, rasterized=dense)
+        keys.append(key(INK, "path of the base"))
+    if flight.goal is not None and flight.robot is not None:
+        # Where the position is not asked for, the ghost shows the attitude alone.
+        r = flight.goal.position if flight.position_counts else path[-1]
+        pose = Pose(matrix_from_quaternion(flight.goal.quaternion), r)
+        for line in base_outlines(flight.robot, pose):
+            flat = view(line)
+            axes.plot(flat[:, 0], flat[:, 1], color=GHOST, lw=0.9, ls=(0, DASHES), zorder=6)
+        keys.append(key(GHOST, "goal", DASHES))
+    axes.axis(limits)
+    return keys
+
+
+def _round_length(longest: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not longer."""
+    power = 10.0 ** math.floor(math.log10(longest))
+    return max(step * power for step in (1, 2, 5) if step * power <= longest * (1 + 1e-9))

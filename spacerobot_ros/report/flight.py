@@ -1,0 +1,308 @@
+"""One flight as a report needs it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import RobotDescription
+from spacerobot_ros.model.description import Array, Joint, Pose
+from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
+from spacerobot_ros.planning import METHODS, Goal, PoseError
+from spacerobot_ros.report.signals import Cycles, Signal, find_cycles, nearest_rotvec
+from spacerobot_ros.report.solids import SolidRobot
+from spacerobot_ros.session.scenario import Published
+
+_FOLLOWED = ("executing", "reached", "failed", "aborted")
+"""States of the planner in which the goal it names is, or was, the one to fly to."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """What the planner said at ``time`` (s): a sentence, and values by name."""
+
+    time: float
+    message: str
+    values: dict[str, str]
+
+    @property
+    def state(self) -> str:
+        """State of the planner."""
+        return self.values.get("state", "")
+
+    def numbers(self, key: str) -> list[float]:
+        """Return a value as numbers; none if it is not there or is no list of numbers."""
+        try:
+            return [float(word) for word in self.values.get(key, "").split()]
+        except ValueError:
+            return []
+
+
+@dataclass(frozen=True)
+class Target:
+    """A goal and when it was flown to, ``start`` to ``end`` in s."""
+
+    start: float
+    end: float
+    goal: Goal
+
+
+@dataclass(frozen=True)
+class Flight:
+    """What a bag holds of a flight. Signals that it does not hold are empty.
+
+    ``position``, ``attitude`` (exponential coordinates), ``twist`` (velocity and angular velocity
+    of the base link, in its frame), ``shape``, ``rates`` and ``momentum`` (as on the topic) are in
+    SI units, times in s since the first state; ``sent`` are the goal poses that are poses,
+    ``planned`` the planned positions of the base (K, 3), one array a schedule. ``tool`` is the pose
+    of the end-effector (N, 7) and ``tool_goals`` the goals it was sent; ``wrench`` (N, 6) what the
+    thrusters were commanded, force and torque in the base link; ``efforts`` what the joints were.
+    """
+
+    file_name: str
+    message_count: int
+    metadata: dict[str, dict[str, str]]
+    robot: RobotDescription | None
+    joint_names: list[str]
+    position: Signal
+    quaternion: Array
+    attitude: Signal
+    shape: Signal
+    twist: Signal
+    rates: Signal
+    momentum: Signal
+    tool: Signal
+    wrench: Signal
+    efforts: Signal
+    statuses: list[Status]
+    sent: list[tuple[float, Goal]]
+    tool_goals: list[tuple[float, Goal]]
+    outputs: frozenset[str]
+    planned: list[Array]
+
+    # -- what it is called --------------------------------------------------------------------
+
+    @property
+    def scenario(self) -> str:
+        """Name of the scenario, or of the bag."""
+        return self.metadata.get("scenario", {}).get("name", "") or Path(self.file_name).stem
+
+    @property
+    def label(self) -> str:
+        """Short name among several flights: that of the file and of the method."""
+        return f"{Path(self.file_name).stem} ({self.method})" if self.method else self.file_name
+
+    @property
+    def description(self) -> str:
+        """What the scenario says of itself."""
+        return self.metadata.get("scenario", {}).get("description", "")
+
+    @property
+    def method(self) -> str:
+        """Gait method: of the first schedule, or the planner's parameter; else the control law."""
+        named = [
+            s.values[key] for key in ("method", "law") for s in self.statuses if s.values.get(key)
+        ]
+        return named[0] if named else str(self.parameter("planner", "method") or "")
+
+    @property
+    def robot_name(self) -> str:
+        """Name in the robot description."""
+        return self.robot.name if self.robot is not None else ""
+
+    def parameter(self, node: str, name: str) -> Any:
+        """Return a parameter of a node; None if the bag does not hold it."""
+        try:
+            return json.loads(self.metadata.get(f"parameters/{node}", {})[name])
+        except (KeyError, ValueError):
+            return None
+
+    @cached_property
+    def published(self) -> list[Published]:
+        """Published figures of the scenario."""
+        try:
+            rows = json.loads(self.metadata.get("scenario", {}).get("published", "[]"))
+            return [
+                Published(str(r["quantity"]), [float(x) for x in r["printed"]], str(r["note"]))
+                for r in rows
+            ]
+        except (KeyError, TypeError, ValueError):
+            return []
+
+    # -- what happened ------------------------------------------------------------------------
+
+    @property
+    def end(self) -> float:
+        """Time of the last sample or status, s."""
+        times = [float(s.time[-1]) for s in self._signals if len(s)]
+        return max([0.0, *times, *(status.time for status in self.statuses)])
+
+    @property
+    def _signals(self) -> tuple[Signal, ...]:
+        return self.position, self.shape, self.momentum
+
+    @property
+    def executing(self) -> list[Status]:
+        """One status for each schedule that was flown."""
+        return [status for status in self.statuses if status.state == "executing"]
+
+    @cached_property
+    def targets(self) -> list[Target]:
+        """Goals of the schedules; without any schedule, the goals that were sent."""
+        found = [(s.time, goal) for s in self.executing if (goal := self._named_goal(s))]
+        goals = found or self.sent
+        ends = [*(time for time, _ in goals), self.end][1:]
+        return [Target(t, end, goal) for (t, goal), end in zip(goals, ends, strict=True)]
+
+    @property
+    def goal(self) -> Goal | None:
+        """The goal that the end is judged by: the one flown to last, or else the one sent last."""
+        for status in reversed(self.statuses):
+            goal = self._named_goal(status)
+            if status.state in _FOLLOWED and goal is not None:
+                return goal
+        return self.sent[-1][1] if self.sent else None
+
+    @property
+    def tool_targets(self) -> list[Target]:
+        """Goals of the end-effector, each until the next."""
+        ends = [*(time for time, _ in self.tool_goals), self.end][1:]
+        return [Target(t, end, goal) for (t, goal), end in zip(self.tool_goals, ends, strict=True)]
+
+    @property
+    def tool_error(self) -> PoseError | None:
+        """What the last pose of the end-effector leaves to its last goal."""
+        if not self.tool_goals or not len(self.tool):
+            return None
+        last = self.tool.values[-1]
+        return PoseError.between(last[:3], last[3:], self.tool_goals[-1][1])
+
+    @property
+    def position_counts(self) -> bool:
+        """Whether the position of the base is part of what the method flies to."""
+        method = METHODS.get(self.method)
+        return method is None or "position" in method.controls
+
+    def controls(self, part: str) -> list[int]:
+        """Components x, y, z, rx, ry, rz (0..5) of ``base`` or ``end_effector`` under control.
+
+        All six where no controller has named its outputs.
+        """
+        if not self.outputs:
+            return list(range(6))
+        axes = ("x", "y", "z", "rx", "ry", "rz")
+        return [i for i, axis in enumerate(axes) if f"{part}.{axis}" in self.outputs]
+
+    @property
+    def final_error(self) -> PoseError | None:
+        """What the last pose leaves to the goal."""
+        if self.goal is None or not len(self.position):
+            return None
+        return PoseError.between(self.position.values[-1], self.quaternion[-1], self.goal)
+
+    def goal_rotvec(self, goal: Goal) -> Array:
+        """Attitude of a goal (3,), rad, with the number of turns nearest to the last attitude."""
+        rotvec = rotvec_from_quaternion(goal.quaternion)
+        return nearest_rotvec(rotvec, self.attitude.values[-1]) if len(self.attitude) else rotvec
+
+    @property
+    def manoeuvre_time(self) -> float | None:
+        """Time from the first schedule for the last goal to its end, s; of a controller, from the
+        first state that it flew to the end that it named.
+        """
+        schedules = self.executing
+        if not schedules:
+            flying = [s.time for s in self.statuses if s.state == "tracking"]
+            ended = [s.time for s in self.statuses if s.state in _FOLLOWED]
+            return ended[-1] - flying[0] if flying and ended else None
+        index = last = self.statuses.index(schedules[-1])
+        goal = schedules[-1].values.get("goal")
+        while index and (before := self.statuses[index - 1]).state == "executing":
+            if before.values.get("goal") != goal:
+                break
+            index -= 1
+        ended = [s.time for s in self.statuses[last + 1 :] if s.state in _FOLLOWED]
+        return (ended[0] if ended else self.end) - self.statuses[index].time
+
+    @cached_property
+    def drawn(self) -> SolidRobot | None:
+        """The robot as something to draw; None if the bag lacks its description or its states."""
+        robot = self.robot
+        if robot is None or not len(self.position):
+            return None
+        if not set(robot.joint_names) <= set(self.joint_names):
+            return None
+        return None if robot.joint_names and not len(self.shape) else SolidRobot(robot)
+
+    def base_at(self, index: int) -> Pose:
+        """Pose of the base link in the world at a recorded state."""
+        R_WB = matrix_from_quaternion(self.quaternion[index])
+        return Pose(R_WB, self.position.values[index])
+
+    def samples(self, count: int) -> list[int]:
+        """Recorded states at about equal intervals, the first and the last among them."""
+        last = len(self.position) - 1
+        return np.unique(np.linspace(0, last, count).astype(int)).tolist()
+
+    @cached_property
+    def flat(self) -> bool:
+        """Whether every link stays in a plane z = const of the world."""
+        assert self.drawn is not None
+        shapes = self.joints
+        poses = [
+            list(self.drawn.link_poses(shapes[index], self.base_at(index)).values())
+            for index in self.samples(25)
+        ]
+        upright = all(abs(pose.R[2, 2]) > 1 - 1e-9 for links in poses for pose in links)
+        heights = np.array([[pose.r[2] for pose in links] for links in poses])
+        return upright and float(np.ptp(heights, axis=0).max()) < 1e-6
+
+    @cached_property
+    def joints(self) -> Array:
+        """Joint positions (N, n), in the order of the robot description, at the base poses."""
+        assert self.robot is not None
+        chosen = [self.joint_names.index(name) for name in self.robot.joint_names]
+        time = self.position.time
+        if not chosen:
+            return np.empty((len(time), 0))
+        if np.array_equal(time, self.shape.time):
+            return self.shape.values[:, chosen]
+        columns = [np.interp(time, self.shape.time, self.shape.values[:, i]) for i in chosen]
+        return np.column_stack(columns)
+
+    @cached_property
+    def cycles(self) -> Cycles | None:
+        """The equal cycles with which the longest schedule ends."""
+        starts = [0.0, *(status.time for status in self.executing)]
+        spans = list(zip(starts, [*starts[1:], self.end], strict=True))
+        start, end = max(spans, key=lambda span: span[1] - span[0])
+        return find_cycles(self.rates.between(start, end))
+
+    def drift(self, first: int) -> float:
+        """Largest change of linear (``first`` 0) or angular (3) momentum, SI."""
+        part = self.momentum.values[:, first : first + 3]
+        return float(np.nanmax(np.linalg.norm(part - part[0], axis=1)))
+
+    def joint(self, name: str) -> Joint | None:
+        """The joint of that name in the robot description."""
+        joints = self.robot.movable_joints if self.robot is not None else ()
+        return next((joint for joint in joints if joint.name == name), None)
+
+    def _named_goal(self, status: Status) -> Goal | None:
+        """The goal in a status, with all the digits of the goal pose that it was sent as."""
+        numbers = status.numbers("goal")
+        try:
+            named = Goal.checked(numbers[:3], numbers[3:])
+        except PlanningError:
+            return None
+        for _, goal in reversed(self.sent):
+            same = np.allclose(goal.position, named.position, rtol=1e-7, atol=1e-8)
+            if same and np.allclose(goal.quaternion, named.quaternion, rtol=0.0, atol=1e-7):
+                return goal
+        return named

@@ -1,0 +1,152 @@
+"""The commands that MeshCat's viewer takes, and the file it is.
+
+The Python package ``meshcat`` sends such commands to a server, which passes them on to the viewer
+in a browser. Here they are written into the page, as that package's ``static_html`` does, so that
+no server is needed and the package is not even imported: it brings the viewer, a script with
+three.js in it. An object is in three.js' JSON object format.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.model.description import Array, Pose, Shape
+from spacerobot_ros.report.solids import EDGE, is_rod, outline
+
+Command = dict[str, Any]
+
+
+def viewer_script() -> str | None:
+    """Return MeshCat's viewer; None where the package ``meshcat`` is not installed."""
+    spec = find_spec("meshcat")
+    for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
+        path = Path(folder) / "viewer" / "dist" / "main.min.js"
+        if path.is_file():
+            return path.read_text(encoding="utf-8")
+    return None
+
+
+def set_property(path: str, name: str, value: Any) -> Command:
+    """Set a property of what is at a path, such as ``visible``."""
+    return {"type": "set_property", "path": path, "property": name, "value": value}
+
+
+def set_transform(path: str, matrix: Array) -> Command:
+    """Set a matrix (4, 4), which is sent column by column."""
+    flat = [round(float(x), 9) for x in matrix.T.ravel()]
+    return {"type": "set_transform", "path": path, "matrix": flat}
+
+
+def _object(path: str, geometry: Command, material: Command, kind: str) -> Command:
+    names = {"geometry": f"{path} geometry", "material": f"{path} material"}
+    unit = np.eye(4).ravel().tolist()
+    return {
+        "type": "set_object",
+        "path": path,
+        "object": {
+            "metadata": {"version": 4.5, "type": "Object"},
+            "geometries": [{"uuid": names["geometry"], **geometry}],
+            "materials": [{"uuid": names["material"], **material}],
+            "object": {"uuid": path, "type": kind, "matrix": unit, **names},
+        },
+    }
+
+
+def line(path: str, points: Array, color: str) -> Command:
+    """A line through points (k, 3)."""
+    return _object(path, _points(points), _stroke(color, 1.0), "Line")
+
+
+def segments(path: str, ends: Array, color: str, opacity: float = 1.0) -> Command:
+    """Separate lines between points (2 k, 3)."""
+    return _object(path, _points(ends), _stroke(color, opacity), "LineSegments")
+
+
+def _points(points: Array) -> Command:
+    numbers = {"type": "Float32Array", "array": _rounded(points)}
+    position = {"itemSize": 3, "normalized": False, **numbers}
+    return {"type": "BufferGeometry", "data": {"attributes": {"position": position}}}
+
+
+def _stroke(color: str, opacity: float) -> Command:
+    stroke = {"type": "LineBasicMaterial", "color": _number(color), "linewidth": 1}
+    return stroke if opacity == 1.0 else stroke | {"transparent": True, "opacity": opacity}
+
+
+def matrix_of(pose: Pose) -> Array:
+    """Return a pose as a matrix (4, 4)."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = pose.R, pose.r
+    return matrix
+
+
+def clip(path: str, time: Array, tracks: dict[str, Array]) -> Command:
+    """Return how an object moves: ``position`` (N, 3), ``quaternion`` (N, 4) or both, at times."""
+    kinds = {"position": "vector3", "quaternion": "quaternion"}
+    made = []
+    for name, values in tracks.items():
+        if name == "quaternion":
+            # The viewer goes the short way round between quaternions of the same sign.
+            flips = np.cumsum((values[1:] * values[:-1]).sum(axis=1) < 0) % 2
+            values = values * np.append(1, 1 - 2 * flips)[:, np.newaxis]
+        numbers = {"times": np.round(time, 4).tolist(), "values": _rounded(values)}
+        made.append({"name": f".{name}", "type": kinds[name], **numbers})
+    return {"path": path, "clip": {"fps": 1, "name": "flight", "tracks": made}}
+
+
+def set_animation(clips: list[Command]) -> Command:
+    """Return the command that loads an animation of several objects."""
+    return {"type": "set_animation", "animations": clips, "options": {"play": True}}
+
+
+def solid(path: str, shape: Shape, color: str, opacity: float = 1.0) -> list[Command]:
+    """A solid and, where it has sharp ones, its edges."""
+    pose, geometry = shape.pose, {"box": _box, "cylinder": _cylinder, "sphere": _sphere}
+    matrix = matrix_of(pose)
+    if shape.kind == "cylinder":
+        # Along y in three.js, along z in URDF.
+        matrix = matrix @ np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
+    look = {"type": "MeshPhongMaterial", "color": _number(color), "shininess": 15}
+    # Edges and ghosts in the surface of a solid are to be seen.
+    look |= {"polygonOffset": True, "polygonOffsetFactor": 1, "polygonOffsetUnits": 1}
+    if opacity < 1.0:
+        look |= {"transparent": True, "opacity": opacity, "depthWrite": False}
+        look |= {"polygonOffsetFactor": -1, "polygonOffsetUnits": -1}
+    commands = [
+        _object(f"{path}/solid", geometry[shape.kind](shape.size), look, "Mesh"),
+        set_transform(f"{path}/solid", matrix),
+    ]
+    if shape.kind != "sphere" and not is_rod(shape):
+        ends = [np.stack([line[:-1], line[1:]], axis=1).reshape(-1, 3) for line in outline(shape)]
+        edges = np.concatenate(ends) @ pose.R.T + pose.r
+        tint = EDGE if opacity == 1.0 else color
+        commands.append(segments(f"{path}/edges", edges, tint, 0.5 if opacity == 1.0 else 1.0))
+    return commands
+
+
+def _box(size: tuple[float, ...]) -> dict[str, Any]:
+    width, height, depth = size
+    return {"type": "BoxGeometry", "width": width, "height": height, "depth": depth}
+
+
+def _cylinder(size: tuple[float, ...]) -> dict[str, Any]:
+    radius, length = size
+    ends = {"radiusTop": radius, "radiusBottom": radius}
+    return {"type": "CylinderGeometry", "height": length, "radialSegments": 32, **ends}
+
+
+def _sphere(size: tuple[float, ...]) -> dict[str, Any]:
+    return {"type": "SphereGeometry", "radius": size[0], "widthSegments": 24, "heightSegments": 16}
+
+
+def _rounded(values: Array) -> list[float]:
+    return np.round(values.ravel(), 5).tolist()
+
+
+def _number(color: str) -> int:
+    """A color ``#rrggbb`` as a number."""
+    return int(color[1:], 16)

@@ -1,0 +1,260 @@
+"""The page of a report: HTML that stands alone, without anything to fetch."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+
+from spacerobot_ros.report.animation import Player
+from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.style import Plate
+from spacerobot_ros.report.tables import (
+    Table,
+    headline,
+    joint_table,
+    published_table,
+    result_table,
+    runs_table,
+)
+
+_CSS = """
+:root { color-scheme: light; --ink: #1f2328; --muted: #5b6472; --line: #dfe3e8; --wash: #f6f7f9;
+  --tone: #0072b2; }
+* { box-sizing: border-box; }
+body { margin: 0; background: #fff; color: var(--ink); line-height: 1.5; font-size: 16px;
+  font-family: system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "Noto Sans",
+  "Liberation Sans", sans-serif; }
+main { max-width: 1000px; margin: 0 auto; padding: 2.5rem 1.25rem 3rem; }
+h1 { font-size: 2rem; line-height: 1.2; font-weight: 650; margin: 0 0 .35rem; }
+h2 { font-size: 1.25rem; font-weight: 650; margin: 2.75rem 0 .75rem; padding-bottom: .3rem;
+  border-bottom: 1px solid var(--line); }
+p { margin: .5rem 0; max-width: 46em; }
+.facts { color: var(--muted); }
+.facts span + span::before { content: "\\00b7"; margin: 0 .5em; }
+.outcome { margin: 1.5rem 0 0; padding: .8rem 1rem; max-width: none; background: var(--wash);
+  border-left: 4px solid var(--tone); font-size: 1.05rem; }
+.outcome.reached { --tone: #009e73; }
+.outcome.failed, .outcome.refused { --tone: #d55e00; }
+.outcome.aborted { --tone: #e69f00; }
+.outcome b { color: var(--tone); filter: brightness(.8); margin-right: .5em; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; width: 100%; font-size: .92rem; margin: .5rem 0;
+  font-variant-numeric: tabular-nums; }
+th, td { text-align: left; vertical-align: top; padding: .42rem .9rem .42rem 0;
+  border-bottom: 1px solid var(--line); }
+thead th { font-weight: 600; color: var(--muted); white-space: nowrap; }
+tbody th { font-weight: 600; white-space: nowrap; }
+th.number, td.number { text-align: right; white-space: nowrap; }
+#published td:nth-child(2), #published td:nth-child(3) { white-space: nowrap; }
+#published td:last-child { min-width: 15em; }
+tr > :last-child { padding-right: 0; }
+figure { margin: 1.75rem 0 2.5rem; }
+figure img { display: block; width: 100%; min-width: 640px; height: auto; }
+figcaption { margin-top: .5rem; color: var(--muted); font-size: .92rem; max-width: 60em; }
+figcaption b { color: var(--ink); }
+.missing { color: var(--muted); font-style: italic; }
+details { margin-top: .75rem; font-size: .92rem; }
+summary { cursor: pointer; color: var(--muted); }
+code { font-family: ui-monospace, "Liberation Mono", Menlo, monospace; font-size: .95em; }
+footer { margin-top: 3rem; color: var(--muted); font-size: .88rem; }
+.tiles { display: grid; gap: .6rem; margin: 1.25rem 0; padding: 0;
+  grid-template-columns: repeat(auto-fit, minmax(min(10.5rem, 45%), 1fr)); }
+.tiles div { border: 1px solid var(--line); border-radius: 6px; padding: .5rem .75rem; }
+.tiles dt { color: var(--muted); font-size: .82rem; }
+.tiles dd { margin: 0; font-size: 1.12rem; font-weight: 600; font-variant-numeric: tabular-nums;
+  overflow-wrap: anywhere; }
+.tiles small { display: block; color: var(--muted); font-weight: 400; font-size: .8rem; }
+#animation { margin: 1.5rem 0 2rem; }
+#stage { position: relative; border: 1px solid var(--line); border-radius: 6px; overflow: hidden;
+  background: var(--wash); }
+#pane { width: 100%; height: clamp(300px, 62vh, 640px); }
+#stage .dg.main, #stage .dg .close-button { max-width: 100%; }
+#stage .dg.main .close-button { background: transparent; color: var(--muted); }
+#bar { display: flex; flex-wrap: wrap; gap: .5rem .75rem; align-items: center; margin-top: .6rem; }
+#bar button, #bar select { font: inherit; font-size: .9rem; color: var(--ink); background: #fff;
+  border: 1px solid var(--line); border-radius: 6px; padding: .35rem .7rem; min-height: 2.3rem; }
+#bar button { min-width: 5em; cursor: pointer; }
+#time { flex: 1 1 14rem; min-width: 10rem; accent-color: var(--tone); }
+#now { min-width: 9.5em; font-variant-numeric: tabular-nums; font-size: .9rem; }
+.caption { color: var(--muted); font-size: .92rem; max-width: 60em; }
+.caption b { color: var(--ink); }
+#animation > .missing { display: none; }
+.without #stage, .without #bar, .without .caption { display: none; }
+#animation.without > .missing { display: block; }
+@media (max-width: 600px) { main { padding: 1.25rem .9rem 2rem; } h1 { font-size: 1.5rem; }
+  #pane { height: 70vw; } .tiles dd { font-size: 1rem; } }
+@media print { #animation { display: none; } }
+@media print { figure { break-inside: avoid; } main { max-width: none; padding: 0; } }
+"""
+
+_SCROLL = '<div class="scroll">'
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
+
+def page(
+    flight: Flight,
+    player: Player,
+    plates: Sequence[Plate | str | None],
+    beside: Sequence[Flight] = (),
+) -> str:
+    """Return the whole page; flights ``beside`` this one get a row in a table."""
+    name = flight.scenario
+    title = ", ".join(filter(None, (name, flight.method, flight.robot_name)))
+    body = [
+        "<header>",
+        f"<h1>{escape(name)}</h1>",
+        f"<p>{escape(flight.description)}</p>" if flight.description else "",
+        _facts(flight),
+        _outcome(flight),
+        _tiles(flight),
+        "</header>",
+        *_runs(flight, beside),
+        player.markup,
+        *_numbers(flight),
+        *_published(flight),
+        "<h2>Figures</h2>",
+        *_figures(plates),
+        *_parameters(flight),
+        _footer(flight),
+    ]
+    policy = "; ".join(filter(None, (_POLICY, player.policy)))
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<link rel="icon" href="data:,">\n'
+        f"<title>{escape(title)}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n<main>\n"
+        + "\n".join(part for part in body if part)
+        + f"\n</main>\n{player.scripts}\n</body>\n</html>\n"
+    )
+
+
+def _facts(flight: Flight) -> str:
+    facts = []
+    if flight.method:
+        facts.append(f"method {flight.method}")
+    if flight.robot is not None:
+        count = len(flight.robot.joint_names)
+        joints = "1 joint" if count == 1 else f"{count} joints"
+        facts.append(f"robot {flight.robot_name}: {joints}, {flight.robot.total_mass:.5g} kg")
+    spans = "".join(f"<span>{escape(fact)}</span>" for fact in facts)
+    return f'<p class="facts">{spans}</p>' if facts else ""
+
+
+def _outcome(flight: Flight) -> str:
+    if not flight.statuses:
+        return (
+            '<p class="outcome">The bag holds no word of a planner or a controller '
+            "(planner/status, controller/status).</p>"
+        )
+    last = flight.statuses[-1]
+    sentence = last.message
+    if last.state == "executing":
+        sentence += " The recording ends before that is decided."
+    state = f"<b>{escape(last.state.capitalize())}</b>" if last.state else ""
+    return f'<p class="outcome {escape(last.state)}">{state}{escape(sentence)}</p>'
+
+
+def _tiles(flight: Flight) -> str:
+    """The numbers of the run that are looked for first."""
+    made = []
+    for label, value, note in headline(flight):
+        small = f"<small>{escape(note)}</small>" if note else ""
+        made.append(f"<div><dt>{escape(label)}</dt><dd>{escape(value)}{small}</dd></div>")
+    return f'<dl class="tiles">{"".join(made)}</dl>' if made else ""
+
+
+def _runs(flight: Flight, beside: Sequence[Flight]) -> list[str]:
+    if not beside:
+        return []
+    return ["<h2>Runs side by side</h2>", _table("runs", runs_table([flight, *beside]))]
+
+
+def _numbers(flight: Flight) -> list[str]:
+    result, joints = result_table(flight), joint_table(flight)
+    parts = ["<h2>Numbers of the run</h2>"]
+    if flight.goal is None:
+        parts.append('<p class="missing">The bag holds no goal pose.</p>')
+    if result.rows:
+        rows = "".join(
+            f'<tr><th scope="row">{escape(label)}</th><td>{escape(value)}</td></tr>\n'
+            for label, value in result.rows
+        )
+        parts.append(f'{_SCROLL}<table id="numbers"><tbody>\n{rows}</tbody></table></div>')
+    if joints is not None:
+        parts.append(_table("joints", joints))
+    return parts
+
+
+def _published(flight: Flight) -> list[str]:
+    table = published_table(flight)
+    if table is None:
+        return []
+    return [
+        "<h2>Published figures beside measured ones</h2>",
+        _table("published", table),
+        '<p class="facts">Source: “planner”, what the planner gave with its first schedule; '
+        "“flight”, what was measured.</p>",
+    ]
+
+
+def _table(identity: str, table: Table) -> str:
+    def row(cells: Sequence[str], tag: str) -> str:
+        made = []
+        for column, cell in enumerate(cells):
+            name, scope = ("th", ' scope="row"') if tag == "td" and column == 0 else (tag, "")
+            kind = ' class="number"' if column in table.numeric else ""
+            made.append(f"<{name}{scope}{kind}>{escape(cell)}</{name}>")
+        return f"<tr>{''.join(made)}</tr>\n"
+
+    body = "".join(row(cells, "td") for cells in table.rows)
+    return (
+        f'{_SCROLL}<table id="{identity}"><thead>\n{row(table.head, "th")}</thead>'
+        f"<tbody>\n{body}</tbody></table></div>"
+    )
+
+
+def _figures(plates: Sequence[Plate | str | None]) -> list[str]:
+    parts, number = [], 0
+    for sentence in dict.fromkeys(plate for plate in plates if isinstance(plate, str)):
+        parts.append(f'<p class="missing">{escape(sentence)}</p>')
+    for plate in plates:
+        if not isinstance(plate, Plate):
+            continue
+        number += 1
+        data = base64.b64encode(plate.svg).decode()
+        parts.append(
+            f'<figure id="{plate.name}"><div class="scroll">'
+            f'<img src="data:image/svg+xml;base64,{data}" alt="{escape(plate.heading)}"></div>\n'
+            f"<figcaption><b>Figure {number}. {escape(plate.heading)}.</b> {escape(plate.caption)}"
+            "</figcaption></figure>"
+        )
+    return parts
+
+
+def _parameters(flight: Flight) -> list[str]:
+    nodes = {
+        name.partition("/")[2]: values
+        for name, values in flight.metadata.items()
+        if name.startswith("parameters/")
+    }
+    if not nodes:
+        return []
+    parts = ["<h2>Parameters</h2>"]
+    for node, values in nodes.items():
+        rows = "".join(
+            f"<tr><td><code>{escape(key)}</code></td><td><code>{escape(value)}</code></td></tr>\n"
+            for key, value in values.items()
+        )
+        parts.append(
+            f"<details><summary>{escape(node)}</summary><table><tbody>\n{rows}</tbody></table></details>"
+        )
+    return parts
+
+
+def _footer(flight: Flight) -> str:
+    version = flight.metadata.get("spacerobot", {}).get("version", "")
+    by = f", recorded by spacerobot_ros {version}" if version else ""
+    text = f"Made from the bag {flight.file_name} alone: {flight.message_count} messages{by}."
+    return f"<footer><p>{escape(text)}</p></footer>"

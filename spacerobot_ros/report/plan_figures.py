@@ -1,0 +1,85 @@
+"""The picture of a plan: joints, their velocities, and the base path that they cause."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.model.rotations import rotvec_from_quaternion
+from spacerobot_ros.report.style import (
+    FAINT,
+    colour,
+    paper_style,
+    png_of,
+    room_for,
+    set_range,
+    set_time,
+    sheet,
+)
+from spacerobot_ros.session.plan import Planned, Problem, json_of
+
+_PIXELS = 1600
+_COMPONENTS = ("x", "y", "z")
+
+
+def draw(problem: Problem, planned: Planned) -> bytes:
+    """Return the picture (PNG) of a plan and its goal."""
+    with paper_style():
+        return png_of(_figure(problem, planned), _PIXELS)
+
+
+def _figure(problem: Problem, planned: Planned) -> Figure:
+    content = json_of(problem, planned)
+    robot, goal = problem.robot, problem.goal
+    positions = np.array(content["schedule"]["positions"])
+    ticks = problem.tick_period * np.arange(len(positions), dtype=np.float64)
+    rates = np.diff(positions, axis=0) / problem.tick_period
+    path_time = np.array(content["path"]["time_s"])
+    base = np.array(content["path"]["position_m"])
+    turned = np.array([rotvec_from_quaternion(x) for x in content["path"]["quaternion"]])
+    names = robot.joint_names
+    figure, rows = sheet([[1], [1], [1, 1]], [1.9, 1.9, 1.9], right=room_for(names) + 0.35)
+    joints, speeds, (place, attitude) = rows[0][0], rows[1][0], rows[2]
+    kinds = {joint.kind is JointKind.PRISMATIC for joint in robot.description.movable_joints}
+    unit = "m, rad" if len(kinds) == 2 else "m" if kinds == {True} else "rad"
+    title = f"{planned.method}, {planned.duration:.6g} s: joints ({unit})"
+    _panel(joints, title, ticks, positions, names)
+    # Held over a tick: steps.
+    held = np.repeat(rates, 2, axis=0)
+    _panel(
+        speeds, f"held joint velocities ({unit} a second)", np.repeat(ticks, 2)[1:-1], held, names
+    )
+    for axes, what, values, wanted in (
+        (place, "base position (m) and goal", base, goal.position),
+        (
+            attitude,
+            "base attitude, rotation vector (rad), and goal",
+            turned,
+            rotvec_from_quaternion(goal.quaternion),
+        ),
+    ):
+        _panel(axes, what, path_time, values, _COMPONENTS, wanted)
+        axes.set_xlabel("time (s)")
+    return figure
+
+
+def _panel(
+    axes: Axes,
+    title: str,
+    time: Array,
+    values: Array,
+    names: tuple[str, ...],
+    wanted: Array | None = None,
+) -> None:
+    axes.set_title(title)
+    set_range(axes, values, () if wanted is None else wanted.tolist())
+    end = float(time[-1]) if len(time) else 0.0
+    set_time(axes, 0.0, end)
+    for index, name in enumerate(names):
+        if wanted is not None:
+            axes.axhline(wanted[index], color=colour(index), linewidth=0.8, linestyle=":")
+        axes.plot(time, values[:, index], color=colour(index), label=name)
+    axes.axhline(0.0, color=FAINT, linewidth=0.6, zorder=0.5)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))

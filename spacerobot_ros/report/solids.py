@@ -1,0 +1,188 @@
+"""A robot as faces and edges in space, from the boxes, cylinders and spheres of its URDF."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+from matplotlib.colors import to_rgb
+
+from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
+from spacerobot_ros.model.kinematics import tree_kinematics
+from spacerobot_ros.report.render import Edge, Face
+from spacerobot_ros.report.style import colour
+
+_BASE = "#c4c9d2"
+EDGE = "#3d4450"
+_AROUND = 24
+"""Facets around a cylinder or sphere."""
+
+_ROD = 0.05
+"""Thinner than this part of its length, a box is a rod: without edges, its outline a line."""
+
+Colour = tuple[float, float, float]
+
+
+@dataclass
+class Solids:
+    """Faces and edges in the world, as lists to draw."""
+
+    faces: list[Face] = field(default_factory=list)
+    edges: list[Edge] = field(default_factory=list)
+
+    def points(self) -> Array:
+        """All corners (k, 3)."""
+        return np.concatenate([f.corners for f in self.faces] + [e.line for e in self.edges])
+
+
+class SolidRobot:
+    """A robot that can be asked where its links are and what it looks like."""
+
+    def __init__(self, robot: RobotDescription) -> None:
+        self.robot = robot
+        kinematics = tree_kinematics(robot)
+        frames = [kinematics.frame(link.name) for link in robot.links]
+        poses = [x for R, r, _ in frames for x in (R, r)]
+        self._evaluate = ca.Function("poses", [kinematics.q], poses)
+
+    def link_poses(self, q: Array, base: Pose) -> dict[str, Pose]:
+        """Poses of all links in the world, at joint positions ``q`` (n,) and a pose of the base."""
+        values = [np.array(value) for value in self._evaluate.call([ca.DM(q)])]
+        return {
+            link.name: base @ Pose(R, r.ravel())
+            for link, R, r in zip(self.robot.links, values[::2], values[1::2], strict=True)
+        }
+
+    def at(self, q: Array, base: Pose) -> Solids:
+        """Return the robot at joint positions ``q`` (n,), its base at a pose in the world.
+
+        A robot without boxes, cylinders and spheres is drawn as lines between its bodies.
+        """
+        poses = self.link_poses(q, base)
+        solids = Solids()
+        for link in self.robot.links:
+            fill = _rgb(link_color(self.robot, link.name))
+            for shape in link.shapes:
+                pose = poses[link.name] @ shape.pose
+                for corners, normal in _facets(shape):
+                    solids.faces.append(Face(pose.r + corners @ pose.R.T, pose.R @ normal, fill))
+                if not is_rod(shape):
+                    solids.edges += [
+                        Edge(pose.r + line @ pose.R.T, normals @ pose.R.T, _rgb(EDGE))
+                        for line, normals in _edges(shape)
+                    ]
+        return solids if solids.faces else _skeleton(self.robot, poses)
+
+
+def base_outlines(robot: RobotDescription, base: Pose) -> list[Array]:
+    """Return the edges of what is rigidly on the base link, as lines (k, 3) in the world."""
+    lines = []
+    for link in robot.links:
+        body, pose = robot.frames[link.name]
+        if body == 0:
+            for shape in link.shapes:
+                placed = base @ pose @ shape.pose
+                lines += [placed.r + line @ placed.R.T for line in outline(shape)]
+    return lines or _cross(base)
+
+
+def _rgb(name: str) -> Colour:
+    r, g, b = to_rgb(name)
+    return r, g, b
+
+
+def link_color(robot: RobotDescription, link: str) -> str:
+    """Return the color of a link: that of the joint that moves it, grey on the base."""
+    body = robot.frames[link][0]
+    return _BASE if body == 0 else colour(body - 1)
+
+
+def is_rod(shape: Shape) -> bool:
+    """Whether a shape is too thin to draw its edges."""
+    size = sorted(shape.size) if shape.kind == "box" else [0.0, 1.0, 1.0]
+    return size[1] < _ROD * size[2]
+
+
+def outline(shape: Shape) -> list[Array]:
+    """Lines (k, 3) that show a solid without hiding what is behind: its axis if it is a rod."""
+    if shape.kind == "sphere":
+        return [shape.size[0] * np.roll(_ring(), k, axis=1) for k in range(3)]
+    if is_rod(shape):
+        longest = int(np.argmax(shape.size))
+        return [np.outer([-0.5, 0.5], np.eye(3)[longest] * shape.size[longest])]
+    return [line for line, _ in _edges(shape)]
+
+
+def _facets(shape: Shape) -> list[tuple[Array, Array]]:
+    """Corners (k, 3) and outward normals of the surface of a solid, in its own frame."""
+    ring, up = _ring(), np.array([0.0, 0.0, 1.0])
+    if shape.kind == "box":
+        half = np.array(shape.size) / 2
+        found = []
+        for axis, sign in itertools.product(range(3), (-1.0, 1.0)):
+            corners = np.empty((4, 3))
+            corners[:, axis] = sign * half[axis]
+            corners[:, (axis + 1) % 3] = half[(axis + 1) % 3] * np.array([-1, 1, 1, -1])
+            corners[:, (axis + 2) % 3] = half[(axis + 2) % 3] * np.array([-1, -1, 1, 1])
+            found.append((corners, sign * np.eye(3)[axis]))
+        return found
+    if shape.kind == "cylinder":
+        radius, half_length = shape.size[0], shape.size[1] / 2 * up
+        found = [
+            (np.array([a - half_length, b - half_length, b + half_length, a + half_length]), a + b)
+            for a, b in itertools.pairwise(radius * ring)
+        ]
+        found += [(radius * ring[:-1] + s * half_length, s * up) for s in (-1.0, 1.0)]
+    elif shape.kind == "sphere":
+        polar = np.linspace(-np.pi / 2, np.pi / 2, _AROUND // 2 + 1)
+        rows = [shape.size[0] * (np.cos(t) * ring + np.sin(t) * up) for t in polar]
+        quads = [
+            np.array([low[k], low[k + 1], high[k + 1], high[k]])
+            for low, high in itertools.pairwise(rows)
+            for k in range(_AROUND)
+        ]
+        found = [(quad, quad.mean(axis=0)) for quad in quads]
+    else:
+        return []
+    return [(corners, normal / np.linalg.norm(normal)) for corners, normal in found]
+
+
+def _edges(shape: Shape) -> list[tuple[Array, Array]]:
+    """Sharp edges (k, 3) with the normals (k - 1, 2, 3) beside them; none of a sphere or a mesh."""
+    found = []
+    if shape.kind == "cylinder":
+        ring, up = _ring(), np.array([0.0, 0.0, 1.0])
+        for s in (-1.0, 1.0):
+            cap = np.tile(s * up, (len(ring) - 1, 1))
+            rim = shape.size[0] * ring + s * shape.size[1] / 2 * up
+            found.append((rim, np.stack([cap, ring[1:]], axis=1)))
+    elif shape.kind == "box":
+        half = np.array(shape.size) / 2
+        for axis, s, t in itertools.product(range(3), (-1.0, 1.0), (-1.0, 1.0)):
+            out = np.array([[s], [t]]) * np.eye(3)[[(axis + 1) % 3, (axis + 2) % 3]]
+            along = np.outer([-half[axis], half[axis]], np.eye(3)[axis])
+            found.append((along + out.sum(axis=0) * half, out[np.newaxis]))
+    return found
+
+
+def _ring() -> Array:
+    """Points (k, 3) around the unit circle, the first also the last."""
+    angles = np.linspace(0.0, 2 * np.pi, _AROUND + 1)
+    return np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+
+
+def _cross(pose: Pose) -> list[Array]:
+    """A small cross (three lines) in the place of what cannot be drawn."""
+    return [pose.r + 0.1 * np.array([-axis, axis]) @ pose.R.T for axis in np.eye(3)]
+
+
+def _skeleton(robot: RobotDescription, poses: dict[str, Pose]) -> Solids:
+    """Lines from each body to those it carries, and a cross at the base."""
+    nowhere = np.empty((0, 2, 3))
+    edges = [Edge(line, nowhere, _rgb(EDGE)) for line in _cross(poses[robot.base_link])]
+    for index, body in enumerate(robot.bodies[1:]):
+        ends = np.array([poses[robot.bodies[body.parent].name].r, poses[body.name].r])
+        edges.append(Edge(ends, nowhere, _rgb(colour(index))))
+    return Solids(edges=edges)

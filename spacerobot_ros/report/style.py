@@ -1,0 +1,323 @@
+"""How the figures of a report look: one palette, one type of panel, output as SVG or PNG."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.report.signals import Signal, envelope, simplified
+
+INK, MUTED, FAINT = "#1f2328", "#667085", "#c3c8d0"
+_OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+_TOL = ("#332288", "#882255", "#999933", "#44AA99")
+PALETTE = (*_OKABE_ITO, *_TOL)
+"""Colours that people with any colour vision tell apart."""
+
+GHOST = PALETTE[3]
+"""Of goals in space."""
+
+WIDTH = 9.6
+"""Width of a figure, inches."""
+
+COLUMNS = 960
+"""Slices of time across a figure in which a dense trace is summed up."""
+
+SLICES = 240
+"""Slices of time in which what matters is the largest value."""
+
+_UNSEEN = 5e-4
+"""Of the height of a panel, what a line may leave out."""
+
+_PATH_DATA = re.compile(rb' d="[^"]*"')
+_DECIMALS = re.compile(rb"(\.\d\d)\d+")
+
+_STYLE: Any = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.5,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.labelsize": 8.5,
+    "axes.titlesize": 8.5,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 6.0,
+    "axes.edgecolor": "#8a919c",
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "axes.formatter.limits": (-4, 5),
+    "grid.color": "#e9ebee",
+    "grid.linewidth": 0.7,
+    "xtick.color": "#8a919c",
+    "ytick.color": "#8a919c",
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "xtick.major.size": 3.0,
+    "ytick.major.size": 3.0,
+    "lines.linewidth": 1.3,
+    "lines.solid_capstyle": "round",
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    # Names of joints are shown as they are, dollars included.
+    "text.parse_math": False,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "spacerobot",
+}
+
+
+@dataclass(frozen=True)
+class Plate:
+    """A figure: a short name, its heading, what is to be seen, and the picture."""
+
+    name: str
+    heading: str
+    caption: str
+    svg: bytes
+
+
+@contextmanager
+def paper_style() -> Iterator[None]:
+    """Draw in the style of these figures while the block lasts."""
+    with mpl.rc_context(_STYLE):
+        yield
+
+
+def sheet(
+    rows: Sequence[Sequence[float]],
+    heights: Sequence[float],
+    *,
+    left: float = 0.72,
+    right: float = 0.25,
+    bottom: float = 0.5,
+    gap: float = 0.62,
+) -> tuple[Figure, list[list[Axes]]]:
+    """Return a figure of panels, row by row.
+
+    Each row gives the relative widths of its panels, ``heights`` those of the rows in inches;
+    there is room for labels ``left`` and ``right`` of the panels, at the ``bottom``, and for titles
+    in the ``gap`` between the rows.
+    """
+    top, between = 0.3, right + left - 0.1
+    height = top + sum(heights) + gap * (len(heights) - 1) + bottom
+    figure = new_figure(height)
+    panels = []
+    y = height - top
+    for widths, row_height in zip(rows, heights, strict=True):
+        y -= row_height
+        room = WIDTH - left - right - between * (len(widths) - 1)
+        x, row = left, []
+        for share in widths:
+            width = room * share / sum(widths)
+            row.append(panel(figure, x, y, width, row_height))
+            x += width + between
+        panels.append(row)
+        y -= gap
+    return figure, panels
+
+
+def new_figure(height: float) -> Figure:
+    """Return an empty figure of so many inches."""
+    figure = Figure(figsize=(WIDTH, height), facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def panel(figure: Figure, x: float, y: float, width: float, height: float) -> Axes:
+    """Add axes to a figure: the place of their lower left corner and their size, in inches."""
+    across, up = figure.get_size_inches()
+    return figure.add_axes((x / across, y / up, width / across, height / up))
+
+
+def room_for(names: Sequence[str]) -> float:
+    """Return the width of the longest name right of a panel, inches."""
+    return 0.15 + 0.075 * max(map(len, names), default=0)
+
+
+def svg_of(figure: Figure) -> bytes:
+    """Return a figure as SVG, the same bytes for the same figure."""
+    stream = io.BytesIO()
+    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    figure.savefig(stream, format="svg", dpi=200, metadata=nothing)
+    # A hundredth of a point is finer than any screen.
+    return _PATH_DATA.sub(lambda found: _DECIMALS.sub(rb"\1", found[0]), stream.getvalue())
+
+
+def png_of(figure: Figure, width: int) -> bytes:
+    """Return a figure as PNG, so many pixels wide."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=width / WIDTH, metadata={"Software": None})
+    return stream.getvalue()
+
+
+def colour(index: int) -> str:
+    """Return the colour of component or joint ``index``."""
+    return PALETTE[index % len(PALETTE)]
+
+
+def draw_traces(
+    axes: Axes, signal: Signal, colours: Sequence[str], share: float = 1.0, factor: float = 1.0
+) -> bool:
+    """Draw every column of a signal; return whether any was summed up as a band.
+
+    A line leaves out samples that nobody could see beside it. Where it would still have more of
+    them than the panel, ``share`` of a figure's width, has room for, a band spans the smallest and
+    the largest value in each slice of time.
+    """
+    columns = max(int(COLUMNS * share), 20)
+    low, high = axes.get_ylim()
+    dense = False
+    for index, tint in enumerate(colours):
+        values = factor * signal.values[:, index]
+        in_sight = Signal(signal.time, values[:, np.newaxis] / (_UNSEEN * (high - low)))
+        crowded = len(signal) > 2 * columns
+        if crowded and _shakes(in_sight, columns):
+            kept, off = np.empty(0, np.int64), np.inf
+        else:
+            kept, off = simplified(in_sight, columns)
+        if off > 1.0 and crowded:
+            dense = True
+            time, least, most = envelope(signal, index, columns)
+            axes.fill_between(
+                time,
+                factor * least,
+                factor * most,
+                facecolor=(*mpl.colors.to_rgb(tint), 0.3),
+                edgecolor=tint,
+                linewidth=0.9,
+                zorder=2.5,
+            )
+            continue
+        if off > 1.0:
+            kept = np.arange(len(signal))
+        marker = "o" if len(signal) < 3 else ""
+        axes.plot(signal.time[kept], values[kept], color=tint, marker=marker, ms=4)
+    return dense
+
+
+def _shakes(signal: Signal, columns: int) -> bool:
+    """Whether a signal, in tolerances, is mostly off the line through so many of its samples."""
+    nodes = np.linspace(0, len(signal) - 1, columns + 1).astype(int)
+    values = signal.values[:, 0]
+    line = np.interp(signal.time, signal.time[nodes], values[nodes])
+    return bool(np.mean(np.abs(values - line) > 1.0) > 0.5)
+
+
+def upper_edge(signal: Signal, column: int) -> tuple[Array, Array]:
+    """Return times and values to draw: the largest in each slice of time where it is dense."""
+    if len(signal) <= 2 * SLICES:
+        return signal.time, signal.values[:, column]
+    time, _, high = envelope(signal, column, SLICES)
+    return time, high
+
+
+def set_range(axes: Axes, values: Array, extra: Sequence[float] = (), least: float = 0.0) -> None:
+    """Set the y axis to hold values with a margin, and those of ``extra`` that are not far off.
+
+    The axis spans at least ``least``, and 0.1 where nothing changes, so that rounding errors are
+    not blown up.
+    """
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    if high - low < max(1e-6, 1e-6 * max(abs(low), abs(high))):
+        least = max(least, 0.1)
+    span = max(high - low, least)
+    near = [x for x in extra if low - 0.2 * span <= x <= high + 0.2 * span]
+    low, high = min([low, *near]), max([high, *near])
+    middle, half = (low + high) / 2, max(high - low, least) / 2
+    axes.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
+    axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+
+
+def set_time(axes: Axes, start: float, end: float, label: bool = True) -> None:
+    """Set the x axis to a span of time in s."""
+    if end - start < 1e-9:
+        start, end = start - 0.5, end + 0.5
+    axes.set_xlim(start, end)
+    axes.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]))
+    if label:
+        axes.set_xlabel("time (s)")
+
+
+def end_labels(axes: Axes, labels: Sequence[tuple[float, str, str]]) -> None:
+    """Write (value, text, colour) right of the axes, each at its value and none over another."""
+    low, high = axes.get_ylim()
+    ordered = sorted(labels)
+    wanted = np.clip([(value - low) / (high - low) for value, _, _ in ordered], 0.0, 1.0)
+    height = axes.get_window_extent().height / axes.figure.dpi
+    gap = min(0.155 / height, 1.0 / max(len(ordered) - 1, 1))
+    for at, (_, text, tint) in zip(_spread(wanted, gap), ordered, strict=True):
+        axes.annotate(
+            text,
+            (1.0, float(at)),
+            (5, 0),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            va="center",
+            color=tint,
+            annotation_clip=False,
+        )
+
+
+def _spread(wanted: Array, gap: float) -> Array:
+    """Move ascending places (n,) in 0..1 apart until neighbours keep a gap."""
+    at = wanted.copy()
+    for _ in range(200):
+        lacking = gap - np.diff(at)
+        push = np.maximum(lacking, 0.0) / 2
+        if not (push > 1e-4).any():
+            break
+        at[:-1] -= push
+        at[1:] += push
+        at = np.clip(at, 0.0, 1.0)
+    return at
+
+
+def key(tint: str, label: str, dashes: tuple[float, ...] = ()) -> Line2D:
+    """Return an entry of a legend."""
+    line = Line2D([], [], color=tint, linewidth=1.2, label=label)
+    if dashes:
+        line.set_linestyle((0, dashes))
+    return line
+
+
+def legend_above(axes: Axes, keys: Sequence[Line2D]) -> None:
+    """Put a legend above the axes, at the right, where it covers nothing."""
+    if keys:
+        axes.legend(
+            handles=keys,
+            loc="lower right",
+            bbox_to_anchor=(1.0, 0.99),
+            ncols=len(keys),
+            borderaxespad=0.1,
+            handlelength=1.6,
+            columnspacing=1.2,
+        )
+
+
+def short(name: str) -> str:
+    """Return a name, its middle left out if it is too long for a label."""
+    return name if len(name) <= 22 else f"{name[:10]}…{name[-11:]}"
+
+
+def scaled(unit: str, largest: float) -> tuple[float, str]:
+    """Return factor and unit in which values of at most ``largest`` read well."""
+    if unit not in ("m", "rad") or largest == 0.0 or largest >= 0.05:
+        return 1.0, unit
+    return (1e3, f"m{unit}") if largest >= 5e-5 else (1e6, f"µ{unit}")

@@ -1,0 +1,211 @@
+"""The numbers of a flight as rows of text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spacerobot_ros.model.rotations import rotvec_from_quaternion
+from spacerobot_ros.planning import PoseError
+from spacerobot_ros.report.figures import joint_unit
+from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.session.scenario import Published
+
+_ABSENT = "–"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under a head; ``numeric`` are the columns to align as numbers."""
+
+    head: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+    numeric: tuple[int, ...] = ()
+
+
+def headline(flight: Flight) -> list[tuple[str, str, str]]:
+    """Label, value and a note for each of the numbers that stand on top."""
+    rows: list[tuple[str, str, str]] = []
+    error, tool = flight.final_error, flight.tool_error
+    if error is not None:
+        if flight.position_counts:
+            rows.append(("Position error", f"{error.distance:.3g} m", ""))
+        angle = f"{math.degrees(error.angle):.3g}°"
+        rows.append(("Attitude error", f"{error.angle:.3g} rad", angle))
+    if tool is not None:
+        turned = set(flight.controls("end_effector")) & {3, 4, 5}
+        note = f"{tool.angle:.3g} rad" if turned else ""
+        rows.append(("End-effector error", f"{tool.distance:.3g} m", note))
+    if flight.manoeuvre_time is not None:
+        rows.append(("Manoeuvre", f"{flight.manoeuvre_time:.6g} s", ""))
+    if flight.method:
+        rows.append(("Method", flight.method, ""))
+    if len(flight.momentum):
+        drift = f"{flight.drift(0):.1e} kg m/s"
+        rows.append(("Momentum drift", drift, f"angular {flight.drift(3):.1e} kg m²/s"))
+    if len(flight.position) > 1:
+        time = flight.position.time
+        rows.append(("Recorded", f"{len(time) - 1} ticks", f"{time[-1] - time[0]:.6g} s"))
+    return rows
+
+
+def runs_table(flights: Sequence[Flight]) -> Table:
+    """What several flights came to, a row each: the numbers on top that any of them has."""
+    found = [{label: value for label, value, _ in headline(flight)} for flight in flights]
+    labels = list(dict.fromkeys(label for values in found for label in values))
+    rows = [
+        (flight.file_name, *(values.get(label, _ABSENT) for label in labels))
+        for flight, values in zip(flights, found, strict=True)
+    ]
+    return Table(("Bag", *labels), rows)
+
+
+def result_table(flight: Flight) -> Table:
+    """Goal, end, errors, times and momentum drift: the rows that the bag has numbers for."""
+    rows: list[tuple[str, ...]] = []
+    goal, error = flight.goal, flight.final_error
+    if goal is not None and (flight.controls("base") or not flight.outputs):
+        last = flight.statuses[-1].state if flight.statuses else ""
+        refused = " (refused)" if last == "refused" and not flight.executing else ""
+        if flight.position_counts:
+            rows.append((f"Goal position{refused}", f"({_vector(goal.position)}) m"))
+        rows.append((f"Goal attitude{refused}", _attitude(rotvec_from_quaternion(goal.quaternion))))
+    if len(flight.position):
+        rows.append(("Final position", f"({_vector(flight.position.values[-1])}) m"))
+        rows.append(("Final attitude", _attitude(rotvec_from_quaternion(flight.quaternion[-1]))))
+    if error is not None:
+        if flight.position_counts:
+            left = f"{error.distance:.4g} m{_tolerance(flight, 'position', 'm')}"
+            rows.append(("Position error", left))
+        angle = f"{error.angle:.4g} rad = {math.degrees(error.angle):.4g}°"
+        rows.append(("Attitude error", f"{angle}{_tolerance(flight, 'attitude', 'rad')}"))
+    if flight.tool_error is not None:
+        rows += _tool_rows(flight, flight.tool_error)
+    if flight.manoeuvre_time is not None:
+        rows.append(("Manoeuvre time", f"{flight.manoeuvre_time:.6g} s{_schedules(flight)}"))
+    if len(flight.position):
+        rows.append(("Recorded", _recorded(flight)))
+    if len(flight.momentum):
+        drifts = f"{flight.drift(0):.3g} kg m/s, angular {flight.drift(3):.3g} kg m²/s"
+        rows.append(("Momentum drift", f"linear {drifts}"))
+    return Table(("Quantity", "Value"), rows)
+
+
+def _tool_rows(flight: Flight, error: PoseError) -> list[tuple[str, ...]]:
+    goal, last = flight.tool_goals[-1][1], flight.tool.values[-1]
+    rows: list[tuple[str, ...]] = [
+        ("End-effector goal", f"({_vector(goal.position)}) m"),
+        ("End-effector, final", f"({_vector(last[:3])}) m"),
+        ("End-effector error", f"{error.distance:.4g} m"),
+    ]
+    if set(flight.controls("end_effector")) & {3, 4, 5}:
+        angle = f"{error.angle:.4g} rad = {math.degrees(error.angle):.4g}°"
+        rows.append(("End-effector attitude error", angle))
+    return rows
+
+
+def joint_table(flight: Flight) -> Table | None:
+    """First and last shape and the peak velocities, beside the limits of the URDF."""
+    if not flight.joint_names or not len(flight.shape):
+        return None
+    rows = []
+    for i, name in enumerate(flight.joint_names):
+        joint = flight.joint(name)
+        unit = joint_unit(flight, name)
+        first, last = flight.shape.values[[0, -1], i]
+        stroke = limit = share = peak_text = _ABSENT
+        if joint is not None:
+            if math.isfinite(joint.limits.lower) and math.isfinite(joint.limits.upper):
+                stroke = f"{joint.limits.lower:.5g} to {joint.limits.upper:.5g}"
+            if math.isfinite(joint.limits.velocity):
+                limit = f"{joint.limits.velocity:.5g} {unit}/s"
+        if len(flight.rates):
+            peak = float(np.abs(flight.rates.values[:, i]).max())
+            peak_text = f"{peak:.5f} {unit}/s"
+            if joint is not None and 0 < joint.limits.velocity < math.inf:
+                share = f"{100 * peak / joint.limits.velocity:.1f} %"
+        kind = joint.kind.value if joint is not None else _ABSENT
+        rows.append(
+            (name, kind, unit, _number(first), _number(last), stroke, peak_text, limit, share)
+        )
+    head = ["Joint", "Type", "Unit", "Start", "Final", "Stroke", "Peak_velocity", "Limit", "Used"]
+    return Table(tuple(word.replace("_", " ") for word in head), rows, (3, 4, 5, 6, 7, 8))
+
+
+def published_table(flight: Flight) -> Table | None:
+    """Published figures beside those of this flight; None if the scenario has none."""
+    if not flight.published:
+        return None
+    rows = []
+    for row in flight.published:
+        measured, source = _measured(flight, row)
+        ours = _ABSENT
+        if measured:
+            decimals = [_decimals(x) for x in row.printed]
+            decimals += [max(decimals, default=4)] * (len(measured) - len(decimals))
+            ours = ", ".join(f"{x:.{d}f}" for x, d in zip(measured, decimals, strict=False))
+        printed = ", ".join(f"{x:.{_decimals(x)}f}" for x in row.printed)
+        rows.append((row.quantity, printed, ours, source, row.note))
+    return Table(("Quantity", "Printed", "Measured", "Source", "Note"), rows)
+
+
+def _measured(flight: Flight, row: Published) -> tuple[list[float], str]:
+    """The figure of this flight that a published one stands for, and where it comes from."""
+    figures: dict[str, Iterable[float]] = {}
+    if len(flight.position):
+        figures["final_position_m"] = flight.position.values[-1]
+        figures["final_attitude_rotvec_rad"] = rotvec_from_quaternion(flight.quaternion[-1])
+    if len(flight.shape):
+        figures["final_joint_positions"] = flight.shape.values[-1]
+    if len(flight.rates):
+        figures["peak_joint_velocities"] = np.abs(flight.rates.values).max(axis=0)
+    if (error := flight.final_error) is not None:
+        figures["position_error_m"] = [error.distance]
+        figures["attitude_error_rad"] = [error.angle]
+    if (time := flight.manoeuvre_time) is not None:
+        figures["manoeuvre_time_s"] = [time]
+    if row.quantity in figures:
+        return [float(x) for x in figures[row.quantity]], "flight"
+    numbers = flight.executing[0].numbers(row.quantity) if flight.executing else []
+    return numbers, "planner" if numbers else ""
+
+
+def _decimals(x: float) -> int:
+    """Number of decimals that a figure was printed with."""
+    text = repr(x)
+    return 0 if "e" in text or text.endswith(".0") else len(text.partition(".")[2])
+
+
+def _vector(values: Iterable[float]) -> str:
+    return ", ".join(_number(x) for x in values)
+
+
+def _number(x: float) -> str:
+    """Return a number of m or rad; what rounds to zero has no sign."""
+    return f"{round(x, 5) + 0.0:.5f}"
+
+
+def _attitude(rotvec: Iterable[float]) -> str:
+    angle = math.degrees(math.hypot(*rotvec))
+    return f"rotation vector ({_vector(rotvec)}) rad, {angle:.3f}° in all"
+
+
+def _tolerance(flight: Flight, what: str, unit: str) -> str:
+    value = flight.parameter("planner", f"{what}_tolerance")
+    return f" (tolerance {value:.4g} {unit})" if isinstance(value, float | int) else ""
+
+
+def _schedules(flight: Flight) -> str:
+    count = len(flight.executing)
+    return f", {count} schedules in the whole flight" if count > 1 else ""
+
+
+def _recorded(flight: Flight) -> str:
+    time = flight.position.time
+    if len(time) < 2:
+        return "1 state"
+    tick = float(np.median(np.diff(time)))
+    return f"{time[-1] - time[0]:.6g} s, {len(time) - 1} ticks of {tick:.4g} s"

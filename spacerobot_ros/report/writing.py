@@ -1,0 +1,138 @@
+"""The picture report of a flight, from its bag alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.report.animation import player_of
+from spacerobot_ros.report.figures import (
+    NO_STATES,
+    attitude_group,
+    attitude_plate,
+    draw_whole,
+    momentum_plate,
+    position_group,
+    position_plate,
+    shape_groups,
+    shape_plate,
+)
+from spacerobot_ros.report.figures_control import efforts_plate, errors_plate, twist_plate
+from spacerobot_ros.report.figures_cycles import cycles_plate
+from spacerobot_ros.report.figures_joints import loops_plate, rates_plate
+from spacerobot_ros.report.figures_path import path_plate
+from spacerobot_ros.report.figures_scene import (
+    configurations_plate,
+    draw_goal_and_path,
+    draw_robot,
+    view_of,
+)
+from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.page import page
+from spacerobot_ros.report.reading import read_flight
+from spacerobot_ros.report.scene import scene_of
+from spacerobot_ros.report.style import (
+    WIDTH,
+    legend_above,
+    new_figure,
+    panel,
+    paper_style,
+    png_of,
+    room_for,
+)
+
+_PICTURE_WIDTH = 1000
+"""Pixels."""
+
+_ROBOT_WIDTH = 3.9
+"""Of the robot in the picture, inches."""
+
+_PLATES = (
+    configurations_plate,
+    position_plate,
+    attitude_plate,
+    cycles_plate,
+    shape_plate,
+    rates_plate,
+    loops_plate,
+    errors_plate,
+    efforts_plate,
+    twist_plate,
+    momentum_plate,
+)
+
+
+def write_report(bag: Path, html: Path, beside: Sequence[Path] = ()) -> None:
+    """Write the report of a bag as one HTML file, which needs nothing besides itself.
+
+    Any bag makes a page: what it does not hold is left out, with a sentence that says so. Bags
+    ``beside`` it, of other methods to the same goal for one, get a row in a table and their paths
+    in the figure of paths.
+
+    Raises
+    ------
+    SpaceRobotError
+        There is no such bag, one is damaged, or the file cannot be written.
+    """
+    flight = read_flight(bag)
+    others = [read_flight(other) for other in beside]
+    with paper_style():
+        plates = [*(plate(flight) for plate in _PLATES), path_plate(flight, others)]
+        text = page(flight, player_of(scene_of(flight)), plates, others)
+    _write(html, text.encode())
+
+
+def write_picture(bag: Path, png: Path) -> None:
+    """Write one picture of a flight, 1000 pixels wide: pose and shape over time, and the robot.
+
+    Raises
+    ------
+    SpaceRobotError
+        There is no such bag, it is damaged or holds no base poses, or the file cannot be written.
+    """
+    flight = read_flight(bag)
+    if not len(flight.position):
+        raise SpaceRobotError(NO_STATES)
+    with paper_style():
+        _write(png, png_of(_overview(flight), _PICTURE_WIDTH))
+
+
+def _overview(flight: Flight) -> Figure:
+    """Base pose and shape over time, beside the robot where it can be drawn."""
+    groups = [position_group(flight), attitude_group(flight)]
+    if len(flight.shape):
+        groups += shape_groups(flight)[:1]
+    drawn = flight.drawn
+    robot = drawn.at(flight.joints[-1], flight.base_at(-1)) if drawn is not None else None
+    height, gap, left = 1.25, 0.42, 0.72
+    up = 0.5 + (height + gap) * len(groups) + 0.35
+    figure = new_figure(up)
+    right = room_for([name for group in groups for name in group.names])
+    width = WIDTH - left - right - (_ROBOT_WIDTH if robot else 0.1)
+    for number, group in enumerate(groups):
+        y = up - 0.35 - (number + 1) * (height + gap)
+        axes = panel(figure, left, y + 0.05, width, height)
+        draw_whole(axes, flight, group, width / WIDTH)
+        if number < len(groups) - 1:
+            axes.set_xlabel("")
+            axes.tick_params(labelbottom=False)
+    if robot is not None:
+        size = _ROBOT_WIDTH - 0.15
+        axes = panel(figure, WIDTH - size - 0.1, 0.2, size, up - 1.0)
+        view = view_of(flight)
+        draw_robot(axes, robot, robot.points(), view)
+        legend_above(axes, draw_goal_and_path(axes, flight, view))
+    title = f"{flight.scenario}: {flight.description}" if flight.description else flight.scenario
+    figure.text(0.1 / WIDTH, 1 - 0.24 / up, title, size=10.5, weight="bold")
+    return figure
+
+
+def _write(path: Path, data: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    except OSError as error:
+        raise SpaceRobotError(f"The file {path} cannot be written: {error.strerror}.") from error

@@ -1,0 +1,314 @@
+"""The nodes of a scenario, each in a process of its own: as users run them, without ros2 launch."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import rclpy
+import yaml
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.clock import Clock, ClockType
+from rclpy.experimental import EventsExecutor
+from rosgraph_msgs.msg import Clock as ClockMessage
+
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.nodes import NODE_TYPES
+from spacerobot_ros.nodes.common.cdr import NANOSECONDS
+from spacerobot_ros.nodes.common.node import spin_until
+from spacerobot_ros.nodes.common.robot_source import robot_of
+from spacerobot_ros.nodes.planner.plan_work import PLANNED
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.session.description import parameter_records, scenario_record
+from spacerobot_ros.session.kills import NEEDS_PROCESSES, KillTimeline
+from spacerobot_ros.session.mission_client import Operator
+from spacerobot_ros.session.scenario import COMMANDERS, Scenario
+
+_START = 60.0
+"""Wall s within which every node must be there."""
+
+_END = 10.0
+"""Wall s that a node has to end after a signal before it is killed."""
+
+_WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+"""Fast DDS may go on writing into what a killed node has left behind, and not to its successor."""
+
+_COMMANDS = ("joint_commands", "base_wrench", "joint_reference")
+"""What commanders publish for every state: nothing of it may be missed."""
+
+_SETTLING = 1.0
+"""Wall s for the recorder to take in what was published before time stood still."""
+
+_LOOK_PERIOD = 0.2
+
+_PLANNED = re.escape(PLANNED).replace(r"\{:\.6f\}", r"([\d.]+)")
+
+
+class ProcessStack:
+    """The processes of a scenario, and the operator of their flight in this one.
+
+    Parameters
+    ----------
+    scenario
+        What to run.
+    bag
+        File to record into; None records nothing.
+    plant_waits
+        Whether the plant begins only with :meth:`start`, when everybody listens.
+
+    Raises
+    ------
+    SpaceRobotError
+        A node ended at its start; the sentence is its own.
+    """
+
+    def __init__(self, scenario: Scenario, bag: Path | None, *, plant_waits: bool = True) -> None:
+        if "time_mode" not in scenario.overrides.get("plant", {}):
+            scenario = scenario.with_overrides("plant", {"time_mode": "lockstep"})
+        if scenario.kills and scenario.lockstep:
+            raise ParameterError(NEEDS_PROCESSES.format(scenario.name))
+        self.scenario = scenario
+        self._timeline = KillTimeline(scenario.kills)
+        self.time_ns = 0
+        self._clock_seen = math.inf
+        self._bag = bag
+        self._folder = tempfile.TemporaryDirectory(prefix="spacerobot_")
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._nodes = ["plant", *scenario.commanders, *(["recorder"] if bag is not None else [])]
+        names = None
+        if scenario.goal.joint_positions is not None:
+            robot = robot_of(
+                {
+                    key: scenario.parameter("plant", key, "")
+                    for key in ("robot_description", "robot")
+                }
+            )
+            names = robot.joint_names if robot is not None else ()
+        self.operator = Operator(
+            scenario.commanders[0],
+            str(scenario.parameter(scenario.commanders[0], "world_frame", "world")),
+            joint_names=None if names is None else lambda: names,
+            end_effector=scenario.end_effector_goal is not None,
+        )
+        node = self.operator.node
+        node.create_subscription(ClockMessage, "/clock", self._on_clock, 10)
+        self._change_state = node.create_client(ChangeState, "plant/change_state")
+        self.executor = EventsExecutor()
+        self.executor.add_node(node)
+        try:
+            for name in self._nodes:
+                self.launch(name, autostart=name != "plant" or not plant_waits)
+            if plant_waits:
+                self._transit(Transition.TRANSITION_CONFIGURE)
+            self._wait_for(self._met, "the nodes to find each other")
+        except BaseException:
+            self.close()
+            raise
+
+    def launch(self, name: str, **parameters: Any) -> None:
+        """Start one node of the scenario, for the first time or again, with more parameters."""
+        overrides = dict(self.scenario.overrides.get(name, {}))
+        if name == "recorder":
+            overrides["bag"] = str(self._bag)
+            record = Path(self._folder.name, "scenario.json")
+            record.write_text(json.dumps(self._records()), "utf-8")
+            overrides["describe"] = str(record)
+        elif self.scenario.kills and name in COMMANDERS:
+            overrides.setdefault("resume_file", str(Path(self._folder.name, f"{name}_goal.json")))
+        overrides |= parameters
+        file = Path(self._folder.name, f"{name}.yaml")
+        file.write_text(yaml.safe_dump({name: {"ros__parameters": overrides}}), "utf-8")
+        said = Path(self._folder.name, f"{name}.txt").open("wb")  # noqa: SIM115
+        with said:
+            self.processes[name] = subprocess.Popen(
+                [
+                    *(sys.executable, "-W", "ignore::RuntimeWarning:runpy"),
+                    *("-m", NODE_TYPES[name].__module__, "--ros-args", "-r", f"__node:={name}"),
+                    *("--params-file", str(self.scenario.path), "--params-file", str(file)),
+                ],
+                env={**_WITHOUT_SHARED_MEMORY, **os.environ},
+                stdout=said,
+                stderr=said,
+                start_new_session=True,
+            )
+
+    def _records(self) -> dict[str, dict[str, str]]:
+        specs = {name: NODE_TYPES[name].SPECS for name in self._nodes if name != "recorder"}
+        return {
+            "scenario": scenario_record(self.scenario),
+            **parameter_records(self.scenario, specs),
+        }
+
+    def said(self, name: str) -> str:
+        """Return what a node has written to its standard output and error."""
+        return Path(self._folder.name, f"{name}.txt").read_text("utf-8", errors="replace")
+
+    @property
+    def plan_time(self) -> float:
+        """Wall time that planning took, as the planner has logged it, s."""
+        if "planner" not in self.processes:
+            return 0.0
+        return sum(float(text) for text in re.findall(_PLANNED, self.said("planner")))
+
+    def start(self, goal: Goal | None) -> None:
+        """Send the goal, if there is one, and let time run."""
+        if goal is not None:
+            self.operator.send(goal, self.scenario.end_effector_goal)
+        self._transit(Transition.TRANSITION_ACTIVATE)
+
+    def spin(self, look: Callable[[], bool]) -> None:
+        """Run until the goal is decided, or until ``look``, called five times a second, is true.
+
+        Raises
+        ------
+        SpaceRobotError
+            A node has ended by itself.
+        """
+        failures: list[SpaceRobotError] = []
+
+        def on_look() -> None:
+            try:
+                self._kill_and_restart()
+                self.require_alive()
+                stop = look()
+            except SpaceRobotError as error:
+                failures.append(error)
+                stop = True
+            if stop and not self.operator.done.done():
+                self.operator.done.set_result("stopped")
+
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        timer = self.operator.node.create_timer(_LOOK_PERIOD, on_look, clock=steady)
+        spin_until(self.executor, self.operator.done)
+        self.operator.node.destroy_timer(timer)
+        if failures:
+            raise failures[0]
+
+    def finish(self) -> None:
+        """Stop time, then end every node, the recorder, whose bag is completed, last.
+
+        Raises
+        ------
+        SpaceRobotError
+            A node did not end well.
+        """
+        if "plant" not in self._timeline.away:
+            self._transit(Transition.TRANSITION_DEACTIVATE)
+        end = time.monotonic() + _SETTLING
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.05)
+        for name in self._nodes:
+            if name in self._timeline.away:
+                continue
+            code = self._end(name)
+            if code != 0:
+                raise SpaceRobotError(
+                    f"Node '{name}' ended with code {code}: {_last_line(self.said(name))}"
+                )
+
+    def close(self) -> None:
+        """End what still runs; safe to call twice."""
+        for process in self.processes.values():
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+        self.executor.shutdown()
+        self.operator.node.destroy_node()
+        self._folder.cleanup()
+
+    def require_alive(self) -> None:
+        """Raise the last words of a node that has ended.
+
+        Raises
+        ------
+        SpaceRobotError
+            There is one.
+        """
+        for name, process in self.processes.items():
+            if process.poll() is not None and name not in self._timeline.away:
+                raise SpaceRobotError(
+                    f"Node '{name}' has ended (code {process.returncode}): "
+                    f"{_last_line(self.said(name))}"
+                )
+
+    def kill(self, name: str) -> None:
+        """Have a node end as it would by a crash."""
+        os.killpg(self.processes[name].pid, signal.SIGKILL)
+        self.processes[name].wait()
+
+    def _kill_and_restart(self) -> None:
+        """Do to the nodes what the scenario says for this time."""
+        # A killed plant has no clock: the wall's goes on for it.
+        factor = float(self.scenario.parameter("plant", "real_time_factor", 1.0))
+        since = factor * (time.monotonic() - self._clock_seen)
+        killed, started = self._timeline.due(self.time_ns / NANOSECONDS + since)
+        for name in killed:
+            self.kill(name)
+        for name in started:
+            again = {"resume_bag": str(self._bag or ""), "autostart": True}
+            self.launch(name, **(again if name == "plant" else {}))
+
+    def _end(self, name: str) -> int:
+        process = self.processes[name]
+        process.send_signal(signal.SIGINT)
+        try:
+            return process.wait(_END)
+        except subprocess.TimeoutExpired:
+            # Its last words then say where it hangs.
+            process.send_signal(signal.SIGABRT)
+        try:
+            return process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            return process.wait()
+
+    def _on_clock(self, message: ClockMessage) -> None:
+        self.time_ns = message.clock.sec * NANOSECONDS + message.clock.nanosec
+        self._clock_seen = time.monotonic()
+
+    def _met(self) -> bool:
+        """Whether commanders and recorder hear the plant and the operator, and are heard."""
+        node = self.operator.node
+        listeners = 2 if self._bag is not None else 1
+        return (
+            self.operator.heard(listeners)
+            and node.count_subscribers("odom") >= len(self._nodes) - 1
+            and all(
+                node.count_subscribers(topic) >= listeners
+                for topic in _COMMANDS
+                if node.count_publishers(topic)
+            )
+        )
+
+    def _transit(self, transition: int) -> None:
+        self._wait_for(self._change_state.service_is_ready, "the plant")
+        request = ChangeState.Request(transition=Transition(id=transition))
+        answer: rclpy.task.Future = self._change_state.call_async(request)
+        self._wait_for(answer.done, "the plant's answer")
+        if not answer.result().success:
+            raise SpaceRobotError(f"The plant refuses: {_last_line(self.said('plant'))}")
+
+    def _wait_for(self, condition: Callable[[], bool], what: str) -> None:
+        deadline = time.monotonic() + _START
+        while not condition():
+            self.require_alive()
+            if time.monotonic() > deadline:
+                raise SpaceRobotError(f"Waited {_START:g} s for {what} in vain.")
+            self.executor.spin_once(timeout_sec=0.05)
+
+
+def _last_line(text: str) -> str:
+    # A crash ends with pages of loaded modules.
+    lines = [line for line in text.strip().splitlines() if not line.startswith("Extension mod")]
+    return lines[-1] if lines else "it said nothing."
