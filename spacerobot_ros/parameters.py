@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -195,7 +195,7 @@ def values_of(config: Any, prefix: str = "") -> dict[str, Value]:
     return {parameter.name: value for parameter, value in _leaves(config, prefix)}
 
 
-def require_known(owner: str, config: type[Any], names: Iterator[str] | Sequence[str]) -> None:
+def require_known(owner: str, config: type[Any], names: Iterable[str]) -> None:
     """Refuse names that are no parameter of a configuration.
 
     Raises

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -78,3 +78,21 @@ def ros_context(ros_domain: int) -> Iterator[rclpy.Context]:
     rclpy.init(args=[], context=context, domain_id=ros_domain)
     yield context
     rclpy.try_shutdown(context=context)
+
+
+@pytest.fixture
+def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the test's nodes in a ROS domain of its own."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
+
+
+@pytest.fixture(params=["transposed_jacobian", "model_based"])
+def law(request: pytest.FixtureRequest) -> str:
+    """Return a law that flies spacecraft and end-effector together."""
+    return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def flown() -> dict[str, Any]:
+    """Return what has been flown, by law: each flies once, for the test that asks first."""
+    return {}

@@ -21,7 +21,6 @@ from spacerobot_ros.control.state import (
     PoseReference,
     Reference,
 )
-from spacerobot_ros.options import Option
 
 __all__ = [
     "LAWS",
@@ -37,7 +36,6 @@ __all__ = [
     "LawStatus",
     "MotionLimits",
     "NotFiniteError",
-    "Option",
     "OutputSelection",
     "PoseReference",
     "QuinticReference",

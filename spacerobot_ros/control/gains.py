@@ -10,6 +10,7 @@ import numpy as np
 from spacerobot_ros.control.selection import OutputSelection
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.parameters import group, parameter
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,10 @@ class GainPair:
     is that of the last wrist link about its joint).
     """
 
-    kp: float
-    kd: float
+    kp: float = parameter(
+        30.0, "proportional gain", unit="of the law", minimum=1e-9, read_only=False
+    )
+    kd: float = parameter(60.0, "derivative gain", unit="of the law", minimum=1e-9, read_only=False)
 
 
 @dataclass(frozen=True)
@@ -40,19 +43,19 @@ class Gains:
         A gain is not positive and finite; the sentence names it.
     """
 
-    base_position: GainPair
-    base_attitude: GainPair
-    end_effector_position: GainPair
-    end_effector_attitude: GainPair
-    joints: GainPair
+    base_position: GainPair = group(GainPair(30.0, 60.0))
+    base_attitude: GainPair = group(GainPair(30.0, 60.0))
+    end_effector_position: GainPair = group(GainPair(30.0, 60.0))
+    end_effector_attitude: GainPair = group(GainPair(30.0, 60.0))
+    joints: GainPair = group(GainPair(4.0, 4.0))
 
     def __post_init__(self) -> None:
-        for group in fields(self):
-            pair: GainPair = getattr(self, group.name)
+        for each in fields(self):
+            pair: GainPair = getattr(self, each.name)
             for name, value in (("kp", pair.kp), ("kd", pair.kd)):
                 if not (math.isfinite(value) and value > 0):
                     raise ParameterError(
-                        f"The gain {group.name}.{name} is {value}; it must be positive and finite."
+                        f"The gain {each.name}.{name} is {value}; it must be positive and finite."
                     )
 
     @classmethod

@@ -12,7 +12,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
-from spacerobot_ros.options import chosen_options
+from spacerobot_ros.parameters import require_known
 from spacerobot_ros.planning.core.goal import Goal, RobotState, Tolerance
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.methods.registry import METHODS, build_method
@@ -68,8 +68,8 @@ def plan(
         raise ParameterError(
             f"There is no gait method '{method}'; there are: {', '.join(METHODS)}."
         )
-    chosen = chosen_options(method, METHODS[method].options, options)
-    named = {f"{method}.{name}": value for name, value in chosen.items()}
+    require_known(method, METHODS[method].Options, options)
+    named = {f"{method}.{name}": value for name, value in options.items()}
     planner = build_method(method, robot, tick_period, tolerance, integration_step, named)
     return planner.plan(_state(robot, start), goal)
 

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.nodes.common.parameters import ParameterSpec
+from spacerobot_ros.parameters import Parameter
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.session.scenario import Scenario
 
-Specs = Mapping[str, Sequence[ParameterSpec]]
+Specs = Mapping[str, Sequence[Parameter]]
 """The parameters of nodes by the nodes' names."""
 
 

@@ -14,6 +14,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
+from spacerobot_ros.parameters import configured, declared, values_of
 from spacerobot_ros.planning import (
     METHODS,
     GaitSchedule,
@@ -25,6 +26,7 @@ from spacerobot_ros.planning import (
 )
 from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.resources import resource_names, robot_file
 from spacerobot_ros.session.scenario import load_scenario, parse_setting, scenario_names
 from spacerobot_ros.simulation.building import initial_state, period_ns
@@ -253,27 +255,12 @@ def _sections(name: str) -> tuple[dict[str, Any], dict[str, Any], Goal]:
 
 
 def _checked(planner: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the planner's parameters with those that are not given; options that exist."""
-    values = {**_PLANNER, **planner}
-    defaults = {**_PLANNER} | {
-        f"{name}.{option.name}": option.default
-        for name, method in METHODS.items()
-        for option in method.options
-    }
-    for name, value in values.items():
-        method = name.partition(".")[0]
-        if method in METHODS and name not in defaults:
+    """Return all parameters of the planner, those that are not given by default."""
+    known = {parameter.name for parameter in declared(PlannerConfig)}
+    for name in planner:
+        if name.partition(".")[0] in METHODS and name not in known:
             raise ParameterError(f"The planner has no parameter '{name}'.")
-        wanted = defaults.get(name)
-        if isinstance(wanted, (int, float)) and (
-            isinstance(value, bool) or not isinstance(value, (int, float))
-        ):
-            raise ParameterError(f"Parameter '{name}' is '{value}'; it must be a number.")
-        if isinstance(wanted, list) and not isinstance(value, list):
-            raise ParameterError(f"Parameter '{name}' is '{value}'; it must be a list.")
-    if not values["tick_rate"] > 0 or not values["integration_step"] > 0:
-        raise ParameterError("The planner's tick_rate and integration_step must be above zero.")
-    return values
+    return dict(values_of(configured(PlannerConfig, {**_PLANNER, **planner})))
 
 
 def start_of(plant: VelocityPlant) -> RobotState:

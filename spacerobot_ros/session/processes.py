@@ -24,11 +24,12 @@ from rclpy.experimental import EventsExecutor
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.model.robot_source import RobotConfig, robot_of
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.node import spin_until
-from spacerobot_ros.nodes.common.robot_source import robot_of
 from spacerobot_ros.nodes.planner.plan_work import PLANNED
+from spacerobot_ros.parameters import configured, declared
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.session.description import parameter_records, scenario_record
 from spacerobot_ros.session.kills import NEEDS_PROCESSES, KillTimeline
@@ -88,12 +89,7 @@ class ProcessStack:
         self._nodes = ["plant", *scenario.commanders, *(["recorder"] if bag is not None else [])]
         names = None
         if scenario.goal.joint_positions is not None:
-            robot = robot_of(
-                {
-                    key: scenario.parameter("plant", key, "")
-                    for key in ("robot_description", "robot")
-                }
-            )
+            robot = robot_of(configured(RobotConfig, scenario.parameters("plant")))
             names = robot.joint_names if robot is not None else ()
         self.operator = Operator(
             scenario.commanders[0],
@@ -144,7 +140,9 @@ class ProcessStack:
             )
 
     def _records(self) -> dict[str, dict[str, str]]:
-        specs = {name: NODE_TYPES[name].SPECS for name in self._nodes if name != "recorder"}
+        specs = {
+            name: declared(NODE_TYPES[name].Config) for name in self._nodes if name != "recorder"
+        }
         return {
             "scenario": scenario_record(self.scenario),
             **parameter_records(self.scenario, specs),

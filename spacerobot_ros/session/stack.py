@@ -25,6 +25,7 @@ from spacerobot_ros.nodes import (
 )
 from spacerobot_ros.nodes.common.node import spin_until
 from spacerobot_ros.nodes.recorder.node import parameters_of
+from spacerobot_ros.parameters import declared
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.session.description import scenario_record
 from spacerobot_ros.session.kills import NEEDS_PROCESSES
@@ -190,7 +191,7 @@ class FlightStack:
             parameters = [Parameter(key, value=value) for key, value in overrides.items()]
         except (TypeError, ValueError) as error:
             raise ParameterError(f"A parameter of node '{name}' is refused: {error}.") from error
-        known = {spec.name for spec in NODE_TYPES[name].SPECS}
+        known = {spec.name for spec in declared(NODE_TYPES[name].Config)}
         unknown = [key for key in overrides if key not in known]
         if unknown:
             raise ParameterError(f"Node '{name}' has no parameter '{unknown[0]}'.")

@@ -44,6 +44,7 @@ from spacerobot_ros.control import (
 from spacerobot_ros.control.selection import AXES
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot, compilation
+from spacerobot_ros.parameters import declared
 
 
 @pytest.mark.parametrize("name", INVERTIBLE)
@@ -105,10 +106,10 @@ def test_registry_and_options() -> None:
     robot = load("planar_manipulator")
     for name, law in LAWS.items():
         assert law.name == name
-        options: dict[str, Any] = {option.name: option.default for option in law.options}
+        options: dict[str, Any] = {option.name: option.default for option in declared(law.Options)}
         built = law(robot, law.default_outputs(robot, END_EFFECTOR), PLANAR_GAINS, **options)
         assert isinstance(built, ControlLaw)
-        for option in law.options:
+        for option in declared(law.Options):
             for value in (option.minimum - 1.0, np.nan):
                 with pytest.raises(ParameterError, match=f"'{option.name}'"):
                     law(robot, built.outputs.selection, PLANAR_GAINS, **{option.name: value})

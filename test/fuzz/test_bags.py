@@ -17,9 +17,10 @@ from support.fuzzing import NUMBERS, VALUES, attempt, damaged, fuzz
 from spacerobot_ros.bag import Playback, iterate_raw, read_bag
 from spacerobot_ros.bag.last_state import last_state
 from spacerobot_ros.bag.salvage import salvage_bag
-from spacerobot_ros.nodes.plant.parameters import PLANT_SPECS
+from spacerobot_ros.parameters import declared
 from spacerobot_ros.report import write_report
 from spacerobot_ros.resources import share_directory
+from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.verification.comparison import verify_bag
 
 WHOLE = (share_directory() / "bags" / "sliding_masses.mcap").read_bytes()
@@ -122,7 +123,7 @@ def test_a_damaged_bag_without_checksums(tmp_path: Path, content: bytes) -> None
 @fuzz(
     "bag's parameters",
     st.dictionaries(
-        st.sampled_from([spec.name for spec in PLANT_SPECS]),
+        st.sampled_from([spec.name for spec in declared(PlantConfig)]),
         st.one_of(
             VALUES.map(json.dumps), st.lists(NUMBERS, min_size=3, max_size=4).map(json.dumps)
         ),

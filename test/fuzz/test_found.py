@@ -23,7 +23,7 @@ from spacerobot_ros.errors import (
 )
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.cdr import TemplateReader, UnreadableError
-from spacerobot_ros.nodes.common.parameters import ParameterSpec
+from spacerobot_ros.parameters import Parameter
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.session.scenario import goal_from_rotvec, load_scenario
@@ -77,7 +77,7 @@ def test_a_rotation_vector_of_absurd_length_is_refused() -> None:
 def test_a_whole_number_beyond_every_float_is_refused(value: Any) -> None:
     default: Any = [0.0] if isinstance(value, list) else 0.0
     with pytest.raises(ParameterError, match="'size'"):
-        ParameterSpec("size", default, "m", "").checked(value)
+        Parameter("size", default, "m", "").checked(value)
 
 
 @pytest.mark.parametrize("section", ["[1, 2]", "{ros__parameters: null}"])

@@ -8,16 +8,16 @@ from typing import Any
 import pytest
 import rclpy
 from hypothesis import strategies as st
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter as RosParameter
 from support.fuzzing import FINITE, MODEST, NUMBERS, TEXTS, VALUES, attempt, fuzz
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import NODE_TYPES, ReplayNode
 from spacerobot_ros.nodes.common.node import AUTOSTART, FlightNode
-from spacerobot_ros.nodes.common.parameters import ParameterSpec
+from spacerobot_ros.parameters import Parameter, declared
 
 KINDS: list[type[FlightNode]] = [*NODE_TYPES.values(), ReplayNode]
-SPECS = [AUTOSTART, *(spec for kind in KINDS for spec in kind.SPECS)]
+SPECS = [AUTOSTART, *(spec for kind in KINDS for spec in declared(kind.Config))]
 WHOLE = st.integers(-(2**63), 2**63 - 1)
 ROS_VALUES = st.one_of(
     st.booleans(),
@@ -40,7 +40,7 @@ BASES: dict[str, dict[str, Any]] = {
 
 
 @fuzz("parameter", st.sampled_from(SPECS), st.one_of(VALUES, ROS_VALUES), fast=200, long=3000)
-def test_every_parameter_takes_a_value_or_names_itself(spec: ParameterSpec, value: object) -> None:
+def test_every_parameter_takes_a_value_or_names_itself(spec: Parameter, value: object) -> None:
     taken = attempt("parameter", spec.checked, value)
     if taken is None:
         with pytest.raises(SpaceRobotError, match=spec.name):
@@ -53,13 +53,13 @@ def test_every_parameter_takes_a_value_or_names_itself(spec: ParameterSpec, valu
     assert spec.checked(taken) == taken
 
 
-def plausible(spec: ParameterSpec) -> st.SearchStrategy[Any]:
+def plausible(spec: Parameter) -> st.SearchStrategy[Any]:
     """Return values of a parameter's own type, at the ends of its range and anywhere."""
     if isinstance(spec.default, bool):
         return st.booleans()
     if isinstance(spec.default, str):
         return st.sampled_from([*spec.choices]) if spec.choices else TEXTS
-    if isinstance(spec.default, list):
+    if isinstance(spec.default, tuple):
         return st.lists(TEXTS if spec.texts else MODEST | FINITE, min_size=1, max_size=4)
     ends = st.sampled_from([x for x in (spec.minimum, spec.maximum) if math.isfinite(x)] or [0.0])
     numbers = st.one_of(ends, MODEST, st.floats(spec.minimum, spec.maximum))
@@ -70,7 +70,9 @@ def plausible(spec: ParameterSpec) -> st.SearchStrategy[Any]:
 
 @st.composite
 def overrides(draw: st.DrawFn, node: str) -> dict[str, Any]:
-    specs = [spec for spec in NODE_TYPES[node].SPECS if spec.name not in ("path", "robot")]
+    specs = [
+        spec for spec in declared(NODE_TYPES[node].Config) if spec.name not in ("path", "robot")
+    ]
     chosen = draw(st.lists(st.sampled_from(specs), min_size=1, max_size=3, unique_by=id))
     return {spec.name: draw(st.one_of(plausible(spec), ROS_VALUES)) for spec in chosen}
 
@@ -79,7 +81,9 @@ def overrides(draw: st.DrawFn, node: str) -> dict[str, Any]:
 def test_a_node_configures_or_says_what_is_wrong(node: str, ros_context: rclpy.Context) -> None:
     @fuzz("node", overrides(node), fast=8, long=15)
     def construct(given: dict[str, Any]) -> None:
-        parameters = [Parameter(name, value=value) for name, value in (BASES[node] | given).items()]
+        parameters = [
+            RosParameter(name, value=value) for name, value in (BASES[node] | given).items()
+        ]
         made = attempt(
             "node",
             NODE_TYPES[node],

@@ -196,7 +196,7 @@ def test_faults_are_a_list_or_a_text(ros_context: rclpy.Context, faults: Any) ->
         "joint_stuck slider_1 at 0",
         "joint_slow slider_2 0.5 at 9",
     ]
-    assert list(plant.get_parameter("faults").value) == plant.parameters["faults"]
+    assert tuple(plant.get_parameter("faults").value) == plant.config.faults
     plant.destroy_node()
 
 

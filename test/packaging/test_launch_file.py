@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from spacerobot_ros.nodes import NODE_TYPES
+from spacerobot_ros.parameters import declared
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.session.scenario import scenario_names
 
@@ -77,7 +78,9 @@ def test_every_scenario_starts_its_nodes(description: Noted, scenario: str) -> N
             if isinstance(given, str):
                 assert Path(given).is_file()
             else:
-                assert set(given) <= {s.name for s in NODE_TYPES[name].SPECS} | {"use_sim_time"}
+                assert set(given) <= {s.name for s in declared(NODE_TYPES[name].Config)} | {
+                    "use_sim_time"
+                }
     assert nodes["recorder"].options["condition"].args[0].args == ("record",)
 
 

@@ -15,6 +15,7 @@ from spacerobot_ros.nodes import (
     ReplayNode,
 )
 from spacerobot_ros.nodes.common.node import AUTOSTART
+from spacerobot_ros.parameters import declared
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 
@@ -39,7 +40,11 @@ def test_parameters_are_documented_with_their_defaults(
         if line.startswith("| `")
     ]
     documented = {row[0]: row[1] for row in rows}
-    for spec in (AUTOSTART, *node.SPECS):
-        default = str(spec.default).lower() if isinstance(spec.default, bool) else spec.default
+    for spec in (AUTOSTART, *declared(node.Config)):
+        default: object = spec.default
+        if isinstance(default, bool):
+            default = str(default).lower()
+        elif isinstance(default, tuple):
+            default = list(default)
         assert documented.pop(spec.name) == (str(default) or "''"), spec.name
     assert documented == {}

@@ -9,16 +9,16 @@ import pytest
 from support.effort_flights import robot_of
 
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.options import Option
+from spacerobot_ros.parameters import Parameter, declared
 from spacerobot_ros.planning import METHODS, Tolerance, plan
 from spacerobot_ros.resources import share_directory
 
 ARM = (share_directory() / "urdf" / "three_joint_arm.urdf").read_text("utf-8")
-OPTIONED = [name for name, method in METHODS.items() if method.options]
+OPTIONED = [name for name, method in METHODS.items() if declared(method.Options)]
 NUMBERS = [
     (name, option)
     for name in OPTIONED
-    for option in METHODS[name].options
+    for option in declared(METHODS[name].Options)
     if not isinstance(option.default, str)
 ]
 
@@ -32,16 +32,18 @@ def test_an_option_that_no_method_has_is_refused(method: str) -> None:
 @pytest.mark.parametrize(
     ("method", "option"), [pytest.param(*x, id=f"{x[0]}.{x[1].name}") for x in NUMBERS]
 )
-def test_numbers_out_of_range_are_refused(method: str, option: Option) -> None:
+def test_numbers_out_of_range_are_refused(method: str, option: Parameter) -> None:
     for number in (option.minimum - 1.0, option.maximum * 2 + 1.0, math.nan):
-        value = [number] if isinstance(option.default, list) else number
+        value = [number] if isinstance(option.default, tuple) else number
         options: dict[str, Any] = {option.name: value}
-        with pytest.raises(ParameterError, match=f"'{option.name}' is .* it must be from "):
+        with pytest.raises(ParameterError, match=f"'{option.name}' is .* it must be "):
             METHODS[method](robot_of(ARM), 0.05, Tolerance(1e-3, 1e-3), **options)
 
 
 def test_a_call_without_ros_checks_its_options_too() -> None:
-    with pytest.raises(ParameterError, match=r"'starts' is 0; it must be from 1 to 10000\."):
+    with pytest.raises(
+        ParameterError, match=r"'starts' is 0; it must be a number from 1 to 10000\."
+    ):
         plan("sliding_masses", starts=0)
     with pytest.raises(ParameterError, match="auto has no option 'starts'"):
         plan("sliding_masses", method="auto", starts=3)

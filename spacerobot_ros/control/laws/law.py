@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -16,7 +16,7 @@ from spacerobot_ros.control.state import Actuation, ControlState, Reference
 from spacerobot_ros.model.compilation import BufferedFunction, compiled, dense_function
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.options import Option, chosen_options
+from spacerobot_ros.parameters import configured, parameter, require_known
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,18 @@ class LawStatus:
     smallest_singular_value: float
     singular: bool
     damping: float
+
+
+@dataclass(frozen=True)
+class LawOptions:
+    """Options that every law has."""
+
+    singular_value_threshold: float = parameter(
+        0.1,
+        "J_z is near singular where its smallest singular value (SI units) is below this",
+        minimum=1e-06,
+        maximum=1000000000.0,
+    )
 
 
 class ControlLaw(ABC):
@@ -58,23 +70,16 @@ class ControlLaw(ABC):
     """
 
     name: ClassVar[str]
-    options: ClassVar[tuple[Option, ...]] = (
-        Option(
-            "singular_value_threshold",
-            0.1,
-            "",
-            "J_z is near singular where its smallest singular value (SI units) is below this",
-            1e-6,
-        ),
-    )
+    Options: ClassVar[Any] = LawOptions
 
     def __init__(
         self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
     ) -> None:
         self.robot = robot
         self.outputs = OutputVector(robot, outputs)
-        self._settings = chosen_options(self.name, self.options, options)
-        self.singular_value_threshold: float = self._settings["singular_value_threshold"]
+        require_known(self.name, self.Options, options)
+        self._options = configured(self.Options, options)
+        self.singular_value_threshold: float = self._options.singular_value_threshold
         symbols = {
             "state": self.outputs.state,
             "reference": self.outputs.reference,

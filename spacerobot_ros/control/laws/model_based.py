@@ -3,19 +3,40 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from spacerobot_ros.control.gains import Gains
-from spacerobot_ros.control.laws.law import ControlLaw
+from spacerobot_ros.control.laws.law import ControlLaw, LawOptions
 from spacerobot_ros.control.selection import OutputSelection
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.model.connection import solve_positive_definite
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.options import Option
+from spacerobot_ros.parameters import parameter
+
+
+@dataclass(frozen=True)
+class ModelBasedOptions(LawOptions):
+    """The options of ``model_based``."""
+
+    null_space_damping: float = parameter(
+        1.0,
+        "rate at which motion that moves no output dies out",
+        unit="1/s",
+        minimum=0.0,
+        maximum=1000000000.0,
+    )
+    posture_stiffness: float = parameter(
+        0.0,
+        "pull of joints that are no outputs to the joint reference, as far as it moves no output",
+        unit="1/s^2",
+        minimum=0.0,
+        maximum=1000000000.0,
+    )
 
 
 class ModelBasedLaw(ControlLaw):
@@ -49,27 +70,15 @@ class ModelBasedLaw(ControlLaw):
     """
 
     name: ClassVar[str] = "model_based"
-    options: ClassVar[tuple[Option, ...]] = (
-        *ControlLaw.options,
-        Option(
-            "null_space_damping", 1.0, "1/s", "rate at which motion that moves no output dies out"
-        ),
-        Option(
-            "posture_stiffness",
-            0.0,
-            "1/s^2",
-            "pull of joints that are no outputs to the joint reference, as far as it moves no "
-            "output",
-        ),
-    )
+    Options: ClassVar[Any] = ModelBasedOptions
 
     def __init__(
         self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
     ) -> None:
         super().__init__(robot, outputs, gains, **options)
         self._in["null_space"][:] = (
-            self._settings["posture_stiffness"],
-            self._settings["null_space_damping"],
+            self._options.posture_stiffness,
+            self._options.null_space_damping,
         )
 
     def _damping(self, singular_value: float) -> float:

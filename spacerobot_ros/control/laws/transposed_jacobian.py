@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import casadi as ca
 
 from spacerobot_ros.control.gains import Gains
-from spacerobot_ros.control.laws.law import ControlLaw
+from spacerobot_ros.control.laws.law import ControlLaw, LawOptions
 from spacerobot_ros.control.selection import OutputSelection
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.options import Option
+from spacerobot_ros.parameters import parameter
+
+
+@dataclass(frozen=True)
+class TransposedJacobianOptions(LawOptions):
+    """The options of ``transposed_jacobian``."""
+
+    joint_damping: float = parameter(
+        0.0,
+        "friction that the joint efforts imitate; brings to rest what moves no output",
+        unit="N m s/rad",
+        minimum=0.0,
+        maximum=1000000000.0,
+    )
 
 
 class TransposedJacobianLaw(ControlLaw):
@@ -32,22 +46,13 @@ class TransposedJacobianLaw(ControlLaw):
     """
 
     name: ClassVar[str] = "transposed_jacobian"
-    options: ClassVar[tuple[Option, ...]] = (
-        *ControlLaw.options,
-        # N s/m of prismatic joints.
-        Option(
-            "joint_damping",
-            0.0,
-            "N m s/rad",
-            "friction that the joint efforts imitate; brings to rest what moves no output",
-        ),
-    )
+    Options: ClassVar[Any] = TransposedJacobianOptions
 
     def __init__(
         self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
     ) -> None:
         super().__init__(robot, outputs, gains, **options)
-        self._in["joint_damping"][:] = self._settings["joint_damping"]
+        self._in["joint_damping"][:] = self._options.joint_damping
 
     def _parameters(self) -> dict[str, ca.SX]:
         return {"joint_damping": ca.SX.sym("joint_damping")}

@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import rclpy
@@ -18,7 +18,7 @@ from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
@@ -27,8 +27,9 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.nodes.common.parameters import ParameterSpec, Value, check_changes, declare
+from spacerobot_ros.nodes.common.parameters import check_changes, declare
 from spacerobot_ros.nodes.common.raw_stream import RawInput, RawOutput, RawStream, Take
+from spacerobot_ros.parameters import Parameter, Value, configured, declared
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """State and commands: reliable, deep enough for a reader that is briefly busy."""
@@ -38,9 +39,12 @@ LATCHED = QoSProfile(
 )
 """What a late subscriber must still get: reliable, transient local, depth 1."""
 
-AUTOSTART = ParameterSpec(
-    "autostart", True, "", "configure and activate at once; false: wait for a supervisor"
+AUTOSTART = Parameter(
+    "autostart",
+    True,
+    description="configure and activate at once; false: wait for a supervisor",
 )
+"""A parameter of every node."""
 
 
 _LONGEST_DELIVERY = 1.0
@@ -52,9 +56,9 @@ _DISCOVERY_CHOICES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_
 class FlightNode(LifecycleNode):
     """A managed node whose parameters are declared, checked and named in every refusal.
 
-    Subclasses give ``SPECS`` and the four hooks :meth:`configure`, :meth:`activate`,
-    :meth:`deactivate` and :meth:`cleanup`, which raise :class:`SpaceRobotError` with a sentence
-    when they cannot.
+    Subclasses give ``Config``, the declaration of their parameters, and the four hooks
+    :meth:`configure`, :meth:`activate`, :meth:`deactivate` and :meth:`cleanup`, which raise
+    :class:`SpaceRobotError` with a sentence when they cannot.
 
     Parameters
     ----------
@@ -70,11 +74,12 @@ class FlightNode(LifecycleNode):
         A parameter is refused, or ``autostart`` is on and the node cannot be configured.
     """
 
-    SPECS: ClassVar[Sequence[ParameterSpec]] = ()
+    Config: ClassVar[type[Any]]
+    """The frozen dataclass that declares the node's parameters."""
 
     def __init__(self, name: str, *, autostart: bool | None = None, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
-        self._specs = [AUTOSTART, *self.SPECS]
+        self._declared = (AUTOSTART, *declared(self.Config))
         self.fault: SpaceRobotError | None = None
         self.on_end: Callable[[int], None] = lambda code: None
         """Called with an exit code by a node that has nothing left to do."""
@@ -82,7 +87,8 @@ class FlightNode(LifecycleNode):
         """What passes through the node as bytes, from its configuration to its cleanup."""
         self._raising = False
         try:
-            self.parameters: dict[str, Value] = declare(self, self._specs)
+            self.parameters: dict[str, Value] = declare(self, self._declared)
+            self._configured()
             self.add_on_set_parameters_callback(self._on_set_parameters)
             self._permanent = set(self._entities())
             if self.parameters["autostart"] if autostart is None else autostart:
@@ -205,6 +211,9 @@ class FlightNode(LifecycleNode):
         self.fault = None
         return TransitionCallbackReturn.SUCCESS
 
+    def _configured(self) -> None:
+        self.config = configured(self.Config, self.parameters)
+
     def _entities(self) -> list[Any]:
         return [*self.timers, *self.subscriptions, *self.services, *self.publishers]
 
@@ -220,13 +229,14 @@ class FlightNode(LifecycleNode):
             if entity not in self._permanent:
                 next(act for kind, act in destroy.items() if isinstance(entity, kind))(entity)
 
-    def _on_set_parameters(self, changes: list[Parameter]) -> SetParametersResult:
-        reason = check_changes(self._specs, changes)
+    def _on_set_parameters(self, changes: list[RosParameter]) -> SetParametersResult:
+        reason = check_changes(self._declared, changes)
         if reason:
             return SetParametersResult(successful=False, reason=reason)
         for change in changes:
             if change.name in self.parameters:
                 self.parameters[change.name] = change.value
+        self._configured()
         self.parameters_changed()
         return SetParametersResult(successful=True)
 

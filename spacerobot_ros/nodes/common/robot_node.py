@@ -8,8 +8,8 @@ from std_msgs.msg import String
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.robot_source import robot_from_text, robot_of
 from spacerobot_ros.nodes.common.node import LATCHED, FlightNode
-from spacerobot_ros.nodes.common.robot_source import robot_from_text, robot_of
 
 
 class RobotNode(FlightNode):
@@ -27,7 +27,7 @@ class RobotNode(FlightNode):
         """
         # What was built for the robot before belongs to topics that are gone.
         self._robot = None
-        robot = robot_of(self.parameters)
+        robot = robot_of(self.config)
         if robot is None:
             self.create_subscription(String, "robot_description", self._on_description, LATCHED)
         else:
@@ -44,7 +44,7 @@ class RobotNode(FlightNode):
     def _on_description(self, message: String) -> None:
         if self._robot is None:
             try:
-                self._use(robot_from_text(message.data, self.parameters))
+                self._use(robot_from_text(message.data, self.config))
             except SpaceRobotError as error:
                 self.get_logger().error(f"robot_description: {error}")
                 return

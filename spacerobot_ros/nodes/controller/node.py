@@ -23,6 +23,7 @@ from spacerobot_ros.control import (
     PoseReference,
     Reference,
 )
+from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.errors import NotFiniteError
 from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
@@ -40,7 +41,6 @@ from spacerobot_ros.nodes.common.joint_command import JointReader
 from spacerobot_ros.nodes.common.node import STREAM, run_node
 from spacerobot_ros.nodes.common.robot_node import RobotNode
 from spacerobot_ros.nodes.controller.goals import END_EFFECTOR, ControlGoals, require_controlled
-from spacerobot_ros.nodes.controller.parameters import CONTROL_SPECS, gains_of
 from spacerobot_ros.nodes.controller.status import ControllerState, ControllerStatus
 from spacerobot_ros.nodes.plant.plant_topics import DEFAULT_END_EFFECTOR
 
@@ -53,7 +53,7 @@ class CoordinatedControlNode(RobotNode):
     there is a goal, the robot holds the pose of its first state.
     """
 
-    SPECS: ClassVar = CONTROL_SPECS
+    Config: ClassVar = ControllerConfig
 
     def __init__(self, name: str = "coordinated_control", **kwargs: Any) -> None:
         self._running = False
@@ -129,8 +129,8 @@ class CoordinatedControlNode(RobotNode):
         }
         if any(chosen.values()):
             outputs = OutputSelection(**chosen, end_effector_link=link)
-        options = {o.name: values[f"{law_type.name}.{o.name}"] for o in law_type.options}
-        law = law_type(robot, outputs, gains_of(self.parameters), **options)
+        options = vars(self.config.options[law_type.name])
+        law = law_type(robot, outputs, self.config.gains, **options)
         self._period = round(NANOSECONDS / values["tick_rate"]) / NANOSECONDS
         motion = {
             name: values[f"motion.{name}"]
@@ -172,7 +172,7 @@ class CoordinatedControlNode(RobotNode):
     def parameters_changed(self) -> None:
         """Take over new gains."""
         if self._robot is not None:
-            self.controller.set_gains(gains_of(self.parameters))
+            self.controller.set_gains(self.config.gains)
 
     # -- topics -------------------------------------------------------------------------------
 

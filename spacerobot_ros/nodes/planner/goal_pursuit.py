@@ -13,11 +13,12 @@ from spacerobot_ros.nodes.common.goal_memory import BASE, GoalMemory
 from spacerobot_ros.nodes.common.measured_state import MeasuredState
 from spacerobot_ros.nodes.common.node import FlightNode
 from spacerobot_ros.nodes.planner.gait_flight import GaitFlight
-from spacerobot_ros.nodes.planner.parameters import tolerance_of
 from spacerobot_ros.nodes.planner.plan_topics import PlanTopics
 from spacerobot_ros.nodes.planner.plan_work import Fly, PlanWork, Refuse
 from spacerobot_ros.nodes.planner.status import PlannerState, PlannerStatus, what_is_left
-from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
+from spacerobot_ros.parameters import configured
+from spacerobot_ros.planning import GaitSchedule, Goal, PoseError, Tolerance
+from spacerobot_ros.planning.execution.config import PlannerConfig
 
 
 class GoalPursuit:
@@ -63,6 +64,10 @@ class GoalPursuit:
         self._ends_at = 0.0
         """Simulated time at which the present schedule ends, s."""
         self._stamp = 0
+
+    @property
+    def _tolerance(self) -> Tolerance:
+        return configured(PlannerConfig, self._values).tolerance
 
     @property
     def plan_time(self) -> float:
@@ -291,7 +296,7 @@ class GoalPursuit:
             **self._account(),
         }
         left = what_is_left(error, self._work.method.controls)
-        if tolerance_of(self._values).admits(error, self._work.method.controls):
+        if self._tolerance.admits(error, self._work.method.controls):
             self._conclude(PlannerState.REACHED, f"The goal is met: {left}.", **result)
             return
         counts = not flown.partial and not replanned

@@ -20,10 +20,10 @@ from spacerobot_ros.nodes.common.node import STREAM, run_node
 from spacerobot_ros.nodes.common.robot_node import RobotNode
 from spacerobot_ros.nodes.planner.gait_flight import ANSWERED
 from spacerobot_ros.nodes.planner.goal_pursuit import GoalPursuit
-from spacerobot_ros.nodes.planner.parameters import PLANNER_SPECS
 from spacerobot_ros.nodes.planner.plan_topics import PlanTopics
 from spacerobot_ros.nodes.planner.status import PlannerState, PlannerStatus
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.config import PlannerConfig
 
 
 class PlannerNode(RobotNode):
@@ -36,7 +36,7 @@ class PlannerNode(RobotNode):
     does not follow, the rest is planned with the joints that remain.
     """
 
-    SPECS: ClassVar = PLANNER_SPECS
+    Config: ClassVar = PlannerConfig
 
     def __init__(self, name: str = "planner", **kwargs: Any) -> None:
         self._running = False

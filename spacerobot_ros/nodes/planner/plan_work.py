@@ -11,10 +11,11 @@ from typing import Any
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.nodes.planner.parameters import tolerance_of
+from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState
 from spacerobot_ros.planning.core.cancellation import wanted_while
 from spacerobot_ros.planning.execution.braking import BrakingFollower
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.stitching import stitched
 from spacerobot_ros.planning.execution.stuck_joints import RemainingJointsGait
 from spacerobot_ros.planning.methods.registry import build_method
@@ -66,7 +67,7 @@ class PlanWork:
             parameters["method"],
             robot,
             tick_period,
-            tolerance_of(parameters),
+            configured(PlannerConfig, parameters).tolerance,
             parameters["integration_step"],
             parameters,
         )
@@ -84,7 +85,9 @@ class PlanWork:
 
     def take_tolerance(self) -> None:
         """Plan with the tolerance that the parameters have now."""
-        self.method.tolerance = self._all_joints.tolerance = tolerance_of(self._values)
+        self.method.tolerance = self._all_joints.tolerance = configured(
+            PlannerConfig, self._values
+        ).tolerance
 
     def use_all_joints(self) -> None:
         """Plan with all joints again."""

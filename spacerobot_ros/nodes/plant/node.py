@@ -11,21 +11,21 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.model.robot_source import robot_of
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, run_node
-from spacerobot_ros.nodes.common.robot_source import robot_of
 from spacerobot_ros.nodes.plant.actuation import CHANNELS
 from spacerobot_ros.nodes.plant.command_channel import CommandChannel
 from spacerobot_ros.nodes.plant.command_gate import CommandGate
 from spacerobot_ros.nodes.plant.command_intake import CommandIntake
 from spacerobot_ros.nodes.plant.deadlines import Deadlines
 from spacerobot_ros.nodes.plant.diagnostics import PlantReport
-from spacerobot_ros.nodes.plant.parameters import PLANT_SPECS
 from spacerobot_ros.nodes.plant.plant_topics import PlantTopics
 from spacerobot_ros.nodes.plant.resumption import resumed
 from spacerobot_ros.nodes.plant.thruster_topics import ThrusterTopics
 from spacerobot_ros.simulation.brakes import JointBrakes
 from spacerobot_ros.simulation.building import PLANTS, build_plant, period_ns
+from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.sensors import SensorModel, Sensors
 from spacerobot_ros.simulation.thrusters import thrusters_in
 
@@ -47,7 +47,7 @@ class PlantNode(FlightNode):
     last command, and brings the joints to rest when that is older than ``command_timeout``.
     """
 
-    SPECS: ClassVar = PLANT_SPECS
+    Config: ClassVar = PlantConfig
 
     def __init__(self, name: str = "plant", **kwargs: Any) -> None:
         self._running = self._paused = False
@@ -69,7 +69,7 @@ class PlantNode(FlightNode):
     def configure(self) -> None:
         """Build the plant and its topics; nothing is published yet."""
         values: dict[str, Any] = self.parameters
-        robot = robot_of(values)
+        robot = robot_of(self.config)
         if robot is None:
             raise ParameterError(
                 "The plant needs a robot: set parameter 'robot' to a URDF file or the name of a "

@@ -20,12 +20,12 @@ from std_msgs.msg import String
 
 from spacerobot_ros import __version__
 from spacerobot_ros.bag import BagWriter, QosProfile, RecordingError
+from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns
 from spacerobot_ros.nodes.common.diagnostics import diagnostic_status
 from spacerobot_ros.nodes.common.message_types import message_class
 from spacerobot_ros.nodes.common.node import FlightNode, run_node
-from spacerobot_ros.nodes.common.parameters import ParameterSpec
 from spacerobot_ros.nodes.common.raw_stream import Take
 from spacerobot_ros.nodes.recorder.message_loss import MessageLoss
 from spacerobot_ros.nodes.recorder.stream_taps import StreamTaps
@@ -56,29 +56,7 @@ class RecorderNode(FlightNode):
     one time: what was decided stays.
     """
 
-    SPECS: ClassVar = (
-        ParameterSpec("bag", "", "", "file to write; '': spacerobot-<date>-<time>.mcap here"),
-        ParameterSpec(
-            "topics", "", "", "names to record, separated by spaces; '': all of the stack"
-        ),
-        ParameterSpec(
-            "compression", "zstd", "", "of the bag's chunks", choices=("zstd", "lz4", "none")
-        ),
-        ParameterSpec(
-            "clock_wait", 2.0, "s", "wall time to wait for a clock before using the wall's"
-        ),
-        ParameterSpec(
-            "describe", "", "", "JSON file of named objects to put into the bag as metadata"
-        ),
-        ParameterSpec(
-            "diagnostics_period", 0.0, "s", "wall time between diagnostics; 0: losses only", 0.0
-        ),
-        ParameterSpec("flush_period", 0.5, "s", "wall time that a kill can lose at most", 0.01),
-        ParameterSpec(
-            "max_size", 0.0, "MB", "begin the next file (NAME_0, NAME_1, ...) at; 0: never", 0.0
-        ),
-        ParameterSpec("max_duration", 0.0, "s", "bag time in a file, likewise; 0: never", 0.0),
-    )
+    Config: ClassVar = RecorderConfig
 
     def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
         self._writer: BagWriter | None = None

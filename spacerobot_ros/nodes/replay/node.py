@@ -16,11 +16,11 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.bag import Playback, QosProfile, RecordingError, ReplayMessage, read_bag
+from spacerobot_ros.bag.config import ReplayConfig
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS, raw_publish
 from spacerobot_ros.nodes.common.message_types import message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode, run_node
-from spacerobot_ros.nodes.common.parameters import ParameterSpec
 
 _READER_CHECK = 0.05
 """Wall s between two looks for readers."""
@@ -46,20 +46,7 @@ class ReplayNode(FlightNode):
     paused, ``~/step`` (Trigger): the next message.
     """
 
-    SPECS: ClassVar = (
-        ParameterSpec("bag", "", "", "MCAP file to replay, or a folder with one"),
-        ParameterSpec("rate", 1.0, "", "bag time over wall time", 1e-3, 1e6),
-        ParameterSpec("start", 0.0, "s", "where to begin, from the first message", 0.0),
-        ParameterSpec("duration", 0.0, "s", "how much of the bag to replay; 0: all", 0.0),
-        ParameterSpec("loop", False, "", "begin again at the end"),
-        ParameterSpec("topics", "", "", "names to replay, separated by spaces; '': all"),
-        ParameterSpec("remap", "", "", "other names for topics: 'old:=new', separated by spaces"),
-        ParameterSpec(
-            "clock", 0.0, "Hz", "publish bag time on /clock so often; 0: what the bag has", 0.0, 1e4
-        ),
-        ParameterSpec("paused", False, "", "begin paused"),
-        ParameterSpec("wait", 3.0, "s", "longest wall time to wait for readers", 0.0),
-    )
+    Config: ClassVar = ReplayConfig
 
     def __init__(self, name: str = "replay", **kwargs: Any) -> None:
         self._sends: dict[str, Callable[[bytes], None]] = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,7 +12,7 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
-from spacerobot_ros.options import Option, chosen_options
+from spacerobot_ros.parameters import configured, require_known
 from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, RobotState, Tolerance
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
@@ -20,6 +21,11 @@ _AT_REST = 1e-9
 
 _BEYOND = 1e-9
 """Rounding that a goal shape may be beyond a limit by, m or rad."""
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """The options of a method that has none."""
 
 
 class GaitMethod(ABC):
@@ -52,7 +58,7 @@ class GaitMethod(ABC):
 
     name: ClassVar[str]
     controls: frozenset[Controlled] = POSE
-    options: ClassVar[tuple[Option, ...]] = ()
+    Options: ClassVar[Any] = NoOptions
 
     def __init__(
         self,
@@ -66,7 +72,8 @@ class GaitMethod(ABC):
         self.tick_period = tick_period
         self.tolerance = tolerance
         self.integration_step = integration_step
-        self._settings = chosen_options(self.name, self.options, options)
+        require_known(self.name, self.Options, options)
+        self._options = configured(self.Options, options)
         self._prepare()
 
     def _prepare(self) -> None:  # noqa: B027 - methods that delegate have nothing to set up here

@@ -13,6 +13,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptio
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.parameters import declared
 from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.core.schedule import GaitSchedule
@@ -34,9 +35,9 @@ _LEAST_BAND = 1e-6
 """Errors below this are rounding, m or rad."""
 
 _OF_JOINTS = frozenset(
-    f"{name}.{option.name}"
+    option.name
     for name, method in METHODS.items()
-    for option in method.options
+    for option in declared(method.Options, f"{name}.")
     if option.of_joints
 )
 """Keys of the options that say something of every joint."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import attitude_error, quaternion_inverse, quaternion_multiply
-from spacerobot_ros.options import Option
+from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.controllability import brackets_anywhere
 from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod
@@ -45,6 +45,47 @@ Ends = list[tuple[Array, float]]
 """Shapes (n,) that straight legs lead to, and how long each leg is to take, s."""
 
 
+@dataclass(frozen=True)
+class AreaLoopOptions:
+    """The options of ``area_loop``."""
+
+    k: float = parameter(
+        0.15, "share of the missing turn that one cycle makes up for", minimum=0.001, maximum=1.0
+    )
+    edge_time: float = parameter(
+        4.0,
+        "duration of an edge; slow joints take longer",
+        unit="s",
+        minimum=0.001,
+        maximum=1000000000.0,
+    )
+    largest_edge: float = parameter(
+        1.0, "longest edge of a loop", unit="m or rad", minimum=0.001, maximum=10.0
+    )
+    nominal: tuple[float, ...] = parameter(
+        (),
+        "nominal shape, all joints; []: the best",
+        unit="m or rad",
+        minimum=-1000000.0,
+        maximum=1000000.0,
+        of_joints=True,
+    )
+    joints: str = parameter(
+        "", "the three joints, separated by spaces; '': the best three", of_joints=True
+    )
+    cycles_per_plan: int = parameter(
+        1, "cycles before the attitude is measured again", minimum=1, maximum=10000
+    )
+    most_cycles: int = parameter(1000, "cycles that a goal may take", minimum=1, maximum=1000000)
+    longest: float = parameter(
+        100000.0,
+        "longest manoeuvre that is still planned",
+        unit="s",
+        minimum=1.0,
+        maximum=1000000000.0,
+    )
+
+
 class AreaLoopGait(GaitMethod):
     """Attitude of a base with three or more joints of any kind, and the shape to end in.
 
@@ -54,43 +95,18 @@ class AreaLoopGait(GaitMethod):
 
     name: ClassVar[str] = "area_loop"
     controls: frozenset[Controlled] = frozenset({"attitude", "shape"})
-    options: ClassVar[tuple[Option, ...]] = (
-        Option("k", 0.15, "", "share of the missing turn that one cycle makes up for", 1e-3, 1.0),
-        Option("edge_time", 4.0, "s", "duration of an edge; slow joints take longer", 1e-3),
-        Option("largest_edge", 1.0, "m or rad", "longest edge of a loop", 1e-3, 10.0),
-        Option(
-            "nominal",
-            [],
-            "m or rad",
-            "nominal shape, all joints; []: the best",
-            -1e6,
-            1e6,
-            of_joints=True,
-        ),
-        Option(
-            "joints",
-            "",
-            "",
-            "the three joints, separated by spaces; '': the best three",
-            of_joints=True,
-        ),
-        Option("cycles_per_plan", 1, "", "cycles before the attitude is measured again", 1, 10_000),
-        Option("most_cycles", 1000, "", "cycles that a goal may take", 1, 1_000_000),
-        Option("longest", 100_000.0, "s", "longest manoeuvre that is still planned", 1.0),
-    )
+    Options: ClassVar[Any] = AreaLoopOptions
 
     def _prepare(self) -> None:
-        robot, chosen = self.robot, self._settings
-        self._k: float = chosen["k"]
-        self._edge_time: float = chosen["edge_time"]
-        self._longest: float = chosen["longest"]
+        robot, chosen = self.robot, self._options
+        self._k: float = chosen.k
+        self._edge_time: float = chosen.edge_time
+        self._longest: float = chosen.longest
         self._goal: Goal | None = None
         self._flown = 0
         # Planners exist before goals: an unsuitable robot is refused with the first one.
         self._refusal = self.objection(robot)
-        self._nominal = NominalChoice(
-            robot, chosen["largest_edge"], chosen["joints"], chosen["nominal"]
-        )
+        self._nominal = NominalChoice(robot, chosen.largest_edge, chosen.joints, chosen.nominal)
         self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)
         if not self._refusal and robot.n == 3:
             # No other joints rest anywhere: the choice need not wait for a shape.
@@ -130,7 +146,7 @@ class AreaLoopGait(GaitMethod):
         # The way from the nominal to the final shape turns the base too: aim that far beside.
         aside = self._turn(nominal, final)
         target = quaternion_multiply(goal.quaternion, quaternion_inverse(aside))
-        cycles_per_plan: int = self._settings["cycles_per_plan"]
+        cycles_per_plan: int = self._options.cycles_per_plan
         for planned in range(cycles_per_plan + 1):
             left = attitude_error(gait.attitudes[-1], target)
             if np.linalg.norm(left) <= self.tolerance.attitude:
@@ -197,7 +213,7 @@ class AreaLoopGait(GaitMethod):
         return many + max(1.0, math.log(unbounded / self.tolerance.attitude) / factor)
 
     def _require_few(self, cycles: float) -> None:
-        most = self._settings["most_cycles"]
+        most = self._options.most_cycles
         if cycles > most:
             raise PlanningError(
                 f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -27,7 +27,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     rotvec_from_quaternion,
 )
-from spacerobot_ros.options import Option
+from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.controllability import (
     WORST_CONDITION,
     best_triple,
@@ -50,33 +50,69 @@ _NO_ROTATION = 1e-9
 _NO_MOTION = 1e-9
 
 
+@dataclass(frozen=True)
+class LieBracketOptions:
+    """The options of ``lie_bracket``."""
+
+    t1: float = parameter(
+        100.0,
+        "duration of step 2, the slide to the final shape",
+        unit="s",
+        minimum=0.001,
+        maximum=1000000000.0,
+    )
+    n1: int = parameter(
+        10, "periods of the sin^2 velocity profile in step 2", minimum=1, maximum=10000
+    )
+    cycle_period: float = parameter(
+        3.0,
+        "duration of one cycle of step 3, (tf - t1) / n",
+        unit="s",
+        minimum=0.001,
+        maximum=1000000000.0,
+    )
+    cycles: int = parameter(
+        0, "n, the number of cycles of step 3; 0: by loop_area", minimum=0, maximum=100000000.0
+    )
+    loop_area: float = parameter(
+        0.04, "|alpha| / n when cycles is 0", unit="m^2", minimum=1e-09, maximum=1000000000.0
+    )
+    a22_ratio: float = parameter(
+        1.0,
+        "free amplitude a22 over sqrt(|a22 b12|); 1: balanced",
+        minimum=0.001,
+        maximum=1000000000.0,
+    )
+    a31_ratio: float = parameter(
+        1.0, "a31 over sqrt(|a31 (b21, b11)|); 1: balanced", minimum=0.001, maximum=1000000000.0
+    )
+    longest: float = parameter(
+        100000.0,
+        "longest manoeuvre that is still planned",
+        unit="s",
+        minimum=1.0,
+        maximum=1000000000.0,
+    )
+
+
 class LieBracketGait(GaitMethod):
     """Position and attitude of a base with three or more sliders, whose slots may be offset."""
 
     name: ClassVar[str] = "lie_bracket"
-    options: ClassVar[tuple[Option, ...]] = (
-        Option("t1", 100.0, "s", "duration of step 2, the slide to the final shape", 1e-3),
-        Option("n1", 10, "", "periods of the sin^2 velocity profile in step 2", 1, 10_000),
-        Option("cycle_period", 3.0, "s", "duration of one cycle of step 3, (tf - t1) / n", 1e-3),
-        Option("cycles", 0, "", "n, the number of cycles of step 3; 0: by loop_area", 0, 1e8),
-        Option("loop_area", 0.04, "m^2", "|alpha| / n when cycles is 0", 1e-9),
-        Option("a22_ratio", 1.0, "", "free amplitude a22 over sqrt(|a22 b12|); 1: balanced", 1e-3),
-        Option("a31_ratio", 1.0, "", "a31 over sqrt(|a31 (b21, b11)|); 1: balanced", 1e-3),
-        Option("longest", 100_000.0, "s", "longest manoeuvre that is still planned", 1.0),
-    )
+    Options: ClassVar[Any] = LieBracketOptions
 
     def _prepare(self) -> None:
-        robot, chosen = self.robot, self._settings
-        self.t1: float = chosen["t1"]
-        self.n1: int = chosen["n1"]
-        self.cycles: int = chosen["cycles"]
-        self.loop_area: float = chosen["loop_area"]
-        self.a22_ratio: float = chosen["a22_ratio"]
-        self.a31_ratio: float = chosen["a31_ratio"]
-        self.longest: float = chosen["longest"]
+        robot, chosen = self.robot, self._options
+        self.t1: float = chosen.t1
+        self.n1: int = chosen.n1
+        self.cycles: int = chosen.cycles
+        self.loop_area: float = chosen.loop_area
+        self.a22_ratio: float = chosen.a22_ratio
+        self.a31_ratio: float = chosen.a31_ratio
+        self.longest: float = chosen.longest
         # Whole ticks a cycle: every cycle is then the same commands and the same rotation.
         self.ticks_a_cycle = max(
-            round(chosen["cycle_period"] / self.tick_period), _FEWEST_TICKS_A_CYCLE
+            round(chosen.cycle_period / self.tick_period), _FEWEST_TICKS_A_CYCLE
         )
         self.sliders = sliders_of(robot)
         self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)

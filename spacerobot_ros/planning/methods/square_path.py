@@ -13,7 +13,8 @@ geometric phase, which depends on the path alone, is that of the smooth motion e
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_inverse, quaternion_multiply
-from spacerobot_ros.options import Option
+from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.core.planar import planar_axis
@@ -37,6 +38,56 @@ _WORTHWHILE = 0.1
 _NO_ROTATION = 1e-9
 
 
+@dataclass(frozen=True)
+class SquarePathOptions:
+    """The options of ``square_path``."""
+
+    t1: float = parameter(
+        8.0,
+        "end of step 1, the motion to the final shape",
+        unit="s",
+        minimum=0.001,
+        maximum=1000000000.0,
+    )
+    t2: float = parameter(
+        12.0,
+        "end of step 2, the motion to the square",
+        unit="s",
+        minimum=0.001,
+        maximum=1000000000.0,
+    )
+    t3: float = parameter(
+        20.0,
+        "end of step 3, one loop; more loops take as long each",
+        unit="s",
+        minimum=0.001,
+        maximum=1000000000.0,
+    )
+    t4: float = parameter(
+        24.0, "end of step 4, the motion back", unit="s", minimum=0.001, maximum=1000000000.0
+    )
+    most_loops: int = parameter(20, "loops that a turn may take", minimum=1, maximum=1000000)
+    given_centre: int = parameter(
+        0, "1: squares round (centre_1, centre_2); 0: the best", minimum=0, maximum=1
+    )
+    centre_1: float = parameter(
+        0.0, "first coordinate of a given centre", unit="rad", minimum=-1000.0, maximum=1000.0
+    )
+    centre_2: float = parameter(
+        0.0, "second coordinate of a given centre", unit="rad", minimum=-1000.0, maximum=1000.0
+    )
+    check_position: int = parameter(
+        0, "1: refuse goals that are not where the base ends", minimum=0, maximum=1
+    )
+    longest: float = parameter(
+        3600.0,
+        "longest manoeuvre that is still planned",
+        unit="s",
+        minimum=1.0,
+        maximum=1000000000.0,
+    )
+
+
 class SquarePathGait(GaitMethod):
     """Attitude and shape of planar trees of three or more links with joints that turn.
 
@@ -45,22 +96,11 @@ class SquarePathGait(GaitMethod):
 
     name: ClassVar[str] = "square_path"
     controls: frozenset[Controlled] = frozenset({"attitude", "shape"})
-    options: ClassVar[tuple[Option, ...]] = (
-        Option("t1", 8.0, "s", "end of step 1, the motion to the final shape", 1e-3),
-        Option("t2", 12.0, "s", "end of step 2, the motion to the square", 1e-3),
-        Option("t3", 20.0, "s", "end of step 3, one loop; more loops take as long each", 1e-3),
-        Option("t4", 24.0, "s", "end of step 4, the motion back", 1e-3),
-        Option("most_loops", 20, "", "loops that a turn may take", 1, 1_000_000),
-        Option("given_centre", 0, "", "1: squares round (centre_1, centre_2); 0: the best", 0, 1),
-        Option("centre_1", 0.0, "rad", "first coordinate of a given centre", -1e3, 1e3),
-        Option("centre_2", 0.0, "rad", "second coordinate of a given centre", -1e3, 1e3),
-        Option("check_position", 0, "", "1: refuse goals that are not where the base ends", 0, 1),
-        Option("longest", 3600.0, "s", "longest manoeuvre that is still planned", 1.0),
-    )
+    Options: ClassVar[Any] = SquarePathOptions
 
     def _prepare(self) -> None:
-        robot, chosen = self.robot, self._settings
-        t1, t2, t3, t4 = (float(chosen[name]) for name in ("t1", "t2", "t3", "t4"))
+        robot, chosen = self.robot, self._options
+        t1, t2, t3, t4 = chosen.t1, chosen.t2, chosen.t3, chosen.t4
         instants = (0.0, t1, t2, t3, t4)
         if not np.all(np.diff(instants) > 0):
             raise ParameterError(
@@ -75,9 +115,9 @@ class SquarePathGait(GaitMethod):
             # Planners exist before goals: the robot is refused with the first one.
             self._refusal = refusal
             return
-        centre = np.array([chosen["centre_1"], chosen["centre_2"]])
+        centre = np.array([chosen.centre_1, chosen.centre_2])
         self._search = SquareSearch(
-            robot, self._phase, chosen["most_loops"], centre if chosen["given_centre"] else None
+            robot, self._phase, chosen.most_loops, centre if chosen.given_centre else None
         )
         self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)
 
@@ -110,11 +150,11 @@ class SquarePathGait(GaitMethod):
             state.q,
             self._legs(psi_e, loop),
             self.tick_period,
-            self._settings["longest"],
+            self._options.longest,
         )
         path = self._prediction.path(state, positions)
         left = PoseError.between(path.position[-1], path.quaternion[-1], goal)
-        if self._settings["check_position"] and left.distance > self.tolerance.position:
+        if self._options.check_position and left.distance > self.tolerance.position:
             raise PlanningError(
                 f"The base will be at {np.round(path.position[-1], 4).tolist()} m, "
                 f"{left.distance:.3g} m from the goal position: without thrust, attitude and shape "

@@ -7,17 +7,16 @@ guesses with loops (:mod:`.initial_guesses`), made into held commands that end o
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.options import Option
+from spacerobot_ros.parameters import parameter, values_of
 from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.core.prediction import BasePrediction
@@ -34,6 +33,101 @@ _NOTHING_LEFT = 1e-10
 """A goal this near, rad, m and joint coordinates, is where the robot is."""
 
 
+@dataclass(frozen=True)
+class OptimalOptions:
+    """The options of ``optimal``."""
+
+    duration: float = parameter(
+        0.0,
+        "0: as fast as possible; else least effort in this time",
+        unit="s",
+        minimum=0.0,
+        maximum=1000000000.0,
+    )
+    max_velocity: tuple[float, ...] = parameter(
+        (),
+        "of every joint, below the URDF's; []: those",
+        unit="m/s or rad/s",
+        minimum=0.0,
+        maximum=1000000000.0,
+        of_joints=True,
+    )
+    max_acceleration: tuple[float, ...] = parameter(
+        (),
+        "of every joint; []: by ramp_time",
+        unit="m/s^2 or rad/s^2",
+        minimum=0.0,
+        maximum=1000000000.0,
+        of_joints=True,
+    )
+    ramp_time: float = parameter(
+        0.5,
+        "from rest to full speed, without max_acceleration",
+        unit="s",
+        minimum=1e-06,
+        maximum=1000000000.0,
+    )
+    joint_margin: tuple[float, ...] = parameter(
+        (),
+        "of every joint to its stops; not in corrections",
+        unit="m or rad",
+        minimum=0.0,
+        maximum=1000000000.0,
+        of_joints=True,
+    )
+    base_position: int = parameter(
+        0, "0: met if sliders can, 1: met, 2: ignored", minimum=0, maximum=2
+    )
+    base_attitude: int = parameter(1, "1: met, 0: ignored", minimum=0, maximum=1)
+    final_shape: int = parameter(
+        0, "without one in the goal: 0: any, 1: the present one", minimum=0, maximum=1
+    )
+    max_base_rate: float = parameter(
+        0.0, "fastest turn of the base; 0: any", unit="rad/s", minimum=0.0, maximum=1000000000.0
+    )
+    keep_axis: tuple[float, ...] = parameter(
+        (),
+        "direction in the base that is kept away ...",
+        minimum=-1000000000.0,
+        maximum=1000000000.0,
+    )
+    keep_direction: tuple[float, ...] = parameter(
+        (), "... from this direction in the world ...", minimum=-1000000000.0, maximum=1000000000.0
+    )
+    keep_angle: float = parameter(
+        0.0, "... by this angle", unit="rad", minimum=0.0, maximum=3.141592653589793
+    )
+    keep_out: tuple[float, ...] = parameter(
+        (),
+        "boxes of shapes: lower, then upper corner",
+        unit="m or rad",
+        minimum=-1000000000.0,
+        maximum=1000000000.0,
+    )
+    intervals: int = parameter(
+        80, "steps of the optimal control problem", minimum=10, maximum=10000
+    )
+    starts: int = parameter(12, "guesses that are tried at most", minimum=1, maximum=10000)
+    answers: int = parameter(
+        3, "manoeuvres to find, of which the fastest is flown", minimum=1, maximum=10000
+    )
+    time_budget: float = parameter(
+        8.0,
+        "wall time to search; 5 times that if nothing is found",
+        unit="s",
+        minimum=0.1,
+        maximum=1000000000.0,
+    )
+    longest: float = parameter(
+        3600.0,
+        "longest manoeuvre that is still planned",
+        unit="s",
+        minimum=1.0,
+        maximum=1000000000.0,
+    )
+    cache: int = parameter(1, "1: manoeuvres are kept on disk", minimum=0, maximum=1)
+
+
 class OptimalGait(GaitMethod):
     """Minimum time, or least effort in a given time, from rest to rest.
 
@@ -42,71 +136,31 @@ class OptimalGait(GaitMethod):
     """
 
     name: ClassVar[str] = "optimal"
-    options: ClassVar[tuple[Option, ...]] = (
-        Option("duration", 0.0, "s", "0: as fast as possible; else least effort in this time"),
-        Option(
-            "max_velocity",
-            [],
-            "m/s or rad/s",
-            "of every joint, below the URDF's; []: those",
-            of_joints=True,
-        ),
-        Option(
-            "max_acceleration",
-            [],
-            "m/s^2 or rad/s^2",
-            "of every joint; []: by ramp_time",
-            of_joints=True,
-        ),
-        Option("ramp_time", 0.5, "s", "from rest to full speed, without max_acceleration", 1e-6),
-        Option(
-            "joint_margin",
-            [],
-            "m or rad",
-            "of every joint to its stops; not in corrections",
-            of_joints=True,
-        ),
-        Option("base_position", 0, "", "0: met if sliders can, 1: met, 2: ignored", 0, 2),
-        Option("base_attitude", 1, "", "1: met, 0: ignored", 0, 1),
-        Option("final_shape", 0, "", "without one in the goal: 0: any, 1: the present one", 0, 1),
-        Option("max_base_rate", 0.0, "rad/s", "fastest turn of the base; 0: any"),
-        Option("keep_axis", [], "", "direction in the base that is kept away ...", -1e9),
-        Option("keep_direction", [], "", "... from this direction in the world ...", -1e9),
-        Option("keep_angle", 0.0, "rad", "... by this angle", 0.0, math.pi),
-        Option("keep_out", [], "m or rad", "boxes of shapes: lower, then upper corner", -1e9, 1e9),
-        Option("intervals", 80, "", "steps of the optimal control problem", 10, 10_000),
-        Option("starts", 12, "", "guesses that are tried at most", 1, 10_000),
-        Option("answers", 3, "", "manoeuvres to find, of which the fastest is flown", 1, 10_000),
-        Option(
-            "time_budget", 8.0, "s", "wall time to search; 5 times that if nothing is found", 0.1
-        ),
-        Option("longest", 3600.0, "s", "longest manoeuvre that is still planned", 1.0),
-        Option("cache", 1, "", "1: manoeuvres are kept on disk", 0, 1),
-    )
+    Options: ClassVar[Any] = OptimalOptions
 
     def _prepare(self) -> None:
-        robot, chosen = self.robot, self._settings
+        robot, chosen = self.robot, self._options
         self._wishes = Wishes.of(
-            robot, chosen["base_position"], chosen["base_attitude"], chosen["final_shape"]
+            robot, chosen.base_position, chosen.base_attitude, chosen.final_shape
         )
         self.controls = self._wishes.controls
         self._limits = MotionLimits.of(
-            robot, chosen["max_velocity"], chosen["max_acceleration"], chosen["ramp_time"]
+            robot, chosen.max_velocity, chosen.max_acceleration, chosen.ramp_time
         )
-        self._margin = _margin(robot, chosen["joint_margin"])
+        self._margin = _margin(robot, chosen.joint_margin)
         self._constraints = PathConstraints.of(
             robot,
-            chosen["max_base_rate"],
-            chosen["keep_axis"],
-            chosen["keep_direction"],
-            chosen["keep_angle"],
-            chosen["keep_out"],
+            chosen.max_base_rate,
+            chosen.keep_axis,
+            chosen.keep_direction,
+            chosen.keep_angle,
+            chosen.keep_out,
         )
         self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)
         self._search = ManoeuvreSearch(
             robot, self._prediction, self.tick_period, self._wishes.axes, self._constraints
         )
-        self._cache = PlanCache() if chosen["cache"] else None
+        self._cache = PlanCache() if chosen.cache else None
 
     @classmethod
     def objection(cls, robot: SpaceRobot) -> str:
@@ -147,17 +201,17 @@ class OptimalGait(GaitMethod):
         return schedule
 
     def _intervals(self, correction: bool) -> int:
-        intervals = int(self._settings["intervals"])
+        intervals = int(self._options.intervals)
         return min(intervals, _CORRECTION_INTERVALS) if correction else intervals
 
     def _effort(self, correction: bool) -> Effort:
-        chosen = self._settings
+        chosen = self._options
         return Effort(
-            duration=0.0 if correction else chosen["duration"],
-            longest=chosen["longest"],
-            starts=chosen["starts"],
-            answers=1 if correction else chosen["answers"],
-            time_budget=chosen["time_budget"],
+            duration=0.0 if correction else chosen.duration,
+            longest=chosen.longest,
+            starts=chosen.starts,
+            answers=1 if correction else chosen.answers,
+            time_budget=chosen.time_budget,
             gentle=correction,
         )
 
@@ -190,7 +244,7 @@ class OptimalGait(GaitMethod):
             "tolerance": np.array([self.tolerance.position, self.tolerance.attitude]),
             **vars(self._limits),
         }
-        return plan_key(self.robot, numbers, self._settings)
+        return plan_key(self.robot, numbers, values_of(self._options))
 
     def _kept(self, goal: Goal, kept: Mapping[str, Array]) -> GaitSchedule:
         path = BasePath(*(kept[f"path_{part}"] for part in _PATH))

@@ -220,5 +220,6 @@ while True:
     assert found == list(range(len(found)))
     # A chunk of 64 KiB holds about 500 of these.
     assert len(found) >= written - 600
-    with pytest.raises(EndOfFile), (tmp_path / "a.mcap").open("rb") as file:
+    # Which of the two depends on where in a record the file ends.
+    with pytest.raises((EndOfFile, struct.error)), (tmp_path / "a.mcap").open("rb") as file:
         list(StreamReader(file).records)

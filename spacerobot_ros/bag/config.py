@@ -1,0 +1,54 @@
+"""The parameters of recorder and replay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from spacerobot_ros.parameters import parameter
+
+
+@dataclass(frozen=True)
+class RecorderConfig:
+    """What is recorded, and how the file is written."""
+
+    bag: str = parameter("", "file to write; '': spacerobot-<date>-<time>.mcap here")
+    topics: str = parameter("", "names to record, separated by spaces; '': all of the stack")
+    compression: str = parameter("zstd", "of the bag's chunks", choices=("zstd", "lz4", "none"))
+    clock_wait: float = parameter(
+        2.0, "wall time to wait for a clock before using the wall's", unit="s"
+    )
+    describe: str = parameter("", "JSON file of named objects to put into the bag as metadata")
+    diagnostics_period: float = parameter(
+        0.0, "wall time between diagnostics; 0: losses only", unit="s", minimum=0.0
+    )
+    flush_period: float = parameter(
+        0.5, "wall time that a kill can lose at most", unit="s", minimum=0.01
+    )
+    max_size: float = parameter(
+        0.0, "begin the next file (NAME_0, NAME_1, ...) at; 0: never", unit="MB", minimum=0.0
+    )
+    max_duration: float = parameter(
+        0.0, "bag time in a file, likewise; 0: never", unit="s", minimum=0.0
+    )
+
+
+@dataclass(frozen=True)
+class ReplayConfig:
+    """What is replayed, and how fast."""
+
+    bag: str = parameter("", "MCAP file to replay, or a folder with one")
+    rate: float = parameter(1.0, "bag time over wall time", minimum=0.001, maximum=1000000.0)
+    start: float = parameter(0.0, "where to begin, from the first message", unit="s", minimum=0.0)
+    duration: float = parameter(0.0, "how much of the bag to replay; 0: all", unit="s", minimum=0.0)
+    loop: bool = parameter(False, "begin again at the end")
+    topics: str = parameter("", "names to replay, separated by spaces; '': all")
+    remap: str = parameter("", "other names for topics: 'old:=new', separated by spaces")
+    clock: float = parameter(
+        0.0,
+        "publish bag time on /clock so often; 0: what the bag has",
+        unit="Hz",
+        minimum=0.0,
+        maximum=10000.0,
+    )
+    paused: bool = parameter(False, "begin paused")
+    wait: float = parameter(3.0, "longest wall time to wait for readers", unit="s", minimum=0.0)

@@ -1,0 +1,91 @@
+"""The parameters of the planner."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from spacerobot_ros.model.robot_source import BelievedRobotConfig
+from spacerobot_ros.parameters import parameter, registered
+from spacerobot_ros.planning.core.goal import Tolerance
+from spacerobot_ros.planning.methods.registry import METHODS
+
+
+@dataclass(frozen=True)
+class PlannerConfig(BelievedRobotConfig):
+    """How a planner plans, flies and corrects."""
+
+    method: str = parameter("auto", "gait method", choices=tuple(METHODS))
+    tick_rate: float = parameter(
+        20.0, "commands a second; the plant's", unit="Hz", minimum=0.001, maximum=100000.0
+    )
+    integration_step: float = parameter(
+        0.01, "longest step of the prediction", unit="s", minimum=1e-06
+    )
+    world_frame: str = parameter("world", "frame that goals must be given in")
+    position_tolerance: float = parameter(
+        0.001, "a goal is met within", unit="m", minimum=0.0, read_only=False
+    )
+    attitude_tolerance: float = parameter(
+        0.001, "a goal is met within", unit="rad", minimum=0.0, read_only=False
+    )
+    joint_tolerance: float = parameter(
+        0.001, "a shape is met within", unit="m or rad", minimum=0.0, read_only=False
+    )
+    output: str = parameter(
+        "commands",
+        "joint_commands (velocities) for the plant, or joint_reference for a controller",
+        choices=("commands", "reference"),
+    )
+    max_corrections: int = parameter(
+        3, "new plans after the first", minimum=0, maximum=1000, read_only=False
+    )
+    abort_time: float = parameter(
+        1.0,
+        "to rest along the gait after ~/abort, or for another goal",
+        unit="s",
+        minimum=0.01,
+        maximum=1000.0,
+    )
+    drift_position: float = parameter(
+        0.0, "farther off the path the rest is planned again; 0: never", unit="m", minimum=0.0
+    )
+    drift_attitude: float = parameter(0.0, "likewise", unit="rad", minimum=0.0)
+    shape_gain: float = parameter(
+        2.0, "feedback on the shape while flying", unit="1/s", minimum=0.0, maximum=1000.0
+    )
+    shape_deadband: float = parameter(
+        0.0, "shape errors up to this are noise: no feedback", unit="m or rad", minimum=0.0
+    )
+    averaging: int = parameter(
+        1,
+        "measured states at rest that are averaged to plan and to judge",
+        minimum=1,
+        maximum=1000000.0,
+    )
+    rest_tolerance: float = parameter(
+        0.0,
+        "measured rates up to this are noise about rest; 0: all count",
+        unit="m/s or rad/s",
+        minimum=0.0,
+    )
+    stuck_ticks: int = parameter(
+        40,
+        "ticks of commanded motion after which a joint that does not follow is stuck; 0: never",
+        minimum=0,
+        maximum=1000000.0,
+    )
+    plan_in_background: bool = parameter(
+        False,
+        "plan in a thread from a robot at rest and go on answering; false: states wait (lockstep)",
+    )
+    resume_file: str = parameter(
+        "", "keeps the present goal for a planner that starts again; '': none"
+    )
+    options: Mapping[str, Any] = registered(METHODS)
+
+    @property
+    def tolerance(self) -> Tolerance:
+        """How near to the goal is near enough."""
+        return Tolerance(self.position_tolerance, self.attitude_tolerance, self.joint_tolerance)

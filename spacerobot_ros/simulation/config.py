@@ -1,0 +1,118 @@
+"""The parameters of the plant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from spacerobot_ros.model.robot_source import RobotConfig
+from spacerobot_ros.parameters import group, parameter
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """How the sensors err: 1 sigma of their noise, their biases, and the seed."""
+
+    position_noise: float = parameter(
+        0.0, "1 sigma an axis of odom, in world", unit="m", minimum=0.0
+    )
+    attitude_noise: float = parameter(
+        0.0, "likewise, a rotation vector in base", unit="rad", minimum=0.0
+    )
+    velocity_noise: float = parameter(0.0, "likewise, of the twist", unit="m/s", minimum=0.0)
+    angular_velocity_noise: float = parameter(0.0, "likewise", unit="rad/s", minimum=0.0)
+    joint_noise: float = parameter(
+        0.0, "1 sigma of every joint position", unit="m or rad", minimum=0.0
+    )
+    joint_rate_noise: float = parameter(
+        0.0, "of every joint velocity", unit="m/s or rad/s", minimum=0.0
+    )
+    position_bias: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0), "of odom, in world", unit="m", length=3
+    )
+    attitude_bias: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0), "rotation vector in base", unit="rad", length=3
+    )
+    joint_bias: tuple[float, ...] = parameter(
+        (), "by joint order of the URDF; []: none", unit="m or rad"
+    )
+    seed: int = parameter(0, "of the noise of sensors and actuators", minimum=0)
+
+
+@dataclass(frozen=True)
+class PlantConfig(RobotConfig):
+    """What a plant is: actuation, time, limits, initial state, faults, sensors."""
+
+    actuation: str = parameter(
+        "velocity", "what joint_commands carry", choices=("velocity", "effort")
+    )
+    time_mode: str = parameter("realtime", "who drives time", choices=("realtime", "lockstep"))
+    tick_rate: float = parameter(
+        20.0, "ticks a second of simulated time", unit="Hz", minimum=0.001, maximum=100000.0
+    )
+    real_time_factor: float = parameter(
+        1.0, "simulated over wall time", minimum=0.001, maximum=1000.0
+    )
+    command_timeout: float = parameter(
+        0.5, "realtime: older commands stop the joints; 0: never", unit="s", minimum=0.0
+    )
+    beyond_limits: str = parameter(
+        "clip", "commands beyond the rate or effort limits of the URDF", choices=("clip", "refuse")
+    )
+    second_commander: str = parameter(
+        "refuse",
+        "realtime: a second answer to the same state, from another commander",
+        choices=("refuse", "accept"),
+    )
+    latched_faults: str = parameter(
+        "second_commander",
+        "reasons to refuse a command after which nothing moves until ~/rearm, separated by "
+        "spaces: malformed not_finite stale early out_of_order beyond_limits second_commander",
+    )
+    integration_step: float = parameter(
+        0.0, "longest step; 0: 0.01 (velocity), 0.001 (effort)", unit="s", minimum=0.0
+    )
+    thrusters: str = parameter("", "'urdf': those of the robot's URDF; a YAML file; '': any wrench")
+    thrusters_excluded: str = parameter(
+        "", "names of thrusters that are not used, separated by spaces"
+    )
+    world_frame: str = parameter("world", "name of the inertial frame")
+    end_effector_frame: str = parameter("", "link of end_effector_pose; '': 'end_effector', if any")
+    base_pose_period: float = parameter(
+        0.0, "simulated time between base_pose; 0: every tick", unit="s", minimum=0.0
+    )
+    marker_period: float = parameter(
+        0.5, "simulated time between markers; 0: none", unit="s", minimum=0.0
+    )
+    diagnostics_period: float = parameter(
+        1.0, "simulated time between diagnostics; 0: none", unit="s", minimum=0.0
+    )
+    resume_bag: str = parameter(
+        "", "bag from whose last state and time to go on; '': the initial state"
+    )
+    initial_position: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0), "base link in the world", unit="m", length=3
+    )
+    initial_orientation: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0, 1.0), "quaternion x, y, z, w", length=4
+    )
+    initial_joint_positions: tuple[float, ...] = parameter(
+        (), "by joint order of the URDF; []: zero", unit="m or rad"
+    )
+    initial_joint_velocities: tuple[float, ...] = parameter(
+        (), "likewise, under efforts; []: zero", unit="m/s or rad/s"
+    )
+    initial_center_of_mass: tuple[float, ...] = parameter(
+        (), "of the system in the world, instead of initial_position", unit="m", length=3
+    )
+    linear_momentum: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0), "total, in world", unit="kg m/s", length=3
+    )
+    angular_momentum: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0), "total, about the centre of mass, in world", unit="kg m^2/s", length=3
+    )
+    faults: tuple[str, ...] = parameter(
+        (),
+        "what goes wrong and when, e.g. 'joint_stuck joint_2 at 10 until 50'; see docs/faults.md",
+        texts=True,
+    )
+    sensors: SensorConfig = group(SensorConfig())
