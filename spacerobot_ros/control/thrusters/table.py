@@ -1,7 +1,7 @@
 """The thrusters of a robot: where they sit, which way they push, how hard, for how long at least.
 
 A table is read from ``<thruster>`` elements of a URDF, which other programs pass over, or from a
-YAML file; docs/thrusters.md shows both.
+YAML file; docs/theory/thrusters.md shows both.
 """
 
 from __future__ import annotations
