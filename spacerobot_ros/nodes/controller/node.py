@@ -40,9 +40,13 @@ from spacerobot_ros.nodes.common.goal_messages import goal_of
 from spacerobot_ros.nodes.common.joint_command import JointReader
 from spacerobot_ros.nodes.common.node import STREAM, run_node
 from spacerobot_ros.nodes.common.robot_node import RobotNode
+from spacerobot_ros.nodes.common.state_synchroniser import Pairing, StateSynchroniser
 from spacerobot_ros.nodes.controller.goals import END_EFFECTOR, ControlGoals, require_controlled
 from spacerobot_ros.nodes.controller.status import ControllerState, ControllerStatus
 from spacerobot_ros.nodes.plant.plant_topics import DEFAULT_END_EFFECTOR
+
+JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
+"""Topics of references from outside; where one has a publisher, every state waits for it."""
 
 
 class CoordinatedControlNode(RobotNode):
@@ -63,11 +67,8 @@ class CoordinatedControlNode(RobotNode):
 
     def configure(self) -> None:
         """Create the topics; without a robot of its own the node waits for robot_description."""
-        self._odom_raw = self._joints_raw = b""
-        self._reference_raw = self._base_reference_raw = b""
-        self._odom_fresh = self._joints_fresh = self._hold = False
-        self._blind = False
-        """Whether odom has failed to come: states are answered without it until it does."""
+        self._states = StateSynchroniser(pose_required=True)
+        self._hold = False
         self._goals = ControlGoals(str(self.parameters["resume_file"]))
         self._odom = TemplateReader(
             Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
@@ -85,11 +86,9 @@ class CoordinatedControlNode(RobotNode):
         )
         self.create_subscription(Odometry, "odom", self._on_odom, STREAM, raw=True)
         self.create_subscription(JointState, "joint_states", self._on_joints, STREAM, raw=True)
+        self.create_subscription(JointState, JOINT_REFERENCE, self._on_reference, STREAM, raw=True)
         self.create_subscription(
-            JointState, "joint_reference", self._on_reference, STREAM, raw=True
-        )
-        self.create_subscription(
-            Odometry, "base_reference", self._on_base_reference, STREAM, raw=True
+            Odometry, BASE_REFERENCE, self._on_base_reference, STREAM, raw=True
         )
         self.create_service(Trigger, "~/abort", self._on_abort)
 
@@ -98,8 +97,8 @@ class CoordinatedControlNode(RobotNode):
         if self._goals.recall(None if self._robot is None else self.controller.law):
             self.get_logger().info("Going on to an earlier goal.")
         self._running = True
-        self._joints_driven = self.count_publishers("joint_reference") > 0
-        self._base_driven = self.count_publishers("base_reference") > 0
+        for topic in (JOINT_REFERENCE, BASE_REFERENCE):
+            self._states.require(topic, required=self.count_publishers(topic) > 0)
         self._status.begin()
         # A lockstep plant may have been waiting for an answer since before.
         self._on_part()
@@ -196,46 +195,31 @@ class CoordinatedControlNode(RobotNode):
         self._goals.give(group, goal)
 
     def _on_odom(self, raw: bytes) -> None:
-        self._odom_raw = raw
-        self._odom_fresh = True
-        self._blind = False
+        self._states.put_odom(raw)
         self._on_part()
 
     def _on_joints(self, raw: bytes) -> None:
-        if self._joints_fresh and self._running and self._robot is not None:
-            # The tick before was not answered: its odom is missing, or whoever gives references
-            # is silent.
-            self._blind = self._odom_raw[4:12] != self._joints_raw[4:12]
+        overdue = self._states.overdue() if self._running and self._robot is not None else None
+        if overdue is not None:
             # An answer to a lost pose would come a tick late; what it estimates goes on from there.
-            self._on_state(measured=not self._blind, send=not self._blind)
-        self._joints_raw = raw
-        self._joints_fresh = True
+            self._on_state(overdue, send=overdue is Pairing.WHOLE)
+        self._states.put_joint_states(raw)
         self._on_part()
 
     def _on_reference(self, raw: bytes) -> None:
-        self._reference_raw = raw
-        self._joints_driven = True
+        self._states.put_required(JOINT_REFERENCE, raw)
         self._on_part()
 
     def _on_base_reference(self, raw: bytes) -> None:
-        self._base_reference_raw = raw
-        self._base_driven = True
+        self._states.put_required(BASE_REFERENCE, raw)
         self._on_part()
 
     def _on_part(self) -> None:
         """Answer a state once, as soon as all its messages are there and the node is."""
-        stamp = self._joints_raw[4:12]
-        if (
-            self._running
-            and (self._odom_fresh or self._blind)
-            and self._joints_fresh
-            and self._robot is not None
-            and (self._blind or stamp == self._odom_raw[4:12])
-            and (not self._joints_driven or stamp == self._reference_raw[4:12])
-            and (not self._base_driven or stamp == self._base_reference_raw[4:12])
-        ):
-            self._odom_fresh = self._joints_fresh = False
-            self._on_state(measured=not self._blind)
+        if self._running and self._robot is not None:
+            pairing = self._states.ready()
+            if pairing is not None:
+                self._on_state(pairing)
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self._running and self._robot is not None
@@ -248,18 +232,19 @@ class CoordinatedControlNode(RobotNode):
 
     # -- flying -------------------------------------------------------------------------------
 
-    def _on_state(self, *, measured: bool, send: bool = True) -> None:
+    def _on_state(self, pairing: Pairing, *, send: bool = True) -> None:
         """Answer one state with one command of the same stamp."""
         try:
-            stamp = self._joints.accept(self._joints_raw)
+            stamp = self._joints.accept(self._states.joint_states)
             q, qdot = self._joints.values["position"], self._joints.values["velocity"]
             now = stamp / NANOSECONDS
-            state = self._measured(q, qdot) if measured else None
+            state = self._measured(q, qdot) if pairing is Pairing.WHOLE else None
             if state is not None:
                 self._take_goals(now, state)
-            if self._joints_driven or self._base_driven:
+            base, joints = self._states.latest(BASE_REFERENCE), self._states.latest(JOINT_REFERENCE)
+            if base or joints:
                 self.controller.follow(
-                    Reference(base=self._given_base(), joints=self._given_joints())
+                    Reference(base=self._given_base(base), joints=self._given_joints(joints))
                 )
             result = self.controller.command(now, state, q, qdot)
         except (CommandError, NotFiniteError) as error:
@@ -271,12 +256,11 @@ class CoordinatedControlNode(RobotNode):
             stamped = stamp_bytes(stamp)
             self._base_wrench.take(self._wrench_message.serialised(stamped))
             self._joint_commands.take(self._joint_message.serialised(stamped))
-        self._joints_fresh = False
         if self._status.update(now, self.controller, result):
             self._goals.forget()
 
     def _measured(self, q: Any, qdot: Any) -> ControlState:
-        self._odom.accept(self._odom_raw)
+        self._odom.accept(self._states.odom)
         pose = self._odom.floats("pose.pose.position.x")
         twist = self._odom.floats("twist.twist.linear.x")
         return ControlState(pose[:3], pose[3:], twist[:3], twist[3:], q, qdot)
@@ -298,11 +282,11 @@ class CoordinatedControlNode(RobotNode):
             except ParameterError as error:
                 self.get_logger().error(f"{error} The goal is flown, but would not be resumed.")
 
-    def _given_joints(self) -> JointReference | None:
+    def _given_joints(self, raw: bytes) -> JointReference | None:
         """Return the joint reference of this tick, whose velocities are held over it."""
-        if not self._reference_raw:
+        if not raw:
             return None
-        self._references.accept(self._reference_raw)
+        self._references.accept(raw)
         held = self._references.values["velocity"].copy()
         before = self._reference_rate if self._reference_rate is not None else held
         self._reference_rate = held
@@ -312,11 +296,11 @@ class CoordinatedControlNode(RobotNode):
             (held - before) / self._period,
         )
 
-    def _given_base(self) -> PoseReference | None:
+    def _given_base(self, raw: bytes) -> PoseReference | None:
         """Return the base reference of this tick; an Odometry's twist is in the base."""
-        if not self._base_reference_raw:
+        if not raw:
             return None
-        self._base_reference.accept(self._base_reference_raw)
+        self._base_reference.accept(raw)
         pose = self._base_reference.floats("pose.pose.position.x")
         twist = self._base_reference.floats("twist.twist.linear.x")
         R_WB = matrix_from_quaternion(pose[3:])
