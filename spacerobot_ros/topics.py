@@ -1,0 +1,324 @@
+"""The topics of the stack in one table, from which publishers, reports and documents are made.
+
+Of the topics on which the plant publishes its state the table also says which numbers they carry:
+the plant's publisher and the re-simulation of a bag read it. A new one is an entry here and a
+quantity in :mod:`spacerobot_ros.simulation.reported_state`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+_POSE = (*(f"position.{x}" for x in "xyz"), *(f"orientation.{x}" for x in "xyzw"))
+_TWIST = (*(f"linear.{x}" for x in "xyz"), *(f"angular.{x}" for x in "xyz"))
+_WRENCH = (*(f"force.{x}" for x in "xyz"), *(f"torque.{x}" for x in "xyz"))
+_MOMENTA = ("linear_x", "linear_y", "linear_z", "angular_x", "angular_y", "angular_z")
+
+
+@dataclass(frozen=True)
+class StateField:
+    """Numbers of a state topic that lie side by side in the message.
+
+    Attributes
+    ----------
+    path
+        Where they are in the message: a part with numbers in it, or an array.
+    quantity
+        What they are: a name in :attr:`~spacerobot_ros.simulation.reported_state.ReportedState.
+        quantities`.
+    members
+        The numbers of the part at ``path``, in their order; empty for an array.
+    entries
+        What the entries of an array are called; empty: it has one for each joint, or whatever the
+        topic is about.
+    """
+
+    path: str
+    quantity: str
+    members: tuple[str, ...] = ()
+    entries: tuple[str, ...] = ()
+
+    @property
+    def columns(self) -> list[str]:
+        """Paths of the numbers in a message, or that of the array."""
+        return [f"{self.path}.{member}" for member in self.members] or [self.path]
+
+    def labels(self, names: Sequence[str]) -> list[str]:
+        """Return what each number is called; ``names`` are of the joints, or whatever it is of."""
+        if self.members:
+            return self.columns
+        return [entry.replace("_", " ") for entry in self.entries] or [
+            f"{self.path} of {name}" for name in names
+        ]
+
+    @property
+    def quaternion(self) -> int | None:
+        """Which of the numbers is the first of a quaternion, if there is one."""
+        first = "orientation.x"
+        return self.members.index(first) if first in self.members else None
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic.
+
+    Attributes
+    ----------
+    name
+        Below the namespace of its robot, or absolute.
+    type
+        Name of the message type, such as ``nav_msgs/msg/Odometry``.
+    publishers
+        The nodes that publish it; ``user`` for what comes from outside the stack.
+    meaning
+        What it says, for people.
+    when
+        Under which condition it is there; empty: always.
+    latched
+        Whether a late subscriber gets the last message (reliable, transient local, depth 1).
+    state
+        The numbers of a state of the plant; empty for other topics.
+    frame
+        The frame of the header of a state topic: ``world`` or ``base``.
+    of
+        What the arrays of a state topic have entries for: ``joints`` or ``thrusters``.
+    every_tick
+        Whether a state topic is published in every tick, or every ``base_pose_period``.
+    verified
+        Whether the re-simulation of a bag compares its numbers.
+    """
+
+    name: str
+    type: str
+    publishers: tuple[str, ...]
+    meaning: str
+    when: str = ""
+    latched: bool = False
+    state: tuple[StateField, ...] = ()
+    frame: str = "world"
+    of: str = "joints"
+    every_tick: bool = True
+    verified: bool = True
+
+    @property
+    def short_type(self) -> str:
+        """The type as ROS documents print it: ``nav_msgs/Odometry``."""
+        return self.type.replace("/msg/", "/")
+
+
+def _joint_states(prefix: str) -> tuple[StateField, ...]:
+    return (
+        StateField("position", f"{prefix}_q"),
+        StateField("velocity", f"{prefix}_qdot"),
+        StateField("effort", "effort"),
+    )
+
+
+def _odometry(prefix: str) -> tuple[StateField, ...]:
+    return (
+        StateField("pose.pose", f"{prefix}_pose", _POSE),
+        StateField("twist.twist", f"{prefix}_twist", _TWIST),
+    )
+
+
+_PLANT = ("plant",)
+_USER = ("user",)
+_ARRAY = "std_msgs/msg/Float64MultiArray"
+_JOINTS = "sensor_msgs/msg/JointState"
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+_STATUS = "diagnostic_msgs/msg/DiagnosticStatus"
+_STRING = "std_msgs/msg/String"
+_WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
+
+# The plant publishes its state in this order: the clock first, so that a subscriber that sees a
+# state has seen its time; odom and joint_states late, because they set the commanders off.
+_TABLE = (
+    Topic("/clock", "rosgraph_msgs/msg/Clock", _PLANT, "simulated time"),
+    Topic(
+        "base_pose",
+        _POSE_STAMPED,
+        _PLANT,
+        "pose of the base link in the world: the truth, every `base_pose_period`",
+        state=(StateField("pose", "pose", _POSE),),
+        every_tick=False,
+    ),
+    Topic(
+        "end_effector_pose",
+        _POSE_STAMPED,
+        _PLANT,
+        "pose of the link `end_effector_frame` in the world: the truth",
+        when="the robot has that link",
+        state=(StateField("pose", "end_effector_pose", _POSE),),
+    ),
+    Topic(
+        "momentum",
+        _ARRAY,
+        _PLANT,
+        "linear momentum (kg m/s), angular momentum about the centre of mass (kg m^2/s), both in "
+        "the world, and kinetic energy (J), summed over the bodies",
+        state=(StateField("data", "momentum", entries=(*_MOMENTA, "kinetic_energy")),),
+    ),
+    Topic(
+        "momentum_expected",
+        _ARRAY,
+        _PLANT,
+        "what the momenta should be: those of the beginning, and what the thrusters put in",
+        when="actuation is effort",
+        state=(StateField("data", "expected_momenta", entries=_MOMENTA),),
+    ),
+    Topic(
+        "odom_true",
+        _ODOMETRY,
+        _PLANT,
+        "the truth beside what odom then measures",
+        when="the sensors err",
+        state=_odometry("true"),
+        verified=False,
+    ),
+    Topic(
+        "joint_states_true",
+        _JOINTS,
+        _PLANT,
+        "the truth beside what joint_states then measures",
+        when="the sensors err",
+        state=_joint_states("true"),
+        frame="base",
+        verified=False,
+    ),
+    Topic(
+        "odom",
+        _ODOMETRY,
+        _PLANT,
+        "measured pose of the base link in the world, and its twist in its own frame",
+        state=_odometry("measured"),
+    ),
+    Topic(
+        "joint_states",
+        _JOINTS,
+        _PLANT,
+        "measured positions and velocities of the joints, and the efforts of their actuators",
+        state=_joint_states("measured"),
+        frame="base",
+    ),
+    Topic(
+        "base_wrench_realised",
+        _WRENCH_STAMPED,
+        _PLANT,
+        "what the thrusters gave of base_wrench in the last tick, on average",
+        when="`thrusters` is set",
+        state=(StateField("wrench", "thruster_wrench", _WRENCH),),
+        frame="base",
+        verified=False,
+    ),
+    Topic(
+        "thrusters",
+        _JOINTS,
+        _PLANT,
+        "of each thruster by name: position, for how long it was on since the beginning (s); "
+        "velocity, for what part of the last tick; effort, its mean force in it (N)",
+        when="`thrusters` is set",
+        state=(
+            StateField("position", "thruster_on_time"),
+            StateField("velocity", "thruster_duty"),
+            StateField("effort", "thruster_force"),
+        ),
+        frame="base",
+        of="thrusters",
+        # On-times go on from before the first state of a bag.
+        verified=False,
+    ),
+    Topic("robot_description", _STRING, _PLANT, "the URDF of the robot", latched=True),
+    Topic(
+        "markers",
+        "visualization_msgs/msg/MarkerArray",
+        ("plant", "planner"),
+        "links, goal and planned path, for viewers",
+    ),
+    Topic(
+        "/diagnostics",
+        "diagnostic_msgs/msg/DiagnosticArray",
+        ("plant", "recorder"),
+        "refused commands, limits, momentum, faults, deadlines; what was recorded and lost",
+    ),
+    Topic(
+        "fault_injection",
+        _STRING,
+        _USER,
+        "faults for the plant, one a line, or `clear`",
+    ),
+    Topic(
+        "joint_commands",
+        _JOINTS,
+        ("planner", "coordinated_control"),
+        "velocities or efforts (by `actuation`), by joint name, stamped with the state that they "
+        "answer",
+    ),
+    Topic(
+        "base_wrench",
+        _WRENCH_STAMPED,
+        ("coordinated_control",),
+        "thruster force and torque wanted at the origin of the base link, in its frame",
+    ),
+    Topic("goal_pose", _POSE_STAMPED, _USER, "where the base is to be, in the world"),
+    Topic("goal_joint_states", _JOINTS, _USER, "the shape that later goals are to end in"),
+    Topic(
+        "end_effector/goal_pose",
+        _POSE_STAMPED,
+        _USER,
+        "where the end-effector is to be, in the world",
+    ),
+    Topic(
+        "joint_reference",
+        _JOINTS,
+        ("planner",),
+        "joint positions and velocities for coordinated control to track",
+        when="`output` is reference",
+    ),
+    Topic(
+        "base_reference",
+        _ODOMETRY,
+        _USER,
+        "a moving reference of the base for coordinated control, one for every state",
+    ),
+    Topic(
+        "gait_schedule",
+        "trajectory_msgs/msg/JointTrajectory",
+        ("planner",),
+        "the whole planned schedule",
+        latched=True,
+    ),
+    Topic(
+        "planned_path",
+        "nav_msgs/msg/Path",
+        ("planner",),
+        "the path of the base that the schedule predicts",
+        latched=True,
+    ),
+    Topic(
+        "planner/status",
+        _STATUS,
+        ("planner",),
+        "state of the planner, why, its goal and the remaining error",
+        latched=True,
+    ),
+    Topic(
+        "controller/status",
+        _STATUS,
+        ("coordinated_control",),
+        "state of the controller, why, its goal, errors, and what saturation cost",
+        latched=True,
+    ),
+)
+
+TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
+"""Every topic of the stack by its name; those of the plant in the order of publication."""
+
+NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event")
+"""Ends of topics with the middleware's own messages: recorded only where they are asked for."""
+
+
+def state_topics() -> list[Topic]:
+    """Return the topics that carry the plant's state, in the order of publication."""
+    return [topic for topic in TOPICS.values() if topic.state]
