@@ -20,5 +20,9 @@ class PlanningError(SpaceRobotError):
     """A goal that is refused or cannot be reached; the sentence says why."""
 
 
+class RecordingError(SpaceRobotError):
+    """A bag that cannot be written or read; the sentence says which, where and what to do."""
+
+
 class CommandError(SpaceRobotError):
     """A joint command that the plant refuses; the sentence says why."""

@@ -1,12 +1,11 @@
 """MCAP bags that any ROS 2 tool opens: writing, reading, replaying and verifying them."""
 
-from spacerobot_ros.bag.errors import RecordingError
-from spacerobot_ros.bag.qos import LATCHED, QosProfile
+from spacerobot_ros.bag.playback import Playback, ReplayMessage, ReplayTopic, Timeline
 from spacerobot_ros.bag.reader import Bag, iterate_raw, read_bag
-from spacerobot_ros.bag.replay import Playback, ReplayMessage, ReplayTopic, Timeline
-from spacerobot_ros.bag.schemas import message_definition, type_hash
+from spacerobot_ros.bag.rosbag2 import LATCHED, QosProfile, message_definition, type_hash
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.bag.writer import BagWriter
+from spacerobot_ros.errors import RecordingError
 
 __all__ = [
     "LATCHED",

@@ -1,8 +1,8 @@
 """An MCAP file on its way to disk: whole records at its end, and the summary that closes it.
 
-The records are encoded by the classes of `mcap.records`. Only what `mcap.writer.Writer` does for
-every single message is left to the caller, who brings whole chunks: that makes the difference
-between keeping up with a simulation and slowing it down.
+The records are encoded by the classes of ``mcap.records``. What ``mcap.writer.Writer`` does for
+every single message is left to the caller, who brings whole chunks: with the library's writer a
+recorder would slow a simulation down.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-from spacerobot_ros.bag.errors import RecordingError
+from spacerobot_ros.errors import RecordingError
 
 _COMPRESSIONS = {"zstd": "zstd", "lz4": "lz4", "none": ""}
 """Our name of each compression -> its name in the file."""
@@ -54,7 +54,7 @@ def _compressor(compression: str) -> Callable[[bytes | bytearray], bytes]:
 
 
 def encode(record: McapRecord) -> bytes:
-    """Give the bytes of one record."""
+    """Return the bytes of one record."""
     builder = RecordBuilder()
     record.write(builder)
     return bytes(builder.end())
@@ -63,17 +63,24 @@ def encode(record: McapRecord) -> bytes:
 class McapFile:
     """An MCAP file that grows by whole records.
 
-    Every append goes to the operating system at once, and one that fails is taken back, so that
-    what a process leaves when it dies is whole but for the record that it was appending.
+    Every append goes to the operating system at once, and one that fails is undone, so that the
+    file of a process that dies is whole but for the record that it was appending.
 
-    Args:
-        path: the file; its folders are made.
-        compression: of the chunks: `zstd`, `lz4` or `none`.
-        overwrite: whether a file that is there is replaced.
-        profile: what the messages are; `ros2` unless they are of something else.
+    Parameters
+    ----------
+    path
+        The file; its folders are made.
+    compression
+        Of the chunks: ``zstd``, ``lz4`` or ``none``.
+    overwrite
+        Whether a file that is there is replaced.
+    profile
+        What the messages are; ``ros2`` unless they are of something else.
 
-    Raises:
-        RecordingError: the file cannot be made, or is there and is not to be replaced.
+    Raises
+    ------
+    RecordingError
+        The file cannot be made, or is there and is not to be replaced.
     """
 
     def __init__(
@@ -117,13 +124,18 @@ class McapFile:
     def append_chunk(self, records: bytearray, entries: dict[int, list[int]]) -> None:
         """Append one chunk and the indexes of its messages.
 
-        Args:
-            records: the encoded records of the chunk.
-            entries: of each channel, for each of its messages, log time in nanoseconds and offset
-                in `records`, one after the other.
+        Parameters
+        ----------
+        records
+            The encoded records of the chunk.
+        entries
+            Of each channel, for each of its messages, log time in nanoseconds and offset
+            in ``records``, one after the other.
 
-        Raises:
-            RecordingError: the disk refused it; the file is as it was.
+        Raises
+        ------
+        RecordingError
+            The disk refused it; the file is as it was.
         """
         entries = {channel: entry for channel, entry in entries.items() if entry}
         times = [entry[::2] for entry in entries.values()]
@@ -167,8 +179,10 @@ class McapFile:
     def append_attachment(self, attachment: Attachment) -> None:
         """Append an attachment.
 
-        Raises:
-            RecordingError: the disk refused it; the file is as it was.
+        Raises
+        ------
+        RecordingError
+            The disk refused it; the file is as it was.
         """
         record, offset = encode(attachment), self._size
         self._append(record)
@@ -187,8 +201,10 @@ class McapFile:
     def append_metadata(self, metadata: Metadata) -> None:
         """Append a metadata record.
 
-        Raises:
-            RecordingError: the disk refused it; the file is as it was.
+        Raises
+        ------
+        RecordingError
+            The disk refused it; the file is as it was.
         """
         record, offset = encode(metadata), self._size
         self._append(record)
@@ -199,8 +215,10 @@ class McapFile:
     def finish(self) -> None:
         """Append the summary, after which the file is complete.
 
-        Raises:
-            RecordingError: the disk refused it; the file is as it was.
+        Raises
+        ------
+        RecordingError
+            The disk refused it; the file is as it was.
         """
         data_end = encode(DataEnd(data_section_crc=0))
         start = self._size + len(data_end)

@@ -1,26 +1,28 @@
-"""Reads the records of an MCAP file, and says in one sentence what is wrong with it."""
+"""Reads messages out of an MCAP file, and says in one sentence what is wrong with it."""
 
 from __future__ import annotations
 
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 import lz4.frame
+import numpy as np
 import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Chunk, DataEnd, Message
+from mcap.records import Chunk, ChunkIndex, DataEnd, Message
 from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
-from spacerobot_ros.bag.errors import RecordingError
+from spacerobot_ros.errors import RecordingError
 
 # Each takes the compressed data and how large they were.
 _DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {
@@ -29,7 +31,10 @@ _DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {
     "": lambda data, _: data,
 }
 _RECORD_HEADER = struct.Struct("<BQ")
-_MESSAGE_HEADER = struct.Struct("<HIQQ")
+_MESSAGE = struct.Struct("<BQHIQQ")
+"""Opcode, length of the rest, channel, sequence, log time, publish time."""
+
+_MESSAGE_INDEX_HEADER = struct.Struct("<BQHI")
 
 RawMessage = tuple[int, int, int, bytes]
 """Channel, log time and publish time in nanoseconds, serialised message."""
@@ -39,15 +44,11 @@ RawMessage = tuple[int, int, int, bytes]
 def open_bag(path: Path) -> Iterator[BinaryIO]:
     """Open a bag that is complete, and turn what is found wrong with it into one sentence.
 
-    Args:
-        path: the MCAP file.
-
-    Yields:
-        The file.
-
-    Raises:
-        RecordingError: there is no such file, it cannot be read, is not MCAP, was cut short, or a
-            record turns out damaged while the context lasts.
+    Raises
+    ------
+    RecordingError
+        There is no such file, it cannot be read, is not MCAP, was cut short, or a record turns out
+        damaged while the context lasts.
     """
     try:
         with path.open("rb") as file:
@@ -85,17 +86,12 @@ def _require_both_ends(path: Path, file: BinaryIO) -> None:
 
 
 def read_summary(path: Path, file: BinaryIO) -> Summary:
-    """Read the summary at the end of a bag.
+    """Read schemas, channels, statistics and indexes from the end of a bag that is open.
 
-    Args:
-        path: the bag, for the sentence.
-        file: the same, open.
-
-    Returns:
-        Its schemas, channels, statistics and indexes.
-
-    Raises:
-        RecordingError: there is none.
+    Raises
+    ------
+    RecordingError
+        There is none.
     """
     summary = SeekingReader(file).get_summary()
     if summary is None or summary.statistics is None:
@@ -106,16 +102,12 @@ def read_summary(path: Path, file: BinaryIO) -> Summary:
 
 
 def messages_in_file_order(file: BinaryIO) -> Iterator[RawMessage]:
-    """Go through all messages of a bag in the order in which they were written.
+    """Go through all messages of a bag, open at its start, in the order they were written.
 
-    Args:
-        file: the bag, open at its start.
-
-    Yields:
-        Channel, log time, publish time, serialised message.
-
-    Raises:
-        ValueError: a chunk is damaged.
+    Raises
+    ------
+    ValueError
+        A chunk is damaged.
     """
     for record in StreamReader(file, emit_chunks=True).records:
         if isinstance(record, Chunk):
@@ -127,10 +119,12 @@ def messages_in_file_order(file: BinaryIO) -> Iterator[RawMessage]:
 
 
 def decompress(chunk: Chunk) -> bytes:
-    """Give the records of a chunk.
+    """Return the records of a chunk.
 
-    Raises:
-        ValueError: its checksum or its compression is wrong.
+    Raises
+    ------
+    ValueError
+        Its checksum or its compression is wrong.
     """
     if chunk.compression not in _DECOMPRESSORS:
         raise ValueError(f"the compression {chunk.compression!r} is unknown")
@@ -144,9 +138,102 @@ def _messages_in_chunk(data: bytes) -> Iterator[RawMessage]:
     position = 0
     while position < len(data):
         opcode, length = _RECORD_HEADER.unpack_from(data, position)
-        body = position + _RECORD_HEADER.size
-        position = body + length
+        end = position + _RECORD_HEADER.size + length
         if opcode == Opcode.MESSAGE:
-            channel_id, _, log_time_ns, publish_time_ns = _MESSAGE_HEADER.unpack_from(data, body)
-            message = data[body + _MESSAGE_HEADER.size : position]
-            yield channel_id, log_time_ns, publish_time_ns, message
+            _, _, channel, _, log_ns, publish_ns = _MESSAGE.unpack_from(data, position)
+            yield channel, log_ns, publish_ns, data[position + _MESSAGE.size : end]
+        position = end
+
+
+def messages_in_time_order(
+    path: str | os.PathLike[str],
+    channel_ids: set[int],
+    start_ns: int = 0,
+    end_ns: int = 2**63 - 1,
+) -> Iterator[RawMessage]:
+    """Go through messages of a bag by log time, those of one time in the order they were written.
+
+    Only chunks whose times overlap are in memory together.
+
+    Parameters
+    ----------
+    path
+        The MCAP file.
+    channel_ids
+        The channels wanted.
+    start_ns
+        Earliest log time wanted, in nanoseconds.
+    end_ns
+        Latest log time wanted, in nanoseconds.
+
+    Raises
+    ------
+    RecordingError
+        There is no such bag, it is not MCAP, was cut short or is damaged.
+    """
+    with open_bag(Path(path)) as file:
+        summary = read_summary(Path(path), file)
+        indexes = summary.chunk_indexes
+        if not indexes or not all(index.message_index_offsets for index in indexes):
+            # Written without chunks or without message indexes.
+            file.seek(0)
+            wanted = [
+                message
+                for message in messages_in_file_order(file)
+                if message[0] in channel_ids and start_ns <= message[1] <= end_ns
+            ]
+            yield from sorted(wanted, key=lambda message: message[1])
+            return
+        for cluster in _clusters(summary, channel_ids, start_ns, end_ns):
+            yield from _messages_of(file, cluster, channel_ids, start_ns, end_ns)
+
+
+def _clusters(
+    summary: Summary, channel_ids: set[int], start_ns: int, end_ns: int
+) -> Iterator[list[ChunkIndex]]:
+    """Group the chunks with something wanted in them: those of a group overlap in time."""
+    wanted = [
+        index
+        for index in summary.chunk_indexes
+        if not channel_ids.isdisjoint(index.message_index_offsets)
+        and index.message_start_time <= end_ns
+        and index.message_end_time >= start_ns
+    ]
+    cluster: list[ChunkIndex] = []
+    latest = 0
+    for index in sorted(wanted, key=lambda i: (i.message_start_time, i.chunk_start_offset)):
+        if cluster and index.message_start_time >= latest:
+            yield cluster
+            cluster = []
+        cluster.append(index)
+        latest = max(latest, index.message_end_time)
+    if cluster:
+        yield cluster
+
+
+def _messages_of(
+    file: BinaryIO,
+    cluster: Sequence[ChunkIndex],
+    channel_ids: set[int],
+    start_ns: int,
+    end_ns: int,
+) -> Iterator[RawMessage]:
+    chunks, entries = [], []
+    for number, index in enumerate(sorted(cluster, key=lambda i: i.chunk_start_offset)):
+        file.seek(index.chunk_start_offset + _RECORD_HEADER.size)
+        chunks.append(decompress(Chunk.read(ReadDataStream(file))))
+        for channel, offset in index.message_index_offsets.items():
+            if channel in channel_ids:
+                file.seek(offset)
+                size = _MESSAGE_INDEX_HEADER.unpack(file.read(_MESSAGE_INDEX_HEADER.size))[3]
+                pairs = np.frombuffer(file.read(size), "<u8").reshape(-1, 2)
+                entries.append(np.column_stack([pairs, np.full(len(pairs), number, np.uint64)]))
+    table = np.concatenate(entries)
+    table = table[(table[:, 0] >= start_ns) & (table[:, 0] <= end_ns)]
+    order = np.lexsort((table[:, 1], table[:, 2], table[:, 0]))
+    for _, position, number in table[order].tolist():
+        chunk = chunks[number]
+        _, length, channel, _, log_ns, publish_ns = _MESSAGE.unpack_from(chunk, position)
+        end = position + _RECORD_HEADER.size + length
+        data = chunk[position + _MESSAGE.size : end]
+        yield channel, log_ns, publish_ns, data

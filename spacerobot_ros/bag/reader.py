@@ -14,24 +14,26 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-from spacerobot_ros.bag.errors import RecordingError
-from spacerobot_ros.bag.mcap_reading import messages_in_file_order, open_bag, read_summary
-from spacerobot_ros.bag.ordered import messages_in_time_order
-from spacerobot_ros.bag.qos import QosProfile
+from spacerobot_ros.bag.mcap_reading import (
+    messages_in_file_order,
+    messages_in_time_order,
+    open_bag,
+    read_summary,
+)
+from spacerobot_ros.bag.rosbag2 import QosProfile
 from spacerobot_ros.bag.series import TopicSeries
+from spacerobot_ros.errors import RecordingError
 
 
 def read_bag(path: str | os.PathLike[str]) -> Bag:
-    """Open a bag for reading.
+    """Open a bag for reading; nothing but its summary is read until asked for.
 
-    Args:
-        path: an MCAP file, or a folder that holds one, as `ros2 bag record` makes it.
+    ``path`` is an MCAP file, or a folder that holds one, as ``ros2 bag record`` makes it.
 
-    Returns:
-        The bag. Nothing but its summary is read until asked for.
-
-    Raises:
-        RecordingError: there is no such bag, it is not MCAP, was cut short or is damaged.
+    Raises
+    ------
+    RecordingError
+        There is no such bag, it is not MCAP, was cut short or is damaged.
     """
     return Bag(_bag_file(path))
 
@@ -39,14 +41,14 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
 def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, int, bytes]]:
     """Go through all messages of a bag, still serialised, in the order they were written.
 
-    Args:
-        path: as for `read_bag`.
+    Yields
+    ------
+    Topic, type, log time and publish time in nanoseconds, serialised message.
 
-    Yields:
-        Topic, type, log time and publish time in nanoseconds, serialised message.
-
-    Raises:
-        RecordingError: as for `read_bag`, when the first message is asked for or a damaged one met.
+    Raises
+    ------
+    RecordingError
+        As of :func:`read_bag`, when the first message or a damaged one is asked for.
     """
     file_path = _bag_file(path)
     with open_bag(file_path) as file:
@@ -64,15 +66,10 @@ def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, i
 
 
 class Bag:
-    """A bag as time series: `bag["/odom"].field("pose.pose.position.x")`.
+    """A bag as time series: ``bag["/odom"].field("pose.pose.position.x")``.
 
-    A topic is read when it is first asked for and kept. The file is not held open.
-
-    Args:
-        path: the MCAP file.
-
-    Raises:
-        RecordingError: there is no such file, it is not MCAP, was cut short or is damaged.
+    A topic is read when it is first asked for and kept. The file is not held open. Raises as
+    :func:`read_bag` does.
     """
 
     def __init__(self, path: Path) -> None:
@@ -123,8 +120,10 @@ class Bag:
     def message_count(self, topic: str | None = None) -> int:
         """Say how many messages a topic has, or the whole bag.
 
-        Raises:
-            RecordingError: there is no such topic.
+        Raises
+        ------
+        RecordingError
+            There is no such topic.
         """
         if topic is None:
             return int(self._statistics.message_count)
@@ -132,38 +131,47 @@ class Bag:
         return sum(counts.get(channel.id, 0) for channel in self._channels(topic))
 
     def channel_ids(self, topic: str) -> set[int]:
-        """Give the numbers under which a topic's messages are in the file.
+        """Return the numbers under which a topic's messages are in the file.
 
-        Raises:
-            RecordingError: there is no such topic.
+        Raises
+        ------
+        RecordingError
+            There is no such topic.
         """
         return {channel.id for channel in self._channels(topic)}
 
     def qos(self, topic: str) -> list[QosProfile]:
-        """Give what the publishers of a topic offered, as far as the bag says it.
+        """Return what the publishers of a topic offered, as far as the bag says it.
 
-        Raises:
-            RecordingError: there is no such topic, or what the bag says cannot be read.
+        Raises
+        ------
+        RecordingError
+            There is no such topic, or what the bag says cannot be read.
         """
         texts = [c.metadata.get("offered_qos_profiles", "") for c in self._channels(topic)]
         return [profile for text in texts for profile in QosProfile.from_yaml(text)]
 
     def times(self, topic: str) -> NDArray[np.float64]:
-        """Give the log times of a topic in seconds, shape (N,).
+        """Return the log times of a topic in seconds, shape (N,).
 
-        Raises:
-            RecordingError: there is no such topic, or the bag is damaged.
+        Raises
+        ------
+        RecordingError
+            There is no such topic, or the bag is damaged.
         """
         return self[topic].time
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Go through the decoded messages of a topic by log time.
 
-        Yields:
-            Log time in nanoseconds, message.
+        Yields
+        ------
+        Log time in nanoseconds, message.
 
-        Raises:
-            RecordingError: there is no such topic, or the bag is damaged.
+        Raises
+        ------
+        RecordingError
+            There is no such topic, or the bag is damaged.
         """
         return self[topic].messages()
 

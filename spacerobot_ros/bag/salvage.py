@@ -18,8 +18,6 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from spacerobot_ros.bag import rosbag2_metadata
-from spacerobot_ros.bag.errors import RecordingError
 from spacerobot_ros.bag.mcap_file import McapFile, encode
 from spacerobot_ros.bag.mcap_reading import (
     decompress,
@@ -27,8 +25,8 @@ from spacerobot_ros.bag.mcap_reading import (
     open_bag,
     read_summary,
 )
-from spacerobot_ros.bag.qos import QosProfile
-from spacerobot_ros.bag.rosbag2_metadata import RecordedTopic
+from spacerobot_ros.bag.rosbag2 import METADATA_NAME, QosProfile, RecordedTopic, metadata_record
+from spacerobot_ros.errors import RecordingError
 
 _CHUNK_SIZE = 65536
 _RECORD = struct.Struct("<BQ")
@@ -41,10 +39,18 @@ _BROKEN = (McapError, ValueError, RuntimeError, struct.error, zstandard.ZstdErro
 
 @dataclass(frozen=True)
 class Salvaged:
-    """What was saved of a bag: messages and the seconds that they span; what was not.
+    """What was saved of a bag, and what was not.
 
-    `lost_chunks` could not be read; of what was behind the last whole record, `lost_bytes` remain
-    where they are.
+    Attributes
+    ----------
+    path
+        The new bag.
+    messages, duration
+        Messages in it, and the time in s that they span.
+    lost_chunks
+        Chunks that could not be read.
+    lost_bytes
+        Bytes behind the last whole record, which remain in the old bag alone.
     """
 
     path: Path
@@ -59,17 +65,14 @@ def salvage_bag(
 ) -> Salvaged:
     """Write what can be read of a bag into a new, complete one; the old one stays as it is.
 
-    Args:
-        path: the MCAP file.
-        out: the new one, which must not be there; beside the old one, `NAME-salvaged.mcap`, unless
-            told.
+    ``out`` is the new file, which must not exist; by default ``NAME-salvaged.mcap`` beside the old
+    one.
 
-    Returns:
-        What was saved.
-
-    Raises:
-        RecordingError: there is no such bag, it is not MCAP, it is complete already, nothing in it
-            can be read, or the new one cannot be written.
+    Raises
+    ------
+    RecordingError
+        There is no such bag, it is not MCAP, it is complete already, nothing in it
+        can be read, or the new one cannot be written.
     """
     source = Path(path)
     target = Path(out) if out is not None else source.with_name(f"{source.stem}-salvaged.mcap")
@@ -202,7 +205,7 @@ class _Copy:
                 self._file.append_attachment(Attachment.read(_stream(body)))
             elif opcode == Opcode.METADATA:
                 metadata = Metadata.read(_stream(body))
-                if metadata.name != rosbag2_metadata.NAME:
+                if metadata.name != METADATA_NAME:
                     self._file.append_metadata(metadata)
 
     def finish(self, profile: str) -> None:
@@ -253,9 +256,5 @@ class _Copy:
                         self._file.message_counts.get(channel.id, 0),
                     )
                 )
-        text = rosbag2_metadata.serialize(
-            self._file.path.name, topics, self._file.start_ns, self._file.end_ns
-        )
-        self._file.append_metadata(
-            Metadata(name=rosbag2_metadata.NAME, metadata={rosbag2_metadata.KEY: text})
-        )
+        file = self._file
+        file.append_metadata(metadata_record(file.path.name, topics, file.start_ns, file.end_ns))

@@ -13,12 +13,15 @@ from types import TracebackType
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from spacerobot_ros.bag import rosbag2_metadata
-from spacerobot_ros.bag.errors import RecordingError
 from spacerobot_ros.bag.mcap_file import McapFile, encode
-from spacerobot_ros.bag.qos import QosProfile
-from spacerobot_ros.bag.rosbag2_metadata import RecordedTopic
-from spacerobot_ros.bag.schemas import message_definition, type_hash
+from spacerobot_ros.bag.rosbag2 import (
+    QosProfile,
+    RecordedTopic,
+    message_definition,
+    metadata_record,
+    type_hash,
+)
+from spacerobot_ros.errors import RecordingError
 
 _MESSAGE_HEADER = struct.Struct("<BQHIQQ")
 """Opcode, length of the rest, channel, sequence, log time, publish time."""
@@ -40,19 +43,28 @@ class BagWriter:
     would add something raise RecordingError, and closing still completes the file where there is
     room.
 
-    Args:
-        path: the bag, usually `*.mcap`; its folders are made.
-        compression: of the chunks: `zstd`, `lz4` or `none`.
-        chunk_size: how large a chunk grows, in bytes before compression.
-        overwrite: whether a file that is there is replaced.
-        max_size: how large a file grows, in bytes, before the next one is begun; 0 for ever. The
-            files of a bag that may be split are `NAME_0.mcap`, `NAME_1.mcap`, ..., each complete,
-            with all attachments and metadata.
-        max_duration_ns: how much log time a file spans, in nanoseconds, likewise. Both are looked
-            at after every chunk.
+    Parameters
+    ----------
+    path
+        The bag, usually ``*.mcap``; its folders are made.
+    compression
+        Of the chunks: ``zstd``, ``lz4`` or ``none``.
+    chunk_size
+        How large a chunk grows, in bytes before compression.
+    overwrite
+        Whether a file that is there is replaced.
+    max_size
+        How large a file grows, in bytes, before the next one is begun; 0: without bound. The files
+        of a bag that may be split are ``NAME_0.mcap``, ``NAME_1.mcap``, ..., each complete, with
+        all attachments and metadata.
+    max_duration_ns
+        How much log time a file spans, in nanoseconds, likewise. Both are checked after every
+        chunk.
 
-    Raises:
-        RecordingError: the file cannot be made, or is there and is not to be replaced.
+    Raises
+    ------
+    RecordingError
+        The file cannot be made, or is there and is not to be replaced.
     """
 
     def __init__(
@@ -120,17 +132,24 @@ class BagWriter:
     def add_topic(self, name: str, type_name: str, qos: QosProfile | None = None) -> int:
         """Make a topic known, before its first message.
 
-        Args:
-            name: full name of the topic, such as `/odom`.
-            type_name: such as `nav_msgs/msg/Odometry`.
-            qos: what its publisher offers; reliable, volatile and depth 10 unless given.
+        Parameters
+        ----------
+        name
+            Full name of the topic, such as ``/odom``.
+        type_name
+            Such as ``nav_msgs/msg/Odometry``.
+        qos
+            What its publisher offers; reliable, volatile and depth 10 unless given.
 
-        Returns:
-            The channel that `write` takes. A topic that is known already keeps its channel and QoS.
+        Returns
+        -------
+        The channel that ``write`` takes. A topic that is known already keeps its channel and QoS.
 
-        Raises:
-            RecordingError: the type is not installed, the topic is known with another type, or
-                nothing more can be written.
+        Raises
+        ------
+        RecordingError
+            The type is not installed, the topic is known with another type, or nothing more can
+            be written.
         """
         self._require_open()
         if name in self._topics:
@@ -160,15 +179,22 @@ class BagWriter:
     def write(self, channel_id: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
         """Add one message.
 
-        Args:
-            channel_id: from `add_topic`.
-            data: the serialised message (CDR with its header), as a raw subscription receives it.
-            log_time_ns: when it was recorded, in nanoseconds, not negative.
-            publish_time_ns: when it was published, in nanoseconds, not negative.
+        Parameters
+        ----------
+        channel_id
+            From ``add_topic``.
+        data
+            The serialised message (CDR with its header), as a raw subscription receives it.
+        log_time_ns
+            When it was recorded, in nanoseconds, not negative.
+        publish_time_ns
+            When it was published, in nanoseconds, not negative.
 
-        Raises:
-            RecordingError: the disk refused it, nothing more can be written, the channel is
-                unknown, or a time is not a whole number of at least 0.
+        Raises
+        ------
+        RecordingError
+            The disk refused it, nothing more can be written, the channel is unknown, or a time is
+            not a whole number of at least 0.
         """
         chunk = self._chunk
         try:
@@ -192,14 +218,12 @@ class BagWriter:
     def add_attachment(self, name: str, data: bytes, media_type: str, log_time_ns: int) -> None:
         """Put a whole file into the bag.
 
-        Args:
-            name: such as `robot.urdf`.
-            data: its content.
-            media_type: such as `application/xml`.
-            log_time_ns: when it was recorded, in nanoseconds.
+        ``media_type`` is such as ``application/xml``, ``log_time_ns`` when it was recorded.
 
-        Raises:
-            RecordingError: the disk refused it, or nothing more can be written.
+        Raises
+        ------
+        RecordingError
+            The disk refused it, or nothing more can be written.
         """
         self._require_open()
         attachment = Attachment(
@@ -210,14 +234,12 @@ class BagWriter:
             self._file.append_attachment(attachment)
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
-        """Put named words into the bag.
+        """Put a record of keys and values into the bag.
 
-        Args:
-            name: of the record.
-            data: its keys and values.
-
-        Raises:
-            RecordingError: the disk refused it, or nothing more can be written.
+        Raises
+        ------
+        RecordingError
+            The disk refused it, or nothing more can be written.
         """
         self._require_open()
         metadata = Metadata(name=name, metadata=data)
@@ -228,8 +250,10 @@ class BagWriter:
     def flush(self) -> None:
         """Hand the chunk in progress to the operating system, so that a kill loses nothing of it.
 
-        Raises:
-            RecordingError: the disk refused it, or nothing more can be written.
+        Raises
+        ------
+        RecordingError
+            The disk refused it, or nothing more can be written.
         """
         self._require_open()
         self._finish_chunk()
@@ -237,8 +261,10 @@ class BagWriter:
     def close(self) -> None:
         """Write what is left and the summary, and let go of the file; a second call does nothing.
 
-        Raises:
-            RecordingError: the disk refused something, and no earlier call has said so.
+        Raises
+        ------
+        RecordingError
+            The disk refused something, and no earlier call has said so.
         """
         if self._closed:
             return
@@ -328,12 +354,8 @@ class BagWriter:
             RecordedTopic(name, type_name, type_hash(type_name), qos, self._count(channel_id))
             for name, (channel_id, type_name, qos) in self._topics.items()
         ]
-        text = rosbag2_metadata.serialize(
-            self.path.name, topics, self._file.start_ns, self._file.end_ns
-        )
-        self._file.append_metadata(
-            Metadata(name=rosbag2_metadata.NAME, metadata={rosbag2_metadata.KEY: text})
-        )
+        file = self._file
+        file.append_metadata(metadata_record(file.path.name, topics, file.start_ns, file.end_ns))
 
     def _count(self, channel_id: int) -> int:
         in_progress = len(self._entries.get(channel_id, ())) // 2

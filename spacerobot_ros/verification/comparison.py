@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from spacerobot_ros.bag.errors import RecordingError
 from spacerobot_ros.bag.reader import read_bag
+from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.building import build_plant
 from spacerobot_ros.verification.recorded_flight import (

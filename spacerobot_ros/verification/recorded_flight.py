@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spacerobot_ros.bag.errors import RecordingError
 from spacerobot_ros.bag.reader import Bag
-from spacerobot_ros.errors import CommandError
+from spacerobot_ros.errors import CommandError, RecordingError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.simulation.building import PLANTS, period_ns
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spacerobot_ros.bag.errors import RecordingError
-from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.simulation.brakes import JointBrakes
 from spacerobot_ros.simulation.faults_plant import FaultyPlant
 from spacerobot_ros.simulation.plant import Plant

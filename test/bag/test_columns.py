@@ -16,7 +16,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
-from spacerobot_ros.bag.columns import columns
+from spacerobot_ros.bag.series import columns
 
 Sample = tuple[str, str, Any]
 

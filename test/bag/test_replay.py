@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from spacerobot_ros.bag import LATCHED, BagWriter, RecordingError, Timeline, read_bag
-from spacerobot_ros.bag.replay import Playback
+from spacerobot_ros.bag.playback import Playback
 
 STRING = "std_msgs/msg/String"
 S = 10**9

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from spacerobot_ros.bag.last_state import last_state
+from spacerobot_ros.bag.recorded_robot import last_state
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.simulation.building import period_ns

@@ -6,10 +6,10 @@ import math
 from collections.abc import Collection, Generator, Iterator
 from dataclasses import dataclass, replace
 
-from spacerobot_ros.bag.errors import RecordingError
-from spacerobot_ros.bag.ordered import messages_in_time_order
-from spacerobot_ros.bag.qos import QosProfile
+from spacerobot_ros.bag.mcap_reading import messages_in_time_order
 from spacerobot_ros.bag.reader import Bag
+from spacerobot_ros.bag.rosbag2 import QosProfile
+from spacerobot_ros.errors import RecordingError
 
 _SECOND = 10**9
 _END_OF_TIME = 2**63 - 1
@@ -41,9 +41,12 @@ class ReplayMessage:
 class Timeline:
     """The time of a bag against a clock that only goes on.
 
-    Args:
-        rate: seconds of the bag in a second of the clock, positive.
-        bag_ns: where in the bag to begin, in nanoseconds; it stands there until `run`.
+    Parameters
+    ----------
+    rate
+        Seconds of the bag in a second of the clock, positive.
+    bag_ns
+        Where in the bag to begin, in nanoseconds; it stands there until ``run``.
     """
 
     def __init__(self, rate: float, bag_ns: int) -> None:
@@ -58,7 +61,7 @@ class Timeline:
         return self._running
 
     def run(self, clock_ns: int) -> None:
-        """Go on, `clock_ns` being the clock's time now."""
+        """Go on, ``clock_ns`` being the clock's time now."""
         if not self._running:
             self._clock_ns, self._running = clock_ns, True
 
@@ -68,17 +71,17 @@ class Timeline:
         self._running = False
 
     def seek(self, bag_ns: int, clock_ns: int) -> None:
-        """Be at `bag_ns` in the bag when the clock is at `clock_ns`."""
+        """Be at ``bag_ns`` in the bag when the clock is at ``clock_ns``."""
         self._bag_ns, self._clock_ns = bag_ns, clock_ns
 
     def bag_time(self, clock_ns: int) -> int:
-        """Give the time in the bag, in nanoseconds."""
+        """Return the time in the bag, in nanoseconds."""
         if not self._running:
             return self._bag_ns
         return self._bag_ns + math.floor((clock_ns - self._clock_ns) * self._rate)
 
     def clock_time(self, bag_ns: int) -> int:
-        """Give the clock's time at which `bag_ns` is reached if nothing stops before."""
+        """Return the clock's time at which ``bag_ns`` is reached if nothing stops before."""
         return self._clock_ns + math.ceil((bag_ns - self._bag_ns) / self._rate)
 
 
@@ -88,16 +91,25 @@ class Playback:
     What was latched before the start is due at once, because who listens to such a topic expects
     its last message whenever it comes.
 
-    Args:
-        bag: what to play.
-        topics: names to play; empty for all.
-        rate: seconds of the bag in a second of the clock.
-        start: where to begin, in seconds from the first message.
-        duration: how much to play, in seconds of the bag; 0 for all.
-        loop: whether to begin again at the end.
+    Parameters
+    ----------
+    bag
+        What to play.
+    topics
+        Names to play; empty for all.
+    rate
+        Seconds of the bag in a second of the clock.
+    start
+        Where to begin, in seconds from the first message.
+    duration
+        How much to play, in seconds of the bag; 0 for all.
+    loop
+        Whether to begin again at the end.
 
-    Raises:
-        RecordingError: the bag has no such topic, or no message there.
+    Raises
+    ------
+    RecordingError
+        The bag has no such topic, or no message there.
     """
 
     def __init__(
@@ -141,13 +153,13 @@ class Playback:
         return self._timeline.running
 
     def bag_time(self, clock_ns: int) -> int:
-        """Give the time in the bag, in nanoseconds, when the clock is at `clock_ns`."""
+        """Return the time in the bag, in nanoseconds, when the clock is at ``clock_ns``."""
         now = self._timeline.bag_time(clock_ns)
         # Not past what is still to come: that is late.
         return now if self._next is None else min(now, max(self._next.log_time_ns, self._start_ns))
 
     def run(self, clock_ns: int) -> None:
-        """Go on, `clock_ns` being the clock's time now."""
+        """Go on, ``clock_ns`` being the clock's time now."""
         self._timeline.run(clock_ns)
 
     def pause(self, clock_ns: int) -> None:
@@ -157,8 +169,10 @@ class Playback:
     def due(self, clock_ns: int, most: int) -> list[ReplayMessage]:
         """Take what is due by now, at most so many messages.
 
-        Raises:
-            RecordingError: the bag turns out damaged.
+        Raises
+        ------
+        RecordingError
+            The bag turns out damaged.
         """
         taken: list[ReplayMessage] = []
         while self._next is not None and self._timeline.running and len(taken) < most:
@@ -168,7 +182,7 @@ class Playback:
         return taken
 
     def next_due(self) -> int | None:
-        """Give the clock's time of the next message; None when there is none, or time stands."""
+        """Return the clock's time of the next message; None when there is none, or time stands."""
         if self._next is None or not self._timeline.running:
             return None
         return self._timeline.clock_time(self._next.log_time_ns)

@@ -1,0 +1,151 @@
+"""The topics of one robot in a bag: what was measured of it, and the state to go on from."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spacerobot_ros.bag.reader import Bag, read_bag
+from spacerobot_ros.bag.salvage import is_complete, salvage_bag
+from spacerobot_ros.bag.series import TopicSeries
+from spacerobot_ros.errors import RecordingError
+
+Array = NDArray[np.float64]
+
+_STATE = ("odom", "joint_states", "momentum")
+
+
+def pose_fields(path: str) -> list[str]:
+    """Return the fields of a geometry_msgs/Pose at a path: position, quaternion (x, y, z, w)."""
+    return [f"{path}.position.{x}" for x in "xyz"] + [f"{path}.orientation.{x}" for x in "xyzw"]
+
+
+ODOMETRY_POSE = pose_fields("pose.pose")
+ODOMETRY_TWIST = [f"twist.twist.{part}.{x}" for part in ("linear", "angular") for x in "xyz"]
+POSE = pose_fields("pose")
+WRENCH = [f"wrench.{part}.{x}" for part in ("force", "torque") for x in "xyz"]
+"""Fields of the messages, for :meth:`TopicSeries.table`."""
+
+
+class RecordedRobot:
+    """The topics of one robot in a bag, by their names without its namespace.
+
+    Parameters
+    ----------
+    bag
+        What was recorded.
+    namespace
+        Of the robot's topics, such as ``/robot_1``; empty for none.
+    """
+
+    def __init__(self, bag: Bag, namespace: str = "") -> None:
+        self.bag = bag
+        self.namespace = namespace
+
+    def get(self, name: str, type_name: str | None = None) -> TopicSeries | None:
+        """Return a topic; None where it has no message, or is not of ``type_name``."""
+        topic = f"{self.namespace}/{name}"
+        kind = self.bag.topics.get(topic)
+        if kind is None or type_name not in (None, kind) or not self.bag.message_count(topic):
+            return None
+        return self.bag[topic]
+
+    def __getitem__(self, name: str) -> TopicSeries:
+        """Return a topic.
+
+        Raises
+        ------
+        RecordingError
+            It has no message, or is damaged.
+        """
+        series = self.get(name)
+        if series is None:
+            topic = f"{self.namespace}/{name}"
+            raise RecordingError(f"The bag {self.bag.path} holds no state: nothing is on {topic}.")
+        return series
+
+    @property
+    def joint_names(self) -> list[str]:
+        """Names of the joints in the order of ``joint_states``; none where that is missing."""
+        joints = self.get("joint_states")
+        return list(map(str, next(joints.messages())[1].name)) if joints is not None else []
+
+    @property
+    def urdf(self) -> bytes | None:
+        """The description of the robot: the attached file, or else the last message about it."""
+        name = f"{self.namespace}/robot_description".strip("/").replace("/", ".")
+        attached = self.bag.attachments.get(f"{name}.urdf")
+        if attached is not None:
+            return attached
+        series = self.get("robot_description", "std_msgs/msg/String")
+        return None if series is None else str(series.field("data")[-1]).encode()
+
+
+@dataclass(frozen=True)
+class LastState:
+    """The last recorded state of a robot.
+
+    Attributes
+    ----------
+    time_ns
+        Its stamp.
+    position, quaternion
+        Of the base link in the world: (3,) m and (x, y, z, w).
+    joint_names, joints, rates
+        Names, positions and velocities (n,) of the joints.
+    momenta
+        Linear over angular momentum in the world (6,).
+    """
+
+    time_ns: int
+    position: Array
+    quaternion: Array
+    joint_names: list[str]
+    joints: Array
+    rates: Array
+    momenta: Array
+
+
+def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
+    """Read the last state of which everything was recorded.
+
+    Of a bag that was cut off, what can be read counts; ``namespace`` is that of the plant's topics.
+
+    Raises
+    ------
+    RecordingError
+        There is no such bag, or no state in it.
+    """
+    source = Path(path)
+    if is_complete(source):
+        return _last_state(RecordedRobot(read_bag(source), namespace))
+    with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
+        whole = Path(folder, source.name)
+        salvage_bag(source, whole)
+        return _last_state(RecordedRobot(read_bag(whole), namespace))
+
+
+def _last_state(robot: RecordedRobot) -> LastState:
+    odom, joints, momentum = (robot[name] for name in _STATE)
+    # Momenta have no stamp; a state is published momenta first, and logged at its time.
+    common = np.intersect1d(odom.stamp_ns, joints.stamp_ns)
+    if not len(common):
+        raise RecordingError(
+            f"The bag {robot.bag.path} holds no state of which all parts are there."
+        )
+    k, j = (int(np.flatnonzero(series.stamp_ns == common[-1])[-1]) for series in (odom, joints))
+    pose = odom.table(ODOMETRY_POSE)[k]
+    return LastState(
+        time_ns=int(common[-1]),
+        position=pose[:3],
+        quaternion=pose[3:],
+        joint_names=robot.joint_names,
+        joints=np.asarray(joints.field("position"))[j],
+        rates=np.asarray(joints.field("velocity"))[j],
+        momenta=np.asarray(momentum.field("data"))[min(k, len(momentum) - 1), :6],
+    )

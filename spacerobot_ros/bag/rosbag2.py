@@ -1,0 +1,346 @@
+"""What rosbag2 adds to MCAP: message definitions, quality of service, its metadata record."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cache
+from pathlib import Path
+from textwrap import indent
+from typing import Any
+
+import yaml
+from mcap.records import Metadata
+
+from spacerobot_ros.errors import RecordingError
+
+# -- message definitions ----------------------------------------------------------------------
+
+_TYPE_NAME = re.compile(r"([a-zA-Z]\w*)/(?:msg/)?([a-zA-Z]\w*)", re.ASCII)
+
+# rosbag2's own expression for the type at the start of a field or constant: with any other one the
+# text of a schema could differ from the text that `ros2 bag record` writes.
+_FIELD_TYPE = re.compile(r"(?:^|\n)\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+", re.ASCII)
+
+_INTEGERS = {f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
+_PRIMITIVES = {"bool", "byte", "char", "float32", "float64", "string", "wstring", *_INTEGERS}
+
+
+@cache
+def message_definition(type_name: str) -> str:
+    """Return the full definition of a message type as rosbag2 writes it into a schema.
+
+    That is the text of the ``.msg`` file, then for every type it uses, depth first, in alphabetical
+    order and each once, a separator line, ``MSG: package/Type`` and its text.
+
+    Parameters
+    ----------
+    type_name
+        Such as ``nav_msgs/msg/Odometry``.
+
+    Returns
+    -------
+    The concatenated definition (encoding ``ros2msg``).
+
+    Raises
+    ------
+    RecordingError
+        The name is not one of a message type, or a package that it needs is not installed.
+    """
+    return _with_dependencies(type_name, set())
+
+
+def _with_dependencies(type_name: str, seen: set[str]) -> str:
+    package, name = _split(type_name)
+    text = _message_file(package, name).read_bytes().decode()
+    types = {
+        found if "/" in found else f"{package}/{found}"
+        for found in _FIELD_TYPE.findall(text)
+        if found not in _PRIMITIVES
+    }
+    parts = [text]
+    for dependency in sorted(types):
+        if dependency not in seen:
+            seen.add(dependency)
+            definition = _with_dependencies(dependency, seen)
+            parts.append(f"\n{'=' * 80}\nMSG: {dependency}\n{definition}")
+    return "".join(parts)
+
+
+@cache
+def type_hash(type_name: str) -> str:
+    """Return the hash by which ROS 2 tells apart versions of a message type.
+
+    It is ``RIHS01_`` and 64 hexadecimal digits; empty where the package was installed without the
+    description of its types (``share/<package>/msg/<Type>.json``). Raises as
+    :func:`message_definition` does.
+    """
+    package, name = _split(type_name)
+    description = _message_file(package, name).with_suffix(".json")
+    if not description.is_file():
+        return ""
+    hashes = json.loads(description.read_bytes())["type_hashes"]
+    return next(
+        (str(h["hash_string"]) for h in hashes if h["type_name"] == f"{package}/msg/{name}"), ""
+    )
+
+
+def _split(type_name: str) -> tuple[str, str]:
+    match = _TYPE_NAME.fullmatch(type_name)
+    if match is None:
+        raise RecordingError(
+            f"{type_name!r} is not the name of a message type: write it as 'package/msg/Type'."
+        )
+    return match[1], match[2]
+
+
+def _message_file(package: str, name: str) -> Path:
+    share = _share_folder(package)
+    path = share / "msg" / f"{name}.msg"
+    if not path.is_file():
+        raise RecordingError(
+            f"The package {package} in {share} has no message {name}: "
+            "check the name, or install the version that has it."
+        )
+    return path
+
+
+def _share_folder(package: str) -> Path:
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        return Path(get_package_share_directory(package))
+    except (ImportError, LookupError, OSError, ValueError):
+        # The wheels install into the environment's own prefix and set no search path.
+        folder = Path(sys.prefix) / "share" / package
+    if not folder.is_dir():
+        raise RecordingError(
+            f"The message package {package} is neither on AMENT_PREFIX_PATH nor in "
+            f"{folder.parent}: install it, or source the workspace that has it."
+        )
+    return folder
+
+
+# -- quality of service -----------------------------------------------------------------------
+
+INFINITE_NS = 2**63 - 1
+"""A duration without end, in nanoseconds (``RMW_DURATION_INFINITE``)."""
+
+_POLICIES = {
+    "history": ("keep_last", "keep_all", "system_default", "unknown"),
+    "reliability": ("reliable", "best_effort", "system_default", "best_available", "unknown"),
+    "durability": ("volatile", "transient_local", "system_default", "best_available", "unknown"),
+    "liveliness": ("automatic", "manual_by_topic", "system_default", "best_available", "unknown"),
+}
+
+# Before Jazzy rosbag2 wrote the numbers of rmw's enumerations.
+_POLICY_NUMBERS = {
+    "history": {0: "system_default", 1: "keep_last", 2: "keep_all"},
+    "reliability": {0: "system_default", 1: "reliable", 2: "best_effort"},
+    "durability": {0: "system_default", 1: "transient_local", 2: "volatile"},
+    "liveliness": {0: "system_default", 1: "automatic", 3: "manual_by_topic"},
+}
+_DURATIONS = ("deadline", "lifespan", "liveliness_lease_duration")
+
+
+@dataclass(frozen=True)
+class QosProfile:
+    """The quality of service that a topic's publisher offers.
+
+    The policies are the lower-case words of rmw (``rmw_qos_*_policy_to_str``), the only ones that
+    ``ros2 bag play`` knows.
+
+    Parameters
+    ----------
+    history
+        ``keep_last``, ``keep_all``, ``system_default`` or ``unknown``.
+    depth
+        How many messages ``keep_last`` keeps.
+    reliability
+        ``reliable``, ``best_effort``, ``system_default``, ``best_available`` or ``unknown``.
+    durability
+        ``volatile``, ``transient_local`` (latched), or as above.
+    deadline_ns
+        Longest time between two messages, in nanoseconds.
+    lifespan_ns
+        How long a message is worth delivering, in nanoseconds.
+    liveliness
+        ``automatic``, ``manual_by_topic``, or as above.
+    liveliness_lease_duration_ns
+        How long a silent publisher counts as alive, in nanoseconds.
+    avoid_ros_namespace_conventions
+        Whether the topic is a bare DDS topic.
+
+    Raises
+    ------
+    RecordingError
+        A policy is not one of its words.
+    """
+
+    history: str = "keep_last"
+    depth: int = 10
+    reliability: str = "reliable"
+    durability: str = "volatile"
+    deadline_ns: int = INFINITE_NS
+    lifespan_ns: int = INFINITE_NS
+    liveliness: str = "automatic"
+    liveliness_lease_duration_ns: int = INFINITE_NS
+    avoid_ros_namespace_conventions: bool = False
+
+    def __post_init__(self) -> None:
+        for policy, words in _POLICIES.items():
+            word = getattr(self, policy)
+            if word not in words:
+                raise RecordingError(f"The QoS {policy} {word!r} is not one of {', '.join(words)}.")
+
+    @classmethod
+    def from_yaml(cls, text: str) -> list[QosProfile]:
+        """Read a channel's ``offered_qos_profiles``, whose policies are words or numbers.
+
+        ``text`` is the YAML of a list with one profile for each publisher; empty for none. What a
+        profile does not say is as in ``QosProfile()``.
+
+        Raises
+        ------
+        RecordingError
+            The text is not such a list.
+        """
+        try:
+            entries = yaml.safe_load(text) or []
+            return [cls(**_arguments(entry)) for entry in entries]
+        except (yaml.YAMLError, TypeError, ValueError, AttributeError) as error:
+            reason = " ".join(str(error).split())
+            raise RecordingError(f"A QoS profile of the bag cannot be read: {reason}.") from error
+
+    def to_yaml(self) -> str:
+        """Return a channel's ``offered_qos_profiles`` with this profile, as rosbag2 dumps it."""
+        return "\n".join(
+            (
+                f"- history: {self.history}",
+                f"  depth: {self.depth}",
+                f"  reliability: {self.reliability}",
+                f"  durability: {self.durability}",
+                *_duration("deadline", self.deadline_ns),
+                *_duration("lifespan", self.lifespan_ns),
+                f"  liveliness: {self.liveliness}",
+                *_duration("liveliness_lease_duration", self.liveliness_lease_duration_ns),
+                "  avoid_ros_namespace_conventions: "
+                + ("true" if self.avoid_ros_namespace_conventions else "false"),
+            )
+        )
+
+
+LATCHED = QosProfile(depth=1, durability="transient_local")
+"""Reliable, transient local, depth 1: a late subscriber gets the last message."""
+
+
+def _duration(name: str, nanoseconds: int) -> tuple[str, str, str]:
+    seconds, rest = divmod(nanoseconds, 10**9)
+    return f"  {name}:", f"    sec: {seconds}", f"    nsec: {rest}"
+
+
+def _arguments(entry: dict[str, Any]) -> dict[str, Any]:
+    """Turn one entry of the YAML into the arguments of a profile."""
+    arguments: dict[str, Any] = {}
+    for name, value in entry.items():
+        if name in _DURATIONS:
+            nanoseconds = int(value["sec"]) * 10**9 + int(value["nsec"])
+            arguments[f"{name}_ns"] = min(nanoseconds, INFINITE_NS)
+        elif name in _POLICIES:
+            number = isinstance(value, int) and not isinstance(value, bool)
+            arguments[name] = _POLICY_NUMBERS[name].get(value, "unknown") if number else value
+        elif name in {field.name for field in fields(QosProfile)}:
+            arguments[name] = value
+    return arguments
+
+
+# -- the metadata record ----------------------------------------------------------------------
+
+METADATA_NAME = "rosbag2"
+"""Name of the MCAP Metadata record that ``ros2 bag info`` and ``ros2 bag play`` read first."""
+
+_METADATA_KEY = "serialized_metadata"
+"""Its only key."""
+
+# The first one whose QoS policies are words; a reader that finds no version takes them for numbers.
+_VERSION = 9
+
+# What every YAML reader takes for a string without quotes: such words, but for these.
+_PLAIN = re.compile(r"[A-Za-z/][\w./-]*", re.ASCII)
+_NOT_STRINGS = {"false", "n", "no", "null", "off", "on", "true", "y", "yes"}
+
+
+@dataclass(frozen=True)
+class RecordedTopic:
+    """One topic of a bag: name, type, hash of the type, QoS offered and messages recorded."""
+
+    name: str
+    type_name: str
+    type_hash: str
+    qos: QosProfile
+    message_count: int
+
+
+def metadata_record(
+    file_name: str, topics: Sequence[RecordedTopic], start_ns: int | None, end_ns: int | None
+) -> Metadata:
+    """Return rosbag2's metadata record, its YAML laid out as rosbag2 dumps it.
+
+    Parameters
+    ----------
+    file_name
+        Name of the bag file, without folders.
+    topics
+        The topics in the bag.
+    start_ns
+        Log time of the earliest message in nanoseconds; None without messages.
+    end_ns
+        Log time of the latest one.
+    """
+    start, duration = INFINITE_NS, 0
+    if start_ns is not None and end_ns is not None:
+        start, duration = start_ns, end_ns - start_ns
+    count = sum(topic.message_count for topic in topics)
+    path = _scalar(file_name)
+    listed = "\n" + "\n".join(map(_topic, topics)) if topics else "\n  []"
+    text = (
+        f"version: {_VERSION}\n"
+        "storage_identifier: mcap\n"
+        f"duration:\n  nanoseconds: {duration}\n"
+        f"starting_time:\n  nanoseconds_since_epoch: {start}\n"
+        f"message_count: {count}\n"
+        f"topics_with_message_count:{listed}\n"
+        'compression_format: ""\n'
+        'compression_mode: ""\n'
+        f"relative_file_paths:\n  - {path}\n"
+        "files:\n"
+        f"  - path: {path}\n"
+        f"    starting_time:\n      nanoseconds_since_epoch: {start}\n"
+        f"    duration:\n      nanoseconds: {duration}\n"
+        f"    message_count: {count}\n"
+        "custom_data: ~\n"
+        f"ros_distro: {_scalar(os.environ.get('ROS_DISTRO', 'jazzy'))}"
+    )
+    return Metadata(name=METADATA_NAME, metadata={_METADATA_KEY: text})
+
+
+def _topic(topic: RecordedTopic) -> str:
+    return (
+        "  - topic_metadata:\n"
+        f"      name: {_scalar(topic.name)}\n"
+        f"      type: {_scalar(topic.type_name)}\n"
+        "      serialization_format: cdr\n"
+        f"      offered_qos_profiles:\n{indent(topic.qos.to_yaml(), ' ' * 8)}\n"
+        f"      type_description_hash: {_scalar(topic.type_hash)}\n"
+        f"    message_count: {topic.message_count}"
+    )
+
+
+def _scalar(text: str) -> str:
+    # Every JSON string is a YAML string.
+    plain = _PLAIN.fullmatch(text) and text.lower() not in _NOT_STRINGS
+    return text if plain else json.dumps(text)
