@@ -6,8 +6,8 @@ from spacerobot_ros.control import ControlState, PoseReference
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.laws.law import ControlLaw
 from spacerobot_ros.errors import ParameterError, PlanningError
-from spacerobot_ros.nodes.common.goal_memory import BASE, GoalMemory
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
 
 END_EFFECTOR = "end_effector"
 """What the goal of the end-effector is kept as."""
@@ -29,7 +29,7 @@ class ControlGoals:
     """
 
     def __init__(self, resume_file: str) -> None:
-        self._memory = GoalMemory(resume_file, GROUPS)
+        self._memory = GoalFile(resume_file, GROUPS)
         self._given: dict[str, Goal] = {}
 
     def give(self, group: str, goal: Goal) -> None:
@@ -46,7 +46,7 @@ class ControlGoals:
         ParameterError
             The file holds something else, or goals of another robot or law.
         """
-        self._given = self._memory.recall()
+        self._given = {group: found.goal for group, found in self._memory.load().items()}
         if law is not None:
             try:
                 self.require_suited(law)
@@ -100,7 +100,9 @@ class ControlGoals:
         ParameterError
             The file cannot be written.
         """
-        self._memory.keep(_flown_to(controller))
+        self._memory.save(
+            {group: IdentifiedGoal(goal) for group, goal in _flown_to(controller).items()}
+        )
 
     def drop(self) -> None:
         """Drop what was not taken up yet."""
@@ -108,7 +110,7 @@ class ControlGoals:
 
     def forget(self) -> None:
         """Keep nothing any more: the goal is met, or given up."""
-        self._memory.forget()
+        self._memory.delete()
 
 
 def require_controlled(law: ControlLaw, group: str) -> None:

@@ -35,7 +35,6 @@ from spacerobot_ros.nodes.common.cdr import (
     TemplateReader,
     stamp_bytes,
 )
-from spacerobot_ros.nodes.common.goal_memory import BASE
 from spacerobot_ros.nodes.common.goal_messages import goal_of
 from spacerobot_ros.nodes.common.joint_command import JointReader
 from spacerobot_ros.nodes.common.node import STREAM, run_node
@@ -44,6 +43,7 @@ from spacerobot_ros.nodes.common.state_synchroniser import Pairing, StateSynchro
 from spacerobot_ros.nodes.controller.goals import END_EFFECTOR, ControlGoals, require_controlled
 from spacerobot_ros.nodes.controller.status import ControllerState, ControllerStatus
 from spacerobot_ros.nodes.plant.plant_topics import DEFAULT_END_EFFECTOR
+from spacerobot_ros.planning.execution.goal_file import BASE
 
 JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
 """Topics of references from outside; where one has a publisher, every state waits for it."""

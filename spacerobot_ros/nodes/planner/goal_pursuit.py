@@ -9,7 +9,6 @@ from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
-from spacerobot_ros.nodes.common.goal_memory import BASE, GoalMemory
 from spacerobot_ros.nodes.common.measured_state import MeasuredState
 from spacerobot_ros.nodes.common.node import FlightNode
 from spacerobot_ros.nodes.planner.gait_flight import GaitFlight
@@ -19,6 +18,7 @@ from spacerobot_ros.nodes.planner.status import PlannerState, PlannerStatus, wha
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError, Tolerance
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
 
 
 class GoalPursuit:
@@ -43,7 +43,7 @@ class GoalPursuit:
         robot: SpaceRobot,
         status: PlannerStatus,
         topics: PlanTopics,
-        memory: GoalMemory,
+        memory: GoalFile,
     ) -> None:
         values: Mapping[str, Any] = node.parameters
         self._values, self._logger, self._robot = values, node.get_logger(), robot
@@ -230,7 +230,7 @@ class GoalPursuit:
         def fly(schedule: GaitSchedule) -> None:
             self._goal, self._landed = proposed, None
             try:
-                self._memory.keep({BASE: proposed})
+                self._memory.save({BASE: IdentifiedGoal(proposed)})
             except ParameterError as error:
                 self._logger.error(f"{error} The goal is flown, but would not be resumed.")
             self._corrections, self._flight.stuck, self._replanning = 0, [], False
@@ -320,4 +320,4 @@ class GoalPursuit:
     def _conclude(self, state: PlannerState, sentence: str, **values: Any) -> None:
         """Be done with the goal: nothing is to be resumed."""
         self._status.publish(state, sentence, **values)
-        self._memory.forget()
+        self._memory.delete()

@@ -13,7 +13,6 @@ from std_srvs.srv import Trigger
 from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.nodes.common.goal_memory import BASE, GoalMemory
 from spacerobot_ros.nodes.common.goal_messages import goal_of, shape_of
 from spacerobot_ros.nodes.common.joint_command import JointReader
 from spacerobot_ros.nodes.common.node import STREAM, run_node
@@ -24,6 +23,7 @@ from spacerobot_ros.nodes.planner.plan_topics import PlanTopics
 from spacerobot_ros.nodes.planner.status import PlannerState, PlannerStatus
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile
 
 
 class PlannerNode(RobotNode):
@@ -61,7 +61,7 @@ class PlannerNode(RobotNode):
         self._commands = self.send_raw(JointState, topic)
         self._plan_topics = PlanTopics(self, str(self.parameters["world_frame"]))
         self._status = PlannerStatus(self)
-        self._memory = GoalMemory(str(self.parameters["resume_file"]))
+        self._memory = GoalFile(str(self.parameters["resume_file"]))
         self.find_robot()
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal, STREAM)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
@@ -71,7 +71,8 @@ class PlannerNode(RobotNode):
 
     def activate(self) -> None:
         """Answer states with commands from now on."""
-        kept = self._memory.recall().get(BASE)
+        found = self._memory.load().get(BASE)
+        kept = found.goal if found is not None else None
         self._running = True
         if kept is None:
             self._status.publish(PlannerState.IDLE, "Waiting for a goal pose.")
@@ -173,7 +174,7 @@ class PlannerNode(RobotNode):
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         message = self._pursuit.abort() if self._robot is not None else ""
         self._waiting = None
-        self._memory.forget()
+        self._memory.delete()
         response.success = bool(message)
         response.message = message or "Nothing is flown."
         if message:

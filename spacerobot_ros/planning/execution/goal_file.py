@@ -1,0 +1,139 @@
+"""Goals with their ids, and the file that keeps them for a commander that is restarted."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.planning.core.goal import Goal
+
+BASE = "base"
+"""Key of the goal of the base in the file."""
+
+
+@dataclass(frozen=True)
+class IdentifiedGoal:
+    """A goal and the id under which statuses report on it; the id is empty if it is not known."""
+
+    goal: Goal
+    goal_id: str = ""
+
+
+class GoalIds:
+    """Gives the goal poses that a node receives their ids."""
+
+    def __init__(self) -> None:
+        self._unstamped = 0
+
+    def of(self, sec: int, nanosec: int) -> str:
+        """Return the id of a goal pose with this header stamp.
+
+        The id is the stamp, ``"<sec>.<nanosec, nine digits>"``; a goal without a stamp (zero) gets
+        ``"unstamped-<n>"``, where n counts the goals without a stamp.
+        """
+        if sec or nanosec:
+            return f"{sec}.{nanosec:09d}"
+        self._unstamped += 1
+        return f"unstamped-{self._unstamped}"
+
+
+class GoalFile:
+    """A file that holds the present goals of a commander until they are reached or given up.
+
+    A commander that is restarted loads them and continues.
+
+    Parameters
+    ----------
+    path
+        The file; empty: nothing is saved and nothing is loaded.
+    keys
+        What the goals may be for; a file with other keys is refused.
+    """
+
+    def __init__(self, path: str, keys: tuple[str, ...] = (BASE,)) -> None:
+        self._path = Path(path) if path else None
+        self._keys = keys
+
+    def save(self, goals: Mapping[str, IdentifiedGoal]) -> None:
+        """Replace the content of the file by these goals, as a whole or not at all.
+
+        Raises
+        ------
+        ParameterError
+            The file cannot be written.
+        """
+        if self._path is None:
+            return
+        text = json.dumps({key: _entry(goal) for key, goal in goals.items()})
+        whole = self._path.with_name(f"{self._path.name}.new")
+        try:
+            whole.write_text(text, encoding="utf-8")
+            os.replace(whole, self._path)
+        except OSError as error:
+            raise ParameterError(
+                f"Parameter 'resume_file' is '{self._path}', which cannot be written: "
+                f"{error.strerror or error}."
+            ) from error
+
+    def delete(self) -> None:
+        """Delete the file: its goals are reached, failed or given up."""
+        if self._path is not None:
+            with suppress(OSError):
+                self._path.unlink()
+
+    def load(self) -> dict[str, IdentifiedGoal]:
+        """Return the goals that were being pursued when the commander ended; empty if none were.
+
+        Raises
+        ------
+        ParameterError
+            The file holds something else.
+        """
+        if self._path is None:
+            return {}
+        try:
+            return self._parse(self._path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, RecursionError, PlanningError) as error:
+            why = str(error).rstrip(".")
+            raise ParameterError(
+                f"Parameter 'resume_file' is '{self._path}', which holds no goal: {why}."
+            ) from error
+
+    def _parse(self, text: str) -> dict[str, IdentifiedGoal]:
+        entries = json.loads(text)
+        if not isinstance(entries, dict) or not entries:
+            raise ValueError("it names none")
+        for key in entries:
+            if key not in self._keys:
+                raise ValueError(f"'{key}' is not one of {', '.join(self._keys)}")
+        try:
+            return {
+                key: IdentifiedGoal(
+                    Goal.checked(entry["position"], entry["quaternion"], entry["joint_positions"]),
+                    # Files of earlier versions have no id.
+                    str(entry.get("id", "")),
+                )
+                for key, entry in entries.items()
+            }
+        except (KeyError, TypeError) as error:
+            raise ValueError(
+                "a goal has 'position', 'quaternion' and 'joint_positions' (null: any shape)"
+            ) from error
+
+
+def _entry(identified: IdentifiedGoal) -> dict[str, list[float] | str | None]:
+    goal = identified.goal
+    shape = goal.joint_positions
+    entry: dict[str, list[float] | str | None] = {
+        "position": goal.position.tolist(),
+        "quaternion": goal.quaternion.tolist(),
+        "joint_positions": None if shape is None else shape.tolist(),
+    }
+    return {**entry, "id": identified.goal_id} if identified.goal_id else entry

@@ -1,0 +1,191 @@
+"""What a planner reports: the state of its goal, and its statistics."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from enum import Enum
+
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError
+from spacerobot_ros.planning.core.schedule import Notes
+
+
+class PlannerState(str, Enum):
+    """The value of ``state`` in planner/status."""
+
+    IDLE = "idle"
+    PLANNING = "planning"
+    EXECUTING = "executing"
+    REACHED = "reached"
+    FAILED = "failed"
+    REFUSED = "refused"
+    ABORTED = "aborted"
+
+    @property
+    def decided(self) -> bool:
+        """Whether nothing more will happen for the goal that the status is about."""
+        return self not in (PlannerState.IDLE, PlannerState.PLANNING, PlannerState.EXECUTING)
+
+    @property
+    def level(self) -> int:
+        """Level of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR."""
+        if self in (PlannerState.FAILED, PlannerState.REFUSED):
+            return 2
+        return 1 if self is PlannerState.ABORTED else 0
+
+
+@dataclass(frozen=True)
+class PlannerStatus:
+    """A status of the planner, as planner/status carries it.
+
+    Attributes
+    ----------
+    state
+        What became of the goal.
+    sentence
+        The same for people.
+    goal_id
+        Which goal the status is about; empty: none, or one whose id is not known.
+    goal
+        (7,) its position in m and quaternion (x, y, z, w); empty where it is not reported.
+    corrections
+        New plans after the first for this goal that count as corrections.
+    position_error_m, attitude_error_rad
+        Remaining error of the measured base pose; None where it was not evaluated.
+    manoeuvre_time_s
+        Duration of all schedules for the goal so far; 0: none.
+    ends_at_s
+        Simulated time at which the latest schedule ends; 0: none.
+    method
+        Gait method of the schedule that begins; empty: none begins.
+    duration_s
+        Its duration.
+    notes
+        Results of the method by name.
+    """
+
+    state: PlannerState
+    sentence: str = ""
+    goal_id: str = ""
+    goal: tuple[float, ...] = ()
+    corrections: int = 0
+    position_error_m: float | None = None
+    attitude_error_rad: float | None = None
+    manoeuvre_time_s: float = 0.0
+    ends_at_s: float = 0.0
+    method: str = ""
+    duration_s: float = 0.0
+    notes: Notes = field(default_factory=dict)
+
+    def to_values(self) -> dict[str, str]:
+        """Return the status as the key-value pairs of a DiagnosticStatus; numbers have 9 digits."""
+        values = {"state": self.state.value, "corrections": str(self.corrections)}
+        if self.goal_id:
+            values["goal_id"] = self.goal_id
+        if self.goal:
+            values["goal"] = _text(list(self.goal))
+        if self.position_error_m is not None:
+            values["position_error_m"] = _text(self.position_error_m)
+        if self.attitude_error_rad is not None:
+            values["attitude_error_rad"] = _text(self.attitude_error_rad)
+        if self.ends_at_s:
+            values["manoeuvre_time_s"] = _text(self.manoeuvre_time_s)
+            values["ends_at_s"] = _text(self.ends_at_s)
+        if self.method:
+            values["method"] = self.method
+            values["duration_s"] = _text(self.duration_s)
+            values.update((name, _text(note)) for name, note in self.notes.items())
+        return values
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, str], sentence: str = "") -> PlannerStatus:
+        """Return the status that :meth:`to_values` has turned into these pairs.
+
+        Raises
+        ------
+        SpaceRobotError
+            They are no status of a planner.
+        """
+        given = dict(values)
+        try:
+            state = PlannerState(given.pop("state"))
+            numbers = {name: float(given.pop(name)) for name in _NUMBERS if name in given}
+            return cls(
+                state=state,
+                sentence=sentence,
+                goal_id=given.pop("goal_id", ""),
+                goal=tuple(float(word) for word in given.pop("goal", "").split()),
+                corrections=int(given.pop("corrections", "0")),
+                method=given.pop("method", ""),
+                **numbers,
+                notes={name: _note(text) for name, text in given.items()},
+            )
+        except (KeyError, ValueError) as error:
+            raise SpaceRobotError(f"This is no status of a planner: {error}.") from error
+
+
+_NUMBERS = (
+    *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "ends_at_s", "duration_s"),
+)
+"""Values that are one number each."""
+
+
+@dataclass(frozen=True)
+class PlannerStatistics:
+    """What a planner has done so far, for benchmarks and summaries.
+
+    Attributes
+    ----------
+    plan_time_s
+        Wall time that planning took for the present goal.
+    plans
+        Plans that were made or refused for the present goal.
+    commands_published
+        Commands since the node was configured.
+    """
+
+    plan_time_s: float = 0.0
+    plans: int = 0
+    commands_published: int = 0
+
+    def to_json(self) -> str:
+        """Return the message of the service ``~/statistics``."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> PlannerStatistics:
+        """Return the statistics in a message of the service ``~/statistics``."""
+        return cls(**json.loads(text))
+
+
+def goal_values(goal: Goal) -> tuple[float, ...]:
+    """Return position and quaternion (7,) of a goal, as a status reports them."""
+    return (*goal.position.tolist(), *goal.quaternion.tolist())
+
+
+def remaining_error(error: PoseError, controls: frozenset[Controlled]) -> str:
+    """Return a clause that says how far from the goal the robot is, in what is controlled."""
+    parts: dict[Controlled, str] = {
+        "position": f"{error.distance:.3g} m",
+        "attitude": f"{error.angle:.3g} rad",
+    }
+    if len(error.shape):
+        parts["shape"] = f"{error.farthest_joint:.3g} at the joints"
+    remaining = " and ".join(text for part, text in parts.items() if part in controls)
+    return f"{remaining} from the goal"
+
+
+def _text(note: list[float] | Array | float | str) -> str:
+    numbers = note if isinstance(note, list) else [note]
+    return " ".join(f"{x:.9g}" if isinstance(x, float) else str(x) for x in numbers)
+
+
+def _note(text: str) -> list[float] | float | str:
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        return text
+    return numbers[0] if len(numbers) == 1 else numbers

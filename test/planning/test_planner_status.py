@@ -1,0 +1,154 @@
+"""Statuses and statistics of the planner as values of messages; goals on file with ids."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
+from spacerobot_ros.planning.execution.status import (
+    PlannerState,
+    PlannerStatistics,
+    PlannerStatus,
+    goal_values,
+)
+
+GOAL = Goal(np.array([0.1, -2.0, 3.5]), np.array([0.0, 0.6, 0.0, 0.8]), np.array([0.25, -0.5]))
+
+# Numbers that nine digits hold.
+numbers = st.integers(-(10**8), 10**8).map(lambda n: n / 1000)
+words = st.text("abcdefgh ", min_size=1, max_size=12).filter(lambda text: text.strip() == text)
+# A list of one number reads as that number, a text that is a number as the number.
+notes = st.dictionaries(
+    st.text("klmnop", min_size=1, max_size=6),
+    st.one_of(numbers, st.lists(numbers, min_size=2, max_size=4), words.map(lambda w: f"x {w}")),
+    max_size=3,
+)
+
+
+@given(
+    st.sampled_from(PlannerState),
+    st.sampled_from(["", "12.000000345", "unstamped-1"]),
+    st.sampled_from([(), goal_values(GOAL)]),
+    st.integers(0, 9),
+    st.one_of(st.none(), numbers),
+    st.one_of(st.none(), numbers),
+    numbers.filter(bool),
+    notes,
+)
+def test_a_status_survives_its_message(
+    state: PlannerState,
+    goal_id: str,
+    goal: tuple[float, ...],
+    corrections: int,
+    position: float | None,
+    attitude: float | None,
+    time: float,
+    notes: dict[str, list[float] | float | str],
+) -> None:
+    status = PlannerStatus(
+        state=state,
+        sentence="So it is.",
+        goal_id=goal_id,
+        goal=goal,
+        corrections=corrections,
+        position_error_m=position,
+        attitude_error_rad=attitude,
+        manoeuvre_time_s=time,
+        ends_at_s=time,
+        method="optimal",
+        duration_s=time,
+        notes=notes,
+    )
+    values = status.to_values()
+    assert all(isinstance(text, str) for text in values.values())
+    assert PlannerStatus.from_values(values, "So it is.") == status
+
+
+def test_a_status_has_the_keys_that_belong_to_it() -> None:
+    assert PlannerStatus(PlannerState.IDLE).to_values() == {"state": "idle", "corrections": "0"}
+    refused = PlannerStatus(
+        PlannerState.REFUSED, "No.", goal_id="3.000000000", goal=goal_values(GOAL)
+    )
+    assert refused.to_values() == {
+        "state": "refused",
+        "corrections": "0",
+        "goal_id": "3.000000000",
+        "goal": "0.1 -2 3.5 0 0.6 0 0.8",
+    }
+    assert [state.value for state in PlannerState if state.decided] == [
+        *("reached", "failed", "refused", "aborted"),
+    ]
+
+
+@pytest.mark.parametrize("values", [{}, {"state": "asleep"}, {"state": "idle", "goal": "a b"}])
+def test_what_is_no_status_is_refused(values: dict[str, str]) -> None:
+    with pytest.raises(SpaceRobotError, match="no status of a planner"):
+        PlannerStatus.from_values(values)
+
+
+def test_statistics_survive_their_message() -> None:
+    statistics = PlannerStatistics(1.25, 3, 98_001)
+    assert json.loads(statistics.to_json()) == {
+        "plan_time_s": 1.25,
+        "plans": 3,
+        "commands_published": 98_001,
+    }
+    assert PlannerStatistics.from_json(statistics.to_json()) == statistics
+
+
+def test_goal_ids_are_the_stamps() -> None:
+    ids = GoalIds()
+    stamps = [(12, 345), (0, 0), (0, 1), (0, 0)]
+    assert [ids.of(*stamp) for stamp in stamps] == [
+        "12.000000345",
+        "unstamped-1",
+        "0.000000001",
+        "unstamped-2",
+    ]
+
+
+@pytest.mark.parametrize("goal_id", ["", "7.000000001"])
+def test_a_goal_survives_its_file(tmp_path: Path, goal_id: str) -> None:
+    file = GoalFile(str(tmp_path / "goal.json"))
+    assert file.load() == {}
+    file.save({BASE: IdentifiedGoal(GOAL, goal_id)})
+    loaded = file.load()[BASE]
+    assert loaded.goal_id == goal_id
+    np.testing.assert_array_equal(loaded.goal.position, GOAL.position)
+    np.testing.assert_allclose(loaded.goal.quaternion, GOAL.quaternion, rtol=0, atol=1e-16)
+    np.testing.assert_array_equal(loaded.goal.joint_positions, GOAL.joint_positions)
+    file.delete()
+    assert file.load() == {}
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_goal_file_without_ids_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "goal.json"
+    entry = {"position": [1, 2, 3], "quaternion": [0, 0, 0, 1], "joint_positions": None}
+    path.write_text(json.dumps({BASE: entry}))
+    loaded = GoalFile(str(path)).load()[BASE]
+    assert loaded.goal_id == ""
+    assert loaded.goal.joint_positions is None
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"arm": {}}', '{"base": 3}', '{"base": {"position": [1]}}']
+)
+def test_a_file_that_holds_no_goal_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "goal.json"
+    path.write_text(text)
+    with pytest.raises(ParameterError, match="holds no goal"):
+        GoalFile(str(path)).load()
+
+
+def test_a_file_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="cannot be written"):
+        GoalFile(str(tmp_path / "none" / "goal.json")).save({BASE: IdentifiedGoal(GOAL)})
