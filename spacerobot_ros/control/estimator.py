@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import casadi as ca
 
-from spacerobot_ros.control.orientation import multiply, quaternion_from_rotvec
 from spacerobot_ros.control.state import Actuation, ControlState
 from spacerobot_ros.model.compilation import BufferedFunction, compiled, dense_function
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.integration import repeated, runge_kutta_step, steps_in
-from spacerobot_ros.model.momentum import rotation_from_quaternion
-from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP, quaternion_rate
+from spacerobot_ros.model.integration import (
+    DEFAULT_INTEGRATION_STEP,
+    repeated,
+    runge_kutta_step,
+    steps_in,
+)
 from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.model.symbolic_rotations import (
+    matrix_from_quaternion,
+    quaternion_from_rotvec,
+    quaternion_multiply,
+    quaternion_rate,
+)
 
 
 class DeadReckoning:
@@ -113,7 +121,7 @@ def _center_rate(robot: SpaceRobot) -> ca.Function:
     dynamics = robot.function("forward_dynamics", compile=False)
     z0ddot = dynamics(q, v_cm, omega, qdot, wrench, tau)
     rate = ca.vertcat(
-        rotation_from_quaternion(quaternion) @ v_cm,
+        matrix_from_quaternion(quaternion) @ v_cm,
         quaternion_rate(quaternion, omega),
         z0ddot[:6],
         qdot,
@@ -126,7 +134,7 @@ def _center_from_origin(robot: SpaceRobot) -> ca.Function:
     """Return ``x -> y``: from the origin of the base to the centre of mass."""
     x = ca.SX.sym("x", 13 + 2 * robot.n)
     r_WB, quaternion, v, omega, q, qdot = _split(x, robot.n)
-    r_cm = r_WB + rotation_from_quaternion(quaternion) @ _center_of_mass(robot, q)
+    r_cm = r_WB + matrix_from_quaternion(quaternion) @ _center_of_mass(robot, q)
     v_cm = v - _base_jacobian(robot, q)[:, 3:] @ ca.vertcat(omega, qdot)
     y = ca.vertcat(r_cm, quaternion, v_cm, omega, q, qdot)
     return dense_function("center_from_origin", [x], [y], (["x"], ["y"]))
@@ -136,7 +144,7 @@ def _origin_from_center(robot: SpaceRobot) -> ca.Function:
     """Return ``y -> x``: from the centre of mass to the origin of the base."""
     y = ca.SX.sym("y", 13 + 2 * robot.n)
     r_cm, quaternion, v_cm, omega, q, qdot = _split(y, robot.n)
-    r_WB = r_cm - rotation_from_quaternion(quaternion) @ _center_of_mass(robot, q)
+    r_WB = r_cm - matrix_from_quaternion(quaternion) @ _center_of_mass(robot, q)
     v = v_cm + _base_jacobian(robot, q)[:, 3:] @ ca.vertcat(omega, qdot)
     x = ca.vertcat(r_WB, quaternion, v, omega, q, qdot)
     return dense_function("origin_from_center", [y], [x], (["y"], ["x"]))
@@ -157,15 +165,15 @@ def _joint_correction(robot: SpaceRobot) -> ca.Function:
     x, measured = ca.SX.sym("x", 13 + 2 * n), ca.SX.sym("q", n)
     measured_rate = ca.SX.sym("qdot", n)
     r_WB, quaternion, v, omega, q, qdot = _split(x, n)
-    r_cm = r_WB + rotation_from_quaternion(quaternion) @ _center_of_mass(robot, q)
+    r_cm = r_WB + matrix_from_quaternion(quaternion) @ _center_of_mass(robot, q)
     p_W, L_W, _ = robot.function("momentum", compile=False)(quaternion, q, v, omega, qdot)
     # At the middle of the difference the connection is right to second order.
     A = ca.reshape(robot.function("connection", compile=False)((q + measured) / 2), 6, n)
-    turned = multiply(quaternion, quaternion_from_rotvec(-A[3:, :] @ (measured - q)))
+    turned = quaternion_multiply(quaternion, quaternion_from_rotvec(-A[3:, :] @ (measured - q)))
     v_next, omega_next = robot.function("base_twist", compile=False)(
         turned, measured, measured_rate, p_W, L_W
     )
-    r_next = r_cm - rotation_from_quaternion(turned) @ _center_of_mass(robot, measured)
+    r_next = r_cm - matrix_from_quaternion(turned) @ _center_of_mass(robot, measured)
     corrected = ca.vertcat(r_next, turned, v_next, omega_next, measured, measured_rate)
     names = ["x", "q", "qdot"], ["x_next"]
     return dense_function("joint_correction", [x, measured, measured_rate], [corrected], names)

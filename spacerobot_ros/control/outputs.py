@@ -19,7 +19,6 @@ import casadi as ca
 import numpy as np
 
 from spacerobot_ros.control.errors import NotFiniteError, TargetNotSetError
-from spacerobot_ros.control.orientation import link_quaternion, multiply, rotation_error
 from spacerobot_ros.control.selection import AXES, OutputSelection
 from spacerobot_ros.control.state import (
     ControlState,
@@ -28,8 +27,13 @@ from spacerobot_ros.control.state import (
     Reference,
 )
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.momentum import rotation_from_quaternion
+from spacerobot_ros.model.kinematics import link_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.model.symbolic_rotations import (
+    matrix_from_quaternion,
+    quaternion_multiply,
+    rotation_error,
+)
 
 _POSE_REFERENCE = 19
 """Numbers of a pose reference: position 3, quaternion 4, two velocities and two accelerations."""
@@ -98,7 +102,7 @@ class OutputVector:
         r_WB, self._quaternion, v, self.omega, self.q, self.qdot = ca.vertsplit(
             self.state, [0, 3, 7, 10, 13, 13 + n, 13 + 2 * n]
         )
-        self._R_WB = rotation_from_quaternion(self._quaternion)
+        self._R_WB = matrix_from_quaternion(self._quaternion)
 
         J_base = self._link_jacobian(robot.base_link)
         self.v_cm = v - J_base[:3, 3:6] @ self.omega - J_base[:3, 6:] @ self.qdot
@@ -200,7 +204,7 @@ class OutputVector:
         _, r_BL = self.robot.function("link_poses", compile=False)(self.q)
         position = r_WB + self._R_WB @ r_BL[:, self.robot.link_names.index(link)]
         attitude = link_quaternion(self.robot.description, link, self.q)
-        quaternion = multiply(self._quaternion, attitude)
+        quaternion = quaternion_multiply(self._quaternion, attitude)
         return self._pose_group(self._link_jacobian(link), position, quaternion, target)
 
     def _joint_group(self, target: ca.SX) -> _Group:

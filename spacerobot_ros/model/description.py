@@ -8,11 +8,10 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spacerobot_ros.errors import RobotDescriptionError
-
-Array = npt.NDArray[np.float64]
+from spacerobot_ros.model.rotations import Array as Array
+from spacerobot_ros.model.rotations import matrix_about_axis
 
 
 class JointKind(str, Enum):
@@ -26,7 +25,7 @@ class JointKind(str, Enum):
 
 @dataclass(frozen=True)
 class JointLimits:
-    """Stroke, rate and effort of a joint (m or rad, /s, N or N m); infinite where free."""
+    """Range, rate and effort of a joint (m or rad, /s, N or N m); infinite where free."""
 
     lower: float = -np.inf
     upper: float = np.inf
@@ -109,9 +108,7 @@ class Joint:
         """Return the fixed joint that holds the child where this one has it at ``position``."""
         moved = Pose(r=position * self.axis)
         if self.kind is not JointKind.PRISMATIC:
-            hat = np.cross(np.eye(3), self.axis)
-            turn = np.eye(3) + np.sin(position) * hat + (1 - np.cos(position)) * (hat @ hat)
-            moved = Pose(turn)
+            moved = Pose(matrix_about_axis(self.axis, position))
         return replace(self, kind=JointKind.FIXED, origin=self.origin @ moved, limits=JointLimits())
 
 
@@ -192,6 +189,28 @@ class RobotDescription:
             for joint in self.joints
         )
         return self._rebuilt(self.links, joints)
+
+    def with_model_error(self, error: float, seed: int) -> RobotDescription:
+        """Return the robot with every mass and every inertia off by a factor of its own.
+
+        The factors are drawn uniformly from ``[1 - error, 1 + error]``, two a link in the order of
+        the links. A tensor of inertia stays a possible one, since its principal moments keep their
+        ratios; centres of mass stay where they are.
+
+        Raises
+        ------
+        ValueError
+            ``error`` is not in [0, 1).
+        """
+        if not 0.0 <= error < 1.0:
+            raise ValueError(f"a relative error of {error} leaves no mass positive")
+        factors = np.random.default_rng(seed).uniform(1 - error, 1 + error, (len(self.links), 2))
+        links = []
+        for link, (mass, moment) in zip(self.links, factors, strict=True):
+            true = link.inertia
+            believed = Inertia(true.mass * float(mass), true.com, true.about_com * moment)
+            links.append(replace(link, inertia=believed))
+        return self.with_links(tuple(links))
 
     def _rebuilt(self, links: tuple[Link, ...], joints: tuple[Joint, ...]) -> RobotDescription:
         bodies, frames = weld({link.name: link for link in links}, joints)

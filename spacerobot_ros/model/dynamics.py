@@ -1,16 +1,148 @@
-"""Equations of motion under forces (paper 4, eqs 18, 19 and 21): ``H+ zddot + C+ = Q``.
+"""Inertia and equations of motion (paper 4, eqs 1-3, 8-10 and 14-21): ``H+ zddot + C+ = Q``.
 
 The independent velocities are ``z0dot = [v_cm; omega; qdot]``, the first two in base components
 (eq. 8), so that nothing depends on where the robot is or how it is turned.
+
+The paper writes barycentric vectors for a chain of revolute joints. Here they stand for any tree:
+the vector from the mass centre of body i to its joint *towards body k* takes the place of the
+paper's ``r_i`` (k outboard) and ``l_i`` (k inboard). A prismatic joint makes that vector grow along
+its axis, which adds the slide terms below; without prismatic joints they vanish and the paper's
+formulas remain.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import casadi as ca
 
-from spacerobot_ros.model.barycentric import BarycentricInertia, point_jacobian
-from spacerobot_ros.model.connection import solve_positive_definite
 from spacerobot_ros.model.kinematics import TreeKinematics
+
+
+@dataclass(frozen=True)
+class BarycentricInertia:
+    """Blocks of ``H+`` (eq. 15) in base components.
+
+    ``D`` (3, 3) system inertia about the system's centre of mass, ``D_q`` (3, n), ``D_qq``
+    (n, n); ``v[i][k]`` are the barycentric vectors, each (3,).
+    """
+
+    mass: float
+    D: ca.SX
+    D_q: ca.SX
+    D_qq: ca.SX
+    v: tuple[tuple[ca.SX, ...], ...]
+
+    @property
+    def H_plus(self) -> ca.SX:
+        """The inertia matrix (6 + n, 6 + n) of ``[v_cm; omega; qdot]``, eq. (15)."""
+        n = self.D_qq.shape[0]
+        return ca.blockcat(
+            [
+                [self.mass * ca.SX.eye(3), ca.SX(3, 3), ca.SX(3, n)],
+                [ca.SX(3, 3), self.D, self.D_q],
+                [ca.SX(n, 3), self.D_q.T, self.D_qq],
+            ]
+        )
+
+
+def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:
+    """Return ``v[i][k]``, eqs (3a) and (3b): ``rho_k = sum_i v[i][k]`` is the mass centre of body k
+    from that of the system, base components.
+    """
+    bodies = range(kin.n + 1)
+    M = kin.robot.total_mass
+    outboard = [set(kin.outboard(k)) for k in bodies]
+    # towards[i][j]: from the mass centre of i to the joint it shares with its neighbour j,
+    # with the mass that lies beyond that joint.
+    towards: list[dict[int, tuple[ca.SX, float]]] = [{} for _ in bodies]
+    for k in bodies[1:]:
+        i = kin.parent(k)
+        beyond = sum(kin.mass(b) for b in outboard[k])
+        towards[i][k] = (kin.p[k] - kin.com[i], beyond)
+        towards[k][i] = (kin.p[k] - kin.com[k], M - beyond)
+    c = [sum((d * (m / M) for d, m in towards[i].values()), ca.SX(3, 1)) for i in bodies]
+
+    def next_body(i: int, k: int) -> int:
+        if k not in outboard[i]:
+            return kin.parent(i)
+        return next(j for j in towards[i] if j != kin.parent(i) and k in outboard[j])
+
+    return tuple(
+        tuple(-c[i] if i == k else towards[i][next_body(i, k)][0] - c[i] for k in bodies)
+        for i in bodies
+    )
+
+
+def barycentric_inertia(kin: TreeKinematics) -> BarycentricInertia:
+    """Return the blocks of ``H+`` (eqs 14-17), with the slide terms of prismatic joints."""
+    n, M = kin.n, kin.robot.total_mass
+    bodies = range(n + 1)
+    v = barycentric_vectors(kin)
+    one = ca.SX.eye(3)
+
+    # Eq. (17): D_ij couples the rotations of bodies i and j.
+    D_ij: dict[tuple[int, int], ca.SX] = {}
+    for i in bodies:
+        D_ii = kin.inertia[i]
+        for k in bodies:
+            D_ii = D_ii + kin.mass(k) * (ca.dot(v[i][k], v[i][k]) * one - v[i][k] @ v[i][k].T)
+        D_ij[i, i] = D_ii
+        for j in range(i):
+            D_ij[i, j] = -M * (ca.dot(v[j][i], v[i][j]) * one - v[j][i] @ v[i][j].T)
+            D_ij[j, i] = D_ij[i, j].T
+
+    # E_ij couples the rotation of body i and the slide j: sum_k m_k v_ik x ds_k/dq_j, where
+    # sum_k m_k v_ik = 0 leaves only the bodies that the slide carries.
+    outboard = [kin.outboard(j) for j in bodies]
+    slides = [j for j in bodies[1:] if not kin.is_revolute(j)]
+    turns = [j for j in bodies[1:] if kin.is_revolute(j)]
+    E = {
+        (i, j): ca.cross(
+            sum((kin.mass(k) * v[i][k] for k in outboard[j]), ca.SX(3, 1)), kin.axis[j]
+        )
+        for i in bodies
+        for j in slides
+    }
+
+    # Eqs (16a, 16b). Joint j turns every body it carries, so F_i' D_ij F_j is summed over the
+    # bodies beyond each joint (column[j][i]) before its axis is applied.
+    D = sum((D_ij[i, j] for i in bodies for j in bodies), ca.SX(3, 3))
+    column = {
+        (i, b): sum((D_ij[i, j] for j in outboard[b]), ca.SX(3, 3)) @ kin.axis[b]
+        for i in bodies
+        for b in turns
+    } | {(i, b): E[i, b] for i in bodies for b in slides}
+    D_q = ca.SX(3, n)
+    D_qq = ca.SX(n, n)
+    for b in bodies[1:]:
+        D_q[:, b - 1] = sum((column[i, b] for i in bodies), ca.SX(3, 1))
+        for a in turns:
+            moment = sum((column[i, b] for i in outboard[a]), ca.SX(3, 1))
+            D_qq[a - 1, b - 1] = ca.dot(kin.axis[a], moment)
+            D_qq[b - 1, a - 1] = D_qq[a - 1, b - 1]
+    for a in slides:
+        for b in slides:
+            carried = [sum(kin.mass(k) for k in outboard[j]) for j in (a, b)]
+            shared = sum(kin.mass(k) for k in set(outboard[a]) & set(outboard[b]))
+            reduced = shared - carried[0] * carried[1] / M
+            D_qq[a - 1, b - 1] = reduced * ca.dot(kin.axis[a], kin.axis[b])
+    return BarycentricInertia(M, D, D_q, D_qq, v)
+
+
+def point_jacobian(kin: TreeKinematics, link: str) -> ca.SX:
+    """Return ``0J+`` (6, 6 + n) of a link's frame origin, eq. (10), in base components.
+
+    It maps ``[v_cm; omega; qdot]`` to the linear velocity of the point over the angular velocity
+    of its body. ``J_12`` is the shape derivative of ``rho = sum_i v_ik,m``, which for revolute
+    joints is the paper's ``-sum_i skew(v_ik,m) F_i``.
+    """
+    _, point, body = kin.frame(link)
+    rho = point - kin.r_BC_B
+    J_11 = -ca.skew(rho)
+    J_12 = ca.jacobian(rho, kin.q)
+    J_22 = kin.angular_jacobian(body)
+    return ca.blockcat([[ca.SX.eye(3), J_11, J_12], [ca.SX(3, 3), ca.SX.eye(3), J_22]])
 
 
 def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
@@ -90,3 +222,9 @@ def forward_dynamics(inertia: BarycentricInertia, C_plus: ca.SX, Q: ca.SX) -> ca
     force = Q - C_plus
     H = ca.blockcat([[inertia.D, inertia.D_q], [inertia.D_q.T, inertia.D_qq]])
     return ca.vertcat(force[:3] / inertia.mass, solve_positive_definite(H, force[3:]))
+
+
+def solve_positive_definite(matrix: ca.SX, right: ca.SX) -> ca.SX:
+    """Solve ``matrix x = right`` for a symmetric positive definite matrix (Cholesky)."""
+    upper = ca.chol(matrix)
+    return ca.solve(upper, ca.solve(upper.T, right))

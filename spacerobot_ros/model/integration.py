@@ -7,6 +7,10 @@ import math
 import casadi as ca
 
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
+
+DEFAULT_INTEGRATION_STEP = 0.01
+"""Longest Runge-Kutta step of the attitude under held joint velocities, s."""
 
 
 def steps_in(tick_period: float, integration_step: float) -> int:
@@ -54,6 +58,39 @@ def repeated(step: ca.Function, count: int) -> ca.Function:
     if count % 2:
         x_next = step(x_next, *held)
     return ca.Function(f"{step.name()}_{count}", [x, *held], [x_next])
+
+
+def attitude_step(locked_inertia: ca.Function) -> ca.Function:
+    """Return one Runge-Kutta step ``(x, qdot, L_W, h) -> x`` of ``x = [q; quaternion_WB]``.
+
+    The reconstruction of the base's motion from the shape's, one held command at a time. Joint
+    velocities are constant over the step (servos hold them), so the shape is exact; the position
+    follows from the centre of mass. What is integrated is the attitude alone:
+    ``R_WB_dot = R_WB hat(omega)``, ``omega = D^-1 (R_WB' L_W - D_q qdot)`` (paper 1, eq. 3, with an
+    angular momentum that need not be zero), as a quaternion in R^4, normalised.
+
+    ``locked_inertia`` is the function ``q -> (D, D_q)``.
+    """
+    n = locked_inertia.size1_in(0)
+    x = ca.SX.sym("x", n + 4)
+    qdot, L_W, h = ca.SX.sym("qdot", n), ca.SX.sym("L_W", 3), ca.SX.sym("h")
+    q, quaternion = x[:n], x[n:]
+    # Start, middle and end of the step: the middle serves two of the four stages.
+    shapes = [locked_inertia(q + fraction * h * qdot) for fraction in (0.0, 0.5, 1.0)]
+
+    def rate(at: ca.SX, shape: tuple[ca.SX, ca.SX]) -> ca.SX:
+        D, D_q = shape
+        L_B = matrix_from_quaternion(at).T @ L_W
+        omega = ca.solve(ca.chol(D), ca.solve(ca.chol(D).T, L_B - D_q @ qdot))
+        return quaternion_rate(at, omega)
+
+    k1 = rate(quaternion, shapes[0])
+    k2 = rate(quaternion + h / 2 * k1, shapes[1])
+    k3 = rate(quaternion + h / 2 * k2, shapes[1])
+    k4 = rate(quaternion + h * k3, shapes[2])
+    turned = quaternion + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    x_next = ca.vertcat(q + h * qdot, turned / ca.norm_2(turned))
+    return ca.Function("attitude_step", [x, qdot, L_W, h], [ca.cse(x_next)])
 
 
 def _arguments(function: ca.Function) -> tuple[ca.MX, list[ca.MX]]:

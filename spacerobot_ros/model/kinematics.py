@@ -9,14 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import casadi as ca
-import numpy as np
 
-from spacerobot_ros.model.description import JointKind, Pose, RobotDescription
-
-
-def skew(a: ca.SX) -> ca.SX:
-    """Return the skew matrix (3, 3) with ``skew(a) @ b == cross(a, b)``."""
-    return ca.skew(a)
+from spacerobot_ros.model.description import Array, JointKind, Pose, RobotDescription
+from spacerobot_ros.model.rotations import quaternion_from_matrix
+from spacerobot_ros.model.symbolic_rotations import matrix_about_axis, quaternion_multiply
 
 
 @dataclass(frozen=True)
@@ -86,13 +82,6 @@ def _chain(R: ca.SX, p: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
     return R @ ca.sparsify(ca.DM(pose.R)), p + R @ ca.sparsify(ca.DM(pose.r))
 
 
-def _rotation(axis: np.ndarray, angle: ca.SX) -> ca.SX:
-    """Rotation matrix about a constant unit axis (Rodrigues)."""
-    a = ca.sparsify(ca.DM(axis))
-    cosine, sine = ca.cos(angle), ca.sin(angle)
-    return cosine * ca.DM.eye(3) + sine * ca.sparsify(ca.skew(a)) + (1 - cosine) * (a @ a.T)
-
-
 def tree_kinematics(robot: RobotDescription) -> TreeKinematics:
     """Build the symbolic kinematics of a robot."""
     n = len(robot.bodies) - 1
@@ -109,7 +98,7 @@ def tree_kinematics(robot: RobotDescription) -> TreeKinematics:
             R.append(R_joint)
             p.append(p_joint + direction * q[k - 1])
         else:
-            R.append(R_joint @ _rotation(joint.axis, q[k - 1]))
+            R.append(R_joint @ matrix_about_axis(joint.axis, q[k - 1]))
             p.append(p_joint)
         axis.append(direction)
     com, inertia = [], []
@@ -121,3 +110,23 @@ def tree_kinematics(robot: RobotDescription) -> TreeKinematics:
     return TreeKinematics(
         robot, q, tuple(R), tuple(p), tuple(com), tuple(inertia), tuple(axis), r_BC_B
     )
+
+
+def link_quaternion(description: RobotDescription, link: str, q: ca.SX) -> ca.SX:
+    """Return the quaternion (4,) of ``R_BL``, smooth in q: no matrix is turned into it."""
+    index, pose = description.frames[link]
+    quaternion = _constant(pose.R)
+    while index > 0:
+        body = description.bodies[index]
+        assert body.joint is not None
+        if body.joint.kind is not JointKind.PRISMATIC:
+            half = q[index - 1] / 2
+            turn = ca.vertcat(ca.sin(half) * ca.DM(body.joint.axis), ca.cos(half))
+            quaternion = quaternion_multiply(turn, quaternion)
+        quaternion = quaternion_multiply(_constant(body.origin.R), quaternion)
+        index = body.parent
+    return quaternion
+
+
+def _constant(R: Array) -> ca.DM:
+    return ca.sparsify(ca.DM(quaternion_from_matrix(R)))

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.model.uncertainty import with_model_error
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.resources import robot_file
@@ -39,7 +38,7 @@ class BelievedRobotConfig(RobotConfig):
     def believed(self, robot: RobotDescription) -> RobotDescription:
         """Return the robot with its masses and inertias wrong by ``model_error``."""
         if self.model_error > 0.0:
-            return with_model_error(robot, self.model_error, self.model_error_seed)
+            return robot.with_model_error(self.model_error, self.model_error_seed)
         return robot
 
 

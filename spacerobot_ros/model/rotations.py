@@ -10,13 +10,21 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.model.description import Array
+Array = npt.NDArray[np.float64]
+"""Numbers: the type of every vector and matrix of the package."""
 
 
 def hat(a: npt.ArrayLike) -> Array:
     """Return the skew matrix (3, 3) with ``hat(a) @ b == cross(a, b)``."""
     x, y, z = np.asarray(a, dtype=float)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def matrix_about_axis(axis: npt.ArrayLike, angle: float) -> Array:
+    """Return the rotation (3, 3) by an angle (rad) about a unit axis (Rodrigues)."""
+    a = hat(axis)
+    turned: Array = np.eye(3) + np.sin(angle) * a + (1 - np.cos(angle)) * (a @ a)
+    return turned
 
 
 def matrix_from_rpy(rpy: npt.ArrayLike) -> Array:
@@ -44,9 +52,12 @@ def matrix_from_quaternion(quaternion: npt.ArrayLike) -> Array:
 
 
 def quaternion_multiply(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
-    """Return the product of two quaternions (x, y, z, w): the rotation b followed by a."""
-    ax, ay, az, aw = np.asarray(a, dtype=float)
-    bx, by, bz, bw = np.asarray(b, dtype=float)
+    """Return the product of two quaternions (x, y, z, w): the rotation b followed by a.
+
+    Either may be many, (N, 4); so is the product then.
+    """
+    ax, ay, az, aw = np.asarray(a, dtype=float).T
+    bx, by, bz, bw = np.asarray(b, dtype=float).T
     return np.array(
         [
             aw * bx + ax * bw + ay * bz - az * by,
@@ -54,11 +65,11 @@ def quaternion_multiply(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
             aw * bz + ax * by - ay * bx + az * bw,
             aw * bw - ax * bx - ay * by - az * bz,
         ]
-    )
+    ).T
 
 
 def quaternion_inverse(quaternion: npt.ArrayLike) -> Array:
-    """Return the inverse of a unit quaternion (x, y, z, w)."""
+    """Return the inverse of a unit quaternion (4,) or of many (N, 4)."""
     return np.asarray(quaternion, dtype=float) * np.array([-1.0, -1.0, -1.0, 1.0])
 
 
@@ -78,6 +89,16 @@ def rotvec_from_quaternion(quaternion: npt.ArrayLike) -> Array:
     sine = float(np.linalg.norm(q[:3]))
     angle = 2 * math.atan2(sine, float(q[3]))
     return q[:3] * (angle / sine if sine > 1e-12 else 2.0)
+
+
+def rotvecs_from_quaternions(quaternions: Array) -> Array:
+    """Return the rotation vectors (N, 3) of unit quaternions (N, 4), each of length at most pi."""
+    q = np.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
+    sine = np.linalg.norm(q[:, :3], axis=1)
+    angle = 2 * np.arctan2(sine, q[:, 3])
+    small = sine < 1e-12
+    scale: Array = np.where(small, 2.0, angle / np.where(small, 1.0, sine))
+    return q[:, :3] * scale[:, np.newaxis]
 
 
 def attitude_error(quaternion: npt.ArrayLike, target: npt.ArrayLike) -> Array:

@@ -16,17 +16,25 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import RobotDescriptionError
-from spacerobot_ros.model.barycentric import barycentric_inertia, point_jacobian
 from spacerobot_ros.model.compilation import BufferedFunction, compiled, dense_function
-from spacerobot_ros.model.composite_rigid_body import composite_dynamics
-from spacerobot_ros.model.connection import connection, curvature
+from spacerobot_ros.model.composite_rigid_body import (
+    composite_dynamics,
+    shape_equations,
+    state_rate,
+    state_slices,
+)
+from spacerobot_ros.model.connection import base_twist, connection, curvature, momentum_of_bodies
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.model.dynamics import bias, forward_dynamics, generalised_forces
-from spacerobot_ros.model.free_flight import shape_equations, state_rate, state_slices
-from spacerobot_ros.model.integration import repeated, runge_kutta_step
+from spacerobot_ros.model.dynamics import (
+    barycentric_inertia,
+    bias,
+    forward_dynamics,
+    generalised_forces,
+    point_jacobian,
+)
+from spacerobot_ros.model.integration import attitude_step, repeated, runge_kutta_step
 from spacerobot_ros.model.kinematics import tree_kinematics
-from spacerobot_ros.model.momentum import base_twist, momentum_of_bodies, rotation_from_quaternion
-from spacerobot_ros.model.reconstruction import attitude_step
+from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 
 
@@ -204,7 +212,7 @@ class SpaceRobot:
         """Return the step under held joint velocities ``(x, qdot, L_W, h) -> x``.
 
         ``x = [q; quaternion_WB]``; the step of ``h`` seconds is taken in ``substeps``
-        Runge-Kutta steps of the attitude (see :mod:`spacerobot_ros.model.reconstruction`).
+        Runge-Kutta steps of the attitude (see :mod:`spacerobot_ros.model.integration`).
         """
         return self.buffered(f"velocity_step:{substeps}")
 
@@ -299,7 +307,7 @@ class SpaceRobot:
     def _momentum(self) -> ca.Function:
         v, omega, qdot = self._velocities()
         quaternion = ca.SX.sym("quaternion", 4)
-        R_WB = rotation_from_quaternion(quaternion)
+        R_WB = matrix_from_quaternion(quaternion)
         p_B, L_B, energy = momentum_of_bodies(self._kin, v, omega, qdot)
         return dense_function(
             "momentum",
@@ -311,7 +319,7 @@ class SpaceRobot:
     def _base_twist(self) -> ca.Function:
         qdot = ca.SX.sym("qdot", self.n)
         quaternion, p_W, L_W = ca.SX.sym("quaternion", 4), ca.SX.sym("p", 3), ca.SX.sym("L", 3)
-        R_BW = rotation_from_quaternion(quaternion).T
+        R_BW = matrix_from_quaternion(quaternion).T
         v, omega = base_twist(self._kin, self._inertia, qdot, R_BW @ p_W, R_BW @ L_W)
         return dense_function(
             "base_twist",
@@ -322,7 +330,7 @@ class SpaceRobot:
 
     def _rotate(self) -> ca.Function:
         quaternion, vector = ca.SX.sym("quaternion", 4), ca.SX.sym("vector", 3)
-        rotated = rotation_from_quaternion(quaternion) @ vector
+        rotated = matrix_from_quaternion(quaternion) @ vector
         names = ["quaternion_WB", "vector_B"]
         return dense_function("rotate", [quaternion, vector], [rotated], (names, ["vector_W"]))
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.parameters import require_known
 from spacerobot_ros.planning.core.goal import Goal, RobotState, Tolerance

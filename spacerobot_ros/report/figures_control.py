@@ -8,8 +8,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from spacerobot_ros.model.rotations import (
+    quaternion_inverse,
+    quaternion_multiply,
+    rotvecs_from_quaternions,
+)
 from spacerobot_ros.report.figures import Group, joint_unit, time_plate
 from spacerobot_ros.report.flight import Flight, Target
 from spacerobot_ros.report.signals import Signal
@@ -54,11 +58,11 @@ def pose_errors(pose: Signal, targets: Sequence[Target]) -> Signal:
     for target in targets:
         part = pose.between(target.start, target.end)
         if len(part):
-            goal = Rotation.from_quat(target.goal.quaternion)
-            turn = goal * Rotation.from_quat(part.values[:, 3:]).inv()
+            inverse = quaternion_inverse(part.values[:, 3:])
+            turn = quaternion_multiply(target.goal.quaternion, inverse)
             left = target.goal.position - part.values[:, :3]
             times.append(part.time)
-            values.append(np.hstack([left, turn.as_rotvec()]))
+            values.append(np.hstack([left, rotvecs_from_quaternions(turn)]))
     return Signal(np.concatenate(times), np.concatenate(values))
 
 

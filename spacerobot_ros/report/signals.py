@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import rotvecs_from_quaternions
 
 Indices = npt.NDArray[np.int64]
 
@@ -125,12 +126,7 @@ def rotvecs(quaternions: Array) -> Array:
     The first has a length of at most pi; each other one is the vector of the same attitude that
     is nearest to the one before.
     """
-    q = np.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
-    sine = np.linalg.norm(q[:, :3], axis=1)
-    angle = 2 * np.arctan2(sine, q[:, 3])
-    small = sine < 1e-12
-    scale = np.where(small, 2.0, angle / np.where(small, 1.0, sine))
-    wrapped = q[:, :3] * scale[:, np.newaxis]
+    wrapped = rotvecs_from_quaternions(quaternions)
     jumps = np.linalg.norm(np.diff(wrapped, axis=0), axis=1) > np.pi
     if not jumps.any():
         return wrapped

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model import SpaceRobot, reconstruction
+from spacerobot_ros.model import SpaceRobot, integration
 from spacerobot_ros.simulation import effort_plant
 from spacerobot_ros.simulation.effort_plant import EffortPlant
 from spacerobot_ros.simulation.faults_plant import FaultyPlant
@@ -42,7 +42,7 @@ class PlantKind:
 
 
 PLANTS: dict[str, PlantKind] = {
-    "velocity": PlantKind(VelocityPlant, reconstruction.DEFAULT_INTEGRATION_STEP, False),
+    "velocity": PlantKind(VelocityPlant, integration.DEFAULT_INTEGRATION_STEP, False),
     "effort": PlantKind(EffortPlant, effort_plant.DEFAULT_INTEGRATION_STEP, True),
 }
 """By what joint commands carry: the parameter ``actuation``."""

@@ -1,9 +1,9 @@
 """The plant under efforts: joint efforts and thrusters drive the full free-flying dynamics.
 
 One tick is one compiled function: limits, integration, and every quantity that is published. The
-total momenta are integrated as such (:mod:`spacerobot_ros.model.free_flight`): without thrust they
-do not change by a single bit. Ticks in which a joint touches the end of its stroke are taken again
-with its stop (:mod:`spacerobot_ros.simulation.joint_stops`).
+total momenta are integrated as such (:mod:`spacerobot_ros.model.composite_rigid_body`): without
+thrust they do not change by a single bit. Ticks in which a joint touches the end of its stroke are
+taken again with its stop (:mod:`spacerobot_ros.simulation.joint_stops`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import numpy.typing as npt
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction, compiled
+from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.free_flight import state_slices
 from spacerobot_ros.model.integration import repeated, steps_in
 from spacerobot_ros.simulation.initial_state import InitialState
 from spacerobot_ros.simulation.joint_stops import JointStops

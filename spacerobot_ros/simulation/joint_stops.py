@@ -22,8 +22,8 @@ import numpy as np
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.free_flight import state_slices
 from spacerobot_ros.simulation.plant import Flags
 
 _BISECTIONS = 40
@@ -34,7 +34,7 @@ _BEYOND = 1e-12
 
 
 class JointStops:
-    """Advances the state of :mod:`spacerobot_ros.model.free_flight` with stops.
+    """Advances the state of :mod:`spacerobot_ros.model.composite_rigid_body` with stops.
 
     Parameters
     ----------

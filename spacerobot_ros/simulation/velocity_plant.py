@@ -14,8 +14,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction, compiled
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.integration import steps_in
-from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP, steps_in
 from spacerobot_ros.simulation.initial_state import InitialState
 from spacerobot_ros.simulation.plant import Flags
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -12,15 +14,18 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.oracles import Array
 
+from spacerobot_ros.model import symbolic_rotations as symbolic
 from spacerobot_ros.model.rotations import (
     attitude_error,
     hat,
+    matrix_about_axis,
     matrix_from_quaternion,
     matrix_from_rpy,
     quaternion_from_rotvec,
     quaternion_inverse,
     quaternion_multiply,
     rotvec_from_quaternion,
+    rotvecs_from_quaternions,
     unit_quaternion,
 )
 
@@ -149,3 +154,65 @@ def test_unit_quaternion(q: Array, scale: float) -> None:
 def test_unit_quaternion_refuses_what_is_no_rotation(q: list[float]) -> None:
     with pytest.raises(ValueError, match="is not a rotation"):
         unit_quaternion(q)
+
+
+@repeatable
+@given(st.lists(st.tuples(quaternions(), quaternions()), min_size=1, max_size=5))
+def test_many_attitudes_at_once_are_what_they_are_one_by_one(
+    pairs: list[tuple[Array, Array]],
+) -> None:
+    a, b = (np.array(each) for each in zip(*pairs, strict=True))
+    products = quaternion_multiply(a, quaternion_inverse(b))
+    assert_near(products, [quaternion_multiply(x, quaternion_inverse(y)) for x, y in pairs], 0.0)
+    one = quaternion_multiply(a[0], b)
+    assert_near(one, [quaternion_multiply(a[0], y) for y in b], 0.0)
+    assert_near(rotvecs_from_quaternions(a), [rotvec_from_quaternion(x) for x in a])
+
+
+# -- with symbols ------------------------------------------------------------------------------
+
+
+def evaluated(build: Callable[..., ca.SX], *arguments: npt.ArrayLike) -> Array:
+    """Return a symbolic function's value at numbers."""
+    symbols = [ca.SX.sym(f"x{i}", np.size(x)) for i, x in enumerate(arguments)]
+    return np.array(ca.Function("f", symbols, [build(*symbols)])(*arguments)).squeeze()
+
+
+@repeatable
+@given(quaternions(), quaternions(), vectors(3.0))
+def test_symbolic_quaternions_agree_with_scipy(a: Array, b: Array, omega: Array) -> None:
+    A, B = Rotation.from_quat(a), Rotation.from_quat(b)
+    assert_near(evaluated(symbolic.matrix_from_quaternion, a), A.as_matrix())
+    product = evaluated(symbolic.quaternion_multiply, a, b)
+    assert_near(Rotation.from_quat(product).as_matrix(), (A * B).as_matrix())
+    vector = evaluated(symbolic.relative_vector, a, b)
+    assert abs(np.linalg.norm(vector) - math.sin((A.inv() * B).magnitude() / 2)) <= 1e-14
+    h = 1e-5
+    after, before = ((A * Rotation.from_rotvec(x * omega)).as_quat() for x in (h, -h))
+    after, before = (x * np.sign(x @ a) for x in (after, before))
+    assert_near(evaluated(symbolic.quaternion_rate, a, omega), (after - before) / (2 * h), 1e-8)
+
+
+@repeatable
+@given(rotation_vectors())
+def test_symbolic_rotation_vectors_agree_with_scipy(rotvec: Array) -> None:
+    turned = Rotation.from_rotvec(rotvec).as_matrix()
+    quaternion = evaluated(symbolic.quaternion_from_rotvec, rotvec)
+    assert_near(Rotation.from_quat(quaternion).as_matrix(), turned)
+    small = evaluated(symbolic.quaternion_from_small_rotvec, rotvec / 10)
+    exact = Rotation.from_rotvec(rotvec / 10).as_quat()
+    assert_near(small, exact * np.sign(exact[3]), 1e-9)
+    angle = float(np.linalg.norm(rotvec))
+    if angle > 1e-9:
+        axis = rotvec / angle
+        assert_near(matrix_about_axis(axis, angle), turned)
+        assert_near(evaluated(lambda x: symbolic.matrix_about_axis(axis, x), angle), turned)
+
+
+@repeatable
+@given(quaternions(), quaternions())
+def test_the_symbolic_error_is_the_shortest_turn_in_world_components(a: Array, b: Array) -> None:
+    error = evaluated(symbolic.rotation_error, a, b)
+    assert np.linalg.norm(error) <= math.pi + 1e-12
+    reached = Rotation.from_rotvec(error) * Rotation.from_quat(a)
+    assert_near(reached.as_matrix(), Rotation.from_quat(b).as_matrix(), 1e-13)

@@ -13,7 +13,7 @@ from support.random_robots import random_chain_urdf, random_robot_urdf
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction
-from spacerobot_ros.model.free_flight import state_slices
+from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.resources import share_directory
 

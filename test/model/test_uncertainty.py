@@ -8,7 +8,6 @@ from support.oracles import PinocchioOracle, assert_agrees
 from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.uncertainty import with_model_error
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.resources import share_directory
 
@@ -23,7 +22,7 @@ def test_every_mass_and_every_inertia_is_off_by_a_factor_of_its_own() -> None:
     true = parse_robot(random_robot_urdf(np.random.default_rng(0), joints=6))
     factors = []
     for seed in range(40):
-        believed = with_model_error(true, error, seed)
+        believed = true.with_model_error(error, seed)
         assert believed.joint_names == true.joint_names
         for link, original in zip(believed.links, true.links, strict=True):
             if original.inertia.mass == 0.0:
@@ -48,13 +47,13 @@ def test_every_mass_and_every_inertia_is_off_by_a_factor_of_its_own() -> None:
 def test_a_seed_is_a_robot_and_no_error_is_the_true_one() -> None:
     true = parse_robot(random_robot_urdf(np.random.default_rng(1), joints=4))
     masses = [
-        [body.inertia.mass for body in with_model_error(true, error, seed).bodies]
+        [body.inertia.mass for body in true.with_model_error(error, seed).bodies]
         for error, seed in ((0.1, 3), (0.1, 3), (0.1, 4), (0.0, 3))
     ]
     assert masses[0] == masses[1] != masses[2]
     assert masses[3] == [body.inertia.mass for body in true.bodies]
     with pytest.raises(ValueError, match=r"error of 1\.0"):
-        with_model_error(true, 1.0, 0)
+        true.with_model_error(1.0, 0)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -17,7 +17,7 @@ from support.random_robots import random_chain_urdf
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction, c_compiler
-from spacerobot_ros.model.free_flight import state_slices
+from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.integration import repeated
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.simulation import EffortPlant, InitialState

@@ -12,7 +12,7 @@ from spacerobot_ros.control.laws.law import ControlLaw
 from spacerobot_ros.control.selection import OutputSelection
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model.connection import solve_positive_definite
+from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.space_robot import SpaceRobot
 
 

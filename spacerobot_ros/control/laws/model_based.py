@@ -13,8 +13,8 @@ from spacerobot_ros.control.gains import Gains
 from spacerobot_ros.control.laws.law import ControlLaw, LawOptions
 from spacerobot_ros.control.selection import OutputSelection
 from spacerobot_ros.control.state import Actuation, Reference
-from spacerobot_ros.model.connection import solve_positive_definite
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
-from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.parameters import declared
 from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import GaitMethod

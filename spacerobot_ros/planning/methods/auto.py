@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.reconstruction import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.planning.core.goal import POSE, Goal, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.core.schedule import GaitSchedule

@@ -8,9 +8,8 @@ import casadi as ca
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model import SpaceRobot, symbolic_rotations
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.momentum import rotation_from_quaternion
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.planning.methods.optimal.trajectory import Trajectory
 
@@ -120,7 +119,8 @@ class PathConstraints:
             x = (q[body.joints] - body.middle) / body.half
             rows.append(ca.log(ca.sum1(x**_SHARPNESS) / len(body.joints) + 1e-3))
         if self.axis_B is not None:
-            seen = ca.dot(rotation_from_quaternion(quaternion) @ ca.DM(self.axis_B), direction)
+            R_WB = symbolic_rotations.matrix_from_quaternion(quaternion)
+            seen = ca.dot(R_WB @ ca.DM(self.axis_B), direction)
             rows.append(np.cos(min(self.cone * (1 + _ROOM), np.pi)) - seen)
         return ca.vertcat(*rows)
 

@@ -24,8 +24,13 @@ import casadi as ca
 import numpy as np
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.connection import solve_positive_definite
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.dynamics import solve_positive_definite
+from spacerobot_ros.model.symbolic_rotations import (
+    quaternion_from_small_rotvec,
+    quaternion_multiply,
+    relative_vector,
+)
 from spacerobot_ros.planning.methods.optimal.constraints import PathConstraints
 
 GAUSS = (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6)
@@ -145,7 +150,7 @@ class Transcription:
             q[:, 1:] - q[:, :-1] - (u[:, :-1] + u[:, 1:]) / 2,
             u[:, 1:-1] - self._h * self._v[:, 1:-1],
             X[:, 1:] - X_next,
-            ca.DM(self._axes) @ _relative_vector(self._turn, X[:, -1]),
+            ca.DM(self._axes) @ relative_vector(self._turn, X[:, -1]),
         ]
         if self._position:
             center_of_mass = self._robot.function("center_of_mass", compile=False)
@@ -219,34 +224,13 @@ def magnus(first: ca.SX, second: ca.SX) -> ca.SX:
 def _step() -> ca.Function:
     """Return ``(X, w_1, w_2) -> X+``."""
     X, first, second = ca.SX.sym("X", 4), ca.SX.sym("w_1", 3), ca.SX.sym("w_2", 3)
-    X_next = _product(X, _exponential(magnus(first, second)))
+    X_next = quaternion_multiply(X, quaternion_from_small_rotvec(magnus(first, second)))
     return ca.Function("step", [X, first, second], [ca.cse(X_next)])
 
 
 def _constant_jacobian(expression: ca.MX, x: ca.MX) -> ca.DM:
     """Return the Jacobian of an expression that is linear in x."""
     return ca.Function("linear", [x], [ca.jacobian(expression, x)])(0)
-
-
-def _product(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Quaternion (x, y, z, w) of the rotation b followed by a."""
-    return ca.vertcat(
-        a[3] * b[:3] + b[3] * a[:3] + ca.cross(a[:3], b[:3]), a[3] * b[3] - ca.dot(a[:3], b[:3])
-    )
-
-
-def _relative_vector(turn: ca.MX, X: ca.MX) -> ca.MX:
-    """Vector part (3,) of the rotation from the goal to X: zero at either sign of X."""
-    return turn[3] * X[:3] - X[3] * turn[:3] - ca.cross(turn[:3], X[:3])
-
-
-def _exponential(Omega: ca.SX) -> ca.SX:
-    """Quaternion of a rotation vector of well under a radian: smooth at zero, order five."""
-    square = ca.sumsqr(Omega)
-    return ca.vertcat(
-        Omega * (1 / 2 - square / 48 + square**2 / 3840),
-        1 - square / 8 + square**2 / 384 - square**3 / 46080,
-    )
 
 
 def turn_function(robot: SpaceRobot) -> ca.Function:

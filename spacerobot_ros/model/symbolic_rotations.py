@@ -1,0 +1,81 @@
+"""Attitude with CasADi: the symbolic counterpart of :mod:`spacerobot_ros.model.rotations`.
+
+Quaternions are unit quaternions (x, y, z, w); one named ``R_WB`` or ``quaternion_WB`` turns vectors
+given in B into vectors given in W. Arguments are SX or MX alike.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+
+def matrix_from_quaternion(quaternion: ca.SX) -> ca.SX:
+    """Return the rotation matrix (3, 3) of a unit quaternion."""
+    x, y, z, w = ca.vertsplit(quaternion)
+    return ca.blockcat(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def matrix_about_axis(axis: np.ndarray, angle: ca.SX) -> ca.SX:
+    """Return the rotation (3, 3) by an angle (rad) about a constant unit axis (Rodrigues)."""
+    a = ca.sparsify(ca.DM(axis))
+    cosine, sine = ca.cos(angle), ca.sin(angle)
+    return cosine * ca.DM.eye(3) + sine * ca.sparsify(ca.skew(a)) + (1 - cosine) * (a @ a.T)
+
+
+def quaternion_multiply(a: ca.SX, b: ca.SX) -> ca.SX:
+    """Return the product (4,) of two quaternions: the rotation b followed by a."""
+    vector = a[3] * b[:3] + b[3] * a[:3] + ca.cross(a[:3], b[:3])
+    return ca.vertcat(vector, a[3] * b[3] - ca.dot(a[:3], b[:3]))
+
+
+def relative_vector(a: ca.SX, b: ca.SX) -> ca.SX:
+    """Return the vector part (3,) of the rotation from a to b: zero at either sign of b."""
+    return a[3] * b[:3] - b[3] * a[:3] - ca.cross(a[:3], b[:3])
+
+
+def quaternion_rate(quaternion: ca.SX, omega_WB_B: ca.SX) -> ca.SX:
+    """Return the rate (4,) of the quaternion of ``R_WB`` at body rate ``omega_WB_B``."""
+    vector, scalar = quaternion[:3], quaternion[3]
+    return 0.5 * ca.vertcat(
+        scalar * omega_WB_B + ca.cross(vector, omega_WB_B), -ca.dot(vector, omega_WB_B)
+    )
+
+
+def quaternion_from_rotvec(rotvec: ca.SX) -> ca.SX:
+    """Return the quaternion (4,) of ``exp(hat(rotvec))``; rotvec (3,) in rad."""
+    # The small number gives the limit, 1/2, at no rotation, and is below rounding elsewhere.
+    angle = ca.sqrt(ca.dot(rotvec, rotvec) + 1e-30)
+    return ca.vertcat(rotvec * (ca.sin(angle / 2) / angle), ca.cos(angle / 2))
+
+
+def quaternion_from_small_rotvec(rotvec: ca.SX) -> ca.SX:
+    """Return the quaternion (4,) of a rotation vector (3,) of well under a radian.
+
+    A power series with an error of order six: smooth at zero, and without a square root.
+    """
+    square = ca.sumsqr(rotvec)
+    return ca.vertcat(
+        rotvec * (1 / 2 - square / 48 + square**2 / 3840),
+        1 - square / 8 + square**2 / 384 - square**3 / 46080,
+    )
+
+
+def rotation_error(quaternion: ca.SX, target: ca.SX) -> ca.SX:
+    """Return the rotation vector (3,), rad, world components, from an attitude to its target.
+
+    It is the shortest: its length is at most pi, whichever of the two signs the quaternions have.
+    At half a turn, where both ways are as short, it takes one of them.
+    """
+    inverse = ca.vertcat(-quaternion[:3], quaternion[3])
+    error = quaternion_multiply(target, inverse)
+    error = error * ca.if_else(error[3] < 0, -1, 1)
+    # The small number gives the limit, 2, at no rotation, and is below rounding elsewhere.
+    sine = ca.sqrt(ca.dot(error[:3], error[:3]) + 1e-30)
+    return error[:3] * (2 * ca.atan2(sine, error[3]) / sine)
