@@ -7,16 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.control.thrusters.pulses import ThrusterPulses
-from spacerobot_ros.control.thrusters.table import ThrusterTable, load_thrusters, thrusters_of_urdf
+from spacerobot_ros.control.thrusters import ThrusterModulator, ThrusterTable, find_thrusters
 from spacerobot_ros.errors import CommandError
 from spacerobot_ros.simulation.plant import Plant, WrappedPlant
-
-IN_URDF = "urdf"
-"""Where a table of thrusters is that is in no file of its own."""
-
-_UNMET = 1e-6
-"""Smaller parts of a wrench are not missed, N or N m."""
 
 
 class ThrusterPlant(WrappedPlant):
@@ -66,22 +59,25 @@ class ThrusterPlant(WrappedPlant):
         super().__init__(plant)
         self.table = table
         self._tick_period = tick_period
-        self._pulses = ThrusterPulses(table, tick_period, excluded)
-        self._excluded = list(excluded)
+        self._modulator = ThrusterModulator(table, tick_period, excluded)
         self._wrenches, self._mass_flow = table.wrenches, table.mass_flow
         count = len(table.names)
         self.wrench = np.zeros(6)
         self.on_time, self.duty, self.thrust = (np.zeros(count) for _ in range(3))
-        self.pulses = np.zeros(count, dtype=np.int64)
+        self.pulses, self.unmet = self._modulator.pulses, self._modulator.unmet
         self.propellant = 0.0
-        self.unmet, self.unmet_ticks = self._pulses.unmet, 0
         self.thruster_health = np.ones(count)
         self.stuck_on: npt.NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
 
     @property
     def missing(self) -> str:
         """What the thrusters in use cannot give; empty if they give every wrench."""
-        return self.table.missing(self._excluded)
+        return self._modulator.missing
+
+    @property
+    def unmet_ticks(self) -> int:
+        """In how many ticks the wanted wrench lost anything to the thrusters' limits."""
+        return self._modulator.unmet_periods
 
     def exclude(self, name: str) -> None:
         """Use a thruster no more, because it is dead; the others give the wrench, if they can.
@@ -91,13 +87,12 @@ class ThrusterPlant(WrappedPlant):
         ParameterError
             There is no thruster of that name.
         """
-        self._pulses.exclude(name)
-        self._excluded.append(name)
+        self._modulator.exclude(name)
 
     def reset(self) -> None:
         """Return to the initial state, thrusters off; what was used and counted goes on."""
         super().reset()
-        self._pulses.reset()
+        self._modulator.reset()
         self.wrench[:] = self.duty[:] = self.thrust[:] = 0.0
 
     def step(self, effort: npt.ArrayLike, wrench: npt.ArrayLike = 0.0) -> bool:
@@ -117,16 +112,14 @@ class ThrusterPlant(WrappedPlant):
             if not np.all(np.isfinite(command)):
                 raise CommandError(f"A command is not finite: {np.asarray(command).tolist()}.")
         tick = self._tick_period
-        on_time = self._pulses.fire(wanted)
+        on_time = self._modulator.fire(wanted)
         on_time[self.stuck_on] = tick
         self.duty[:] = on_time / tick
         works = self.thruster_health * self.duty
         self.thrust[:] = self.table.force * works
         self.wrench[:] = self._wrenches @ works
         self.on_time += on_time
-        self.pulses += self._pulses.begun
         self.propellant += tick * float(self._mass_flow @ works)
-        self.unmet_ticks += bool(np.any(np.abs(self.unmet) > _UNMET))
         limited: bool = self.plant.step(effort, self.wrench)
         return limited
 
@@ -141,7 +134,7 @@ def with_thrusters(plant: Plant, tick_period: float, source: str, excluded: str 
     tick_period
         Duration of a tick, s.
     source
-        :data:`IN_URDF`, the path of a file, or empty: then the plant is returned as it is.
+        ``urdf``, the path of a file, or empty: then the plant is returned as it is.
     excluded
         Names of thrusters that are not used, separated by spaces.
 
@@ -155,8 +148,7 @@ def with_thrusters(plant: Plant, tick_period: float, source: str, excluded: str 
     if not source:
         return plant
     robot = plant.robot.description
-    table = thrusters_of_urdf(robot) if source == IN_URDF else load_thrusters(source, robot)
-    return ThrusterPlant(plant, tick_period, table, excluded.split())
+    return ThrusterPlant(plant, tick_period, find_thrusters(source, robot), excluded.split())
 
 
 def thrusters_in(plant: Plant) -> ThrusterPlant | None:

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from scipy.optimize import linprog
 
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError, SpaceRobotError
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
@@ -23,6 +22,9 @@ from spacerobot_ros.model.rotations import matrix_from_rpy
 
 STANDARD_GRAVITY = 9.80665
 """What a specific impulse in seconds is counted in, m/s^2."""
+
+IN_URDF = "urdf"
+"""Source of a table that is in no file of its own."""
 
 _LARGEST = 1e12
 """Of the numbers of a table, in SI units."""
@@ -80,6 +82,9 @@ class ThrusterTable:
         They give every wrench if, with factors of zero or more, they give both ways along the six
         axes: what they give is a convex cone.
         """
+        # Imported where it is used: scipy.optimize loads slowly.
+        from scipy.optimize import linprog
+
         kept = [i for i, name in enumerate(self.names) if name not in without]
         if not kept:
             return "any wrench"
@@ -93,6 +98,19 @@ class ThrusterTable:
                 if not linprog(np.ones(len(kept)), A_eq=wrenches, b_eq=wanted).success:
                     lacking.append(text)
         return ", ".join(lacking)
+
+
+def find_thrusters(source: str, robot: RobotDescription) -> ThrusterTable:
+    """Return the table at :data:`IN_URDF` or in the YAML file of a path.
+
+    Raises
+    ------
+    ParameterError
+        The file or a thruster in it is refused.
+    RobotDescriptionError
+        A thruster of the URDF is refused, or there is none.
+    """
+    return thrusters_of_urdf(robot) if source == IN_URDF else load_thrusters(source, robot)
 
 
 def thrusters_of_urdf(robot: RobotDescription) -> ThrusterTable:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from spacerobot_ros.control.thrusters.table import ThrusterTable, load_thrusters, thrusters_of_urdf
+from spacerobot_ros.control.thrusters import ThrusterTable, load_thrusters, thrusters_of_urdf
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 

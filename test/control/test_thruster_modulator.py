@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.oracles import Array
 
-from spacerobot_ros.control.thrusters.pulses import ThrusterPulses
-from spacerobot_ros.control.thrusters.table import ThrusterTable, thrusters_of_urdf
+from spacerobot_ros.control.thrusters import ThrusterModulator, ThrusterTable, thrusters_of_urdf
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.resources import share_directory
@@ -61,7 +60,7 @@ def test_impulse_is_met_within_a_shortest_pulse_of_each_thruster(
 ) -> None:
     rng = np.random.default_rng(seed)
     table = with_shortest(shortest)
-    pulses = ThrusterPulses(table, TICK)
+    pulses = ThrusterModulator(table, TICK)
     wanted, given_, fired = np.zeros(6), np.zeros(6), []
     # Both ways along every axis at most 12 N and 5 N m: far within the thrust of the table.
     wrench = np.zeros(6)
@@ -87,7 +86,7 @@ def test_impulse_is_met_within_a_shortest_pulse_of_each_thruster(
 @pytest.mark.parametrize("force", [0.013, 0.5, 1.9, 2.0, -0.7])
 @pytest.mark.parametrize("shortest", [0.0, 0.003, 0.025])
 def test_mean_of_a_second_is_the_wanted_force(force: float, shortest: float) -> None:
-    pulses = ThrusterPulses(pair(shortest), TICK)
+    pulses = ThrusterModulator(pair(shortest), TICK)
     second = np.array([pulses.fire(along_x(force)) for _ in range(100)])
     impulse = float(np.sum(second @ [2.0, -2.0]))
     assert abs(impulse - force) <= 2.0 * shortest + 1e-9
@@ -96,13 +95,13 @@ def test_mean_of_a_second_is_the_wanted_force(force: float, shortest: float) -> 
 
 
 def test_little_wanted_both_ways_fires_nothing() -> None:
-    pulses = ThrusterPulses(pair(0.02), TICK)
+    pulses = ThrusterModulator(pair(0.02), TICK)
     fired = [pulses.fire(along_x(1.5 * (-1) ** tick)) for tick in range(200)]
     assert not np.any(fired)
 
 
 def test_a_begun_pulse_is_ended_although_nothing_is_wanted_any_more() -> None:
-    pulses = ThrusterPulses(pair(0.035), TICK)
+    pulses = ThrusterModulator(pair(0.035), TICK)
     first = [pulses.fire(along_x(2.0))[0] for _ in range(4)]
     assert first == [0.0, 0.0, 0.0, pytest.approx(TICK)]
     assert pulses.begun.tolist() == [True, False]
@@ -120,7 +119,7 @@ def pulses_end(on_times: list[float]) -> bool:
 
 
 def test_what_is_beyond_the_thrust_is_dropped_and_told() -> None:
-    pulses = ThrusterPulses(pair(0.02), TICK)
+    pulses = ThrusterModulator(pair(0.02), TICK)
     for _ in range(100):
         pulses.fire(along_x(5.0))
     assert pulses.unmet[0] == pytest.approx(3.0)
@@ -131,7 +130,7 @@ def test_what_is_beyond_the_thrust_is_dropped_and_told() -> None:
 
 
 def test_a_direction_without_thrusters_is_told() -> None:
-    pulses = ThrusterPulses(pair(0.0), TICK)
+    pulses = ThrusterModulator(pair(0.0), TICK)
     on_time = pulses.fire(np.array([1.0, 0.5, 0, 0, 0, -0.25]))
     assert on_time.tolist() == [pytest.approx(TICK / 2), 0.0]
     np.testing.assert_allclose(pulses.unmet, [0, 0.5, 0, 0, 0, -0.25], atol=1e-12)
@@ -139,7 +138,7 @@ def test_a_direction_without_thrusters_is_told() -> None:
 
 def test_excluded_thrusters_stay_off() -> None:
     dead = [SERVICER.names[0], SERVICER.names[9]]
-    pulses = ThrusterPulses(SERVICER, TICK, dead)
+    pulses = ThrusterModulator(SERVICER, TICK, dead)
     rng = np.random.default_rng(5)
     fired = np.zeros(24)
     for _ in range(200):
@@ -148,16 +147,43 @@ def test_excluded_thrusters_stay_off() -> None:
     assert fired[[0, 9]].tolist() == [0.0, 0.0]
     assert fired.sum() > 0.2
     with pytest.raises(ParameterError, match="no thruster 'nose'"):
-        ThrusterPulses(SERVICER, TICK, ["nose"])
+        ThrusterModulator(SERVICER, TICK, ["nose"])
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_rounding_does_not_choose_the_thrusters(seed: int) -> None:
     """The servicer's are symmetric: many allocations of a wrench cost the same."""
     rng = np.random.default_rng(seed)
-    pulses, others = ThrusterPulses(SERVICER, TICK), ThrusterPulses(SERVICER, TICK)
+    pulses, others = ThrusterModulator(SERVICER, TICK), ThrusterModulator(SERVICER, TICK)
     for tick in range(150):
         if tick % 10 == 0:
             wrench = rng.uniform(-6.0, 6.0, 6) * rng.integers(0, 2, 6)
         rounded = wrench + 1e-13 * rng.normal(size=6)
         np.testing.assert_allclose(pulses.fire(wrench), others.fire(rounded), atol=1e-11)
+
+
+def test_propellant_and_pulses_are_counted_from_the_commanded_on_times() -> None:
+    modulator = ThrusterModulator(pair(0.02), TICK)
+    fired = np.array([modulator.fire(along_x(0.5)) for _ in range(400)])
+    np.testing.assert_allclose(modulator.on_time, fired.sum(axis=0), rtol=1e-12)
+    # 2 N at a specific impulse of 100 s, for a mean thrust of 0.5 N over 4 s.
+    assert modulator.propellant == pytest.approx(0.5 * 4.0 / (100.0 * 9.80665), rel=0.02)
+    assert modulator.pulses[0] == len(pulse_lengths(fired[:, 0])) > 10
+    assert modulator.pulses[1] == 0
+    modulator.reset()
+    assert modulator.on_time[0] > 0.0, "what was used stays used"
+
+
+def test_what_cannot_be_given_without_a_thruster_is_named_and_counted() -> None:
+    modulator = ThrusterModulator(SERVICER, TICK)
+    assert modulator.missing == ""
+    pulls = [
+        name
+        for name, direction in zip(SERVICER.names, SERVICER.direction_B, strict=True)
+        if direction[0] < -0.5
+    ]
+    for name in pulls:
+        modulator.exclude(name)
+    assert "negative force along x" in modulator.missing
+    modulator.fire(along_x(-1.0))
+    assert modulator.unmet_periods == 1
