@@ -10,7 +10,7 @@ PIP := $(BIN)/python3 -m pip -qq --disable-pip-version-check
 
 # What decides on the dependencies, and what is installed with the package. Directories are among
 # the latter because a deleted file changes nothing else.
-DECLARATION := setup.py setup.cfg
+DECLARATION := setup.py setup.cfg constraints.txt
 SOURCES := package.xml LICENSE $(shell find $(wildcard bags config foxglove launch resource rviz \
     scripts spacerobot_ros urdf) -not -path bags -not -path '*/__pycache__*' -not -name '.*')
 
@@ -76,10 +76,17 @@ bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed be
 	$(FLY) servicer --set coordinated_control.time_limit=8
 	$(FLY) servicer_thrusters --set coordinated_control.time_limit=5
 
+# What mkdocs prints of its theme's successor is no warning of the build.
+.PHONY: docs
+docs: $(STAMP)/docs ## build the documentation site; see out/docs/index.html
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python3 -m mkdocs build --strict --quiet
+	@echo "out/docs/index.html"
+
 .PHONY: clean
-clean: ## remove .venv, caches, and the demo's bag and report
+clean: ## remove .venv, caches, the site, and the demo's bag and report
 	rm -rf $(VENV) build/lib build/bdist.* spacerobot_ros.egg-info
 	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf out/docs
 	rm -f out/sliding_masses.mcap out/sliding_masses_paper.mcap out/sliding_masses.html
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 	@rmdir build out 2>/dev/null || true
@@ -100,13 +107,15 @@ $(STAMP)/venv:
 
 $(STAMP)/demo: EXTRAS := jazzy,viewer
 $(STAMP)/test: EXTRAS := jazzy,test
+$(STAMP)/docs: EXTRAS := jazzy,docs
 
 # A changed declaration or a new stamp: the package with its dependencies. Changed sources: the
 # package alone. What is left in build/lib would be installed again, deleted files too.
-$(STAMP)/demo $(STAMP)/test: $(DECLARATION) $(SOURCES) | $(STAMP)/venv
+$(STAMP)/demo $(STAMP)/test $(STAMP)/docs: $(DECLARATION) $(SOURCES) | $(STAMP)/venv
 	@rm -rf build/lib
 	@echo "Installing spacerobot_ros[$(EXTRAS)] into $(VENV)$(if $(ALL), (once; a minute or two)) ..."
-	@$(PIP) install --no-build-isolation $(if $(ALL),'.[$(EXTRAS)]',--no-deps --force-reinstall .)
+	@$(PIP) install --no-build-isolation \
+	    $(if $(ALL),-c constraints.txt '.[$(EXTRAS)]',--no-deps --force-reinstall .)
 	@rm -rf build/lib build/bdist.* spacerobot_ros.egg-info
 	@rmdir build 2>/dev/null || true
 	@touch $@

@@ -25,6 +25,16 @@ def share(folder: str) -> list[tuple[str, list[str]]]:
     return sorted(contents.items())
 
 
+# The documentation site, whose pages ask no server for anything.
+DOCS = [
+    "fonttools",
+    "math-core",
+    "mermaidx",
+    "mkdocs-material>=9.5",
+    "mkdocstrings[python]>=0.26",
+    "ziamath",
+]
+
 setup(
     name=NAME,
     version="0.1.0",
@@ -75,7 +85,9 @@ setup(
         ],
         # The 3D view of reports is MeshCat's. Only its script is used, but the package brings much.
         "viewer": ["meshcat"],
+        "docs": DOCS,
         "test": [
+            *DOCS,
             "catkin_pkg",
             "hypothesis",
             "mcap-ros2-support",

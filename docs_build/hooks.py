@@ -1,3 +1,85 @@
 """What mkdocs calls while it builds the site."""
 
 from __future__ import annotations
+
+import json
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from mkdocs.exceptions import PluginError
+
+from docs_build import diagrams, equations, reference
+from docs_build.blocks import Block, replace_blocks
+
+FIGURES = reference.DOCS / "figures.json"
+"""The numbers of the documents; `make figures` writes them."""
+
+_characters: set[str] = set()
+"""Of all equations of the site."""
+
+_PLACEHOLDER = re.compile(r"\{\{ *(?P<kind>\w+)(?: +(?P<argument>[^{}]+?))? *\}\}")
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Draw diagrams, take the marks off blocks, put in generated references and numbers."""
+    try:
+        return prepared(markdown)
+    except (ValueError, KeyError) as error:
+        raise PluginError(f"{page.file.src_uri}: {error}") from error
+
+
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Turn LaTeX into MathML."""
+    try:
+        content = equations.with_equations(html)
+    except ValueError as error:
+        raise PluginError(f"{page.file.src_uri}: {error}") from error
+    _characters.update(equations.characters(content))
+    return content
+
+
+def on_post_build(config: Any, **_: Any) -> None:
+    """Add the font of the equations."""
+    equations.write_font(Path(config.site_dir) / "stylesheets" / "math.woff", _characters)
+
+
+def prepared(markdown: str) -> str:
+    """Return the Markdown text of a page as mkdocs is to read it.
+
+    ``{{ value KEY }}``
+        A number of ``docs/figures.json``, with the digits that it has there.
+    ``{{ parameters NODE }}``, ``{{ cli }}``, ``{{ api PACKAGE }}``
+        Generated references.
+
+    Raises
+    ------
+    ValueError, KeyError
+        A placeholder, a key of a number, or the mark of a block is unknown.
+    """
+    return _PLACEHOLDER.sub(_replacement, replace_blocks(markdown, _drawn))
+
+
+@cache
+def figures() -> dict[str, str]:
+    """Return the numbers of the documents by key."""
+    return dict(json.loads(FIGURES.read_text(encoding="utf-8")))
+
+
+def _drawn(block: Block) -> str | None:
+    return diagrams.diagram(block.text) if block.language == "mermaid" else None
+
+
+def _replacement(found: re.Match[str]) -> str:
+    argument = found["argument"] or ""
+    match found["kind"]:
+        case "value":
+            return figures()[argument]
+        case "parameters":
+            return reference.parameters(argument)
+        case "cli":
+            return reference.command_line()
+        case "api":
+            return reference.python_api(argument)
+    raise ValueError(f"The placeholder {found[0]} is unknown.")

@@ -1,0 +1,123 @@
+"""The generated references, as Markdown: parameters, command line, Python API."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from spacerobot_ros.cli.main import main
+from spacerobot_ros.nodes import NODE_TYPES, ReplayNode
+from spacerobot_ros.nodes.common.node import AUTOSTART
+from spacerobot_ros.parameters import Parameter, declared
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+"""The texts."""
+
+NODES: dict[str, Any] = {**NODE_TYPES, "replay": ReplayNode}
+"""Nodes by the names that parameter files give them."""
+
+
+def parameters(node: str) -> str:
+    """Return the table of a node's parameters."""
+    return parameter_table((AUTOSTART, *declared(NODES[node].Config)))
+
+
+def parameter_table(declarations: Iterable[Parameter]) -> str:
+    """Return a table of parameters: name, type, default, unit, range, description."""
+    header = ("parameter", "type", "default", "unit", "range", "description")
+    return table(header, [_row(declaration) for declaration in declarations])
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
+        for cells in (header, ["---"] * len(header), *rows)
+    )
+
+
+def default_text(value: Any) -> str:
+    """Return a default as a parameter file writes it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return "[" + ", ".join(default_text(each) for each in value) + "]"
+    return str(value) or "''"
+
+
+def _row(declaration: Parameter) -> tuple[str, ...]:
+    changes = "" if declaration.read_only else " *May change while the node runs.*"
+    return (
+        f"`{declaration.name}`",
+        _type(declaration),
+        f"`{default_text(declaration.default)}`",
+        declaration.unit,
+        _range(declaration),
+        declaration.description.replace("<", "&lt;") + changes,
+    )
+
+
+def _type(declaration: Parameter) -> str:
+    value = declaration.default
+    if isinstance(value, tuple):
+        return "texts" if declaration.texts else "numbers"
+    return {"bool": "true or false", "int": "whole number", "float": "number", "str": "text"}[
+        type(value).__name__
+    ]
+
+
+def _range(declaration: Parameter) -> str:
+    if declaration.choices:
+        return ", ".join(f"`{choice}`" for choice in declaration.choices)
+    parts = []
+    if declaration.length is not None:
+        parts.append(f"{declaration.length} entries, or none")
+    low, high = declaration.minimum, declaration.maximum
+    if math.isfinite(low) and math.isfinite(high):
+        parts.append(f"{low:g} to {high:g}")
+    elif math.isfinite(low):
+        parts.append(f"at least {low:g}")
+    elif math.isfinite(high):
+        parts.append(f"at most {high:g}")
+    return "; ".join(parts)
+
+
+def command_line() -> str:
+    """Return a section for every command: what it does, its usage, its options."""
+    context = click.Context(main, info_name="spacerobot")
+    sections = []
+    for name in main.list_commands(context):
+        command = main.get_command(context, name)
+        assert command is not None
+        inner = click.Context(command, info_name=name, parent=context)
+        usage = " ".join(command.collect_usage_pieces(inner))
+        rows = [
+            (f"`{record[0]}`", record[1])
+            for parameter in command.get_params(inner)
+            if (record := parameter.get_help_record(inner)) is not None
+        ]
+        parts = [
+            f"## {name}",
+            inspect.cleandoc(command.help or "").replace("\f", ""),
+            f"```text\nspacerobot {name} {usage}\n```",
+            table(("option", "meaning"), rows),
+        ]
+        sections.append("\n\n".join(part for part in parts if part))
+    return "\n\n".join(sections)
+
+
+def python_api(package: str) -> str:
+    """Return the instructions that have mkdocstrings document all public names of a package."""
+    module = importlib.import_module(package)
+    lines = [inspect.cleandoc(module.__doc__ or "")]
+    for name in module.__all__:
+        if name.startswith("__"):
+            continue
+        lines.append(f"::: {package}.{name}")
+    return "\n\n".join(lines)

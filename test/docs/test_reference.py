@@ -1,0 +1,70 @@
+"""The generated references list what there is, with its defaults."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from docs_build import reference
+from docs_build.hooks import prepared
+from spacerobot_ros.cli.main import main
+from spacerobot_ros.nodes import (
+    CoordinatedControlNode,
+    FlightNode,
+    PlannerNode,
+    PlantNode,
+    RecorderNode,
+    ReplayNode,
+)
+from spacerobot_ros.nodes.common.node import AUTOSTART
+from spacerobot_ros.parameters import declared
+
+
+def rows_of(markdown: str) -> list[list[str]]:
+    """Return the cells of a table whose rows begin with a code span."""
+    return [
+        [cell.strip().strip("`").replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+        for line in markdown.splitlines()
+        if line.startswith("| `")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("heading", "node"),
+    [
+        ("plant", PlantNode),
+        ("planner", PlannerNode),
+        ("coordinated_control", CoordinatedControlNode),
+        ("recorder", RecorderNode),
+        ("replay", ReplayNode),
+    ],
+)
+def test_parameters_are_documented_with_their_defaults(
+    heading: str, node: type[FlightNode]
+) -> None:
+    page = prepared((reference.DOCS / "reference" / "parameters.md").read_text(encoding="utf-8"))
+    section = page.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    documented = {row[0]: row for row in rows_of(section)}
+    for spec in (AUTOSTART, *declared(node.Config)):
+        default: object = spec.default
+        if isinstance(default, bool):
+            default = str(default).lower()
+        elif isinstance(default, tuple):
+            default = list(default)
+        row = documented.pop(spec.name)
+        assert row[2] == (str(default) or "''"), spec.name
+        assert row[3] == spec.unit
+        for choice in spec.choices:
+            assert f"`{choice}`" in f"`{row[4]}`"
+        assert row[5].startswith(spec.description.replace("<", "&lt;"))
+    assert documented == {}
+
+
+def test_every_command_and_option_is_documented() -> None:
+    page = reference.command_line()
+    for name, command in main.commands.items():
+        section = page.split(f"## {name}\n")[1].split("\n## ")[0]
+        for parameter in command.params:
+            for option in (*parameter.opts, *parameter.secondary_opts):
+                assert option in section or parameter.human_readable_name in section
