@@ -6,6 +6,7 @@ import statistics
 import time
 from collections.abc import Iterator
 
+from spacerobot_ros.planning import PlanRequest
 from spacerobot_ros.session.plan import problem, start_of
 
 _GAITS = (
@@ -25,10 +26,11 @@ def planning_times() -> Iterator[tuple[str, float, float]]:
     """
     for scenario, name in _GAITS:
         task = problem(scenario)
-        method, state = task.method(name), start_of(task.plant())
+        method = task.method(name)
+        request = PlanRequest(start_of(task.plant()), task.goal, task.tolerance)
         times = []
         for _ in range(1 + _REPEATS):
             began = time.perf_counter()
-            method.plan(state, task.goal)
+            method.plan(request)
             times.append(time.perf_counter() - began)
         yield name, times[0], statistics.median(times[1:])

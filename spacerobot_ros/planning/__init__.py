@@ -1,20 +1,26 @@
 """Goal to gait: one module a method, one common type."""
 
 from spacerobot_ros.planning.api import plan
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
-from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
-from spacerobot_ros.planning.methods.registry import METHODS, build_method
+from spacerobot_ros.planning.methods.registry import METHODS, build_method, method_options
 
 __all__ = [
     "METHODS",
+    "NEVER",
     "BasePath",
+    "Cancellation",
     "GaitMethod",
     "GaitSchedule",
     "Goal",
+    "PlanRequest",
+    "PlanningCancelled",
     "PoseError",
     "RobotState",
     "Tolerance",
     "build_method",
+    "method_options",
     "plan",
 ]

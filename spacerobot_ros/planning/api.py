@@ -12,10 +12,10 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
-from spacerobot_ros.parameters import require_known
 from spacerobot_ros.planning.core.goal import Goal, RobotState, Tolerance
+from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
-from spacerobot_ros.planning.methods.registry import METHODS, build_method
+from spacerobot_ros.planning.methods.registry import build_method, method_options
 from spacerobot_ros.resources import robot_file
 
 _TOLERANCE = Tolerance(1e-6, 1e-6, 1e-6)
@@ -64,14 +64,9 @@ def plan(
         robot = SpaceRobot.from_file(robot_file(str(robot)))
     if goal is None:
         goal = Goal.checked(position, quaternion_from_rotvec(rotvec), joint_positions)
-    if method not in METHODS:
-        raise ParameterError(
-            f"There is no gait method '{method}'; there are: {', '.join(METHODS)}."
-        )
-    require_known(method, METHODS[method].Options, options)
-    named = {f"{method}.{name}": value for name, value in options.items()}
-    planner = build_method(method, robot, tick_period, tolerance, integration_step, named)
-    return planner.plan(_state(robot, start), goal)
+    options_of_method = {method: method_options(method, options)}
+    planner = build_method(method, robot, tick_period, integration_step, options_of_method)
+    return planner.plan(PlanRequest(_state(robot, start), goal, tolerance))
 
 
 def _state(robot: SpaceRobot, start: RobotState | npt.ArrayLike | None) -> RobotState:

@@ -19,6 +19,7 @@ from spacerobot_ros.planning import (
     METHODS,
     GaitSchedule,
     Goal,
+    PlanRequest,
     PoseError,
     RobotState,
     Tolerance,
@@ -78,9 +79,8 @@ class Problem:
     def method(self, name: str) -> GaitMethod:
         """Build a method with its options."""
         step = self.parameters["integration_step"]
-        return build_method(
-            name, self.robot, self.tick_period, self.tolerance, step, self.parameters
-        )
+        options = configured(PlannerConfig, self.parameters).options
+        return build_method(name, self.robot, self.tick_period, step, options)
 
     def plant(self) -> VelocityPlant:
         """Return the robot at the start."""
@@ -94,7 +94,8 @@ class Planned:
 
     ``pieces`` are the schedules flown one after the other: one, for a method that plans to the
     end. ``error`` is what was left to the goal at ``pose`` (7,), ``limited`` the ticks in which the
-    plant limited a joint, ``plan_time`` wall time in s, ``controls`` what the method brings about.
+    plant limited a joint, ``plan_time`` wall time in s, ``controls`` the parts of the goal
+    that the schedules control.
     """
 
     method: str
@@ -159,17 +160,27 @@ def solve(problem: Problem, name: str, method: GaitMethod | None = None) -> Plan
     plan_time = time.perf_counter() - began
     while not pieces or (pieces[-1].partial and len(pieces) < _MOST_PIECES):
         began = time.perf_counter()
-        schedule = method.plan(start_of(plant), problem.goal, correction=bool(pieces))
+        schedule = method.plan(
+            PlanRequest(
+                start_of(plant),
+                problem.goal,
+                problem.tolerance,
+                correction=bool(pieces),
+                previous=pieces[-1] if pieces else None,
+            )
+        )
         plan_time += time.perf_counter() - began
         for rates in schedule.velocities:
             plant.step(rates)
         pieces.append(schedule)
         error = PoseError.between(plant.pose[:3], plant.pose[3:], problem.goal, plant.q)
-        if problem.tolerance.admits(error, method.controls):
+        if problem.tolerance.admits(error, schedule.controls):
             break
     limited = sum(int(counts.max(initial=0)) for counts in plant.limit_counts.values())
-    met = problem.tolerance.admits(error, method.controls)
-    return Planned(name, pieces, error, plant.pose.copy(), limited, plan_time, met, method.controls)
+    met = problem.tolerance.admits(error, schedule.controls)
+    return Planned(
+        name, pieces, error, plant.pose.copy(), limited, plan_time, met, schedule.controls
+    )
 
 
 def compare(problem: Problem) -> dict[str, Planned | str]:

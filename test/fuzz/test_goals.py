@@ -10,11 +10,11 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from hypothesis import strategies as st
 from sensor_msgs.msg import JointState
 from support.fuzzing import NUMBERS, TEXTS, VALUES, attempt, fuzz
+from support.planners import planner_of
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.goal_messages import goal_of, shape_of
 from spacerobot_ros.planning import Goal, RobotState, Tolerance
-from spacerobot_ros.planning.methods.registry import build_method
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.session.scenario import goal_from_rotvec
 
@@ -94,7 +94,7 @@ def test_a_plan_for_a_goal(
     if goal is None:
         return
     model = robot(ROBOTS[method])
-    planner = build_method(method, model, 0.05, Tolerance(1e-3, 1e-3), 0.01, {})
+    planner = planner_of(method, model, 0.05, Tolerance(1e-3, 1e-3), 0.01)
     q = np.clip(start[: model.n], model.lower, model.upper)
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
     schedule = attempt("planned goal", planner.plan, state, goal)

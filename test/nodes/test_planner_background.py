@@ -13,8 +13,7 @@ from std_srvs.srv import Trigger
 from support.planner_flight import HERE, NEAR, TURNED, Flight, values_of
 from support.ros_harness import Harness
 
-from spacerobot_ros.planning import METHODS, GaitSchedule
-from spacerobot_ros.planning.core.cancellation import require_wanted
+from spacerobot_ros.planning import METHODS, Cancellation, GaitSchedule, PlanRequest
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 FAR = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
@@ -167,9 +166,11 @@ def test_a_plan_after_an_abort_is_wanted_again(
 ) -> None:
     plan = LieBracketGait.plan
 
-    def searching(*args: Any, **options: Any) -> GaitSchedule:
-        require_wanted()
-        return plan(*args, **options)
+    def searching(
+        method: LieBracketGait, request: PlanRequest, cancellation: Cancellation
+    ) -> GaitSchedule:
+        cancellation.raise_if_requested()
+        return plan(method, request, cancellation)
 
     monkeypatch.setattr(LieBracketGait, "plan", searching)
     flight = Flight(harness, {"plan_in_background": background, "abort_time": 0.5})

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
+from support.planners import Planner
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import GaitMethod, GaitSchedule, Goal, RobotState
+from spacerobot_ros.planning import GaitSchedule, Goal, RobotState
 from spacerobot_ros.simulation.initial_state import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
@@ -47,7 +48,7 @@ def measured(plant: VelocityPlant) -> RobotState:
 
 
 def fly(
-    method: GaitMethod,
+    method: Planner,
     plant: VelocityPlant,
     goal: Goal,
     *,

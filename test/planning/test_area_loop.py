@@ -13,10 +13,11 @@ from planning.flown import STEP, fly, measured, plant_at
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from support.oracles import PinocchioOracle
+from support.planners import Planner, planner_of
 from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import METHODS, GaitMethod, Goal, RobotState, Tolerance
+from spacerobot_ros.planning import Goal, RobotState, Tolerance
 from spacerobot_ros.planning.methods.edge_path import edge_path
 from spacerobot_ros.planning.methods.nominal_shape import NominalShape, best_nominal, given_nominal
 
@@ -34,8 +35,8 @@ def arm() -> SpaceRobot:
 
 def planner(
     robot: SpaceRobot, attitude: float = 1e-3, period: float = PERIOD, **options: Any
-) -> GaitMethod:
-    return METHODS["area_loop"](robot, period, Tolerance(1.0, attitude, 1e-6), STEP, **options)
+) -> Planner:
+    return planner_of("area_loop", robot, period, Tolerance(1.0, attitude, 1e-6), STEP, **options)
 
 
 def goal_of(attitude: Rotation, shape: npt.ArrayLike | None = None) -> Goal:

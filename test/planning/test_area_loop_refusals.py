@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
+from support.planners import Planner, planner_of
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import METHODS, GaitMethod, Goal, RobotState, Tolerance
+from spacerobot_ros.planning import METHODS, Goal, RobotState, Tolerance
 
 Array = npt.NDArray[np.float64]
 
@@ -35,8 +36,8 @@ def changed(*replacements: tuple[str, str]) -> SpaceRobot:
     return SpaceRobot.from_urdf(text)
 
 
-def planner(robot: SpaceRobot, attitude: float = 1e-3, **options: Any) -> GaitMethod:
-    return METHODS["area_loop"](robot, 0.25, Tolerance(1.0, attitude), 0.05, **options)
+def planner(robot: SpaceRobot, attitude: float = 1e-3, **options: Any) -> Planner:
+    return planner_of("area_loop", robot, 0.25, Tolerance(1.0, attitude), 0.05, **options)
 
 
 def at(q: npt.ArrayLike, **momenta: Array) -> RobotState:

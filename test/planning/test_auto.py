@@ -10,18 +10,23 @@ import numpy as np
 import pytest
 from planning.flown import STEP, fly, plant_at
 from scipy.spatial.transform import Rotation
+from support.planners import Planner, planner_of
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import (
     METHODS,
+    NEVER,
     BasePath,
+    Cancellation,
     GaitMethod,
     GaitSchedule,
     Goal,
+    PlanRequest,
     RobotState,
     Tolerance,
     build_method,
+    method_options,
 )
 from spacerobot_ros.planning.methods.auto import AutoGait, Candidate
 
@@ -40,9 +45,9 @@ def robot_named(name: str) -> SpaceRobot:
     return SpaceRobot.from_file(FOLDER / f"{name}.urdf")
 
 
-def auto(robot: SpaceRobot, **options: Any) -> GaitMethod:
-    given = {key.replace("__", "."): value for key, value in options.items()}
-    return build_method("auto", robot, PERIOD, TOLERANCE, STEP, given)
+def auto(robot: SpaceRobot, tolerance: Tolerance = TOLERANCE, **area_loop: Any) -> Planner:
+    given = {"area_loop": method_options("area_loop", area_loop)}
+    return Planner(build_method("auto", robot, PERIOD, STEP, given), tolerance)
 
 
 def at(q: np.ndarray[Any, Any], **momenta: Any) -> RobotState:
@@ -69,7 +74,7 @@ def test_the_robots_of_the_papers_get_their_papers_method(
     schedule = method.plan(at(START[name]), goal_of([0.0, 0.0, 0.2]))
     assert schedule.method == chosen
     assert schedule.notes["chosen"] == chosen
-    assert method.controls == controls
+    assert schedule.controls == controls
     reason = str(schedule.notes["because"])
     assert f"{chosen} suits robot '{name}'" in reason
     if chosen != "lie_bracket":
@@ -79,20 +84,17 @@ def test_the_robots_of_the_papers_get_their_papers_method(
 def test_options_are_those_of_the_chosen_method() -> None:
     robot = robot_named("three_joint_arm")
     nominal = [0.5, -1.0, 1.0]
-    method = auto(robot, area_loop__nominal=nominal, area_loop__edge_time=9.0)
+    method = auto(robot, nominal=nominal, edge_time=9.0)
     schedule = method.plan(at(np.array(nominal)), goal_of([0.0, 0.0, 0.2]))
     assert schedule.notes["nominal"] == nominal
     assert schedule.duration >= 4 * 9.0
-    alone = build_method(
-        "area_loop", robot, PERIOD, TOLERANCE, STEP, {"area_loop.nominal": nominal}
-    )
+    alone = planner_of("area_loop", robot, PERIOD, TOLERANCE, STEP, nominal=nominal)
     assert alone.plan(at(np.array(nominal)), goal_of([0, 0, 0.2])).notes["nominal"] == nominal
 
 
 def test_the_goal_is_flown_with_the_tolerance_of_the_moment() -> None:
     robot = robot_named("three_joint_arm")
-    method, goal = auto(robot, area_loop__k=0.5), goal_of([0.1, 0.0, 0.2])
-    method.tolerance = Tolerance(1.0, 0.005)
+    method, goal = auto(robot, Tolerance(1.0, 0.005), k=0.5), goal_of([0.1, 0.0, 0.2])
     flight = fly(method, plant_at(robot, START["three_joint_arm"], PERIOD), goal)
     assert np.linalg.norm(flight.left(goal)[-1]) <= 0.005
     assert {piece.notes["chosen"] for piece in flight.pieces} == {"area_loop"}
@@ -107,12 +109,13 @@ class Made(GaitMethod):
     refusal: ClassVar[str] = ""
     built: ClassVar[list[str]] = []
 
-    def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
+    def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         if self.refusal:
             raise PlanningError(self.refusal)
+        state = request.state
         path = BasePath(np.zeros(1), state.position[np.newaxis], state.quaternion[np.newaxis])
         q = state.q[np.newaxis]
-        return GaitSchedule(self.name, self.robot.joint_names, PERIOD, q, path, goal)
+        return self._schedule_of(request.goal, q, path, {})
 
 
 def made(
@@ -129,15 +132,15 @@ def made(
     return type(name, (Made,), {**members, "objection": staticmethod(refuse)})
 
 
-def choice_of(*methods: type[Made]) -> tuple[AutoGait, list[str]]:
+def choice_of(*methods: type[Made]) -> tuple[Planner, list[str]]:
     robot, built = robot_named("planar_chain"), list[str]()
 
     def build(method: type[Made]) -> GaitMethod:
         built.append(method.name)
-        return method(robot, PERIOD, TOLERANCE)
+        return method(robot, PERIOD)
 
     candidates = {entry.name: Candidate(entry, partial(build, entry)) for entry in methods}
-    return AutoGait(robot, PERIOD, TOLERANCE, candidates=candidates), built
+    return Planner(AutoGait(robot, PERIOD, candidates=candidates), TOLERANCE), built
 
 
 ATTITUDE = frozenset({"attitude"})
@@ -171,9 +174,10 @@ def test_attitude_alone_is_no_substitute_for_a_pose() -> None:
         method.plan(at(np.zeros(2)), goal_of([0, 0, 1]))
     # Where nothing moves the base, a turn is what there is.
     method, built = choice_of(made("moves", objection="moves wants sliders."), turns)
-    assert method.plan(at(np.zeros(2)), goal_of([0, 0, 1])).notes["chosen"] == "turns"
+    schedule = method.plan(at(np.zeros(2)), goal_of([0, 0, 1]))
+    assert schedule.notes["chosen"] == "turns"
     assert built == ["turns"]
-    assert method.controls == ATTITUDE
+    assert schedule.controls == ATTITUDE
 
 
 def test_a_goal_stays_with_its_method() -> None:
@@ -188,17 +192,17 @@ def test_a_goal_stays_with_its_method() -> None:
     assert other.notes["chosen"] == "first"
 
 
-def test_a_refused_goal_does_not_change_what_is_judged() -> None:
+def test_a_refused_goal_does_not_change_what_a_schedule_controls() -> None:
     turns = made("turns", controls=ATTITUDE)
     method, _ = choice_of(turns)
-    method.plan(at(np.zeros(2)), goal_of([0, 0, 1]))
+    schedule = method.plan(at(np.zeros(2)), goal_of([0, 0, 1]))
     turns.refusal = "Too far."
     with pytest.raises(PlanningError):
         method.plan(at(np.zeros(2)), goal_of([0, 0, 2]))
-    assert method.controls == ATTITUDE
+    assert schedule.controls == ATTITUDE
 
 
 def test_every_method_of_the_registry_is_built_with_its_defaults() -> None:
     robot = robot_named("three_joint_arm")
     for name, entry in METHODS.items():
-        assert type(build_method(name, robot, PERIOD, TOLERANCE, STEP, {})) is entry
+        assert type(build_method(name, robot, PERIOD, STEP, {})) is entry

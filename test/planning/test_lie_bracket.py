@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 from planning.sliding_robots import SlidingRobot, paper_robot
 from scipy.spatial.transform import Rotation
+from support.planners import planner_of
 from support.slides_and_turns import (
     PERIOD,
     TIGHT,
@@ -24,7 +25,6 @@ from support.slides_and_turns import (
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal, Tolerance
-from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 Array = npt.NDArray[np.float64]
 
@@ -165,7 +165,7 @@ def test_other_joints_stay_where_they_are() -> None:
     hinge = robot.joint_names.index("hinge")
     q = np.zeros(4)
     q[hinge] = 0.7
-    method = LieBracketGait(robot, PERIOD, TIGHT, t1=5.0, n1=1, cycle_period=1.0)
+    method = planner_of("lie_bracket", robot, PERIOD, TIGHT, t1=5.0, n1=1, cycle_period=1.0)
     goal = goal_at([0.03, -0.02, 0.01], Rotation.from_rotvec([0.02, 0.01, -0.02]))
     schedule = method.plan(state_at(np.zeros(3), Rotation.identity(), q), goal)
     np.testing.assert_array_equal(schedule.positions[:, hinge], 0.7)

@@ -27,6 +27,7 @@ from support.slides_and_turns import (
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.planning import Goal, RobotState, Tolerance
+from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 Array = npt.NDArray[np.float64]
 
@@ -126,7 +127,8 @@ def test_a_fourth_slider_takes_what_the_others_have_no_stroke_for() -> None:
     robot = SlidingRobot(10.0, np.diag([1.0, 1.5, 1.5]), np.zeros(3), sliders)
     # 0.1 m of 18 kg is 0.9 m of 2 kg.
     goal = goal_at([-0.1, 0.0, 0.0], Rotation.identity())
-    method = planner(robot)
+    method = planner(robot).method
+    assert isinstance(method, LieBracketGait)
     z_f = method.final_shape(origin(4), goal)
     assert z_f[0] + z_f[3] == pytest.approx(0.9, abs=1e-9)
     assert -0.2 <= z_f[0] <= 0.2

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from planning.sliding_robots import paper_robot
 from scipy.spatial.transform import Rotation
+from support.planners import planner_of
 from support.slides_and_turns import PERIOD, URDF, goal_at, misses, note, origin, state_at
 
 from spacerobot_ros.model import SpaceRobot
@@ -27,8 +28,8 @@ PAPER_OPTIONS = {
 @pytest.fixture(scope="module")
 def paper_gait() -> GaitSchedule:
     """Return the manoeuvre of 4900 s, at a tolerance that admits the first order."""
-    method = LieBracketGait(
-        SpaceRobot.from_file(URDF), PERIOD, Tolerance(0.02, 0.06), **PAPER_OPTIONS
+    method = planner_of(
+        "lie_bracket", SpaceRobot.from_file(URDF), PERIOD, Tolerance(0.02, 0.06), **PAPER_OPTIONS
     )
     return method.plan(origin(), PAPER_GOAL)
 
@@ -79,8 +80,8 @@ def test_the_manoeuvre_of_the_paper_integrated_otherwise(paper_gait: GaitSchedul
 
 
 def test_a_tighter_tolerance_refines_the_manoeuvre_of_the_paper() -> None:
-    method = LieBracketGait(
-        SpaceRobot.from_file(URDF), PERIOD, Tolerance(1e-4, 1e-5), **PAPER_OPTIONS
+    method = planner_of(
+        "lie_bracket", SpaceRobot.from_file(URDF), PERIOD, Tolerance(1e-4, 1e-5), **PAPER_OPTIONS
     )
     schedule = method.plan(origin(), PAPER_GOAL)
     assert schedule.ticks == 98_000
@@ -91,8 +92,8 @@ def test_a_tighter_tolerance_refines_the_manoeuvre_of_the_paper() -> None:
 
 
 def test_a_correction_asks_for_little(paper_gait: GaitSchedule) -> None:
-    method = LieBracketGait(
-        SpaceRobot.from_file(URDF), PERIOD, Tolerance(1e-3, 1e-3), **PAPER_OPTIONS
+    method = planner_of(
+        "lie_bracket", SpaceRobot.from_file(URDF), PERIOD, Tolerance(1e-3, 1e-3), **PAPER_OPTIONS
     )
     end = Rotation.from_quat(paper_gait.path.quaternion[-1])
     state = state_at(paper_gait.path.position[-1], end, paper_gait.positions[-1])

@@ -11,10 +11,10 @@ import pytest
 from planning.sliding_robots import paper_robot, random_sliding_robot
 from scipy.spatial.transform import Rotation
 from support.oracles import PinocchioOracle
+from support.planners import planner_of
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, plan
-from spacerobot_ros.planning.methods.optimal import OptimalGait
 
 Array = npt.NDArray[np.float64]
 
@@ -179,7 +179,7 @@ def test_corrections_meet_the_goal_where_masses_are_not_as_believed() -> None:
     turn = Rotation.from_rotvec([0.2, -0.3, 0.25])
     oracle = PinocchioOracle(text, believed.joint_names)
     options = {key: value for key, value in QUICK.items() if key != "tick_period"}
-    method = OptimalGait(believed, PERIOD, Tolerance(1e-3, 1e-3), **options)
+    method = planner_of("optimal", believed, PERIOD, Tolerance(1e-3, 1e-3), **options)
     attitude, q, left = Rotation.identity(), ARM_START, []
     for number in range(3):
         state = RobotState(np.zeros(3), attitude.as_quat(), q)

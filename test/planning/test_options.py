@@ -10,7 +10,7 @@ from support.effort_flights import robot_of
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.parameters import Parameter, declared
-from spacerobot_ros.planning import METHODS, Tolerance, plan
+from spacerobot_ros.planning import METHODS, plan
 from spacerobot_ros.resources import share_directory
 
 ARM = (share_directory() / "urdf" / "three_joint_arm.urdf").read_text("utf-8")
@@ -26,7 +26,7 @@ NUMBERS = [
 @pytest.mark.parametrize("method", OPTIONED)
 def test_an_option_that_no_method_has_is_refused(method: str) -> None:
     with pytest.raises(ParameterError, match=rf"^{method} has no option 'thrust'\.$"):
-        METHODS[method](robot_of(ARM), 0.05, Tolerance(1e-3, 1e-3), thrust=1.0)
+        plan(robot_of(ARM), method=method, thrust=1.0)
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,7 @@ def test_numbers_out_of_range_are_refused(method: str, option: Parameter) -> Non
         value = [number] if isinstance(option.default, tuple) else number
         options: dict[str, Any] = {option.name: value}
         with pytest.raises(ParameterError, match=f"'{option.name}' is .* it must be "):
-            METHODS[method](robot_of(ARM), 0.05, Tolerance(1e-3, 1e-3), **options)
+            plan(robot_of(ARM), method=method, **options)
 
 
 def test_a_call_without_ros_checks_its_options_too() -> None:

@@ -14,10 +14,11 @@ import numpy.typing as npt
 import pytest
 from planning.flown import STEP, fly, plant_at
 from scipy.spatial.transform import Rotation
+from support.planners import Planner, planner_of
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import METHODS, GaitMethod, Goal, RobotState, Tolerance
+from spacerobot_ros.planning import Goal, RobotState, Tolerance
 
 Array = npt.NDArray[np.float64]
 
@@ -43,10 +44,10 @@ def robots() -> dict[str, SpaceRobot]:
     return {method: SpaceRobot.from_file(FOLDER / f"{name}.urdf") for method, name in names.items()}
 
 
-def planner(method: str, robot: SpaceRobot, **options: Any) -> GaitMethod:
+def planner(method: str, robot: SpaceRobot, **options: Any) -> Planner:
     if method == "lie_bracket":
         options = {"t1": 10.0, "n1": 1, "loop_area": 0.2, **options}
-    return METHODS[method](robot, PERIOD[method], TOLERANCE, STEP, **options)
+    return planner_of(method, robot, PERIOD[method], TOLERANCE, STEP, **options)
 
 
 def at(q: npt.ArrayLike, attitude: Rotation, **momenta: Array) -> RobotState:
@@ -107,7 +108,7 @@ def test_fifty_goals_are_planned_and_met_in_the_plant(
 # -- goals that cannot ------------------------------------------------------------------------
 
 
-def refused(gait: GaitMethod, state: RobotState, goal: Goal) -> str:
+def refused(gait: Planner, state: RobotState, goal: Goal) -> str:
     with pytest.raises(PlanningError) as refusal:
         gait.plan(state, goal)
     return str(refusal.value)

@@ -25,9 +25,10 @@ from support.planar_manoeuvres import (
     turns,
 )
 from support.planar_trees import random_tree
+from support.planners import planner_of
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import METHODS, Tolerance
+from spacerobot_ros.planning import Tolerance
 from spacerobot_ros.planning.core.planar import planar_axis
 from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase
 
@@ -92,7 +93,7 @@ def test_all_loops_are_the_same_square(chain: SpaceRobot) -> None:
 
 def test_the_phase_does_not_depend_on_the_ticks(chain: SpaceRobot) -> None:
     goal = goal_of(about_z(np.pi / 2), DEPLOYED)
-    coarse = METHODS["square_path"](chain, 0.7, TIGHT).plan(at_rest(FOLDED), goal)
+    coarse = planner_of("square_path", chain, 0.7, TIGHT).plan(at_rest(FOLDED), goal)
     fine = paper_gait(chain)
     assert coarse.notes["z_star"] == fine.notes["z_star"]
     assert turns(closed_forms, coarse.positions).sum() == pytest.approx(np.pi / 2, abs=1e-9)

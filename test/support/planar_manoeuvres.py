@@ -12,9 +12,10 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from support.planar_trees import PlanarTree, random_tree
+from support.planners import Planner, planner_of
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import METHODS, GaitMethod, GaitSchedule, Goal, RobotState, Tolerance
+from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance
 
 Array = npt.NDArray[np.float64]
 
@@ -50,8 +51,8 @@ def phase_density(psi: npt.ArrayLike) -> Array:
 # -- planning ---------------------------------------------------------------------------------
 
 
-def planner(robot: SpaceRobot, tolerance: Tolerance = TIGHT, **options: Any) -> GaitMethod:
-    return METHODS["square_path"](robot, PERIOD, tolerance, **options)
+def planner(robot: SpaceRobot, tolerance: Tolerance = TIGHT, **options: Any) -> Planner:
+    return planner_of("square_path", robot, PERIOD, tolerance, **options)
 
 
 def at_rest(q: Array, attitude: Rotation | None = None) -> RobotState:

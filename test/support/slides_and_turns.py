@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from planning.sliding_robots import SlidingRobot, random_sliding_robot
 from scipy.spatial.transform import Rotation
+from support.planners import Planner, planner_of
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance
-from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 Array = npt.NDArray[np.float64]
 
@@ -21,11 +21,11 @@ PERIOD = 0.05
 TIGHT = Tolerance(1e-5, 1e-5)
 
 
-def planner(robot: SlidingRobot, tolerance: Tolerance = TIGHT, **options: Any) -> LieBracketGait:
+def planner(robot: SlidingRobot, tolerance: Tolerance = TIGHT, **options: Any) -> Planner:
     """Return the method for a robot, with a short slide and short cycles unless given."""
     chosen = {"t1": 5.0, "n1": 1, "cycle_period": 1.0, **options}
     model = SpaceRobot.from_urdf(robot.urdf)
-    return LieBracketGait(model, PERIOD, tolerance, **chosen)
+    return planner_of("lie_bracket", model, PERIOD, tolerance, **chosen)
 
 
 def state_at(position: npt.ArrayLike, attitude: Rotation, shape: npt.ArrayLike) -> RobotState:

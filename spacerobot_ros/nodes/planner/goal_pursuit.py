@@ -17,6 +17,7 @@ from spacerobot_ros.nodes.planner.plan_work import Fly, PlanWork, Refuse
 from spacerobot_ros.nodes.planner.status import PlannerState, PlannerStatus, what_is_left
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError, Tolerance
+from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
 
@@ -57,6 +58,8 @@ class GoalPursuit:
         self._corrections = 0
         self._landed: GaitSchedule | None = None
         """A schedule that has ended, and whose result is still to be judged."""
+        self._previous: GaitSchedule | None = None
+        """The schedule that was flown last for the present goal."""
         self._replanning = False
         """Whether the next plan takes the place of one that was broken off."""
         self._flown_time = 0.0
@@ -83,10 +86,6 @@ class GoalPursuit:
     def wants_pose(self) -> bool:
         """Whether the next state is planned from, or judged."""
         return self._pending or self._landed is not None
-
-    def take_tolerance(self) -> None:
-        """Plan and judge with the tolerances that the parameters have now."""
-        self._work.take_tolerance()
 
     def propose(self, goal: Goal) -> None:
         """Plan for a goal from the next state that is measured."""
@@ -217,7 +216,8 @@ class GoalPursuit:
         """Come to rest, and plan what is left with the joints that are not stuck."""
         self._flight.stuck += stuck
         names = [self._robot.joint_names[i] for i in self._flight.stuck]
-        self._work.go_without(names)
+        assert self._previous is not None
+        self._work.go_without(names, self._previous.controls & POSE)
         self._replanning = True
         self._land(arrived=False)
         self._logger.warning(f"Stuck: {', '.join(names)}. What is left is planned without.")
@@ -252,11 +252,13 @@ class GoalPursuit:
             refuse(reason)
             return
         flown = self._flight.coming_to_rest(self._stamp)
-        self._work.begin(goal, state, fly, refuse, correction, flown, self._stamp)
+        previous = self._previous if goal is self._goal else None
+        self._work.begin(goal, state, fly, refuse, correction, previous, flown, self._stamp)
 
     def _fly(self, schedule: GaitSchedule, error: PoseError | None = None) -> None:
         stamp = self._stamp
         self._flight.begin(schedule, stamp)
+        self._previous = schedule
         self._flown_time += schedule.duration
         self._ends_at = stamp / NANOSECONDS + schedule.duration
         self._status.publish(
@@ -295,8 +297,8 @@ class GoalPursuit:
             "error": error,
             **self._account(),
         }
-        left = what_is_left(error, self._work.method.controls)
-        if self._tolerance.admits(error, self._work.method.controls):
+        left = what_is_left(error, flown.controls)
+        if self._tolerance.admits(error, flown.controls):
             self._conclude(PlannerState.REACHED, f"The goal is met: {left}.", **result)
             return
         counts = not flown.partial and not replanned

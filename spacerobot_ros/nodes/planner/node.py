@@ -96,11 +96,6 @@ class PlannerNode(RobotNode):
         if self._waiting is not None:
             self._pursuit.propose(self._waiting)
 
-    def parameters_changed(self) -> None:
-        """Plan and judge with the new tolerances."""
-        if self._robot is not None:
-            self._pursuit.take_tolerance()
-
     # -- topics -------------------------------------------------------------------------------
 
     def _on_goal(self, message: PoseStamped) -> None:

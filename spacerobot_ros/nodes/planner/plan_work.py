@@ -12,13 +12,14 @@ from typing import Any
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
-from spacerobot_ros.planning import GaitSchedule, Goal, RobotState
-from spacerobot_ros.planning.core.cancellation import wanted_while
+from spacerobot_ros.planning import GaitMethod, GaitSchedule, Goal, PlanRequest, RobotState
+from spacerobot_ros.planning.core.cancellation import Cancellation
+from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.planning.execution.braking import BrakingFollower
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.stitching import stitched
-from spacerobot_ros.planning.execution.stuck_joints import RemainingJointsGait
 from spacerobot_ros.planning.methods.registry import build_method
+from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 
 _LONGEST_END = 1.5
 """Wall s that work in the background may take to end when it is told to."""
@@ -61,18 +62,20 @@ class PlanWork:
         self.plan_time = 0.0
         """Wall time that the plans have taken together, s."""
         self._log = log
-        self._robot, self._values = robot, parameters
+        self._robot, self._values, self._tick_period = robot, parameters, tick_period
         self.background: bool = parameters["plan_in_background"]
         self._all_joints = build_method(
             parameters["method"],
             robot,
             tick_period,
-            configured(PlannerConfig, parameters).tolerance,
             parameters["integration_step"],
-            parameters,
+            configured(PlannerConfig, parameters).options,
         )
-        self.method = self._all_joints
-        """What plans now: with all joints, or with those that are not stuck."""
+        self.method: GaitMethod | None = self._all_joints
+        """What plans now: with all joints, or with those that are not stuck; None: to be built."""
+        self._stuck: list[str] = []
+        self._required: frozenset[Controlled] = frozenset()
+        self._cancellation = Cancellation()
         self._future: Future[_Outcome] | None = None
         self._dropped = False
         self._thread: Thread | None = None
@@ -83,21 +86,27 @@ class PlanWork:
         """Whether a plan is being made in the background."""
         return self._future is not None
 
-    def take_tolerance(self) -> None:
-        """Plan with the tolerance that the parameters have now."""
-        self.method.tolerance = self._all_joints.tolerance = configured(
-            PlannerConfig, self._values
-        ).tolerance
-
     def use_all_joints(self) -> None:
         """Plan with all joints again."""
         self.method = self._all_joints
 
-    def go_without(self, stuck: list[str]) -> None:
-        """Plan without these joints from now on."""
-        self.method = RemainingJointsGait.instead_of(
-            self._all_joints, stuck, self._values["method"], self._values
-        )
+    def go_without(self, stuck: list[str], required: frozenset[Controlled]) -> None:
+        """Plan without these joints from now on, and for these parts of the goal at least."""
+        self.method, self._stuck, self._required = None, stuck, required
+
+    def _method(self, state: RobotState) -> GaitMethod:
+        if self.method is None:
+            places = dict(zip(self._robot.joint_names, state.q.tolist(), strict=True))
+            self.method = RemainingJointsGait(
+                self._robot,
+                self._tick_period,
+                self._values["integration_step"],
+                stuck={name: places[name] for name in self._stuck},
+                method=self._values["method"],
+                options=configured(PlannerConfig, self._values).options,
+                required=self._required,
+            )
+        return self.method
 
     def begin(
         self,
@@ -106,6 +115,7 @@ class PlanWork:
         fly: Fly,
         refuse: Refuse,
         correction: bool,
+        previous: GaitSchedule | None,
         flown: BrakingFollower | None,
         stamp_ns: int,
     ) -> None:
@@ -114,18 +124,21 @@ class PlanWork:
         ``flown`` comes to rest first, from ``stamp_ns`` on.
         """
 
+        tolerance = configured(PlannerConfig, self._values).tolerance
+        cancellation = self._cancellation = Cancellation()
+
         def plan(start: RobotState) -> GaitSchedule:
-            return self.method.plan(start, goal, correction=correction)
+            request = PlanRequest(start, goal, tolerance, correction, previous)
+            return self._method(start).plan(request, cancellation)
 
         def work() -> _Outcome:
             began = time.perf_counter()
             try:
-                with wanted_while(lambda: not self._dropped):
-                    if flown is None:
-                        schedule = plan(state)
-                    else:
-                        step = self._values["integration_step"]
-                        schedule = stitched(flown, stamp_ns, state, self._robot, step, plan)
+                if flown is None:
+                    schedule = plan(state)
+                else:
+                    step = self._values["integration_step"]
+                    schedule = stitched(flown, stamp_ns, state, self._robot, step, plan)
             except PlanningError as reason:
                 return partial(refuse, reason), time.perf_counter() - began
             return partial(fly, schedule), time.perf_counter() - began
@@ -165,6 +178,7 @@ class PlanWork:
         """Fly nothing of what is being planned, and return whether something is."""
         dropped = self.busy and not self._dropped
         self._dropped = True
+        self._cancellation.cancel()
         return dropped
 
     def end(self) -> None:

@@ -1,38 +1,50 @@
-"""Plans that nobody waits for any more: long searches look whether they are still wanted."""
+"""Cancellation of plans: the caller asks for it, and long searches look for it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+from typing import NoReturn
 
 from spacerobot_ros.errors import PlanningError
 
-_wanted: ContextVar[Callable[[], bool]] = ContextVar("wanted", default=lambda: True)
+
+class PlanningCancelled(PlanningError):  # noqa: N818 - a request, not a failure
+    """The caller cancelled the plan before it was found."""
 
 
-@contextmanager
-def wanted_while(condition: Callable[[], bool]) -> Iterator[None]:
-    """Give up what is planned in this block, in this thread, when ``condition`` turns false."""
-    token = _wanted.set(condition)
-    try:
-        yield
-    finally:
-        _wanted.reset(token)
+class Cancellation:
+    """A request to stop planning, made in one thread and looked for in another."""
+
+    def __init__(self) -> None:
+        self._requested = False
+
+    @property
+    def requested(self) -> bool:
+        """Whether the plan is no longer wanted."""
+        return self._requested
+
+    def cancel(self) -> None:
+        """Request that planning stops."""
+        self._requested = True
+
+    def raise_if_requested(self) -> None:
+        """Stop planning if that is requested.
+
+        Raises
+        ------
+        PlanningCancelled
+            It is.
+        """
+        if self._requested:
+            raise PlanningCancelled("Planning was cancelled.")
 
 
-def still_wanted() -> bool:
-    """Whether somebody waits for what is being planned in this thread."""
-    return _wanted.get()()
+class _Never(Cancellation):
+    """The cancellation of a plan that nobody can cancel."""
+
+    def cancel(self) -> NoReturn:
+        """Refuse: every plan without a cancellation of its own shares this one."""
+        raise RuntimeError("NEVER is shared by all plans that are not to be cancelled.")
 
 
-def require_wanted() -> None:
-    """Give up unless somebody waits.
-
-    Raises
-    ------
-    PlanningError
-        Nobody does.
-    """
-    if not still_wanted():
-        raise PlanningError("Planning was given up: nobody waits for the plan.")
+NEVER: Cancellation = _Never()
+"""The cancellation of plans that are never cancelled."""

@@ -1,4 +1,4 @@
-"""What every gait method is: a state and a goal in, a schedule or a reason out."""
+"""What every gait method is: a request in, a schedule or a reason out."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
-from spacerobot_ros.parameters import configured, require_known
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, RobotState, Tolerance
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
@@ -24,6 +24,34 @@ _BEYOND = 1e-9
 
 
 @dataclass(frozen=True)
+class PlanRequest:
+    """Everything that a plan depends on, beside the robot and the options of the method.
+
+    Attributes
+    ----------
+    state
+        Where the gait begins; the joints are at rest.
+    goal
+        Where it is to end.
+    tolerance
+        How near is there.
+    correction
+        Whether an earlier schedule for the same goal has just ended: the remaining error is small,
+        and options that fix the size of the first manoeuvre do not apply.
+    previous
+        The schedule that was executed last for the same goal, None for the first. Methods keep to
+        the choices that it made: ``auto`` tries its method first, and methods that plan piece by
+        piece go on from its ``progress``.
+    """
+
+    state: RobotState
+    goal: Goal
+    tolerance: Tolerance
+    correction: bool = False
+    previous: GaitSchedule | None = None
+
+
+@dataclass(frozen=True)
 class NoOptions:
     """The options of a method that has none."""
 
@@ -31,53 +59,52 @@ class NoOptions:
 class GaitMethod(ABC):
     """A way to turn a goal pose into a gait.
 
-    A method is constructed once for a robot and plans many times. Its ``options`` become the
-    parameters ``<name>.<option>`` of the planner node and arrive as keyword arguments.
-
-    ``controls`` names the parts of a goal that the method brings about and is judged by; the others
-    come out as they must.
+    A method is built once for a robot and plans many times. It keeps nothing between the calls of
+    :meth:`plan` but functions that it has compiled.
 
     Parameters
     ----------
     robot
         The model.
-    tick_period
+    control_period
         How long a command is held, s.
-    tolerance
-        How near is there.
     integration_step
         Longest Runge-Kutta step of the predicted attitude, s; the plant's, for equal numbers.
     options
-        Values of the method's ``options`` by name; those left out have their defaults.
+        An instance of the method's ``Options``; None: the defaults.
+
+    Attributes
+    ----------
+    name
+        Name in the registry, and of the group of parameters ``<name>.<option>``.
+    controls
+        The parts of a goal that the method's schedules control; the others come out as they must.
+        A method that chooses among others says it in each schedule alone.
+    Options
+        A frozen dataclass, whose fields are declared by :mod:`spacerobot_ros.parameters`.
 
     Raises
     ------
     ParameterError
-        There is no such option, or a value does not go with its range, the robot or another option.
+        An option does not go with the robot or with another option.
     """
 
     name: ClassVar[str]
     controls: frozenset[Controlled] = POSE
-    Options: ClassVar[Any] = NoOptions
+    Options: ClassVar[type[Any]] = NoOptions
+    options: Any
 
     def __init__(
         self,
         robot: SpaceRobot,
-        tick_period: float,
-        tolerance: Tolerance,
+        control_period: float,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
-        **options: Any,
+        options: Any = None,
     ) -> None:
         self.robot = robot
-        self.tick_period = tick_period
-        self.tolerance = tolerance
+        self.control_period = control_period
         self.integration_step = integration_step
-        require_known(self.name, self.Options, options)
-        self._options = configured(self.Options, options)
-        self._prepare()
-
-    def _prepare(self) -> None:  # noqa: B027 - methods that delegate have nothing to set up here
-        """Set up what the method keeps for all its plans, by ``_settings``; called once."""
+        self.options = self.Options() if options is None else options
 
     @classmethod
     def objection(cls, robot: SpaceRobot) -> str:
@@ -85,31 +112,39 @@ class GaitMethod(ABC):
         return ""
 
     @abstractmethod
-    def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
-        """Return a gait from ``state`` to ``goal``, at rest at both ends.
-
-        ``correction`` says that an earlier schedule for the same goal has just ended: what is left
-        is small, and options that fix the size of the first manoeuvre do not apply.
+    def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
+        """Return a gait that begins and ends at rest: for equal requests, an equal one.
 
         Raises
         ------
         PlanningError
             The method cannot reach the goal; the sentence says why.
+        PlanningCancelled
+            The cancellation was requested meanwhile.
         """
 
     def _schedule_of(
-        self, goal: Goal, positions: Array, path: BasePath, notes: Notes, *, partial: bool = False
+        self,
+        goal: Goal,
+        positions: Array,
+        path: BasePath,
+        notes: Notes,
+        *,
+        partial: bool = False,
+        progress: object = None,
     ) -> GaitSchedule:
         """Return shapes (N + 1, n) at the ticks as a schedule of this method."""
         return GaitSchedule(
             method=self.name,
             joint_names=self.robot.joint_names,
-            tick_period=self.tick_period,
+            tick_period=self.control_period,
             positions=positions,
             path=path,
             goal=goal,
             notes=notes,
             partial=partial,
+            controls=self.controls,
+            progress=progress,
         )
 
     def _goal_shape(self, goal: Goal) -> Array | None:

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.goal import Goal
+from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal
 
 Notes = dict[str, list[float] | float | str]
 """Named results of a method, for reports."""
@@ -46,6 +46,11 @@ class GaitSchedule:
     partial
         It ends short of the goal on purpose: the measured pose at its end decides on the next
         piece.
+    controls
+        The parts of the goal that it controls, and by which its result is evaluated.
+    progress
+        What its method needs to go on with the same goal, of a type of the method's own; see
+        ``PlanRequest.previous``.
     """
 
     method: str
@@ -56,6 +61,8 @@ class GaitSchedule:
     goal: Goal
     notes: Notes = field(default_factory=dict)
     partial: bool = False
+    controls: frozenset[Controlled] = POSE
+    progress: object = None
 
     @property
     def ticks(self) -> int:

@@ -1,23 +1,11 @@
-"""Joints that do not follow: found, and planned around with those that remain."""
+"""Joints that do not follow their commands, found while a gait is executed."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptionError
-from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, JointKind
-from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
-from spacerobot_ros.parameters import declared
-from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, RobotState, Tolerance
-from spacerobot_ros.planning.core.method import GaitMethod
-from spacerobot_ros.planning.core.schedule import GaitSchedule
-from spacerobot_ros.planning.methods.registry import METHODS, build_method
+from spacerobot_ros.model.description import Array
 
 _STUCK_SHARE = 0.05
 """A joint that goes less than this part of what it is commanded to go is stuck."""
@@ -33,14 +21,6 @@ _LOOK_EVERY = 16
 
 _LEAST_BAND = 1e-6
 """Errors below this are rounding, m or rad."""
-
-_OF_JOINTS = frozenset(
-    option.name
-    for name, method in METHODS.items()
-    for option in declared(method.Options, f"{name}.")
-    if option.of_joints
-)
-"""Keys of the options that say something of every joint."""
 
 
 class StuckJointWatch:
@@ -122,157 +102,3 @@ class StuckJointWatch:
 def _widen(ranges: Array, values: Array) -> None:
     np.minimum(ranges[0], values, out=ranges[0])
     np.maximum(ranges[1], values, out=ranges[1])
-
-
-class RemainingJointsGait(GaitMethod):
-    """Plans with the joints that are not stuck; the others are part of the bodies they join.
-
-    The model is that of the robot with the stuck joints fixed where the first plan finds them. Its
-    schedules name every joint and leave the stuck ones there.
-
-    Parameters
-    ----------
-    stuck
-        Names of the joints.
-    method, options
-        What plans for the robot that is left, as for :func:`build_method`; where it refuses, the
-        method ``auto`` is asked.
-    controls
-        Parts of the goal that must not be left as they come.
-    """
-
-    name: ClassVar[str] = "remaining_joints"
-
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        tick_period: float,
-        tolerance: Tolerance,
-        integration_step: float = DEFAULT_INTEGRATION_STEP,
-        *,
-        stuck: Sequence[str],
-        method: str,
-        options: Mapping[str, Any],
-        controls: frozenset[Controlled] = frozenset(),
-    ) -> None:
-        super().__init__(robot, tick_period, tolerance, integration_step)
-        self._stuck = np.array([name in stuck for name in robot.joint_names], dtype=np.bool_)
-        self._names = list(dict.fromkeys((method, "auto")))
-        self._required = controls
-        self._options = _options_without(options, self._stuck, robot.joint_names)
-        self._remaining: SpaceRobot | None = None
-        self._methods: dict[str, GaitMethod] = {}
-
-    @classmethod
-    def instead_of(
-        cls, method: GaitMethod, stuck: Sequence[str], name: str, options: Mapping[str, Any]
-    ) -> RemainingJointsGait:
-        """Return what goes on for a method, of a name and with options, without some joints."""
-        return cls(
-            method.robot,
-            method.tick_period,
-            method.tolerance,
-            method.integration_step,
-            stuck=stuck,
-            method=name,
-            options=options,
-            controls=method.controls & POSE,
-        )
-
-    def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
-        """Plan with the remaining joints; see :meth:`GaitMethod.plan`."""
-        try:
-            return self._plan(state, goal, correction)
-        except PlanningError as refusal:
-            raise PlanningError(f"{self._where(state)}; {refusal}") from None
-
-    def _plan(self, state: RobotState, goal: Goal, correction: bool) -> GaitSchedule:
-        moving = ~self._stuck
-        if not moving.any():
-            raise PlanningError(
-                "no joint follows; /diagnostics says whether the plant refuses the commands."
-            )
-        shape = goal.joint_positions
-        left = replace(state, q=state.q[moving])
-        wanted = replace(goal, joint_positions=None if shape is None else shape[moving])
-        reasons = []
-        for name in self._names:
-            try:
-                method = self._method(name, state)
-                schedule = method.plan(left, wanted, correction=correction)
-            except (PlanningError, ParameterError, RobotDescriptionError) as refusal:
-                reasons.append(str(refusal))
-                continue
-            lost = self._required - method.controls
-            if lost:
-                parts = " and ".join(sorted(lost))
-                reasons.append(f"{schedule.method} would leave the {parts} as it comes.")
-                continue
-            if "shape" in method.controls and shape is not None:
-                self._require_shape(state, shape)
-            self.controls = method.controls
-            self._names = [name]
-            positions = np.tile(state.q, (len(schedule.positions), 1))
-            positions[:, moving] = schedule.positions
-            return replace(
-                schedule, joint_names=self.robot.joint_names, positions=positions, goal=goal
-            )
-        raise PlanningError(f"with the remaining joints: {' '.join(dict.fromkeys(reasons))}")
-
-    def _method(self, name: str, state: RobotState) -> GaitMethod:
-        if self._remaining is None:
-            fixed = {
-                joint: float(position)
-                for joint, position, stuck in zip(
-                    self.robot.joint_names, state.q, self._stuck, strict=True
-                )
-                if stuck
-            }
-            self._remaining = SpaceRobot(self.robot.description.with_locked(fixed))
-        if name not in self._methods:
-            self._methods[name] = build_method(
-                name,
-                self._remaining,
-                self.tick_period,
-                self.tolerance,
-                self.integration_step,
-                self._options,
-            )
-        method = self._methods[name]
-        method.tolerance = self.tolerance
-        return method
-
-    def _require_shape(self, state: RobotState, shape: Array) -> None:
-        far = np.abs(shape - state.q) * self._stuck
-        worst = int(np.argmax(far))
-        if far[worst] > self.tolerance.shape:
-            raise PlanningError(
-                f"the goal wants joint '{self.robot.joint_names[worst]}' at {shape[worst]:.4g}."
-            )
-
-    def _where(self, state: RobotState) -> str:
-        places = []
-        for joint, position, stuck in zip(
-            self.robot.description.movable_joints, state.q, self._stuck, strict=True
-        ):
-            if stuck:
-                unit = "m" if joint.kind is JointKind.PRISMATIC else "rad"
-                places.append(f"joint '{joint.name}' is stuck at {position:.4g} {unit}")
-        return " and ".join(places)
-
-
-def _options_without(
-    options: Mapping[str, Any], stuck: npt.NDArray[np.bool_], names: Sequence[str]
-) -> dict[str, Any]:
-    """Return options for the remaining joints: lists with a number a joint lose those of the stuck
-    ones, and names of joints are left to the method if one of them is stuck.
-    """
-    gone = {name for name, is_stuck in zip(names, stuck, strict=True) if is_stuck}
-    kept = dict(options)
-    for key in _OF_JOINTS & kept.keys():
-        value = kept[key]
-        if isinstance(value, str):
-            kept[key] = "" if gone & set(value.split()) else value
-        elif len(value) == len(names):
-            kept[key] = [x for x, is_stuck in zip(value, stuck, strict=True) if not is_stuck]
-    return kept

@@ -12,20 +12,21 @@ the path alone, and held commands move along it.
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import attitude_error, quaternion_inverse, quaternion_multiply
 from spacerobot_ros.parameters import parameter
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import brackets_anywhere
-from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState
-from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.core.goal import Controlled, PoseError
+from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 from spacerobot_ros.planning.methods.edge_path import EdgePath, edge_path
@@ -86,6 +87,18 @@ class AreaLoopOptions:
     )
 
 
+@dataclass(frozen=True)
+class AreaLoopProgress:
+    """What the next schedule for the same goal goes on with.
+
+    ``nominal`` is the nominal shape that was chosen, ``cycles`` how many are flown when the
+    schedule has ended.
+    """
+
+    nominal: NominalShape
+    cycles: int
+
+
 class AreaLoopGait(GaitMethod):
     """Attitude of a base with three or more joints of any kind, and the shape to end in.
 
@@ -95,23 +108,24 @@ class AreaLoopGait(GaitMethod):
 
     name: ClassVar[str] = "area_loop"
     controls: frozenset[Controlled] = frozenset({"attitude", "shape"})
-    Options: ClassVar[Any] = AreaLoopOptions
+    Options: ClassVar[type[AreaLoopOptions]] = AreaLoopOptions
+    options: AreaLoopOptions
 
-    def _prepare(self) -> None:
-        robot, chosen = self.robot, self._options
-        self._k: float = chosen.k
-        self._edge_time: float = chosen.edge_time
-        self._longest: float = chosen.longest
-        self._goal: Goal | None = None
-        self._flown = 0
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        control_period: float,
+        integration_step: float = DEFAULT_INTEGRATION_STEP,
+        options: AreaLoopOptions | None = None,
+    ) -> None:
+        super().__init__(robot, control_period, integration_step, options)
+        chosen = self.options
         # Planners exist before goals: an unsuitable robot is refused with the first one.
         self._refusal = self.objection(robot)
         self._nominal = NominalChoice(robot, chosen.largest_edge, chosen.joints, chosen.nominal)
-        self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)
-        if not self._refusal and robot.n == 3:
-            # No other joints rest anywhere: the choice need not wait for a shape.
-            with suppress(PlanningError):
-                self._nominal.at(np.zeros(3))
+        self._prediction = BasePrediction(robot, control_period, integration_step)
+        if not self._refusal:
+            self._nominal.prepare()
 
     @classmethod
     def objection(cls, robot: SpaceRobot) -> str:
@@ -124,51 +138,72 @@ class AreaLoopGait(GaitMethod):
         found = brackets_anywhere(robot)
         return "" if found.controllable else found.sentence
 
-    def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
+    def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan the way to the nominal shape and the next cycle; see :meth:`GaitMethod.plan`.
 
-        The schedule is ``partial`` unless its own prediction meets the goal. ``most_cycles`` and
-        ``longest`` bound what the same goal object takes, whatever ``correction`` says.
+        The schedule is ``partial`` unless its own prediction reaches the goal. ``most_cycles`` and
+        ``longest`` bound what the goal takes, with the cycles before, which ``request.previous``
+        counts.
         """
         if self._refusal:
             raise PlanningError(self._refusal)
+        state, goal, tolerance = request.state, request.goal, request.tolerance
         self._require_rest(state)
         final = self._goal_shape(goal)
         gait = _Gait(state.q[np.newaxis], state.quaternion[np.newaxis])
         notes: Notes = {"cycles": 0.0}
+        progress = None if request.previous is None else request.previous.progress
+        if not isinstance(progress, AreaLoopProgress):
+            progress = None
         error = PoseError.between(state.position, state.quaternion, goal, state.q)
-        if self.tolerance.admits(error, self.controls):
-            return self._schedule(gait, state, goal, notes)
-        nominal = self._nominal.at(state.q)
-        if goal is not self._goal:
-            self._goal, self._flown = goal, 0
-        gait = self._moved(gait, [(nominal.shape, self._edge_time)])
+        if tolerance.admits(error, self.controls):
+            return self._schedule(gait, request, notes, progress)
+        chosen = self._nominal.at(state.q, None if progress is None else progress.nominal)
+        nominal = self._nominal.nearest_turn(chosen, state.q)
+        flown = 0 if progress is None else progress.cycles
+        gait = self._moved(gait, [(nominal.shape, self.options.edge_time)])
         # The way from the nominal to the final shape turns the base too: aim that far beside.
         aside = self._turn(nominal, final)
         target = quaternion_multiply(goal.quaternion, quaternion_inverse(aside))
-        cycles_per_plan: int = self._options.cycles_per_plan
-        for planned in range(cycles_per_plan + 1):
+        for planned in range(self.options.cycles_per_plan + 1):
+            cancellation.raise_if_requested()
             left = attitude_error(gait.attitudes[-1], target)
-            if np.linalg.norm(left) <= self.tolerance.attitude:
+            if np.linalg.norm(left) <= tolerance.attitude:
                 if final is not None:
-                    gait = self._moved(gait, [(final, self._edge_time)])
+                    gait = self._moved(gait, [(final, self.options.edge_time)])
                 break
-            if planned < cycles_per_plan:
-                gait, cycle_notes = self._cycle(gait, target, left, nominal)
-                self._flown += 1
+            if planned < self.options.cycles_per_plan:
+                gait, cycle_notes = self._cycle(
+                    gait, target, left, nominal, tolerance.attitude, flown
+                )
+                flown += 1
                 notes = {**cycle_notes, "cycles": float(planned + 1)}
-        return self._schedule(gait, state, goal, notes)
+        return self._schedule(gait, request, notes, AreaLoopProgress(chosen, flown))
 
     def _cycle(
-        self, gait: _Gait, target: Array, left: Array, nominal: NominalShape
+        self,
+        gait: _Gait,
+        target: Array,
+        left: Array,
+        nominal: NominalShape,
+        enough: float,
+        flown: int,
     ) -> tuple[_Gait, Notes]:
-        """Add one cycle for the turn ``left`` (3,), rad; return the paper's symbols as well."""
-        S = self._k * np.linalg.solve(nominal.M, left).astype(float)
+        """Add one cycle for the turn ``left`` (3,), rad; return the paper's symbols as well.
+
+        Cycles go on until the attitude is off by ``enough`` (rad); ``flown`` are done.
+        """
+        S = self.options.k * np.linalg.solve(nominal.M, left).astype(float)
         # Edges go as the root of areas.
         share = min(1.0, edge_path(S, nominal.longest).excess ** -2)
         missing = float(np.linalg.norm(left))
-        cycles = self._flown + self._cycles_left(missing, share)
-        self._require_few(cycles)
+        cycles = flown + self._cycles_left(missing, share, enough)
+        most = self.options.most_cycles
+        if cycles > most:
+            raise PlanningError(
+                f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
+                f"{flown} are flown."
+            )
         for _ in range(_TRIALS):
             path = edge_path(share * S, nominal.longest)
             after = self._moved(gait, self._ends(path, nominal))
@@ -181,11 +216,11 @@ class AreaLoopGait(GaitMethod):
                 f"{np.round(nominal.shape, 4).tolist()}, however small, brings the base nearer to "
                 f"its goal than {missing:.3g} rad."
             )
-        duration = (len(after.positions) - len(gait.positions)) * self.tick_period
-        if cycles * duration > self._longest:
+        duration = (len(after.positions) - len(gait.positions)) * self.control_period
+        if cycles * duration > self.options.longest:
             raise PlanningError(
                 f"The manoeuvre would take about {cycles:.4g} cycles of {duration:.4g} s, more "
-                f"than longest = {self._longest:.6g} s."
+                f"than longest = {self.options.longest:.6g} s."
             )
         return after, {
             "joints": ", ".join(self.robot.joint_names[i] for i in nominal.joints),
@@ -197,28 +232,20 @@ class AreaLoopGait(GaitMethod):
             "expected_cycles": cycles,
         }
 
-    def _cycles_left(self, missing: float, share: float) -> float:
+    def _cycles_left(self, missing: float, share: float, enough: float) -> float:
         """Return how many cycles a turn (rad) takes to first order, the first by a share of k.
 
         While edges are as long as they may be, every cycle turns the base as far; then the
         missing turn shrinks by the factor 1 - k.
         """
         unbounded = missing * share
-        many = (1.0 / share - 1.0) / self._k
-        if unbounded <= self.tolerance.attitude:
-            return max(1.0, (missing - self.tolerance.attitude) / (self._k * unbounded))
-        if self.tolerance.attitude <= 0.0:
+        many = (1.0 / share - 1.0) / self.options.k
+        if unbounded <= enough:
+            return max(1.0, (missing - enough) / (self.options.k * unbounded))
+        if enough <= 0.0:
             return math.inf
-        factor = -math.log1p(-min(self._k, _ALL))
-        return many + max(1.0, math.log(unbounded / self.tolerance.attitude) / factor)
-
-    def _require_few(self, cycles: float) -> None:
-        most = self._options.most_cycles
-        if cycles > most:
-            raise PlanningError(
-                f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
-                f"{self._flown} are flown."
-            )
+        factor = -math.log1p(-min(self.options.k, _ALL))
+        return many + max(1.0, math.log(unbounded / enough) / factor)
 
     def _ends(self, path: EdgePath, nominal: NominalShape) -> Ends:
         """Return where the edges of a path end, from the nominal shape and back to it."""
@@ -232,21 +259,21 @@ class AreaLoopGait(GaitMethod):
             corners = np.tile(nominal.shape, (len(loop), 1))
             corners[:, chosen] = np.clip(centre + loop, lower, upper)
             # From the middle of the box to a corner is half as far as an edge.
-            ends.append((corners[0], self._edge_time / 2))
-            ends += [(corner, self._edge_time) for corner in corners[1:]]
-            ends.append((nominal.shape, self._edge_time / 2))
+            ends.append((corners[0], self.options.edge_time / 2))
+            ends += [(corner, self.options.edge_time) for corner in corners[1:]]
+            ends.append((nominal.shape, self.options.edge_time / 2))
         return ends
 
     def _turn(self, nominal: NominalShape, final: Array | None) -> Array:
         """Return the turn (4,) of the base on the straight way from nominal to final shape."""
         start = _Gait(nominal.shape[np.newaxis], _IDENTITY[np.newaxis])
-        ends = [] if final is None else [(final, self._edge_time)]
+        ends = [] if final is None else [(final, self.options.edge_time)]
         return self._moved(start, ends).attitudes[-1]
 
     def _moved(self, gait: _Gait, ends: Ends) -> _Gait:
         """Return the gait with straight legs added."""
         shapes = straight_motion(
-            self.robot, gait.positions[-1], ends, self.tick_period, self._longest
+            self.robot, gait.positions[-1], ends, self.control_period, self.options.longest
         )
         # At rest there is no momentum: the attitudes depend on the shapes alone.
         attitudes = self._prediction.attitudes(shapes, gait.attitudes[-1], np.zeros(3))
@@ -254,12 +281,17 @@ class AreaLoopGait(GaitMethod):
             np.vstack([gait.positions, shapes[1:]]), np.vstack([gait.attitudes, attitudes[1:]])
         )
 
-    def _schedule(self, gait: _Gait, state: RobotState, goal: Goal, notes: Notes) -> GaitSchedule:
-        path = self._prediction.path(state, gait.positions, gait.attitudes)
+    def _schedule(
+        self, gait: _Gait, request: PlanRequest, notes: Notes, progress: AreaLoopProgress | None
+    ) -> GaitSchedule:
+        goal = request.goal
+        path = self._prediction.path(request.state, gait.positions, gait.attitudes)
         left = PoseError.between(path.position[-1], path.quaternion[-1], goal, gait.positions[-1])
         notes = {**notes, "predicted_attitude_error": left.angle}
-        partial = not self.tolerance.admits(left, self.controls)
-        return self._schedule_of(goal, gait.positions, path, notes, partial=partial)
+        partial = not request.tolerance.admits(left, self.controls)
+        return self._schedule_of(
+            goal, gait.positions, path, notes, partial=partial, progress=progress
+        )
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ from typing import ClassVar
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
-from spacerobot_ros.planning.core.goal import POSE, Goal, RobotState, Tolerance
-from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
+from spacerobot_ros.planning.core.goal import POSE
+from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 
 
@@ -26,8 +27,8 @@ class AutoGait(GaitMethod):
     """Tries the methods that suit the robot, in a given order, and takes the first that plans.
 
     Where a method that suits the robot moves the base to a position, one that leaves the position
-    as it comes does not stand in for it. ``controls`` is that of the method last chosen, which
-    also corrects what is left of its goal.
+    as it comes does not stand in for it. The method of the schedule flown before for the same goal
+    is tried first. A schedule is that of the chosen method, in all but its notes.
 
     Parameters
     ----------
@@ -40,22 +41,19 @@ class AutoGait(GaitMethod):
     def __init__(
         self,
         robot: SpaceRobot,
-        tick_period: float,
-        tolerance: Tolerance,
+        control_period: float,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
         *,
         candidates: Mapping[str, Candidate],
     ) -> None:
-        super().__init__(robot, tick_period, tolerance, integration_step)
+        super().__init__(robot, control_period, integration_step)
         self._candidates = candidates
         self._objections = {
             name: candidate.method.objection(robot) for name, candidate in candidates.items()
         }
         self._built: dict[str, GaitMethod] = {}
-        self._goal: Goal | None = None
-        self._chosen = ""
 
-    def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
+    def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan by the first method that can; see :meth:`GaitMethod.plan`.
 
         ``notes`` say which (``chosen``) and why (``because``).
@@ -67,7 +65,7 @@ class AutoGait(GaitMethod):
         """
         reasons = dict(self._objections)
         parts = frozenset[str]()
-        for name in self._order(goal):
+        for name in self._order(request):
             if self._objections[name]:
                 continue
             method = self._method(name)
@@ -77,13 +75,13 @@ class AutoGait(GaitMethod):
                 reasons[name] = f"{name} would leave the {lost} of the base as it comes."
                 continue
             try:
-                schedule = method.plan(state, goal, correction=correction)
+                schedule = method.plan(request, cancellation)
+            except PlanningCancelled:
+                raise
             except PlanningError as refusal:
                 reasons[name] = str(refusal)
                 parts |= pose
                 continue
-            self.controls = method.controls
-            self._goal, self._chosen = goal, name
             notes = {**schedule.notes, "chosen": name, "because": self._because(name, reasons)}
             return replace(schedule, notes=notes)
         raise PlanningError(
@@ -91,19 +89,15 @@ class AutoGait(GaitMethod):
             + " ".join(f"{name}: {reason}" for name, reason in reasons.items())
         )
 
-    def _order(self, goal: Goal) -> list[str]:
+    def _order(self, request: PlanRequest) -> list[str]:
         """Return the names in the order of trial: first the method that flies this goal already."""
-        names = list(self._candidates)
-        if goal is self._goal:
-            names.sort(key=lambda name: name != self._chosen)
-        return names
+        flying = "" if request.previous is None else request.previous.method
+        return sorted(self._candidates, key=lambda name: name != flying)
 
     def _method(self, name: str) -> GaitMethod:
         if name not in self._built:
             self._built[name] = self._candidates[name].build()
-        method = self._built[name]
-        method.tolerance = self.tolerance
-        return method
+        return self._built[name]
 
     def _because(self, chosen: str, reasons: Mapping[str, str]) -> str:
         """Return the reasons against what comes before the chosen method, and that it suits."""

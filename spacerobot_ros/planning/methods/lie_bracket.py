@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -20,6 +20,7 @@ from scipy.optimize import lsq_linear
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import (
     attitude_error,
     matrix_from_quaternion,
@@ -28,6 +29,7 @@ from spacerobot_ros.model.rotations import (
     rotvec_from_quaternion,
 )
 from spacerobot_ros.parameters import parameter
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import (
     WORST_CONDITION,
     best_triple,
@@ -37,7 +39,7 @@ from spacerobot_ros.planning.core.controllability import (
     slot_objection,
 )
 from spacerobot_ros.planning.core.goal import Goal, RobotState
-from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
@@ -99,23 +101,23 @@ class LieBracketGait(GaitMethod):
     """Position and attitude of a base with three or more sliders, whose slots may be offset."""
 
     name: ClassVar[str] = "lie_bracket"
-    Options: ClassVar[Any] = LieBracketOptions
+    Options: ClassVar[type[LieBracketOptions]] = LieBracketOptions
+    options: LieBracketOptions
 
-    def _prepare(self) -> None:
-        robot, chosen = self.robot, self._options
-        self.t1: float = chosen.t1
-        self.n1: int = chosen.n1
-        self.cycles: int = chosen.cycles
-        self.loop_area: float = chosen.loop_area
-        self.a22_ratio: float = chosen.a22_ratio
-        self.a31_ratio: float = chosen.a31_ratio
-        self.longest: float = chosen.longest
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        control_period: float,
+        integration_step: float = DEFAULT_INTEGRATION_STEP,
+        options: LieBracketOptions | None = None,
+    ) -> None:
+        super().__init__(robot, control_period, integration_step, options)
         # Whole ticks a cycle: every cycle is then the same commands and the same rotation.
         self.ticks_a_cycle = max(
-            round(chosen.cycle_period / self.tick_period), _FEWEST_TICKS_A_CYCLE
+            round(self.options.cycle_period / control_period), _FEWEST_TICKS_A_CYCLE
         )
         self.sliders = sliders_of(robot)
-        self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)
+        self._prediction = BasePrediction(robot, control_period, integration_step)
 
     @classmethod
     def objection(cls, robot: SpaceRobot) -> str:
@@ -123,14 +125,15 @@ class LieBracketGait(GaitMethod):
         found = sliding_masses(robot)
         return "" if found.controllable else found.sentence
 
-    def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
+    def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan steps 1 to 3; see :meth:`GaitMethod.plan`."""
+        state, goal = request.state, request.goal
         self._require_rest(state)
         z_f = self.final_shape(state, goal)
         slide = self._slide(state.q, z_f)
-        t1 = (len(slide) - 1) * self.tick_period or self.t1
+        t1 = (len(slide) - 1) * self.control_period or self.options.t1
         attitudes = self._prediction.attitudes(slide, state.quaternion, state.angular_momentum)
-        cycle, n, notes = self._turn(attitudes[-1], z_f, goal, correction)
+        cycle, n, notes = self._turn(attitudes[-1], z_f, request)
         turn = np.tile(cycle[1:], (n, 1)) if n else np.empty((0, self.robot.n))
         path = self._path(state, slide, attitudes, cycle, n)
         symbols: Notes = {
@@ -186,22 +189,23 @@ class LieBracketGait(GaitMethod):
         if np.abs(displacement).max() <= _NO_MOTION:
             return z_f[np.newaxis].copy()
         t1 = self._slide_time(displacement)
-        ticks = max(math.ceil(t1 / self.tick_period - 1e-9), 4 * self.n1)
+        ticks = max(math.ceil(t1 / self.control_period - 1e-9), 4 * self.options.n1)
         phase = np.linspace(0.0, 1.0, ticks + 1)[:, np.newaxis]
-        progress = phase - np.sin(4 * np.pi * self.n1 * phase) / (4 * np.pi * self.n1)
+        n1 = self.options.n1
+        progress = phase - np.sin(4 * np.pi * n1 * phase) / (4 * np.pi * n1)
         shapes = z0 + progress * displacement
         shapes[-1] = z_f
         return shapes
 
     def _slide_time(self, displacement: Array) -> float:
         """Return t1 (s), longer where a servo is slow: the peak speed is twice the mean."""
-        slowest = self.t1
+        slowest, longest = self.options.t1, self.options.longest
         for name, distance, rate in zip(
             self.robot.joint_names, np.abs(displacement), self.robot.velocity_limit, strict=True
         ):
-            if distance > _NO_MOTION and 2 * distance > rate * self.longest:
+            if distance > _NO_MOTION and 2 * distance > rate * longest:
                 raise PlanningError(
-                    f"The slide would take more than {self.longest:.6g} s: joint '{name}' is to "
+                    f"The slide would take more than {longest:.6g} s: joint '{name}' is to "
                     f"move {distance:.4g} m at no more than {rate:.4g} m/s."
                 )
             if distance > _NO_MOTION:
@@ -209,21 +213,22 @@ class LieBracketGait(GaitMethod):
         return float(slowest)
 
     def _turn(
-        self, quaternion: Array, z_f: Array, goal: Goal, correction: bool
+        self, quaternion: Array, z_f: Array, request: PlanRequest
     ) -> tuple[Array, int, Notes]:
         """Step 3: one cycle of shapes (m + 1, n), how many of them, and the paper's symbols."""
-        wanted = attitude_error(quaternion, goal.quaternion)
+        wanted = attitude_error(quaternion, request.goal.quaternion)
+        enough = request.tolerance.attitude
         if np.linalg.norm(wanted) <= _NO_ROTATION:
             return z_f[np.newaxis].copy(), 0, {"cycles": 0.0}
         triple, brackets = self._best_triple(z_f)
-        least = 0 if correction else self.cycles
-        best = self._refine(wanted, brackets, triple, z_f, least)
+        least = 0 if request.correction else self.options.cycles
+        best = self._refine(wanted, brackets, triple, z_f, least, enough)
         while (
-            best.miss > self.tolerance.attitude
-            and 2 * best.cycles * self.ticks_a_cycle * self.tick_period <= self.longest
+            best.miss > enough
+            and 2 * best.cycles * self.ticks_a_cycle * self.control_period <= self.options.longest
         ):
             # The error of the first order goes as 1/sqrt(n).
-            best = self._refine(wanted, brackets, triple, z_f, 2 * best.cycles)
+            best = self._refine(wanted, brackets, triple, z_f, 2 * best.cycles, enough)
         names = [self.robot.joint_names[i] for i in triple]
         return (
             best.shapes,
@@ -245,8 +250,9 @@ class LieBracketGait(GaitMethod):
         triple: tuple[int, int, int],
         z_f: Array,
         least: int,
+        enough: float,
     ) -> _Turn:
-        """Ask for what the first order misses as well, until the turn is within tolerance.
+        """Ask for what the first order misses as well, until the turn misses ``enough`` (rad).
 
         The number of cycles is chosen once, from ``least`` up, so that the answer is smooth.
         """
@@ -262,7 +268,7 @@ class LieBracketGait(GaitMethod):
             if best is None or turn.miss < best.miss:
                 best = turn
             omega_d = omega_d + wanted - reached
-            if turn.miss <= self.tolerance.attitude or np.linalg.norm(omega_d) > 4 * np.pi:
+            if turn.miss <= enough or np.linalg.norm(omega_d) > 4 * np.pi:
                 break
         assert best is not None
         return best
@@ -285,20 +291,20 @@ class LieBracketGait(GaitMethod):
         """Choose n, from ``least`` up, so that the cycle keeps rates and strokes; more cycles are
         smaller ones. With ``least`` 0 it is what ``loop_area`` gives.
         """
-        n = least or max(1, math.ceil(float(np.linalg.norm(alpha)) / self.loop_area))
+        n = least or max(1, math.ceil(float(np.linalg.norm(alpha)) / self.options.loop_area))
         amplitudes = self._amplitudes(alpha)
-        robot = self.robot
+        robot, longest = self.robot, self.options.longest
         room = np.minimum(z_f - robot.lower, robot.upper - z_f)
         while True:
-            if n * self.ticks_a_cycle * self.tick_period > self.longest:
+            if n * self.ticks_a_cycle * self.control_period > longest:
                 raise PlanningError(
-                    f"The turn would take more than {self.longest:.6g} s within the strokes and "
+                    f"The turn would take more than {longest:.6g} s within the strokes and "
                     f"rates of the sliders at the final shape {np.round(z_f, 4).tolist()}; "
                     "a goal that leaves the sliders more room takes less."
                 )
             shapes = self._cycle(amplitudes, n, triple, z_f)
             swing = np.abs(shapes - z_f).max(axis=0)
-            rate = np.abs(np.diff(shapes, axis=0)).max(axis=0) / self.tick_period
+            rate = np.abs(np.diff(shapes, axis=0)).max(axis=0) / self.control_period
             active = swing > 0
             with np.errstate(divide="ignore"):
                 excess = max(
@@ -315,8 +321,8 @@ class LieBracketGait(GaitMethod):
         ``a31 b11 = alpha3/pi``, each product raised by what the polygons lose.
         """
         p12, p23, p13 = 2 * alpha[0] / np.pi, alpha[1] / np.pi, alpha[2] / np.pi
-        a22 = self.a22_ratio * math.sqrt(abs(p12))
-        a31 = self.a31_ratio * math.sqrt(math.hypot(p23, p13))
+        a22 = self.options.a22_ratio * math.sqrt(abs(p12))
+        a31 = self.options.a31_ratio * math.sqrt(math.hypot(p23, p13))
         step = 2 * np.pi / self.ticks_a_cycle
         first, second = np.sinc(step / np.pi), np.sinc(2 * step / np.pi)
         b12 = p12 / (second * a22) if a22 else 0.0
@@ -347,7 +353,7 @@ class LieBracketGait(GaitMethod):
         """Base path: step 2 as it goes, step 3 at the ends of some cycles."""
         stride = max(1, len(slide) // _KNOTS)
         chosen = np.unique(np.append(np.arange(0, len(slide), stride), len(slide) - 1))
-        time, shapes, quaternions = chosen * self.tick_period, slide[chosen], attitudes[chosen]
+        time, shapes, quaternions = chosen * self.control_period, slide[chosen], attitudes[chosen]
         if n:
             done = np.unique(np.append(np.arange(0, n, max(1, n // _KNOTS))[1:], n))
             rotation = self._rotation(cycle)
@@ -355,7 +361,7 @@ class LieBracketGait(GaitMethod):
                 quaternion_multiply(attitudes[-1], quaternion_from_rotvec(k * rotation))
                 for k in done
             ]
-            seconds = (len(slide) - 1 + done * self.ticks_a_cycle) * self.tick_period
+            seconds = (len(slide) - 1 + done * self.ticks_a_cycle) * self.control_period
             time = np.append(time, seconds)
             shapes = np.vstack([shapes, np.tile(cycle[-1], (len(done), 1))])
             quaternions = np.vstack([quaternions, turned])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +24,7 @@ _SAME_SHAPE = 1e-3
 
 
 class NominalChoice:
-    """The nominal shape of one robot, chosen once and kept.
+    """The nominal shapes of one robot.
 
     Parameters
     ----------
@@ -49,27 +50,36 @@ class NominalChoice:
         self._largest_edge = largest_edge
         self._triples = _triples(robot, joints.split())
         self._given = _checked(robot, np.array(nominal, dtype=float)) if len(nominal) else None
-        self._chosen: NominalShape | None = None
+        self._only: NominalShape | None = None
         kinds = [joint.kind for joint in robot.description.movable_joints]
         turning = np.array([kind is not JointKind.PRISMATIC for kind in kinds], dtype=bool)
         self._repeating = turning & np.isinf(robot.lower) & np.isinf(robot.upper)
 
-    def at(self, q: Array) -> NominalShape:
+    def prepare(self) -> None:
+        """Choose beforehand where the choice depends on no shape: for robots with three joints."""
+        if self._robot.n == 3:
+            with suppress(PlanningError):
+                self._only = self._choose(np.zeros(3))
+
+    def at(self, q: Array, kept: NominalShape | None = None) -> NominalShape:
         """Return the nominal shape to use from shape ``q`` (n,).
 
-        Of a robot with more than three joints the others rest where they are, and the choice
-        holds as long as they do. Joints without limits take the nearest of their turns.
+        Of a robot with more than three joints the others rest where they are; ``kept``, an earlier
+        choice, holds as long as they do.
 
         Raises
         ------
         PlanningError
             Limits leave no room for loops, or loops there do not turn the base about all axes.
         """
-        if self._chosen is None or not self._holds(self._chosen, q):
-            self._chosen = self._choose(q)
-        chosen = self._chosen
-        turns = np.where(self._repeating, np.round((q - chosen.shape) / (2 * math.pi)), 0.0)
-        return replace(chosen, shape=chosen.shape + 2 * math.pi * turns)
+        if self._only is not None:
+            return self._only
+        return kept if kept is not None and self._holds(kept, q) else self._choose(q)
+
+    def nearest_turn(self, nominal: NominalShape, q: Array) -> NominalShape:
+        """Return the nominal shape with joints without limits at their turn nearest to ``q``."""
+        turns = np.where(self._repeating, np.round((q - nominal.shape) / (2 * math.pi)), 0.0)
+        return replace(nominal, shape=nominal.shape + 2 * math.pi * turns)
 
     def _holds(self, chosen: NominalShape, q: Array) -> bool:
         moved = np.abs(np.delete(q - chosen.shape, chosen.joints)).max(initial=0.0)

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning.core.goal import Tolerance
+from spacerobot_ros.parameters import configured, require_known
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
 from spacerobot_ros.planning.methods.auto import AutoGait, Candidate
@@ -28,12 +29,13 @@ METHODS: dict[str, type[GaitMethod]] = {
 def build_method(
     name: str,
     robot: SpaceRobot,
-    tick_period: float,
-    tolerance: Tolerance,
+    control_period: float,
     integration_step: float,
     options: Mapping[str, Any],
 ) -> GaitMethod:
-    """Return a method for a robot; ``options`` are keyed ``<method>.<option>``.
+    """Return a method for a robot; ``options`` holds instances of ``Options`` by method.
+
+    A method that is not among them has its defaults.
 
     Raises
     ------
@@ -43,18 +45,28 @@ def build_method(
         An option does not go with the robot or with another option.
     """
     method = METHODS[name]
-    if method is AutoGait:
-        candidates = {
-            other: Candidate(
-                entry,
-                partial(
-                    build_method, other, robot, tick_period, tolerance, integration_step, options
-                ),
-            )
-            for other, entry in METHODS.items()
-            if entry is not AutoGait
-        }
-        return AutoGait(robot, tick_period, tolerance, integration_step, candidates=candidates)
-    own = f"{name}."
-    chosen = {key.removeprefix(own): value for key, value in options.items() if key.startswith(own)}
-    return method(robot, tick_period, tolerance, integration_step, **chosen)
+    if method is not AutoGait:
+        return method(robot, control_period, integration_step, options.get(name))
+    candidates = {
+        other: Candidate(
+            entry,
+            partial(build_method, other, robot, control_period, integration_step, options),
+        )
+        for other, entry in METHODS.items()
+        if entry is not AutoGait
+    }
+    return AutoGait(robot, control_period, integration_step, candidates=candidates)
+
+
+def method_options(name: str, values: Mapping[str, Any]) -> Any:
+    """Return the ``Options`` of a method with values by name; others have their defaults.
+
+    Raises
+    ------
+    ParameterError
+        There is no such method or option, or a value is refused.
+    """
+    if name not in METHODS:
+        raise ParameterError(f"There is no gait method '{name}'; there are: {', '.join(METHODS)}.")
+    require_known(name, METHODS[name].Options, values)
+    return configured(METHODS[name].Options, values)

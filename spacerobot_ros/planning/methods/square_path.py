@@ -14,17 +14,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import quaternion_inverse, quaternion_multiply
 from spacerobot_ros.parameters import parameter
-from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState
-from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
+from spacerobot_ros.planning.core.goal import Controlled, PoseError
+from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.planar import planar_axis
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
@@ -96,10 +98,18 @@ class SquarePathGait(GaitMethod):
 
     name: ClassVar[str] = "square_path"
     controls: frozenset[Controlled] = frozenset({"attitude", "shape"})
-    Options: ClassVar[Any] = SquarePathOptions
+    Options: ClassVar[type[SquarePathOptions]] = SquarePathOptions
+    options: SquarePathOptions
 
-    def _prepare(self) -> None:
-        robot, chosen = self.robot, self._options
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        control_period: float,
+        integration_step: float = DEFAULT_INTEGRATION_STEP,
+        options: SquarePathOptions | None = None,
+    ) -> None:
+        super().__init__(robot, control_period, integration_step, options)
+        chosen = self.options
         t1, t2, t3, t4 = chosen.t1, chosen.t2, chosen.t3, chosen.t4
         instants = (0.0, t1, t2, t3, t4)
         if not np.all(np.diff(instants) > 0):
@@ -119,7 +129,7 @@ class SquarePathGait(GaitMethod):
         self._search = SquareSearch(
             robot, self._phase, chosen.most_loops, centre if chosen.given_centre else None
         )
-        self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)
+        self._prediction = BasePrediction(robot, control_period, integration_step)
 
     @classmethod
     def objection(cls, robot: SpaceRobot) -> str:
@@ -130,12 +140,13 @@ class SquarePathGait(GaitMethod):
             return str(refusal)
         return ""
 
-    def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
+    def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan steps 1 to 4; see :meth:`GaitMethod.plan`."""
+        state, goal, tolerance = request.state, request.goal, request.tolerance
         if self._refusal is not None:
             raise PlanningError(str(self._refusal))
         self._require_rest(state)
-        turn = self._turn(state, goal)
+        turn = self._turn(request)
         psi_e = self._goal_shape(goal)
         if psi_e is None:
             psi_e = np.clip(state.q, self.robot.lower, self.robot.upper)
@@ -143,18 +154,18 @@ class SquarePathGait(GaitMethod):
         # Whole turns are no matter: the smaller of the two ways round.
         wanted = math.remainder(turn - step_1, 2 * math.pi)
         loop = None
-        if abs(wanted) > max(_NO_ROTATION, _WORTHWHILE * self.tolerance.attitude):
+        if abs(wanted) > max(_NO_ROTATION, _WORTHWHILE * tolerance.attitude):
             loop = self._search.loop(psi_e, wanted)
         positions = straight_motion(
             self.robot,
             state.q,
             self._legs(psi_e, loop),
-            self.tick_period,
-            self._options.longest,
+            self.control_period,
+            self.options.longest,
         )
         path = self._prediction.path(state, positions)
         left = PoseError.between(path.position[-1], path.quaternion[-1], goal)
-        if self._options.check_position and left.distance > self.tolerance.position:
+        if self.options.check_position and left.distance > tolerance.position:
             raise PlanningError(
                 f"The base will be at {np.round(path.position[-1], 4).tolist()} m, "
                 f"{left.distance:.3g} m from the goal position: without thrust, attitude and shape "
@@ -170,16 +181,17 @@ class SquarePathGait(GaitMethod):
         }
         return self._schedule_of(goal, positions, path, notes)
 
-    def _turn(self, state: RobotState, goal: Goal) -> float:
+    def _turn(self, request: PlanRequest) -> float:
         """Return the angle in [-pi, pi] about the robot's axis from the present attitude."""
+        start, wanted = request.state.quaternion, request.goal.quaternion
         axis = self._phase.axis
-        x, y, z, w = quaternion_multiply(quaternion_inverse(state.quaternion), goal.quaternion)
+        x, y, z, w = quaternion_multiply(quaternion_inverse(start), wanted)
         vector = np.array([x, y, z])
         # Swing after twist: what the twist about the axis leaves is a tilt out of the plane.
         about = float(axis @ vector)
         across = float(np.linalg.norm(vector - about * axis))
         tilt = 2 * math.atan2(across, math.hypot(about, float(w)))
-        if tilt > max(self.tolerance.attitude, _NO_ROTATION):
+        if tilt > max(request.tolerance.attitude, _NO_ROTATION):
             raise PlanningError(
                 f"The goal attitude is {tilt:.4g} rad off any rotation about the axis "
                 f"{np.round(axis, 6).tolist()} of {self.robot.base_link}: planar robot "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -72,10 +73,10 @@ class PathConstraints:
         cls,
         robot: SpaceRobot,
         base_rate: float,
-        axis: list[float],
-        direction: list[float],
+        axis: Sequence[float],
+        direction: Sequence[float],
         cone: float,
-        boxes: list[float],
+        boxes: Sequence[float],
     ) -> PathConstraints:
         """Return constraints from a method's options; boxes as lower and upper corners in turn.
 
@@ -160,7 +161,7 @@ class PathConstraints:
         return guess.retimed(max(1.0, fastest / self.imposed_base_rate))
 
 
-def _direction(name: str, values: list[float]) -> Array | None:
+def _direction(name: str, values: Sequence[float]) -> Array | None:
     if not values:
         return None
     vector = np.asarray(values, dtype=float)

@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.parameters import parameter, values_of
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
-from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 from spacerobot_ros.planning.methods.optimal.constraints import PathConstraints
@@ -136,10 +138,18 @@ class OptimalGait(GaitMethod):
     """
 
     name: ClassVar[str] = "optimal"
-    Options: ClassVar[Any] = OptimalOptions
+    Options: ClassVar[type[OptimalOptions]] = OptimalOptions
+    options: OptimalOptions
 
-    def _prepare(self) -> None:
-        robot, chosen = self.robot, self._options
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        control_period: float,
+        integration_step: float = DEFAULT_INTEGRATION_STEP,
+        options: OptimalOptions | None = None,
+    ) -> None:
+        super().__init__(robot, control_period, integration_step, options)
+        chosen = self.options
         self._wishes = Wishes.of(
             robot, chosen.base_position, chosen.base_attitude, chosen.final_shape
         )
@@ -156,9 +166,9 @@ class OptimalGait(GaitMethod):
             chosen.keep_angle,
             chosen.keep_out,
         )
-        self._prediction = BasePrediction(robot, self.tick_period, self.integration_step)
+        self._prediction = BasePrediction(robot, control_period, integration_step)
         self._search = ManoeuvreSearch(
-            robot, self._prediction, self.tick_period, self._wishes.axes, self._constraints
+            robot, self._prediction, control_period, self._wishes.axes, self._constraints
         )
         self._cache = PlanCache() if chosen.cache else None
 
@@ -167,11 +177,12 @@ class OptimalGait(GaitMethod):
         """Return why no goal of this robot can be planned; see :meth:`GaitMethod.objection`."""
         return Wishes.of(robot).objection(robot)
 
-    def plan(self, state: RobotState, goal: Goal, *, correction: bool = False) -> GaitSchedule:
+    def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan within the time budget; see :meth:`GaitMethod.plan`.
 
         A correction takes the smallest way instead of the fastest, and may use the margins.
         """
+        state, goal, correction = request.state, request.goal, request.correction
         self._require_rest(state)
         # Measured shapes may be a little beyond the stops.
         state = replace(state, q=np.clip(state.q, self.robot.lower, self.robot.upper))
@@ -179,21 +190,28 @@ class OptimalGait(GaitMethod):
         shape = self._goal_shape(goal)
         direction = self._constraints.direction_W
         task = self._wishes.task(
-            self.robot, state, goal, shape, self._limits, self.tolerance, direction
+            self.robot, state, goal, shape, self._limits, request.tolerance, direction
         )
         # Where a goal needs the margin, the manoeuvre ends in it.
         limits = self._limits.within(margin, state.q, task.likely)
         if self._is_met(state, goal):
             return self._schedule(state, goal, state.q[np.newaxis], {"starts": 0.0})
         attitude = state.quaternion[np.newaxis]
-        broken = self._constraints.violation(state.q[np.newaxis], attitude, self.tick_period)
+        broken = self._constraints.violation(state.q[np.newaxis], attitude, self.control_period)
         if broken:
             raise PlanningError(f"The robot is where it must not be: at the start, {broken}.")
-        key = None if self._cache is None or correction else self._key(state, goal)
+        key = None
+        if self._cache is not None and not correction:
+            key = self._key(state, goal, request.tolerance)
         if self._cache is not None and key is not None and (kept := self._cache.load(key)):
             return self._kept(goal, kept)
         found = self._search.search(
-            task, limits, state.quaternion, self._intervals(correction), self._effort(correction)
+            task,
+            limits,
+            state.quaternion,
+            self._intervals(correction),
+            self._effort(correction),
+            cancellation,
         )
         schedule = self._schedule(state, goal, found.held.positions, _notes(found))
         if self._cache is not None and key is not None:
@@ -201,11 +219,11 @@ class OptimalGait(GaitMethod):
         return schedule
 
     def _intervals(self, correction: bool) -> int:
-        intervals = int(self._options.intervals)
+        intervals = int(self.options.intervals)
         return min(intervals, _CORRECTION_INTERVALS) if correction else intervals
 
     def _effort(self, correction: bool) -> Effort:
-        chosen = self._options
+        chosen = self.options
         return Effort(
             duration=0.0 if correction else chosen.duration,
             longest=chosen.longest,
@@ -234,17 +252,17 @@ class OptimalGait(GaitMethod):
         }
         return self._schedule_of(goal, positions, path, notes)
 
-    def _key(self, state: RobotState, goal: Goal) -> str:
+    def _key(self, state: RobotState, goal: Goal, tolerance: Tolerance) -> str:
         shape = goal.joint_positions
         numbers = {
             "state": np.concatenate([state.position, state.quaternion, state.q]),
             "goal": np.concatenate([goal.position, goal.quaternion]),
             "shape": np.zeros(0) if shape is None else shape,
-            "time": np.array([self.tick_period, self.integration_step]),
-            "tolerance": np.array([self.tolerance.position, self.tolerance.attitude]),
+            "time": np.array([self.control_period, self.integration_step]),
+            "tolerance": np.array([tolerance.position, tolerance.attitude]),
             **vars(self._limits),
         }
-        return plan_key(self.robot, numbers, values_of(self._options))
+        return plan_key(self.robot, numbers, values_of(self.options))
 
     def _kept(self, goal: Goal, kept: Mapping[str, Array]) -> GaitSchedule:
         path = BasePath(*(kept[f"path_{part}"] for part in _PATH))

@@ -11,7 +11,7 @@ import numpy as np
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.cancellation import still_wanted
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.methods.optimal.constraints import PathConstraints
 from spacerobot_ros.planning.methods.optimal.limits import MotionLimits
 from spacerobot_ros.planning.methods.optimal.trajectory import Task, Trajectory
@@ -82,6 +82,7 @@ class ManoeuvreProblem:
         shortest: float,
         longest: float,
         effort: bool = False,
+        cancellation: Cancellation = NEVER,
     ) -> Trajectory | None:
         """Return the fastest trajectory near ``guess``, or that of least effort; None if none.
 
@@ -93,6 +94,8 @@ class ManoeuvreProblem:
             ``time.monotonic()`` at which to stop whatever was seen.
         shortest, longest
             Bounds of the duration, s; equal for least effort in a given time.
+        cancellation
+            Stops the solver at its next step.
         effort
             Whether the mean square of the accelerations, over the joints' speeds, is minimised.
         """
@@ -111,7 +114,7 @@ class ManoeuvreProblem:
         most = _packed(longest / N, upper, *bounds)
         first = 1 + 3 * n * (N + 1)
         least[first : first + 4] = most[first : first + 4] = identity
-        self._watch.begin(deadline, last_call)
+        self._watch.begin(deadline, last_call, cancellation)
         result = self._solver(
             x0=self._start(guess),
             lbx=least,
@@ -173,7 +176,7 @@ def _packed(step: float, *knots: Array) -> Array:
 
 
 class _Watch(ca.Callback):
-    """Sees every iterate: keeps the best feasible one; stops at the deadline, or unwanted."""
+    """Sees every iterate: keeps the best feasible one; stops at the deadline, or cancelled."""
 
     def __init__(self, problem: dict[str, ca.MX], lower: Array, upper: Array) -> None:
         ca.Callback.__init__(self)
@@ -183,10 +186,11 @@ class _Watch(ca.Callback):
         self.best: Array | None = None
         self.construct("watch", {})
 
-    def begin(self, deadline: float, last_call: float) -> None:
+    def begin(self, deadline: float, last_call: float, cancellation: Cancellation) -> None:
         """Forget the problem before."""
         self.best, self._least = None, math.inf
         self._deadline, self._last_call = deadline, last_call
+        self._cancellation = cancellation
 
     def get_n_in(self) -> int:
         """Return the number of what a solver reports."""
@@ -209,4 +213,4 @@ class _Watch(ca.Callback):
             if worst <= _FEASIBLE:
                 self.best, self._least = arguments[0].full().ravel(), f
         stop = self._last_call if self.best is None else self._deadline
-        return [float(time.monotonic() > stop or not still_wanted())]
+        return [float(time.monotonic() > stop or self._cancellation.requested)]

@@ -12,7 +12,7 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
-from spacerobot_ros.planning.core.cancellation import require_wanted
+from spacerobot_ros.planning.core.cancellation import Cancellation
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.constraints import PathConstraints
 from spacerobot_ros.planning.methods.optimal.held_commands import CommandHolder, HeldCommands
@@ -96,14 +96,20 @@ class ManoeuvreSearch:
         self._problems: dict[tuple[int, bool], ManoeuvreProblem] = {}
 
     def search(
-        self, task: Task, limits: MotionLimits, quaternion: Array, intervals: int, effort: Effort
+        self,
+        task: Task,
+        limits: MotionLimits,
+        quaternion: Array,
+        intervals: int,
+        effort: Effort,
+        cancellation: Cancellation,
     ) -> Found:
         """Return the fastest manoeuvre found from attitude ``quaternion`` (4,) of R_WB.
 
         Raises
         ------
         PlanningError
-            None was found, or nobody waits for it any more.
+            None was found, or the search was cancelled.
         """
         began = time.monotonic()
         deadline = began + effort.time_budget
@@ -115,8 +121,10 @@ class ManoeuvreSearch:
         for guess in guesses.of(task, limits, task.likely):
             # Until something is found the search may go on beyond its time.
             last_call = deadline if found else began + _LAST_CALL * effort.time_budget
-            trajectory = self._solved(problem, task, limits, guess, deadline, last_call, effort)
-            require_wanted()
+            trajectory = self._solved(
+                problem, task, limits, guess, deadline, last_call, effort, cancellation
+            )
+            cancellation.raise_if_requested()
             answer = self._checked(trajectory, task, limits, quaternion, effort)
             now = time.monotonic()
             _LOG.info(
@@ -182,6 +190,7 @@ class ManoeuvreSearch:
         deadline: float,
         last_call: float,
         effort: Effort,
+        cancellation: Cancellation,
     ) -> Trajectory | None:
         shortest = _FEWEST_TICKS * self._period
         guess = self._constraints.slowed(guess)
@@ -203,6 +212,7 @@ class ManoeuvreSearch:
                 longest=effort.longest,
                 deadline=deadline,
                 last_call=last_call,
+                cancellation=cancellation,
             )
             if solution is None or problem.converged or self._constraints.base_rate > 0:
                 return solution
@@ -218,6 +228,7 @@ class ManoeuvreSearch:
             effort=True,
             deadline=deadline,
             last_call=last_call,
+            cancellation=cancellation,
         )
         if solution is None or not effort.gentle:
             return solution

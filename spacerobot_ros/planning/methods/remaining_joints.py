@@ -1,0 +1,179 @@
+"""Plans with the joints that follow, where others are stuck."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptionError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.parameters import declared
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
+from spacerobot_ros.planning.core.goal import Controlled, RobotState
+from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
+from spacerobot_ros.planning.core.schedule import GaitSchedule
+from spacerobot_ros.planning.methods.registry import build_method
+
+
+@dataclass(frozen=True)
+class _Progress:
+    """That of a schedule without the ``stuck`` joints: of the method ``planner`` that made it."""
+
+    stuck: frozenset[str]
+    planner: str
+    inner: object
+
+
+class RemainingJointsGait(GaitMethod):
+    """Plans with the joints that are not stuck; the others are part of the bodies they join.
+
+    Its schedules name every joint and leave the stuck ones where they are.
+
+    Parameters
+    ----------
+    robot, control_period, integration_step
+        As for any :class:`GaitMethod`.
+    stuck
+        The joints that do not move, by name, and where they are, m or rad: the model is that of
+        the robot with these joints fixed there.
+    method, options
+        What plans for the robot that is left, as for :func:`build_method`; where it refuses,
+        ``auto`` is tried.
+    required
+        Parts of the goal that a schedule must control.
+    """
+
+    name: ClassVar[str] = "remaining_joints"
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        control_period: float,
+        integration_step: float,
+        *,
+        stuck: Mapping[str, float],
+        method: str,
+        options: Mapping[str, Any],
+        required: frozenset[Controlled] = frozenset(),
+    ) -> None:
+        super().__init__(robot, control_period, integration_step)
+        self._stuck = dict(stuck)
+        self._is_stuck = np.array([name in stuck for name in robot.joint_names], dtype=np.bool_)
+        self._names = list(dict.fromkeys((method, "auto")))
+        self._required = required
+        self._options = {
+            name: _options_without(chosen, self._is_stuck, robot.joint_names)
+            for name, chosen in options.items()
+        }
+        self._remaining: SpaceRobot | None = None
+        self._methods: dict[str, GaitMethod] = {}
+
+    def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
+        """Plan with the remaining joints; see :meth:`GaitMethod.plan`."""
+        try:
+            return self._plan(request, cancellation)
+        except PlanningCancelled:
+            raise
+        except PlanningError as refusal:
+            raise PlanningError(f"{self._where()}; {refusal}") from None
+
+    def _plan(self, request: PlanRequest, cancellation: Cancellation) -> GaitSchedule:
+        moving, state, shape = ~self._is_stuck, request.state, request.goal.joint_positions
+        if not moving.any():
+            raise PlanningError(
+                "no joint follows; /diagnostics says whether the plant refuses the commands."
+            )
+        names, previous = self._going_on(request.previous)
+        inner = replace(
+            request,
+            state=replace(state, q=state.q[moving]),
+            goal=replace(request.goal, joint_positions=None if shape is None else shape[moving]),
+            previous=previous,
+        )
+        reasons = []
+        for name in names:
+            try:
+                schedule = self._method(name).plan(inner, cancellation)
+            except PlanningCancelled:
+                raise
+            except (PlanningError, ParameterError, RobotDescriptionError) as refusal:
+                reasons.append(str(refusal))
+                continue
+            if lost := self._required - schedule.controls:
+                parts = " and ".join(sorted(lost))
+                reasons.append(f"{schedule.method} would leave the {parts} as it comes.")
+                continue
+            if "shape" in schedule.controls and shape is not None:
+                self._require_shape(state, shape, request.tolerance.shape)
+            positions = np.tile(state.q, (len(schedule.positions), 1))
+            positions[:, moving] = schedule.positions
+            return replace(
+                schedule,
+                joint_names=self.robot.joint_names,
+                positions=positions,
+                goal=request.goal,
+                progress=_Progress(frozenset(self._stuck), name, schedule.progress),
+            )
+        raise PlanningError(f"with the remaining joints: {' '.join(dict.fromkeys(reasons))}")
+
+    def _going_on(self, previous: GaitSchedule | None) -> tuple[list[str], GaitSchedule | None]:
+        """Return the methods to try, and the previous schedule as theirs.
+
+        What was planned with other joints is not gone on with.
+        """
+        progress = None if previous is None else previous.progress
+        if previous is None or not isinstance(progress, _Progress):
+            return self._names, None
+        if progress.stuck != self._stuck.keys():
+            return self._names, None
+        return [progress.planner], replace(previous, progress=progress.inner)
+
+    def _method(self, name: str) -> GaitMethod:
+        if self._remaining is None:
+            self._remaining = SpaceRobot(self.robot.description.with_locked(self._stuck))
+        if name not in self._methods:
+            self._methods[name] = build_method(
+                name, self._remaining, self.control_period, self.integration_step, self._options
+            )
+        return self._methods[name]
+
+    def _require_shape(self, state: RobotState, shape: Array, tolerance: float) -> None:
+        far = np.abs(shape - state.q) * self._is_stuck
+        worst = int(np.argmax(far))
+        if far[worst] > tolerance:
+            raise PlanningError(
+                f"the goal wants joint '{self.robot.joint_names[worst]}' at {shape[worst]:.4g}."
+            )
+
+    def _where(self) -> str:
+        places = []
+        for joint in self.robot.description.movable_joints:
+            if joint.name in self._stuck:
+                unit = "m" if joint.kind is JointKind.PRISMATIC else "rad"
+                place = f"{self._stuck[joint.name]:.4g} {unit}"
+                places.append(f"joint '{joint.name}' is stuck at {place}")
+        return " and ".join(places)
+
+
+def _options_without(options: Any, stuck: npt.NDArray[np.bool_], names: Sequence[str]) -> Any:
+    """Return options for the remaining joints: lists with a number a joint lose those of the stuck
+    ones, and names of joints are left to the method if one of them is stuck.
+    """
+    gone = {name for name, is_stuck in zip(names, stuck, strict=True) if is_stuck}
+    kept: dict[str, Any] = {}
+    for option in declared(options):
+        value = option.default
+        if not option.of_joints:
+            continue
+        if isinstance(value, str):
+            kept[option.name] = "" if gone & set(value.split()) else value
+        elif isinstance(value, tuple) and len(value) == len(names):
+            kept[option.name] = tuple(
+                x for x, is_stuck in zip(value, stuck, strict=True) if not is_stuck
+            )
+    return replace(options, **kept)
