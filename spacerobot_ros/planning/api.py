@@ -30,7 +30,7 @@ def plan(
     joint_positions: npt.ArrayLike | None = None,
     start: RobotState | npt.ArrayLike | None = None,
     method: str = "optimal",
-    tick_period: float = 0.05,
+    control_period: float = 0.05,
     tolerance: Tolerance = _TOLERANCE,
     integration_step: float = DEFAULT_INTEGRATION_STEP,
     **options: Any,
@@ -49,7 +49,7 @@ def plan(
         shape zero, or as near to it as the strokes are.
     method
         Name of a gait method; ``options`` are its own.
-    tick_period, tolerance, integration_step
+    control_period, tolerance, integration_step
         How long a command is held (s), how near is there, and the longest step of the prediction
         (s): the plant's, for a flight that ends where the plan does.
 
@@ -65,7 +65,7 @@ def plan(
     if goal is None:
         goal = Goal.checked(position, quaternion_from_rotvec(rotvec), joint_positions)
     options_of_method = {method: method_options(method, options)}
-    planner = build_method(method, robot, tick_period, integration_step, options_of_method)
+    planner = build_method(method, robot, control_period, integration_step, options_of_method)
     return planner.plan(PlanRequest(_state(robot, start), goal, tolerance))
 
 

@@ -41,12 +41,12 @@ def check_trajectory(message: Any, schedule: GaitSchedule, stamp_ns: int, frame:
     assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp_ns
     assert tuple(message.joint_names) == schedule.joint_names
     assert len(message.points) == len(schedule.positions)
-    period_ns = round(schedule.tick_period * 1e9)
+    period_ns = round(schedule.control_period * 1e9)
     for k, point in enumerate(message.points):
         np.testing.assert_array_equal(point.positions, schedule.positions[k])
         held = np.zeros(len(schedule.joint_names))
         if k < schedule.ticks:
-            held = (schedule.positions[k + 1] - schedule.positions[k]) / schedule.tick_period
+            held = (schedule.positions[k + 1] - schedule.positions[k]) / schedule.control_period
         np.testing.assert_array_equal(point.velocities, held)
         assert len(point.accelerations) == len(point.effort) == 0
         since = point.time_from_start

@@ -24,7 +24,7 @@ QUICK: dict[str, Any] = {
     "cache": 0,
     "answers": 1,
     "intervals": 40,
-    "tick_period": PERIOD,
+    "control_period": PERIOD,
     "time_budget": 60.0,
 }
 ARM_START = np.array([0.0, -np.pi / 4, np.pi / 2])
@@ -40,15 +40,15 @@ def assert_within(
 ) -> None:
     """Finite differences of the shapes at the ticks, from rest to rest, keep the limits."""
     rest = np.zeros((1, schedule.positions.shape[1]))
-    rates = np.vstack([rest, np.diff(schedule.positions, axis=0) / schedule.tick_period, rest])
-    changes = np.abs(np.diff(rates, axis=0)) / schedule.tick_period
+    rates = np.vstack([rest, np.diff(schedule.positions, axis=0) / schedule.control_period, rest])
+    changes = np.abs(np.diff(rates, axis=0)) / schedule.control_period
     assert np.all(np.abs(rates).max(axis=0) <= np.asarray(velocity) * (1 + 1e-8))
     assert np.all(changes.max(axis=0) <= np.asarray(acceleration) * (1 + 1e-8))
 
 
 def momentum_attitude(oracle: PinocchioOracle, schedule: GaitSchedule) -> Rotation:
     """Return R_WB at the end by Pinocchio's momentum: omega = -A(q) qdot, two stages of order 4."""
-    R, h = Rotation.identity(), schedule.tick_period
+    R, h = Rotation.identity(), schedule.control_period
     reach = np.sqrt(3) / 6
     for q, q_next in zip(schedule.positions[:-1], schedule.positions[1:], strict=True):
         move = q_next - q
@@ -178,7 +178,7 @@ def test_corrections_meet_the_goal_where_masses_are_not_as_believed() -> None:
     assert believed.total_mass != SpaceRobot.from_urdf(text).total_mass
     turn = Rotation.from_rotvec([0.2, -0.3, 0.25])
     oracle = PinocchioOracle(text, believed.joint_names)
-    options = {key: value for key, value in QUICK.items() if key != "tick_period"}
+    options = {key: value for key, value in QUICK.items() if key != "control_period"}
     method = planner_of("optimal", believed, PERIOD, Tolerance(1e-3, 1e-3), **options)
     attitude, q, left = Rotation.identity(), ARM_START, []
     for number in range(3):

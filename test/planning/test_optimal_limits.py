@@ -220,7 +220,7 @@ def test_a_plan_is_found_again_only_where_all_is_the_same(
     others: list[tuple[SpaceRobot, dict[str, Any]]] = [
         (robot, {"rotvec": [0, 0, 0.6]}),
         (robot, {"start": [0.1, 0.0]}),
-        (robot, {"tick_period": 0.05}),
+        (robot, {"control_period": 0.05}),
         (robot, {"max_velocity": [1.0, 1.0]}),
         (robot, {"joint_positions": [0.0, 0.0]}),
         (SpaceRobot.from_urdf(heavier), {}),

@@ -65,7 +65,7 @@ def note(schedule: GaitSchedule, name: str) -> Array:
 
 def knots(schedule: GaitSchedule) -> list[int]:
     """Return the ticks of the predicted path."""
-    ticks = schedule.path.time / schedule.tick_period
+    ticks = schedule.path.time / schedule.control_period
     np.testing.assert_allclose(ticks, np.round(ticks), atol=1e-6)
     return [int(k) for k in np.round(ticks)]
 

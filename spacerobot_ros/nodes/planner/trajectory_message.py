@@ -64,7 +64,7 @@ def serialised_trajectory(schedule: GaitSchedule, stamp_ns: int, frame: str) -> 
     count = len(schedule.positions)
     records = np.tile(np.frombuffer(raw[ends[1] : ends[2]], np.uint8), (count, 1))
     velocities = np.vstack([schedule.velocities, np.zeros(n)])
-    times = np.arange(count, dtype=np.int64) * round(schedule.tick_period * NANOSECONDS)
+    times = np.arange(count, dtype=np.int64) * round(schedule.control_period * NANOSECONDS)
     clock = np.stack([times // NANOSECONDS, times % NANOSECONDS], axis=1).astype("<u4")
     for values, offset in zip((schedule.positions, velocities, clock), at[2], strict=True):
         data = np.ascontiguousarray(values).view(np.uint8)

@@ -137,7 +137,7 @@ class GaitMethod(ABC):
         return GaitSchedule(
             method=self.name,
             joint_names=self.robot.joint_names,
-            tick_period=self.control_period,
+            control_period=self.control_period,
             positions=positions,
             path=path,
             goal=goal,

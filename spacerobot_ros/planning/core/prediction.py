@@ -22,7 +22,7 @@ class BasePrediction:
     ----------
     robot
         The model.
-    tick_period
+    control_period
         How long a command is held, s.
     integration_step
         Longest Runge-Kutta step of the attitude, s; the plant's, for equal numbers.
@@ -33,11 +33,11 @@ class BasePrediction:
         A duration is not positive.
     """
 
-    def __init__(self, robot: SpaceRobot, tick_period: float, integration_step: float) -> None:
+    def __init__(self, robot: SpaceRobot, control_period: float, integration_step: float) -> None:
         self._robot = robot
-        self._tick_period = tick_period
-        self._step = robot.velocity_step(steps_in(tick_period, integration_step))
-        self._step.inputs[3][:] = tick_period
+        self._control_period = control_period
+        self._step = robot.velocity_step(steps_in(control_period, integration_step))
+        self._step.inputs[3][:] = control_period
 
     def attitudes(self, positions: Array, quaternion: Array, L_W: Array) -> Array:
         """Return the attitude (N + 1, 4) at every tick of the shapes ``positions`` (N + 1, n)."""
@@ -78,6 +78,6 @@ class BasePrediction:
             attitudes = self.attitudes(positions, state.quaternion, state.angular_momentum)
         last = len(positions) - 1
         chosen = np.unique(np.append(np.arange(0, last, max(1, last // _KNOTS)), last))
-        time, quaternions = chosen * self._tick_period, attitudes[chosen]
+        time, quaternions = chosen * self._control_period, attitudes[chosen]
         positions_W = self.positions(state, time, positions[chosen], quaternions)
         return BasePath(time, positions_W, quaternions)

@@ -33,7 +33,7 @@ class GaitSchedule:
         Registry name of the method that made it.
     joint_names
         Names of the joints, the columns of ``positions``.
-    tick_period
+    control_period
         s.
     positions
         (N + 1, n) shape at the ticks 0..N, m or rad.
@@ -55,7 +55,7 @@ class GaitSchedule:
 
     method: str
     joint_names: tuple[str, ...]
-    tick_period: float
+    control_period: float
     positions: Array
     path: BasePath
     goal: Goal
@@ -72,9 +72,9 @@ class GaitSchedule:
     @property
     def duration(self) -> float:
         """Time the gait takes, s."""
-        return self.ticks * self.tick_period
+        return self.ticks * self.control_period
 
     @cached_property
     def velocities(self) -> Array:
         """Held joint velocities (N, n), m/s or rad/s; they carry the shape from tick to tick."""
-        return np.diff(self.positions, axis=0) / self.tick_period
+        return np.diff(self.positions, axis=0) / self.control_period

@@ -41,7 +41,7 @@ class BrakingFollower:
         self.schedule = schedule
         self._begin = (stamp_ns - start_ns) / 1e9
         self._stamp_ns, self._duration = stamp_ns, duration
-        self._gain = min(shape_gain, 1.0 / schedule.tick_period)
+        self._gain = min(shape_gain, 1.0 / schedule.control_period)
 
     def ended(self, stamp_ns: int, q: Array) -> bool:
         """Whether the shape is at rest."""
@@ -51,19 +51,19 @@ class BrakingFollower:
         """Write the wanted shape now (n,) and the velocities to hold from now (n,)."""
         since = (stamp_ns - self._stamp_ns) / 1e9
         position[:] = self._shape(since)
-        tick = self.schedule.tick_period
+        tick = self.schedule.control_period
         velocity[:] = (self._shape(since + tick) - position) / tick + self._gain * (position - q)
 
     def shapes(self, stamp_ns: int) -> Array:
         """Return the wanted shapes (N + 1, n) at the ticks from now until the rest."""
-        tick = self.schedule.tick_period
+        tick = self.schedule.control_period
         since = (stamp_ns - self._stamp_ns) / 1e9
         ticks = max(1, math.ceil((self._duration - since) / tick - 1e-9))
         return np.array([self._shape(since + k * tick) for k in range(ticks + 1)])
 
     def _shape(self, since: float) -> Array:
         tau = min(since / self._duration, 1.0)
-        ticks = (self._begin + self._duration * (tau - tau**2 / 2)) / self.schedule.tick_period
+        ticks = (self._begin + self._duration * (tau - tau**2 / 2)) / self.schedule.control_period
         positions = self.schedule.positions
         k = min(max(int(ticks), 0), len(positions) - 1)
         ahead = positions[min(k + 1, len(positions) - 1)] - positions[k]

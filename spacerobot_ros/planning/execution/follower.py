@@ -35,10 +35,10 @@ class GaitFollower:
     ) -> None:
         self.schedule = schedule
         self._start_ns = start_ns
-        self._period_ns = round(schedule.tick_period * 1e9)
+        self._period_ns = round(schedule.control_period * 1e9)
         self._last_tick = schedule.ticks
         self._end_ns = start_ns + self._last_tick * self._period_ns
-        self._gain = min(shape_gain, 1.0 / schedule.tick_period)
+        self._gain = min(shape_gain, 1.0 / schedule.control_period)
         self._positions = schedule.positions
         # At rest after the last tick. The part of the feedback that is known beforehand is added
         # here: qdot = qdot_k + gain (q_k - q), and q alone is measured.

@@ -28,7 +28,7 @@ class DriftWatch:
         self._path = schedule.path
         self._position, self._attitude = position or np.inf, attitude or np.inf
         self._stamps = start_ns + (schedule.path.time * 1e9).round().astype(np.int64)
-        self._slack = round(schedule.tick_period * 0.5e9)
+        self._slack = round(schedule.control_period * 0.5e9)
         self._next = 0
         self._used = position > 0 or attitude > 0
 

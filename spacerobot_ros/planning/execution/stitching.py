@@ -43,7 +43,7 @@ def stitched(
     PlanningError
         Nothing can be planned from where the robot will rest.
     """
-    tick_period = flown.schedule.tick_period
+    tick_period = flown.schedule.control_period
     shapes = flown.shapes(stamp_ns)
     shapes[0] = state.q
     prediction = BasePrediction(robot, tick_period, integration_step)

@@ -23,7 +23,7 @@ def straight_motion(
     robot: SpaceRobot,
     start: Array,
     ends: Sequence[tuple[Array, float]],
-    tick_period: float,
+    control_period: float,
     longest: float,
 ) -> Array:
     """Return the shapes (N + 1, n) at the ticks from ``start`` (n,) through ``ends``.
@@ -53,7 +53,7 @@ def straight_motion(
         )
     pieces = [start[np.newaxis]]
     for before, end, duration in legs:
-        tau = np.linspace(0.0, 1.0, 1 + math.ceil(duration / tick_period - 1e-9))[1:]
+        tau = np.linspace(0.0, 1.0, 1 + math.ceil(duration / control_period - 1e-9))[1:]
         progress = tau - np.sin(2 * math.pi * tau) / (2 * math.pi)
         pieces.append(before + progress[:, np.newaxis] * (end - before))
         pieces[-1][-1:] = end

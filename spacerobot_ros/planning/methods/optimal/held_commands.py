@@ -62,10 +62,10 @@ class CommandHolder:
     """
 
     def __init__(
-        self, robot: SpaceRobot, prediction: BasePrediction, tick_period: float, axes: Array
+        self, robot: SpaceRobot, prediction: BasePrediction, control_period: float, axes: Array
     ) -> None:
         self._prediction = prediction
-        self._period = tick_period
+        self._period = control_period
         self._axes = axes
         self._curvature = robot.function("curvature", compile=False)
         self._n = robot.n

@@ -74,7 +74,7 @@ class ManoeuvreSearch:
 
     Parameters
     ----------
-    robot, prediction, tick_period
+    robot, prediction, control_period
         The model, the base motion that commands cause, and how long each is held, s.
     axes
         (m, 3) directions in the base along which the attitude is met.
@@ -86,13 +86,13 @@ class ManoeuvreSearch:
         self,
         robot: SpaceRobot,
         prediction: BasePrediction,
-        tick_period: float,
+        control_period: float,
         axes: Array,
         constraints: PathConstraints,
     ) -> None:
-        self._robot, self._period = robot, tick_period
+        self._robot, self._period = robot, control_period
         self._axes, self._constraints = axes, constraints
-        self._holder = CommandHolder(robot, prediction, tick_period, axes)
+        self._holder = CommandHolder(robot, prediction, control_period, axes)
         self._problems: dict[tuple[int, bool], ManoeuvreProblem] = {}
 
     def search(
