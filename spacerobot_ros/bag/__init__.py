@@ -2,6 +2,8 @@
 
 from spacerobot_ros.bag.playback import Playback, ReplayMessage, ReplayTopic, Timeline
 from spacerobot_ros.bag.reader import Bag, iterate_raw, read_bag
+from spacerobot_ros.bag.recorded_robot import RecordedRobot
+from spacerobot_ros.bag.recording import Recording, RecordingState
 from spacerobot_ros.bag.rosbag2 import LATCHED, QosProfile, message_definition, type_hash
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.bag.writer import BagWriter
@@ -13,7 +15,10 @@ __all__ = [
     "BagWriter",
     "Playback",
     "QosProfile",
+    "RecordedRobot",
+    "Recording",
     "RecordingError",
+    "RecordingState",
     "ReplayMessage",
     "ReplayTopic",
     "Timeline",

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Generator, Iterator
+from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from spacerobot_ros.bag.mcap_reading import messages_in_time_order
 from spacerobot_ros.bag.reader import Bag
 from spacerobot_ros.bag.rosbag2 import QosProfile
-from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.errors import ParameterError, RecordingError
 
 _SECOND = 10**9
 _END_OF_TIME = 2**63 - 1
@@ -85,11 +85,64 @@ class Timeline:
         return self._clock_ns + math.ceil((bag_ns - self._bag_ns) / self._rate)
 
 
+class ReaderWait:
+    """Decides when a replay may begin: when all known readers are matched and no more come.
+
+    Parameters
+    ----------
+    period
+        Time between two checks, s.
+    longest
+        When to begin in any case, s.
+    settled
+        Time without a new reader after which all are taken to be there, s.
+    """
+
+    def __init__(self, period: float, longest: float, settled: float = 0.3) -> None:
+        self._period, self._longest, self._settled = period, longest, settled
+        self._readers = 0
+        self._waited = self._quiet = 0.0
+
+    def check(self, matched: Sequence[int], known: Sequence[int]) -> bool:
+        """Return whether to begin, given the readers of each topic: matched ones, and all known."""
+        readers = sum(matched)
+        self._waited += self._period
+        self._quiet = self._quiet + self._period if readers == self._readers else 0.0
+        self._readers = readers
+        settled = readers > 0 and self._quiet >= self._settled and matched == known
+        return settled or self._waited >= self._longest
+
+
+def renamed(remap: str, topics: Collection[str]) -> dict[str, str]:
+    """Return the new name of each topic that ``remap`` (``old:=new``, by spaces) renames.
+
+    Raises
+    ------
+    ParameterError
+        A rule is written otherwise, or renames what is not among ``topics``.
+    """
+    names = {}
+    for rule in remap.split():
+        old, separator, new = rule.partition(":=")
+        if not (old and separator and new):
+            raise ParameterError(
+                f"Parameter 'remap' has '{rule}'; write it as 'old:=new', such as "
+                "'/odom:=/replayed/odom'."
+            )
+        if old not in topics:
+            raise ParameterError(
+                f"Parameter 'remap' renames '{old}', which is not replayed: "
+                f"{', '.join(sorted(topics))} are."
+            )
+        names[old] = new
+    return names
+
+
 class Playback:
     """The messages of a bag in the rhythm of their log times.
 
-    What was latched before the start is due at once, because who listens to such a topic expects
-    its last message whenever it comes.
+    What was latched before the start is due at once, because a subscriber of such a topic expects
+    its last message whenever it subscribes.
 
     Parameters
     ----------

@@ -4,8 +4,8 @@ from spacerobot_ros.nodes.common.node import FlightNode
 from spacerobot_ros.nodes.controller.node import CoordinatedControlNode
 from spacerobot_ros.nodes.planner.node import PlannerNode
 from spacerobot_ros.nodes.plant.node import PlantNode
-from spacerobot_ros.nodes.recorder.node import RecorderNode
-from spacerobot_ros.nodes.replay.node import ReplayNode
+from spacerobot_ros.nodes.recorder import RecorderNode
+from spacerobot_ros.nodes.replay import ReplayNode
 
 NODE_TYPES: dict[str, type[FlightNode]] = {
     "plant": PlantNode,

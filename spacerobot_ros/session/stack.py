@@ -24,7 +24,7 @@ from spacerobot_ros.nodes import (
     RecorderNode,
 )
 from spacerobot_ros.nodes.common.node import spin_until
-from spacerobot_ros.nodes.recorder.node import parameters_of
+from spacerobot_ros.nodes.recorder import parameters_of
 from spacerobot_ros.parameters import declared
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.session.description import scenario_record

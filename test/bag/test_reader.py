@@ -20,6 +20,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 import spacerobot_ros
 from spacerobot_ros.bag import (
     BagWriter,
+    RecordedRobot,
+    RecordingError,
     iterate_raw,
     read_bag,
 )
@@ -239,3 +241,48 @@ assert not hasattr(spacerobot_ros, "write_bag")
         text=True,
     )
     assert (done.stdout, done.stderr) == ("spacerobot_ros.bag.reader\n", "")
+
+
+def test_a_table_has_a_row_for_every_message_and_nan_where_numbers_are_missing(
+    tmp_path: Path,
+) -> None:
+    shapes = [[1.0, 2.0], [3.0], [], [4.0, 5.0]]
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        channel = writer.add_topic("/joint_states", "sensor_msgs/msg/JointState")
+        for k, position in enumerate(shapes):
+            message = JointState(position=position, velocity=[-x for x in position])
+            writer.write(channel, serialize_message(message), k, k)
+        odom = writer.add_topic("/odom", "nav_msgs/msg/Odometry")
+        for k in range(3):
+            pose = Odometry()
+            pose.pose.pose.position.x, pose.pose.pose.position.z = 0.5 * k, -1.0 * k
+            writer.write(odom, serialize_message(pose), k, k)
+    bag = read_bag(tmp_path / "a.mcap")
+    nan = math.nan
+    expected = [[1, 2, -1, -2], [nan] * 4, [nan] * 4, [4, 5, -4, -5]]
+    joints = bag["/joint_states"]
+    np.testing.assert_array_equal(joints.table(["position", "velocity"], 4), expected)
+    assert joints.table(["position"], 0).shape == (4, 0)
+    fields = ["pose.pose.position.x", "pose.pose.position.z"]
+    np.testing.assert_array_equal(bag["/odom"].table(fields), [[0, 0], [0.5, -1], [1, -2]])
+
+
+def test_the_topics_of_one_robot_are_found_by_their_names(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        for namespace in ("", "/craft"):
+            channel = writer.add_topic(f"{namespace}/joint_states", "sensor_msgs/msg/JointState")
+            message = JointState(name=["a", "b"] if namespace else ["c"])
+            writer.write(channel, serialize_message(message), 0, 0)
+        writer.add_topic("/craft/odom", "nav_msgs/msg/Odometry")
+        text = writer.add_topic("/craft/robot_description", STRING)
+        writer.write(text, string("<robot/>"), 0, 0)
+    bag = read_bag(tmp_path / "a.mcap")
+    craft = RecordedRobot(bag, "/craft")
+    assert craft.joint_names == ["a", "b"]
+    assert RecordedRobot(bag).joint_names == ["c"]
+    assert craft.urdf == b"<robot/>"
+    assert RecordedRobot(bag).urdf is None
+    assert craft.get("odom") is None, "it has no message"
+    assert craft.get("joint_states", "nav_msgs/msg/Odometry") is None, "it is of another type"
+    with pytest.raises(RecordingError, match="nothing is on /craft/odom"):
+        craft["odom"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +13,8 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from spacerobot_ros.bag import LATCHED, BagWriter, RecordingError, Timeline, read_bag
-from spacerobot_ros.bag.playback import Playback
+from spacerobot_ros.bag.playback import Playback, ReaderWait, renamed
+from spacerobot_ros.errors import ParameterError
 
 STRING = "std_msgs/msg/String"
 S = 10**9
@@ -193,4 +195,31 @@ def test_time_goes_on_by_the_rate_and_stands_in_pauses(
     assert timeline.bag_time(clock) == pytest.approx(exact, abs=9, rel=1e-15)
     if timeline.running:
         due = timeline.clock_time(timeline.bag_time(clock) + at)
-        assert timeline.bag_time(due) >= timeline.bag_time(clock) + at - max(1, at * 1e-12)
+        least = timeline.bag_time(clock) + at - max(1, math.ceil(at * 1e-12))
+        assert timeline.bag_time(due) >= least
+
+
+def test_a_replay_waits_for_readers_to_be_matched_and_to_be_all() -> None:
+    wait = ReaderWait(period=0.1, longest=60.0, settled=0.25)
+    assert not wait.check([0, 0], [0, 0]), "nobody is there"
+    assert not wait.check([1, 0], [1, 1]), "one is known and not matched"
+    assert not any(wait.check([1, 0], [1, 1]) for _ in range(9))
+    assert not wait.check([1, 1], [1, 1]), "one has just come"
+    assert [wait.check([1, 1], [1, 1]) for _ in range(3)] == [False, False, True]
+
+
+def test_a_replay_without_readers_begins_after_the_longest_wait() -> None:
+    wait = ReaderWait(period=0.25, longest=1.0)
+    assert [wait.check([0], [0]) for _ in range(4)] == [False, False, False, True]
+
+
+def test_topics_get_new_names() -> None:
+    topics = ["/odom", "/joint_states"]
+    assert renamed("", topics) == {}
+    assert renamed("/odom:=/a/odom  /joint_states:=/b", topics) == {
+        "/odom": "/a/odom",
+        "/joint_states": "/b",
+    }
+    for rule in ("/odom", "/odom:=", ":=/odom", "/odom=/a", "/momentum:=/a"):
+        with pytest.raises(ParameterError, match="'remap'"):
+            renamed(rule, topics)

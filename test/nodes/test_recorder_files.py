@@ -23,6 +23,7 @@ from support.ros_harness import Harness
 from spacerobot_ros.bag import RecordingError, read_bag
 from spacerobot_ros.bag.salvage import salvage_bag
 from spacerobot_ros.nodes import RecorderNode
+from spacerobot_ros.nodes.recorder import loss_events
 
 ROOT = Path(__file__).parents[2]
 
@@ -44,7 +45,7 @@ def test_a_recording_is_split_by_size(harness: Harness, tmp_path: Path) -> None:
         publisher.publish(String(data=f"{n:04d}" + "x" * 1000))
         if n % 50 == 49:
             harness.spin_until(lambda n=n: recorder.messages_recorded > n, "they are recorded")  # type: ignore[misc]
-            recorder._flush()
+            recorder.flush()
     recorder.trigger_deactivate()
     recorder.trigger_cleanup()
     files = sorted(tmp_path.iterdir(), key=lambda path: int(path.stem.split("_")[1]))
@@ -60,10 +61,12 @@ def test_lost_messages_are_published_and_stay_in_the_bag(harness: Harness, tmp_p
     publisher = probe.create_publisher(String, "/talk", 10)
     recorder = harness.make(RecorderNode, {"bag": str(tmp_path / "flight.mcap")})
     harness.matched(publisher)
-    assert recorder.loss.total == 0
+    assert recorder.recording is not None
+    assert recorder.recording.lost.total() == 0
     assert recorder.count_publishers("/diagnostics") == 0
     for count in (3, 4):
-        recorder.loss.events("/talk").message_lost(SimpleNamespace(total_count_change=count))
+        events = loss_events(recorder.recording, "/talk")
+        events.message_lost(SimpleNamespace(total_count_change=count))
     harness.spin_until(lambda: probe.messages["/diagnostics"], "the loss is published")
     (status,) = probe.last("/diagnostics").status
     assert status.level == DiagnosticStatus.WARN
@@ -96,7 +99,7 @@ def test_a_kill_at_any_moment_leaves_all_but_the_last_second(
         bag = tmp_path / f"{turn}.mcap"
         parameters = ["-p", f"bag:={bag}", "-p", "clock_wait:=0.0", "-p", f"topics:=/talk_{turn}"]
         with subprocess.Popen(
-            [sys.executable, "-m", "spacerobot_ros.nodes.recorder.node", "--ros-args", *parameters],
+            [sys.executable, "-m", "spacerobot_ros.nodes.recorder", "--ros-args", *parameters],
             cwd=ROOT,
             env={**os.environ, "ROS_DOMAIN_ID": str(ros_domain)},
             stderr=subprocess.DEVNULL,

@@ -19,7 +19,7 @@ from support.ros_harness import LATCHED, Harness, nanoseconds
 
 from spacerobot_ros import __version__
 from spacerobot_ros.nodes import PlantNode, RecorderNode
-from spacerobot_ros.nodes.recorder.node import parameters_of
+from spacerobot_ros.nodes.recorder import parameters_of
 
 URDF = Path(__file__).parents[2] / "urdf" / "sliding_masses.urdf"
 

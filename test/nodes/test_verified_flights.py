@@ -17,7 +17,7 @@ from support.ros_harness import Harness
 
 from spacerobot_ros.bag import RecordingError
 from spacerobot_ros.nodes import PlantNode, RecorderNode
-from spacerobot_ros.nodes.recorder.node import parameters_of
+from spacerobot_ros.nodes.recorder import parameters_of
 from spacerobot_ros.verification.comparison import verify_bag
 
 SLIDERS = ["slider_1", "slider_2", "slider_3"]

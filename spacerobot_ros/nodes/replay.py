@@ -15,18 +15,16 @@ from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool, Trigger
 
-from spacerobot_ros.bag import Playback, QosProfile, RecordingError, ReplayMessage, read_bag
+from spacerobot_ros.bag import Playback, QosProfile, ReplayMessage, read_bag
 from spacerobot_ros.bag.config import ReplayConfig
-from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.bag.playback import ReaderWait, renamed
+from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS, raw_publish
 from spacerobot_ros.nodes.common.message_types import message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode, run_node
 
 _READER_CHECK = 0.05
 """Wall s between two looks for readers."""
-
-_SETTLED = 0.3
-"""Wall s without a new reader after which all are taken to be there."""
 
 _BURST = 500
 """Messages that are sent without a look at services and signals."""
@@ -47,6 +45,7 @@ class ReplayNode(FlightNode):
     """
 
     Config: ClassVar = ReplayConfig
+    config: ReplayConfig
 
     def __init__(self, name: str = "replay", **kwargs: Any) -> None:
         self._sends: dict[str, Callable[[bytes], None]] = {}
@@ -58,23 +57,24 @@ class ReplayNode(FlightNode):
 
     def configure(self) -> None:
         """Open the bag and make its publishers and the services."""
-        values: dict[str, Any] = self.parameters
-        if not values["bag"]:
+        config = self.config
+        if not config.bag:
             raise ParameterError("Parameter 'bag' is empty; name the MCAP file to replay.")
         self.messages_replayed = 0
         self._playback = Playback(
-            read_bag(values["bag"]),
-            topics=values["topics"].split(),
-            rate=values["rate"],
-            start=values["start"],
-            duration=values["duration"],
-            loop=values["loop"],
+            read_bag(config.bag),
+            topics=config.topics.split(),
+            rate=config.rate,
+            start=config.start,
+            duration=config.duration,
+            loop=config.loop,
         )
         self._close_bag = self._playback.close
         self._outputs: list[Publisher] = []
         self._sends = {}
-        self._create_publishers(self._new_names(values["remap"]))
-        self._paused = bool(values["paused"])
+        replayed = {topic.name for topic in self._playback.topics}
+        self._create_publishers(renamed(config.remap, replayed))
+        self._paused = config.paused
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/resume", self._on_resume)
@@ -83,17 +83,17 @@ class ReplayNode(FlightNode):
     def activate(self) -> None:
         """Wait for readers, then go on from where the replay is."""
         self._begun = False
-        self._readers, self._waited, self._quiet = 0, 0.0, 0.0
+        self._wait = ReaderWait(_READER_CHECK, self.config.wait)
         # One timer for the next message, always set anew: half the load of looking every
         # millisecond. Its first period is never waited for.
         self._timer = self.create_timer(1.0, self._play, clock=self._steady)
         self._timer.cancel()
         self._waiting = self.create_timer(_READER_CHECK, self._on_reader_check, clock=self._steady)
         self._timers = [self._timer, self._waiting]
-        rate = float(self.parameters["clock"])  # type: ignore[arg-type]
+        rate = self.config.clock
         if rate:
             self._timers.append(self.create_timer(1.0 / rate, self._on_clock, clock=self._steady))
-        if not self.parameters["wait"]:
+        if not self.config.wait:
             self._begin()
 
     def deactivate(self) -> None:
@@ -110,27 +110,8 @@ class ReplayNode(FlightNode):
 
     # -- publishers ---------------------------------------------------------------------------
 
-    def _new_names(self, remap: str) -> dict[str, str]:
-        """Return the new name of each topic that gets one."""
-        known = {topic.name for topic in self._playback.topics}
-        names = {}
-        for rule in remap.split():
-            old, separator, new = rule.partition(":=")
-            if not (old and separator and new):
-                raise ParameterError(
-                    f"Parameter 'remap' has '{rule}'; write it as 'old:=new', such as "
-                    "'/odom:=/replayed/odom'."
-                )
-            if old not in known:
-                raise ParameterError(
-                    f"Parameter 'remap' renames '{old}', which is not replayed: "
-                    f"{', '.join(sorted(known))} are."
-                )
-            names[old] = new
-        return names
-
     def _create_publishers(self, new_names: dict[str, str]) -> None:
-        own_clock = bool(self.parameters["clock"])
+        own_clock = self.config.clock > 0
         if own_clock:
             self._clock_publisher = self.create_publisher(ClockMessage, _CLOCK, STREAM)
             self._last_clock = -1
@@ -155,15 +136,9 @@ class ReplayNode(FlightNode):
             raise SpaceRobotError("None of the bag's message types is installed here.")
 
     def _on_reader_check(self) -> None:
-        """Begin as soon as every reader that is known is matched and no more come."""
-        counts = [p.get_subscription_count() for p in self._outputs]
+        matched = [p.get_subscription_count() for p in self._outputs]
         known = [self.count_subscribers(p.topic_name) for p in self._outputs]
-        readers = sum(counts)
-        self._waited += _READER_CHECK
-        self._quiet = self._quiet + _READER_CHECK if readers == self._readers else 0.0
-        self._readers = readers
-        settled = readers > 0 and self._quiet >= _SETTLED and counts == known
-        if settled or self._waited >= float(self.parameters["wait"]):  # type: ignore[arg-type]
+        if self._wait.check(matched, known):
             self._begin()
 
     # -- time ---------------------------------------------------------------------------------
@@ -200,7 +175,7 @@ class ReplayNode(FlightNode):
         self._end_if_done()
 
     def _send(self, message: ReplayMessage) -> None:
-        if self.parameters["clock"]:
+        if self.config.clock:
             self._publish_clock(message.log_time_ns)
         send = self._sends.get(message.topic)
         if send is not None:

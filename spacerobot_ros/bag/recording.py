@@ -1,0 +1,198 @@
+"""Serialised messages on their way into a bag: which time they carry, and what went wrong."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from enum import Enum
+from typing import NamedTuple
+
+from spacerobot_ros.bag.writer import BagWriter
+from spacerobot_ros.errors import RecordingError
+
+_SECOND = 10**9
+
+
+class RecordingState(Enum):
+    """What is done with a message that arrives."""
+
+    PAUSED = "paused"
+    """It is dropped."""
+
+    WAITING = "waiting"
+    """It is kept in memory: whether a clock is published is not known yet."""
+
+    ON_CLOCK = "on clock"
+    """It is written with the time of the clock."""
+
+    ON_WALL_TIME = "on wall time"
+    """It is written with the wall time of its arrival."""
+
+    FAILED = "failed"
+    """It is dropped: the disk is full or gone. What was written before stays."""
+
+    CLOSED = "closed"
+    """It is dropped: the bag is complete."""
+
+
+_DROPPING = (RecordingState.PAUSED, RecordingState.FAILED, RecordingState.CLOSED)
+
+
+class _Early(NamedTuple):
+    """A message from before the time was known."""
+
+    channel: int
+    message: bytes
+    published_ns: int
+    arrival_ns: int
+
+
+class Recording:
+    """Writes messages with the one time of their bag; begins paused.
+
+    Messages carry the time of the clock, those before its first message that one's time. Where no
+    clock is published for ``clock_wait`` all carry the wall time of their arrival. What was decided
+    stays, because a bag has one time.
+
+    Parameters
+    ----------
+    writer
+        The bag, which is closed with the recording.
+    clock_wait
+        How long the first message waits for a clock, wall time in s.
+    on_failure
+        Called once, with the reason, when the disk refuses something.
+    wall_time
+        Returns the wall time in ns.
+    """
+
+    def __init__(
+        self,
+        writer: BagWriter,
+        clock_wait: float,
+        on_failure: Callable[[RecordingError], None] = lambda error: None,
+        wall_time: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self.writer = writer
+        self.state = RecordingState.PAUSED
+        self.now_ns = 0
+        """The latest time of the clock, or the arrival of the latest message."""
+        self.messages = 0
+        """How many messages were written."""
+        self.lost: Counter[str] = Counter()
+        """How many messages of each topic were published and never arrived."""
+        self.attached: set[str] = set()
+        """Names of the files in the bag."""
+        self.failure: RecordingError | None = None
+        self._clock_wait_ns = clock_wait * _SECOND
+        self._on_failure = on_failure
+        self._wall_time = wall_time
+        self._early: list[_Early] = []
+        self._decided: RecordingState | None = None
+        self._write = writer.write
+
+    @property
+    def running(self) -> bool:
+        """Whether messages are recorded."""
+        return self.state not in _DROPPING
+
+    def start(self) -> None:
+        """Record from now on."""
+        if self.state is RecordingState.PAUSED:
+            self.state = self._decided or RecordingState.WAITING
+
+    def pause(self) -> None:
+        """Record nothing until the next start."""
+        if self.running:
+            self.state = RecordingState.PAUSED
+
+    def set_clock(self, time_ns: int) -> None:
+        """Set the time that the clock shows; without effect once wall time was decided on."""
+        if self._decided is RecordingState.ON_WALL_TIME:
+            return
+        self.now_ns = time_ns
+        if self.state is RecordingState.WAITING:
+            self._decide(RecordingState.ON_CLOCK)
+
+    def record(self, channel: int, message: bytes, published_ns: int = 0) -> None:
+        """Write a message, or keep it until the time of the bag is decided.
+
+        ``published_ns`` is its stamp; 0: the time at which it is recorded.
+        """
+        if self.state is not RecordingState.ON_CLOCK:
+            if not self.running:
+                return
+            arrival_ns = self._wall_time()
+            if self.state is RecordingState.WAITING:
+                self._early.append(_Early(channel, message, published_ns, arrival_ns))
+                return
+            self.now_ns = arrival_ns
+        try:
+            self._write(channel, message, self.now_ns, published_ns or self.now_ns)
+        except RecordingError as error:
+            self._fail(error)
+            return
+        self.messages += 1
+
+    def flush(self, clock_is_published: bool) -> None:
+        """Hand to the operating system what is in memory; decide on wall time if it is time."""
+        if self._early and not clock_is_published:
+            waited_ns = self._wall_time() - self._early[0].arrival_ns
+            if waited_ns > self._clock_wait_ns:
+                self._decide(RecordingState.ON_WALL_TIME)
+        self._guarded(self.writer.flush)
+
+    def describe(self, name: str, values: dict[str, str]) -> None:
+        """Put named values into the bag."""
+        self._guarded(lambda: self.writer.add_metadata(name, values))
+
+    def attach(self, name: str, data: bytes, media_type: str) -> None:
+        """Put a whole file into the bag."""
+        self.attached.add(name)
+        self._guarded(lambda: self.writer.add_attachment(name, data, media_type, self.now_ns))
+
+    def close(self) -> None:
+        """Write what is left, with the counts of messages, and complete the bag; once.
+
+        Raises
+        ------
+        RecordingError
+            The disk refused something, and nothing had failed before.
+        """
+        if self.state is RecordingState.CLOSED:
+            return
+        self._decide(RecordingState.ON_WALL_TIME)
+        counts = {"messages": self.messages, "messages_lost": self.lost.total()}
+        self.describe("recorder", {name: str(count) for name, count in counts.items()})
+        self.state = RecordingState.CLOSED
+        self.writer.close()
+
+    def _decide(self, state: RecordingState) -> None:
+        """Settle which time the bag has, unless it is settled, and write the early messages."""
+        if self._decided is not None or self.failure is not None:
+            return
+        self._decided = state
+        if self.state is RecordingState.WAITING:
+            self.state = state
+        on_clock = state is RecordingState.ON_CLOCK
+        early, self._early = self._early, []
+
+        def write_all() -> None:
+            for channel, message, published_ns, arrival_ns in early:
+                log_ns = self.now_ns if on_clock else arrival_ns
+                self._write(channel, message, log_ns, published_ns or log_ns)
+                self.messages += 1
+
+        self._guarded(write_all)
+
+    def _guarded(self, act: Callable[[], None]) -> None:
+        if self.failure is None and self.state is not RecordingState.CLOSED:
+            try:
+                act()
+            except RecordingError as error:
+                self._fail(error)
+
+    def _fail(self, error: RecordingError) -> None:
+        self.failure, self.state = error, RecordingState.FAILED
+        self._on_failure(error)

@@ -1,0 +1,388 @@
+"""The recorder node: every topic as it was published, into an MCAP bag."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.clock import Clock as RosClock
+from rclpy.clock import ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.experimental import EventsExecutor
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
+
+from spacerobot_ros import __version__
+from spacerobot_ros.bag import BagWriter, QosProfile, Recording, RecordingState
+from spacerobot_ros.bag.config import RecorderConfig
+from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns
+from spacerobot_ros.nodes.common.diagnostics import diagnostic_status
+from spacerobot_ros.nodes.common.message_types import message_class
+from spacerobot_ros.nodes.common.node import STREAM, FlightNode, run_node
+from spacerobot_ros.nodes.common.raw_stream import RawInput, RawStream, Take
+from spacerobot_ros.topics import NOT_RECORDED
+
+_CLOCK = "/clock"
+
+_QUEUE = 2000
+"""Messages a subscription may be behind; the events executor wedges above 5000."""
+
+_CHUNK_SIZE = 262_144
+"""Bytes before compression: of larger ones the fixed costs are smaller, a seek's are larger."""
+
+_SCAN_PERIOD = 0.1
+"""Wall s between two looks for new topics."""
+
+_LONGEST_DRAIN = 1.5
+"""Wall s after a signal in which what is on its way is still recorded."""
+
+_LOSS_LOG_PERIOD = 5.0
+"""Wall s between two log lines about lost messages."""
+
+
+class RecorderNode(FlightNode):
+    """Records topics as raw bytes, as rosbag2 would; :class:`Recording` says with which time."""
+
+    Config: ClassVar = RecorderConfig
+    config: RecorderConfig
+    recording: Recording | None = None
+    """What is being recorded, or was last."""
+
+    def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
+        self._taps = _StreamTaps()
+        super().__init__(name, **kwargs)
+
+    # -- life ---------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Open the bag and look for topics; they are subscribed, and recorded once active."""
+        config = self.config
+        writer = BagWriter(
+            config.bag or time.strftime("spacerobot-%Y%m%d-%H%M%S.mcap"),
+            compression=config.compression,
+            chunk_size=_CHUNK_SIZE,
+            max_size=round(config.max_size * 1e6),
+            max_duration_ns=round(config.max_duration * NANOSECONDS),
+        )
+        self.recording = Recording(writer, config.clock_wait, self._on_failure)
+        self._wanted = {self.resolve_topic_name(topic) for topic in config.topics.split()}
+        self._recorded: set[str] = set()
+        self._unknown: set[str] = set()
+        self._diagnostics: Publisher | None = None
+        steady = RosClock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_SCAN_PERIOD, self.scan, clock=steady)
+        self.create_timer(config.flush_period, self.flush, clock=steady)
+        if config.diagnostics_period:
+            self.create_timer(config.diagnostics_period, self._publish_state, clock=steady)
+        self.describe("spacerobot", {"version": __version__})
+        for title, values in _descriptions(config.describe):
+            self.describe(title, values)
+        if self._wanted and _CLOCK not in self._wanted:
+            self._follow_clock(self.recording)
+        self.scan()
+
+    def activate(self) -> None:
+        """Record from now on."""
+        if self.recording is not None:
+            self.recording.start()
+
+    def deactivate(self) -> None:
+        """Pause: what arrives is not recorded."""
+        if self.recording is not None:
+            self.recording.pause()
+
+    def drain(self, executor: EventsExecutor, quiet: float = 0.3) -> None:
+        """Record what is still on its way, until nothing has come for ``quiet`` wall s."""
+        began = last = time.monotonic()
+        recording = self.recording
+        while recording is not None and recording.running and last - began < _LONGEST_DRAIN:
+            before = recording.messages
+            executor.spin_once(timeout_sec=0.001)
+            if recording.messages != before:
+                last = time.monotonic()
+            elif time.monotonic() - last > quiet:
+                return
+
+    def cleanup(self) -> None:
+        """Complete the bag.
+
+        Raises
+        ------
+        RecordingError
+            The disk refused what was left.
+        """
+        self._taps.release()
+        if self.recording is not None:
+            self.recording.close()
+
+    # -- for the composer of the nodes --------------------------------------------------------
+
+    def watch(self, nodes: Iterable[FlightNode]) -> None:
+        """Take the streams of nodes of this process and executor where they pass through them.
+
+        To be called before the recorder is configured. Messages are then recorded in the order of
+        their publication, and a plant's commands as the plant received them. Other topics are
+        subscribed, and so is what a node outside publishes too.
+        """
+        self._taps.nodes = list(nodes)
+
+    @property
+    def topics(self) -> set[str]:
+        """Full names of the topics that are subscribed."""
+        return set(self._recorded)
+
+    @property
+    def messages_recorded(self) -> int:
+        """How many messages were written."""
+        return self.recording.messages if self.recording is not None else 0
+
+    @property
+    def failure(self) -> RecordingError | None:
+        """Why the recording has ended early."""
+        return self.recording.failure if self.recording is not None else None
+
+    def describe(self, name: str, values: dict[str, str]) -> None:
+        """Put named values into the bag (parameters, seed, version)."""
+        if self.recording is not None:
+            self.recording.describe(name, values)
+
+    def attach(self, name: str, data: bytes, media_type: str) -> None:
+        """Put a whole file into the bag; the URDF of a recorded robot_description is by itself."""
+        if self.recording is not None:
+            self.recording.attach(name, data, media_type)
+
+    def scan(self) -> None:
+        """Subscribe to topics that have appeared."""
+        recording = self.recording
+        if recording is None or recording.state is RecordingState.CLOSED:
+            return
+        for topic in self._taps.release_incomplete(self.count_publishers):
+            if topic in self._recorded:
+                self._recorded.remove(topic)
+            else:
+                self._follow_clock(recording)
+        for topic, types in self.get_topic_names_and_types():
+            chosen = topic in self._wanted if self._wanted else not topic.endswith(NOT_RECORDED)
+            if chosen and topic not in self._recorded and topic not in self._unknown:
+                self._record(recording, topic, types[0])
+
+    def flush(self) -> None:
+        """Hand what was recorded to the operating system, and report what was lost."""
+        if self.recording is not None:
+            self.recording.flush(clock_is_published=self.count_publishers(_CLOCK) > 0)
+            self._publish_losses(self.recording)
+
+    # -- subscriptions ------------------------------------------------------------------------
+
+    def _follow_clock(self, recording: Recording) -> None:
+        """Know the time of a clock that is not recorded itself."""
+
+        def on_clock(raw: bytes) -> None:
+            recording.set_clock(first_time_ns(raw))
+
+        if not self._taps.tap(_CLOCK, on_clock, self.count_publishers(_CLOCK)):
+            depth = QoSProfile(depth=_QUEUE)
+            self.create_subscription(Clock, _CLOCK, on_clock, depth, raw=True)
+
+    def _record(self, recording: Recording, topic: str, type_name: str) -> None:
+        offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        if not offered:
+            return  # Only readers so far: its quality of service is not known yet.
+        try:
+            kind = message_class(type_name)
+            channel = recording.writer.add_topic(topic, type_name, _recorded_qos(offered[0]))
+        except SpaceRobotError as error:
+            self._unknown.add(topic)
+            self.get_logger().warning(f"Topic '{topic}' is not recorded: {error}")
+            return
+        self._recorded.add(topic)
+        take = _take(recording, topic, kind, channel)
+        if self._taps.tap(topic, take, len(offered)):
+            return
+        events, qos = loss_events(recording, topic), _subscribed_qos(offered)
+        self.create_subscription(kind, topic, take, qos, event_callbacks=events, raw=True)
+
+    # -- what the recorder reports ------------------------------------------------------------
+
+    def _on_failure(self, error: RecordingError) -> None:
+        """Log once why nothing is recorded any more; the other nodes go on."""
+        self.get_logger().error(f"Recording has ended: {error}")
+
+    def _publish_losses(self, recording: Recording) -> None:
+        if not recording.lost:
+            return
+        sentence = f"{recording.lost.total()} messages were lost on their way to the recorder."
+        self.get_logger().warning(sentence, throttle_duration_sec=_LOSS_LOG_PERIOD)
+        counts = dict(sorted(recording.lost.items()))
+        self._publish("lost messages", DiagnosticStatus.WARN, sentence, counts)
+
+    def _publish_state(self) -> None:
+        recording = self.recording
+        if recording is None or recording.state is RecordingState.CLOSED:
+            return
+        failure = recording.failure
+        self._publish(
+            "bag",
+            DiagnosticStatus.ERROR if failure else DiagnosticStatus.OK,
+            str(failure) if failure else "recording" if recording.running else "paused",
+            {
+                "messages": recording.messages,
+                "messages_lost": recording.lost.total(),
+                "topics": len(self._recorded),
+                "bytes_written": recording.writer.bytes_written,
+                "bytes_waiting": recording.writer.bytes_waiting,
+            },
+        )
+
+    def _publish(
+        self, what: str, level: bytes, sentence: str, values: Mapping[str, object]
+    ) -> None:
+        # A publisher without need would be one more thing to wait for and to record.
+        if self._diagnostics is None:
+            self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
+        name = f"{self.get_fully_qualified_name()}: {what}"
+        array = DiagnosticArray(status=[diagnostic_status(name, level, sentence, values)])
+        now_ns = self.recording.now_ns if self.recording is not None else 0
+        array.header.stamp.sec, array.header.stamp.nanosec = divmod(now_ns, NANOSECONDS)
+        self._diagnostics.publish(array)
+
+
+class _StreamTaps:
+    """Listens to the streams of nodes of this process, where these carry all of a topic."""
+
+    def __init__(self) -> None:
+        self.nodes: Sequence[FlightNode] = ()
+        self._tapped: dict[str, list[RawStream]] = {}
+
+    def tap(self, topic: str, listener: Take, publishers: int) -> bool:
+        """Listen to a topic with so many publishers; return whether nothing can escape."""
+        streams = self._streams(topic, publishers)
+        if streams:
+            self._tapped[topic] = streams
+        for stream in streams:
+            stream.listen(listener)
+        return bool(streams)
+
+    def release_incomplete(self, count_publishers: Callable[[str], int]) -> list[str]:
+        """Release topics that have changed their publishers or nodes, and return which."""
+        changed = [
+            topic
+            for topic, streams in self._tapped.items()
+            if self._streams(topic, count_publishers(topic)) != streams
+        ]
+        for topic in changed:
+            self._release(topic)
+        return changed
+
+    def release(self) -> None:
+        """Release everything."""
+        for topic in list(self._tapped):
+            self._release(topic)
+
+    def _release(self, topic: str) -> None:
+        for stream in self._tapped.pop(topic):
+            stream.unlisten()
+
+    def _streams(self, topic: str, publishers: int) -> list[RawStream]:
+        """Return the streams that carry every message of a topic, empty if some may escape."""
+        found = [s for node in self.nodes for s in node.raw_streams if s.topic == topic]
+        for stream in found:
+            if isinstance(stream, RawInput):
+                return [stream]
+        return found if len(found) == publishers else []
+
+
+def _take(recording: Recording, topic: str, kind: Any, channel: int) -> Take:
+    """Return what is done with a topic's messages: the clock sets the time of all others."""
+    record = recording.record
+    urdf_name = f"{topic.strip('/').replace('/', '.')}.urdf"
+
+    def on_clock(raw: bytes) -> None:
+        recording.set_clock(first_time_ns(raw))
+        record(channel, raw)
+
+    def on_stamped(raw: bytes) -> None:
+        record(channel, raw, first_time_ns(raw))
+
+    def on_description(raw: bytes) -> None:
+        if recording.running and urdf_name not in recording.attached:
+            urdf = deserialize_message(raw, String).data.encode()
+            recording.attach(urdf_name, urdf, "application/xml")
+        record(channel, raw)
+
+    if topic == _CLOCK:
+        return on_clock
+    if topic.endswith("/robot_description"):
+        return on_description
+    header = next(iter(kind.get_fields_and_field_types().values()), "")
+    return on_stamped if header == "std_msgs/Header" else lambda raw: record(channel, raw)
+
+
+def loss_events(recording: Recording, topic: str) -> SubscriptionEventCallbacks:
+    """Return what a subscription is created with, so that lost messages are counted.
+
+    The middleware reports messages that their publisher no longer kept when they should have been
+    sent again; it does not report the overflow of the subscription's own queue (Fast DDS).
+    """
+
+    def on_loss(info: Any) -> None:
+        recording.lost[topic] += info.total_count_change
+
+    return SubscriptionEventCallbacks(message_lost=on_loss)
+
+
+def _recorded_qos(offered: QoSProfile) -> QosProfile:
+    """Return a publisher's quality of service as a bag says it."""
+    return QosProfile(
+        history=offered.history.name.lower(),
+        depth=offered.depth,
+        reliability=offered.reliability.name.lower(),
+        durability=offered.durability.name.lower(),
+        liveliness=offered.liveliness.name.lower(),
+    )
+
+
+def _subscribed_qos(offered: Sequence[QoSProfile]) -> QoSProfile:
+    """Return the best quality of service that all publishers of a topic offer."""
+    reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
+    latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
+    return QoSProfile(
+        depth=_QUEUE,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _descriptions(path: str) -> list[tuple[str, dict[str, str]]]:
+    if not path:
+        return []
+    try:
+        records = json.loads(Path(path).read_text(encoding="utf-8"))
+        return [(n, {k: str(v) for k, v in values.items()}) for n, values in records.items()]
+    except (OSError, ValueError, AttributeError) as error:
+        raise ParameterError(
+            f"Parameter 'describe' is '{path}', which is no JSON file of named objects: {error}."
+        ) from error
+
+
+def parameters_of(node: FlightNode) -> dict[str, str]:
+    """Return a node's parameters as JSON texts by name, for a bag's metadata."""
+    return {name: json.dumps(value) for name, value in node.parameters.items()}
+
+
+def main() -> None:
+    """Record until SIGINT or SIGTERM."""
+    sys.exit(run_node(RecorderNode))
+
+
+if __name__ == "__main__":
+    main()

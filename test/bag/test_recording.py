@@ -1,0 +1,168 @@
+"""Which time recorded messages carry, and when: against bags read with the MCAP library alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+
+from spacerobot_ros.bag import BagWriter, Recording, RecordingError
+
+STRING = "std_msgs/msg/String"
+S = 10**9
+WALL = 1_700_000_000 * S
+
+
+class Bench:
+    """A recording of two topics against a wall clock that is set by hand."""
+
+    def __init__(self, path: Path, clock_wait: float = 2.0) -> None:
+        self.path = path
+        self.wall_ns = WALL
+        self.failures: list[RecordingError] = []
+        self.recording = Recording(
+            BagWriter(path), clock_wait, self.failures.append, wall_time=lambda: self.wall_ns
+        )
+        self.a, self.b = (self.recording.writer.add_topic(name, STRING) for name in ("/a", "/b"))
+
+    def written(self) -> list[tuple[str, str, int, int]]:
+        """Topic, content, log time and publish time of every message, in the order of writing."""
+        self.recording.close()
+        with self.path.open("rb") as file:
+            found = make_reader(file).iter_messages(log_time_order=False)
+            return [(c.topic, m.data.decode(), m.log_time, m.publish_time) for _, c, m in found]
+
+    def metadata(self) -> dict[str, Any]:
+        with self.path.open("rb") as file:
+            return {m.name: dict(m.metadata) for m in make_reader(file).iter_metadata()}
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    return Bench(tmp_path / "a.mcap")
+
+
+def test_nothing_is_recorded_before_the_start_and_in_a_pause(bench: Bench) -> None:
+    recording = bench.recording
+    assert recording.state.value == "paused"
+    recording.record(bench.a, b"early")
+    recording.set_clock(3 * S)
+    recording.start()
+    recording.set_clock(4 * S)
+    recording.record(bench.a, b"one")
+    recording.pause()
+    assert not recording.running
+    recording.set_clock(5 * S)
+    recording.record(bench.a, b"paused")
+    recording.start()
+    recording.record(bench.a, b"two")
+    assert bench.written() == [("/a", "one", 4 * S, 4 * S), ("/a", "two", 5 * S, 5 * S)]
+    assert recording.messages == 2
+
+
+def test_what_comes_before_the_clock_carries_its_first_time(bench: Bench) -> None:
+    recording = bench.recording
+    recording.start()
+    assert recording.state.value == "waiting"
+    recording.record(bench.a, b"unstamped")
+    recording.record(bench.b, b"stamped", 7)
+    bench.wall_ns += 60 * S
+    recording.flush(clock_is_published=True)  # It is there and has not begun: go on waiting.
+    states = [recording.state]
+    recording.set_clock(4 * S)
+    states.append(recording.state)
+    assert [state.value for state in states] == ["waiting", "on clock"]
+    recording.record(bench.a, b"later", 3 * S)
+    assert bench.written() == [
+        ("/a", "unstamped", 4 * S, 4 * S),
+        ("/b", "stamped", 4 * S, 7),
+        ("/a", "later", 4 * S, 3 * S),
+    ]
+
+
+def test_without_a_clock_messages_carry_the_wall_time_of_their_arrival(bench: Bench) -> None:
+    recording = bench.recording
+    recording.start()
+    recording.record(bench.a, b"one")
+    bench.wall_ns += 2 * S
+    recording.record(bench.b, b"two", 9)
+    recording.flush(clock_is_published=False)  # Exactly the wait is not longer than the wait.
+    assert recording.state.value == "waiting"
+    bench.wall_ns += 1
+    recording.flush(clock_is_published=False)
+    assert recording.state.value == "on wall time"
+    recording.set_clock(4 * S)  # Too late: a bag has one time.
+    bench.wall_ns += S
+    recording.record(bench.a, b"three")
+    last = WALL + 3 * S + 1
+    assert bench.written() == [
+        ("/a", "one", WALL, WALL),
+        ("/b", "two", WALL + 2 * S, 9),
+        ("/a", "three", last, last),
+    ]
+
+
+def test_a_pause_keeps_what_was_decided(bench: Bench) -> None:
+    recording = bench.recording
+    recording.start()
+    recording.record(bench.a, b"one")
+    recording.pause()
+    bench.wall_ns += 3 * S
+    recording.flush(clock_is_published=False)
+    assert recording.state.value == "paused"
+    recording.start()
+    assert recording.state.value == "on wall time"
+    assert bench.written() == [("/a", "one", WALL, WALL)]
+
+
+def test_a_bag_that_ends_undecided_has_wall_time_and_its_counts(bench: Bench) -> None:
+    recording = bench.recording
+    recording.start()
+    recording.record(bench.a, b"one")
+    recording.lost["/b"] += 3
+    assert bench.written() == [("/a", "one", WALL, WALL)]
+    assert bench.metadata()["recorder"] == {"messages": "1", "messages_lost": "3"}
+    assert recording.state.value == "closed"
+    recording.start()
+    recording.record(bench.a, b"after")
+    recording.describe("after", {"a": "b"})
+    recording.close()
+    assert recording.state.value == "closed"
+    assert recording.messages == 1
+
+
+def test_a_failure_is_reported_once_and_what_was_written_stays(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = bench.recording
+    recording.start()
+    recording.set_clock(S)
+    recording.record(bench.a, b"one")
+
+    def full() -> None:
+        raise RecordingError("no space left")
+
+    monkeypatch.setattr(recording.writer, "flush", full)
+    recording.flush(clock_is_published=True)
+    recording.flush(clock_is_published=True)
+    assert recording.state.value == "failed"
+    recording.start()
+    recording.record(bench.a, b"two")
+    assert [str(failure) for failure in bench.failures] == ["no space left"]
+    assert recording.failure is bench.failures[0]
+    assert bench.written() == [("/a", "one", S, S)]
+    assert recording.messages == 1
+
+
+def test_files_carry_the_latest_time(bench: Bench) -> None:
+    recording = bench.recording
+    recording.start()
+    recording.set_clock(5 * S)
+    recording.attach("robot.urdf", b"<robot/>", "application/xml")
+    assert recording.attached == {"robot.urdf"}
+    bench.written()
+    with bench.path.open("rb") as file:
+        (attachment,) = make_reader(file).iter_attachments()
+    assert (attachment.log_time, attachment.data) == (5 * S, b"<robot/>")
