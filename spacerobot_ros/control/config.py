@@ -6,21 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from spacerobot_ros.control.gains import Gains
+from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.laws.registry import LAWS
+from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.reference import PROFILES
 from spacerobot_ros.model.robot_source import BelievedRobotConfig
 from spacerobot_ros.parameters import group, parameter, registered
-
-
-@dataclass(frozen=True)
-class MotionConfig:
-    """The fastest that a reference moves."""
-
-    speed: float = parameter(0.1, "fastest reference", unit="m/s", minimum=1e-06)
-    acceleration: float = parameter(0.02, "of the reference", unit="m/s^2", minimum=1e-06)
-    angular_speed: float = parameter(0.1, "fastest reference", unit="rad/s", minimum=1e-06)
-    angular_acceleration: float = parameter(0.02, "of the reference", unit="rad/s^2", minimum=1e-06)
 
 
 @dataclass(frozen=True)
@@ -37,7 +28,7 @@ class ControllerConfig(BelievedRobotConfig):
     end_effector_outputs: str = parameter("", "axes of the end-effector; '': by the robot")
     joint_outputs: str = parameter("", "joints that are outputs; '': by the robot")
     profile: str = parameter("step", "how references move to goals", choices=tuple(PROFILES))
-    motion: MotionConfig = group(MotionConfig())
+    motion: MotionLimits = group(MotionLimits())
     max_force: float = parameter(0.0, "of the thrusters; 0: no limit", unit="N", minimum=0.0)
     max_torque: float = parameter(0.0, "of the thrusters; 0: no limit", unit="N m", minimum=0.0)
     estimation_time: float = parameter(
@@ -62,3 +53,8 @@ class ControllerConfig(BelievedRobotConfig):
     resume_file: str = parameter("", "keeps the present goals for one that starts again; '': none")
     gains: Gains = group(Gains())
     options: Mapping[str, Any] = registered(LAWS)
+
+    @property
+    def control_period(self) -> float:
+        """Time between two commands, a whole number of nanoseconds, s."""
+        return round(1e9 / self.tick_rate) / 1e9

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
+from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.estimator import DeadReckoning
-from spacerobot_ros.control.gains import Gains
 from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
-from spacerobot_ros.control.laws.law import ControlLaw
-from spacerobot_ros.control.pacing import within_thrust
-from spacerobot_ros.control.reference import MotionLimits, ReferenceProfile, StepReference
-from spacerobot_ros.control.saturation import ActuatorLimits, Saturated
+from spacerobot_ros.control.laws.law import ControlLaw, Gains
+from spacerobot_ros.control.laws.registry import LAWS
+from spacerobot_ros.control.limits import ActuatorLimits, MotionLimits, Saturated
+from spacerobot_ros.control.outputs import OutputSelection
+from spacerobot_ros.control.reference import PROFILES, ReferenceProfile, StepReference
 from spacerobot_ros.control.state import (
     Actuation,
     ControlState,
@@ -23,6 +25,7 @@ from spacerobot_ros.control.state import (
     Reference,
 )
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.space_robot import SpaceRobot
 
 _BRAKE_RATE = 2.0
 """Rate at which joints are brought to rest when the base is no longer known, 1/s."""
@@ -59,8 +62,8 @@ class CoordinatedController:
         Of thrusters and joints; what a command loses to them is reported.
     profile, motion
         How references move to goals; accelerations that the thrusters cannot give are lowered.
-    tick_period
-        s.
+    control_period
+        Time between two commands, s.
     estimation_time
         For how long the base may be estimated by integration when its measurements stop (paper 4,
         section IV), s. After that the thrusters are off and the joints are brought to rest.
@@ -72,12 +75,12 @@ class CoordinatedController:
         limits: ActuatorLimits,
         profile: type[ReferenceProfile],
         motion: MotionLimits,
-        tick_period: float,
+        control_period: float,
         estimation_time: float,
     ) -> None:
         self.law = law
         self._limits, self._profile_type, self._motion = limits, profile, motion
-        self._tick_period, self._estimation_time = tick_period, estimation_time
+        self._control_period, self._estimation_time = control_period, estimation_time
         self.mode = Mode.MEASURED
         self._profile: ReferenceProfile | None = None
         self._began = 0.0
@@ -115,7 +118,7 @@ class CoordinatedController:
             goal = replace(goal, end_effector=end_effector)
         if joints is not None:
             goal = replace(goal, joints=JointReference.at_rest(joints))
-        motion = within_thrust(self._motion, self._limits, self.law.robot, state.q)
+        motion = self._motion.within_thrust(self._limits, self.law.robot, state.q)
         self._profile = self._profile_type(start, goal, motion)
         self._began = time
 
@@ -210,9 +213,9 @@ class CoordinatedController:
             self.mode = Mode.STOPPED
             return None
         if self._estimator is None:
-            self._estimator = DeadReckoning(self.law.robot, self._tick_period)
+            self._estimator = DeadReckoning(self.law.robot, self._control_period)
             self._estimator.reset(self._last)
-        if self._estimator.elapsed + self._tick_period > self._estimation_time + 1e-9:
+        if self._estimator.elapsed + self._control_period > self._estimation_time + 1e-9:
             self.mode = Mode.STOPPED
             return None
         self.mode = Mode.ESTIMATED
@@ -232,3 +235,32 @@ class CoordinatedController:
         # Forces between base and arm depend on the base's rotation alone; taken as none.
         state = ControlState(rest, np.array([0.0, 0.0, 0.0, 1.0]), rest, rest, q, qdot)
         return law.command(state, reference)
+
+
+def build_controller(robot: SpaceRobot, config: ControllerConfig) -> CoordinatedController:
+    """Return the controller of a robot that a configuration describes.
+
+    Raises
+    ------
+    ParameterError
+        The robot does not have the outputs that are named, or the law cannot drive them.
+    """
+    law_type = LAWS[config.law]
+    link = robot.description.end_effector(config.end_effector_frame)
+    chosen = OutputSelection(
+        tuple(config.base_outputs.split()),
+        tuple(config.end_effector_outputs.split()),
+        tuple(config.joint_outputs.split()),
+        link,
+    )
+    outputs = chosen if chosen.labels else law_type.default_outputs(robot, link)
+    return CoordinatedController(
+        law_type(robot, outputs, config.gains, config.options[config.law]),
+        ActuatorLimits(
+            config.max_force or math.inf, config.max_torque or math.inf, robot.effort_limit
+        ),
+        PROFILES[config.profile],
+        config.motion,
+        config.control_period,
+        config.estimation_time,
+    )

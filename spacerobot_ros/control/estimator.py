@@ -25,8 +25,8 @@ from spacerobot_ros.model.symbolic_rotations import (
 class DeadReckoning:
     """Paper 4, end of section IV: the state by integration of eq. (19) under the commands sent.
 
-    It starts at the last measured state and steps a tick at a time under held actuation, by
-    Runge-Kutta 4. What the model and the real robot differ in accumulates: see :attr:`elapsed`.
+    It starts at the last measured state and steps a control period at a time under held actuation,
+    by Runge-Kutta 4. What the model and the real robot differ in accumulates: see :attr:`elapsed`.
 
     While the joints are still measured they need not be predicted. The predicted shape is then
     replaced by the measured one and the base moved as that difference moves it: the centre of mass
@@ -37,7 +37,7 @@ class DeadReckoning:
     ----------
     robot
         The model, as the controller believes it.
-    tick_period
+    control_period
         Duration of a step, s.
     integration_step
         Longest Runge-Kutta step, s.
@@ -51,17 +51,17 @@ class DeadReckoning:
     def __init__(
         self,
         robot: SpaceRobot,
-        tick_period: float,
+        control_period: float,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
     ) -> None:
-        substeps = steps_in(tick_period, integration_step)
+        substeps = steps_in(control_period, integration_step)
         self.robot = robot
-        self.tick_period = tick_period
+        self.control_period = control_period
         self.elapsed = 0.0
         """Time since the last measured state, s."""
         self._advance = BufferedFunction(compiled(_effort_step(robot, substeps)))
         self._correct = BufferedFunction(compiled(_joint_correction(robot)))
-        self._advance.inputs[3][:] = tick_period
+        self._advance.inputs[3][:] = control_period
         self._state, self._next = self._advance.inputs[0], self._advance.outputs[0]
 
     def reset(self, measured: ControlState) -> None:
@@ -77,9 +77,9 @@ class DeadReckoning:
     def step(
         self, actuation: Actuation, q: Array | None = None, qdot: Array | None = None
     ) -> ControlState:
-        """Advance one tick under held actuation and return the estimate at its end.
+        """Advance one control period under held actuation and return the estimate at its end.
 
-        ``q`` and ``qdot`` (n,) are the joints measured at the end of the tick, if they are.
+        ``q`` and ``qdot`` (n,) are the joints measured at the end of the period, if they are.
         """
         self._advance.inputs[1][:] = actuation.wrench_B
         self._advance.inputs[2][:] = actuation.tau
@@ -90,7 +90,7 @@ class DeadReckoning:
             predicted[:], measured_q[:], measured_qdot[:] = self._next, q, qdot
             self._correct.evaluate()
             self._state[:] = self._correct.outputs[0]
-        self.elapsed += self.tick_period
+        self.elapsed += self.control_period
         return self.state
 
 

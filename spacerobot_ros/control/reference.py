@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import ClassVar
 
 import numpy as np
 
-from spacerobot_ros.control.errors import TargetNotSetError
-from spacerobot_ros.control.state import JointReference, PoseReference, Reference
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.control.limits import MotionLimits
+from spacerobot_ros.control.state import JointReference, PoseReference, Reference, TargetNotSetError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     attitude_error,
@@ -28,32 +27,6 @@ _PEAK_RATE = 15 / 8
 
 _PEAK_ACCELERATION = 10 / math.sqrt(3)
 """Largest d2s/dt2 of the quintic over one second."""
-
-
-@dataclass(frozen=True)
-class MotionLimits:
-    """The fastest a reference moves: speeds and accelerations of poses and of joints.
-
-    ``joint_speed`` and ``joint_acceleration`` hold for every joint (m or rad, s).
-
-    Raises
-    ------
-    ParameterError
-        A limit is not positive; the sentence names it.
-    """
-
-    speed: float = 0.1
-    acceleration: float = 0.02
-    angular_speed: float = 0.1
-    angular_acceleration: float = 0.02
-    joint_speed: float = 0.1
-    joint_acceleration: float = 0.02
-
-    def __post_init__(self) -> None:
-        for limit in fields(self):
-            value = getattr(self, limit.name)
-            if not value > 0:
-                raise ParameterError(f"The limit '{limit.name}' is {value}; it must be positive.")
 
 
 class ReferenceProfile(ABC):

@@ -1,4 +1,4 @@
-"""What a control law is given and what it returns."""
+"""What a control law is given, what it returns, and what it refuses."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.model.space_robot import SpaceRobot
@@ -16,6 +17,14 @@ _ZERO.flags.writeable = False
 
 def _zero() -> Array:
     return _ZERO
+
+
+class TargetNotSetError(SpaceRobotError):
+    """A controlled output has no reference; the sentence says which."""
+
+
+class NotFiniteError(SpaceRobotError):
+    """A state or reference holds a number that is not finite; no command follows from it."""
 
 
 @dataclass(frozen=True)

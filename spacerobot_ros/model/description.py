@@ -13,6 +13,9 @@ from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.rotations import Array as Array
 from spacerobot_ros.model.rotations import matrix_about_axis
 
+DEFAULT_END_EFFECTOR = "end_effector"
+"""Name of the link that is the end-effector of a robot where no parameter names another."""
+
 
 class JointKind(str, Enum):
     """The joint types of URDF that a free-floating tree may have."""
@@ -166,6 +169,14 @@ class RobotDescription:
         """Return one limit (n,) of the movable joints: lower, upper, velocity or effort."""
         values: list[Any] = [getattr(joint.limits, what) for joint in self.movable_joints]
         return np.array(values, dtype=float)
+
+    def end_effector(self, link: str = "") -> str:
+        """Return the link that is the end-effector; empty: the robot has none.
+
+        ``link`` names it; without a name it is the link ``end_effector``, if there is one.
+        """
+        names = [each.name for each in self.links]
+        return link or (DEFAULT_END_EFFECTOR if DEFAULT_END_EFFECTOR in names else "")
 
     def with_links(self, links: tuple[Link, ...]) -> RobotDescription:
         """Return the robot with other links of the same names; ``urdf`` stays what it was."""

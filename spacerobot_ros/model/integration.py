@@ -13,18 +13,18 @@ DEFAULT_INTEGRATION_STEP = 0.01
 """Longest Runge-Kutta step of the attitude under held joint velocities, s."""
 
 
-def steps_in(tick_period: float, integration_step: float) -> int:
-    """Return how many equal steps, none longer than ``integration_step`` s, make a tick.
+def steps_in(control_period: float, integration_step: float) -> int:
+    """Return how many equal steps, none longer than ``integration_step`` s, make a control period.
 
     Raises
     ------
     ParameterError
         A duration is not positive.
     """
-    for name, value in (("tick period", tick_period), ("integration step", integration_step)):
+    for name, value in (("control period", control_period), ("integration step", integration_step)):
         if not (math.isfinite(value) and value > 0):
             raise ParameterError(f"The {name} must be positive, not {value} s.")
-    return max(1, math.ceil(tick_period / integration_step - 1e-9))
+    return max(1, math.ceil(control_period / integration_step - 1e-9))
 
 
 def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from spacerobot_ros.control.gains import Gains
 from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
+from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.state import ControlState, JointReference, Reference
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.simulation.plant import Plant

@@ -125,7 +125,7 @@ def servicer_start() -> ControlState:
 
 def law_of(name: str, robot: SpaceRobot, gains: Gains, **options: float) -> ControlLaw:
     law = LAWS[name]
-    return law(robot, law.default_outputs(robot, END_EFFECTOR), gains, **options)
+    return law(robot, law.default_outputs(robot, END_EFFECTOR), gains, law.Options(**options))
 
 
 @dataclass

@@ -25,7 +25,7 @@ from spacerobot_ros.control import (
     OutputSelection,
     Reference,
 )
-from spacerobot_ros.control.selection import AXES
+from spacerobot_ros.control.outputs import AXES
 from spacerobot_ros.model import SpaceRobot
 
 GAINS = Gains(

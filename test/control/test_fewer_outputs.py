@@ -35,7 +35,7 @@ from spacerobot_ros.control import (
 )
 from spacerobot_ros.control.laws.model_based import ModelBasedLaw
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
-from spacerobot_ros.control.selection import AXES
+from spacerobot_ros.control.outputs import AXES
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -50,7 +50,8 @@ def test_fewer_outputs_keep_their_error_dynamics(seed: int) -> None:
     commands = []
     for options in ({"null_space_damping": 0.0}, {"null_space_damping": 3.0}, {}):
         extra = {"posture_stiffness": 2.0} if not options else {}
-        law = ModelBasedLaw(robot, selection, GAINS, **options, **extra)
+        chosen = ModelBasedLaw.Options(**options, **extra)
+        law = ModelBasedLaw(robot, selection, GAINS, chosen)
         command = law.command(state, reference)
         commands.append(command)
         motion = OutputMotion(robot, state, command)
@@ -83,8 +84,7 @@ def test_null_space_damping_and_posture() -> None:
             robot,
             selection,
             Gains.uniform(1.0, 2.0),
-            null_space_damping=2.0,
-            posture_stiffness=stiffness,
+            ModelBasedLaw.Options(null_space_damping=2.0, posture_stiffness=stiffness),
         )
         flight = fly(plant_of(robot, start), law, lambda _: goal, 12.0, rate=25.0, every=10)
         last = flight.states[-1]
@@ -108,7 +108,7 @@ def test_joint_damping_of_the_transposed_jacobian(damping: float) -> None:
         robot,
         OutputSelection(AXES, ("x", "y", "z"), (), END_EFFECTOR),
         SERVICER_GAINS["transposed_jacobian"],
-        joint_damping=damping,
+        TransposedJacobianLaw.Options(joint_damping=damping),
     )
     goal = Reference.present(robot, still, END_EFFECTOR)
     flight = fly(plant_of(robot, start), law, lambda _: goal, 12.0, rate=50.0, every=10)

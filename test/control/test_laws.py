@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +40,7 @@ from spacerobot_ros.control import (
     Reference,
     TargetNotSetError,
 )
-from spacerobot_ros.control.selection import AXES
+from spacerobot_ros.control.outputs import AXES
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot, compilation
 from spacerobot_ros.parameters import declared
@@ -106,13 +105,13 @@ def test_registry_and_options() -> None:
     robot = load("planar_manipulator")
     for name, law in LAWS.items():
         assert law.name == name
-        options: dict[str, Any] = {option.name: option.default for option in declared(law.Options)}
-        built = law(robot, law.default_outputs(robot, END_EFFECTOR), PLANAR_GAINS, **options)
+        built = law(robot, law.default_outputs(robot, END_EFFECTOR), PLANAR_GAINS, law.Options())
         assert isinstance(built, ControlLaw)
         for option in declared(law.Options):
             for value in (option.minimum - 1.0, np.nan):
+                options = law.Options(**{option.name: value})
                 with pytest.raises(ParameterError, match=f"'{option.name}'"):
-                    law(robot, built.outputs.selection, PLANAR_GAINS, **{option.name: value})
+                    law(robot, built.outputs.selection, PLANAR_GAINS, options)
 
 
 def test_compiled_law_gives_the_numbers_of_the_interpreted(

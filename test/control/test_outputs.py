@@ -27,8 +27,7 @@ from spacerobot_ros.control import (
     Reference,
     TargetNotSetError,
 )
-from spacerobot_ros.control.outputs import OutputVector
-from spacerobot_ros.control.selection import AXES
+from spacerobot_ros.control.outputs import AXES, OutputVector
 from spacerobot_ros.model import SpaceRobot
 
 STEP = 1e-6

@@ -8,7 +8,7 @@ from control.flights import END_EFFECTOR, load
 from support.random_robots import random_chain_urdf
 
 from spacerobot_ros.control import OutputSelection, default_selection, plane_normal
-from spacerobot_ros.control.selection import AXES
+from spacerobot_ros.control.outputs import AXES
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import RobotDescription, parse_robot
 

@@ -97,7 +97,7 @@ def test_motion_beyond_numbers_is_refused_and_undone() -> None:
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
 def test_durations_must_be_positive(value: float) -> None:
     robot = robot_of(random_urdf(0))
-    with pytest.raises(ParameterError, match="tick period must be positive"):
+    with pytest.raises(ParameterError, match="control period must be positive"):
         EffortPlant(robot, value)
     with pytest.raises(ParameterError, match="integration step must be positive"):
         EffortPlant(robot, TICK, integration_step=value)

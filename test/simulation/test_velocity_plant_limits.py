@@ -65,7 +65,7 @@ def test_no_joint_ever_leaves_its_limits(seed: int) -> None:
 @pytest.mark.parametrize("period", [0.0, -0.05, np.nan, np.inf])
 def test_a_bad_tick_period_is_refused(period: float) -> None:
     robot = robot_of((URDF / "sliding_masses.urdf").read_text("utf-8"))
-    with pytest.raises(ParameterError, match="tick period"):
+    with pytest.raises(ParameterError, match="control period"):
         VelocityPlant(robot, period)
 
 

@@ -7,9 +7,8 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.control.gains import Gains
-from spacerobot_ros.control.laws.law import ControlLaw
-from spacerobot_ros.control.selection import OutputSelection
+from spacerobot_ros.control.laws.law import ControlLaw, Gains, LawOptions
+from spacerobot_ros.control.outputs import OutputSelection
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.dynamics import solve_positive_definite
@@ -34,9 +33,14 @@ class ComputedTorqueLaw(ControlLaw):
     """
 
     name: ClassVar[str] = "computed_torque"
+    gain_units: ClassVar[tuple[str, str]] = ("1/s^2", "1/s")
 
     def __init__(
-        self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
+        self,
+        robot: SpaceRobot,
+        outputs: OutputSelection,
+        gains: Gains,
+        options: LawOptions | None = None,
     ) -> None:
         if outputs.base or outputs.end_effector or set(outputs.joints) != set(robot.joint_names):
             raise ParameterError(
@@ -45,7 +49,7 @@ class ComputedTorqueLaw(ControlLaw):
             )
         # In the order of q, whatever order they were named in.
         in_order = OutputSelection(joints=robot.joint_names)
-        super().__init__(robot, in_order, gains, **options)
+        super().__init__(robot, in_order, gains, options)
 
     @classmethod
     def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:

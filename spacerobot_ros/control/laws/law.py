@@ -2,21 +2,94 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.control.gains import Gains
-from spacerobot_ros.control.outputs import OutputVector
-from spacerobot_ros.control.selection import OutputSelection, default_selection
+from spacerobot_ros.control.outputs import OutputSelection, OutputVector, default_selection
 from spacerobot_ros.control.state import Actuation, ControlState, Reference
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.compilation import BufferedFunction, compiled, dense_function
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.parameters import configured, parameter, require_known
+from spacerobot_ros.parameters import configured, group, parameter, values_of
+
+
+@dataclass(frozen=True)
+class GainPair:
+    """Proportional and derivative gain of each output of a group, a diagonal of Kp and Kd.
+
+    Their units are the law's (:attr:`ControlLaw.gain_units`): a force or torque per error and per
+    error rate with ``transposed_jacobian``, an acceleration per error and per error rate with the
+    laws that know the inertia.
+
+    Commands are held for a control period. A derivative gain that takes more than its velocity
+    within one makes the loop unstable: Kd times the period must stay well below 2 (with
+    ``transposed_jacobian``, below twice the least inertia that the output meets, which for the
+    attitude of an end-effector is that of the last wrist link about its joint).
+    """
+
+    kp: float = parameter(
+        30.0,
+        "proportional gain; N/m (N m/rad) with transposed_jacobian, else 1/s^2",
+        unit="by law",
+        minimum=1e-9,
+        read_only=False,
+    )
+    kd: float = parameter(
+        60.0,
+        "derivative gain; N s/m (N m s/rad) with transposed_jacobian, else 1/s",
+        unit="by law",
+        minimum=1e-9,
+        read_only=False,
+    )
+
+
+@dataclass(frozen=True)
+class Gains:
+    """The diagonals of Kp and Kd (paper 4, eqs 27 and 29), positive definite.
+
+    Raises
+    ------
+    ParameterError
+        A gain is not positive and finite; the sentence names it.
+    """
+
+    base_position: GainPair = group(GainPair(30.0, 60.0))
+    base_attitude: GainPair = group(GainPair(30.0, 60.0))
+    end_effector_position: GainPair = group(GainPair(30.0, 60.0))
+    end_effector_attitude: GainPair = group(GainPair(30.0, 60.0))
+    joints: GainPair = group(GainPair(4.0, 4.0))
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            pair: GainPair = getattr(self, each.name)
+            for name, value in (("kp", pair.kp), ("kd", pair.kd)):
+                if not (math.isfinite(value) and value > 0):
+                    raise ParameterError(
+                        f"The gain {each.name}.{name} is {value}; it must be positive and finite."
+                    )
+
+    @classmethod
+    def uniform(cls, kp: float, kd: float) -> Gains:
+        """Return the same gains for every group."""
+        return cls(*(GainPair(kp, kd) for _ in fields(cls)))
+
+    def diagonals(self, selection: OutputSelection) -> tuple[Array, Array]:
+        """Return the diagonals of Kp and Kd (m,) of the selected outputs."""
+        pairs = [
+            *(_pair(axis, self.base_position, self.base_attitude) for axis in selection.base),
+            *(
+                _pair(axis, self.end_effector_position, self.end_effector_attitude)
+                for axis in selection.end_effector
+            ),
+            *(self.joints for _ in selection.joints),
+        ]
+        return np.array([pair.kp for pair in pairs]), np.array([pair.kd for pair in pairs])
 
 
 @dataclass(frozen=True)
@@ -48,8 +121,10 @@ class LawOptions:
 class ControlLaw(ABC):
     """A way to turn errors of the outputs into thruster forces and joint efforts.
 
-    A law is constructed once for a robot and commands every tick. Its ``options`` become the
-    parameters ``<name>.<option>`` of the controller node and arrive as keyword arguments.
+    A law is constructed once for a robot and commands once every control period. A subclass gives
+    ``name``, ``gain_units``, and where it has options, ``Options``: a frozen dataclass derived from
+    :class:`LawOptions`, whose fields become the parameters ``<name>.<option>`` of the controller
+    node. A line in :mod:`spacerobot_ros.control.laws.registry` makes it available.
 
     Parameters
     ----------
@@ -60,26 +135,31 @@ class ControlLaw(ABC):
     gains
         Diagonals of Kp and Kd by group, in the law's units (:class:`GainPair`).
     options
-        Values of the law's ``options`` by name; those left out have their defaults.
+        An instance of the law's ``Options``; None: their defaults.
 
     Raises
     ------
     ParameterError
-        The robot does not have these outputs, the law cannot drive them, there is no such option,
-        or one is out of range.
+        The robot does not have these outputs, the law cannot drive them, or an option is out of
+        range.
     """
 
     name: ClassVar[str]
+    gain_units: ClassVar[tuple[str, str]]
+    """Units of Kp and Kd."""
     Options: ClassVar[Any] = LawOptions
 
     def __init__(
-        self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
+        self,
+        robot: SpaceRobot,
+        outputs: OutputSelection,
+        gains: Gains,
+        options: LawOptions | None = None,
     ) -> None:
         self.robot = robot
         self.outputs = OutputVector(robot, outputs)
-        require_known(self.name, self.Options, options)
-        self._options = configured(self.Options, options)
-        self.singular_value_threshold: float = self._options.singular_value_threshold
+        self.options: Any = configured(self.Options, values_of(options or self.Options()))
+        self.singular_value_threshold: float = self.options.singular_value_threshold
         symbols = {
             "state": self.outputs.state,
             "reference": self.outputs.reference,
@@ -159,3 +239,7 @@ class ControlLaw(ABC):
     @abstractmethod
     def _actuation(self, reference: Reference) -> Actuation:
         """Evaluate the function at the packed inputs and return the command."""
+
+
+def _pair(axis: str, position: GainPair, attitude: GainPair) -> GainPair:
+    return attitude if axis.startswith("r") else position

@@ -9,9 +9,8 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.control.gains import Gains
-from spacerobot_ros.control.laws.law import ControlLaw, LawOptions
-from spacerobot_ros.control.selection import OutputSelection
+from spacerobot_ros.control.laws.law import ControlLaw, Gains, LawOptions
+from spacerobot_ros.control.outputs import OutputSelection
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
@@ -70,15 +69,20 @@ class ModelBasedLaw(ControlLaw):
     """
 
     name: ClassVar[str] = "model_based"
+    gain_units: ClassVar[tuple[str, str]] = ("1/s^2", "1/s")
     Options: ClassVar[Any] = ModelBasedOptions
 
     def __init__(
-        self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
+        self,
+        robot: SpaceRobot,
+        outputs: OutputSelection,
+        gains: Gains,
+        options: LawOptions | None = None,
     ) -> None:
-        super().__init__(robot, outputs, gains, **options)
+        super().__init__(robot, outputs, gains, options)
         self._in["null_space"][:] = (
-            self._options.posture_stiffness,
-            self._options.null_space_damping,
+            self.options.posture_stiffness,
+            self.options.null_space_damping,
         )
 
     def _damping(self, singular_value: float) -> float:

@@ -7,9 +7,8 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from spacerobot_ros.control.gains import Gains
-from spacerobot_ros.control.laws.law import ControlLaw, LawOptions
-from spacerobot_ros.control.selection import OutputSelection
+from spacerobot_ros.control.laws.law import ControlLaw, Gains, LawOptions
+from spacerobot_ros.control.outputs import OutputSelection
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
@@ -46,13 +45,18 @@ class TransposedJacobianLaw(ControlLaw):
     """
 
     name: ClassVar[str] = "transposed_jacobian"
+    gain_units: ClassVar[tuple[str, str]] = ("N/m or N m/rad", "N s/m or N m s/rad")
     Options: ClassVar[Any] = TransposedJacobianOptions
 
     def __init__(
-        self, robot: SpaceRobot, outputs: OutputSelection, gains: Gains, **options: float
+        self,
+        robot: SpaceRobot,
+        outputs: OutputSelection,
+        gains: Gains,
+        options: LawOptions | None = None,
     ) -> None:
-        super().__init__(robot, outputs, gains, **options)
-        self._in["joint_damping"][:] = self._options.joint_damping
+        super().__init__(robot, outputs, gains, options)
+        self._in["joint_damping"][:] = self.options.joint_damping
 
     def _parameters(self) -> dict[str, ca.SX]:
         return {"joint_damping": ca.SX.sym("joint_damping")}

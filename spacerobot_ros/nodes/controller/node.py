@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from typing import Any, ClassVar
 
@@ -13,19 +12,14 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from spacerobot_ros.control import (
-    LAWS,
-    PROFILES,
-    ActuatorLimits,
     ControlState,
     JointReference,
-    MotionLimits,
-    OutputSelection,
     PoseReference,
     Reference,
 )
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.controller import CoordinatedController
-from spacerobot_ros.control.errors import NotFiniteError
+from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.state import NotFiniteError
 from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import matrix_from_quaternion
@@ -42,7 +36,6 @@ from spacerobot_ros.nodes.common.robot_node import RobotNode
 from spacerobot_ros.nodes.common.state_synchroniser import Pairing, StateSynchroniser
 from spacerobot_ros.nodes.controller.goals import END_EFFECTOR, ControlGoals, require_controlled
 from spacerobot_ros.nodes.controller.status import ControllerState, ControllerStatus
-from spacerobot_ros.nodes.plant.plant_topics import DEFAULT_END_EFFECTOR
 from spacerobot_ros.planning.execution.goal_file import BASE
 
 JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
@@ -112,41 +105,7 @@ class CoordinatedControlNode(RobotNode):
 
     def _use(self, robot: SpaceRobot) -> None:
         self._robot = robot
-        values: dict[str, Any] = self.parameters
-        law_type = LAWS[values["law"]]
-        link = values["end_effector_frame"]
-        if not link and DEFAULT_END_EFFECTOR in robot.link_names:
-            link = DEFAULT_END_EFFECTOR
-        outputs = law_type.default_outputs(robot, link)
-        chosen = {
-            group: tuple(values[f"{key}_outputs"].split())
-            for group, key in (
-                ("base", "base"),
-                ("end_effector", "end_effector"),
-                ("joints", "joint"),
-            )
-        }
-        if any(chosen.values()):
-            outputs = OutputSelection(**chosen, end_effector_link=link)
-        options = vars(self.config.options[law_type.name])
-        law = law_type(robot, outputs, self.config.gains, **options)
-        self._period = round(NANOSECONDS / values["tick_rate"]) / NANOSECONDS
-        motion = {
-            name: values[f"motion.{name}"]
-            for name in ("speed", "acceleration", "angular_speed", "angular_acceleration")
-        }
-        self.controller = CoordinatedController(
-            law,
-            ActuatorLimits(
-                values["max_force"] or math.inf,
-                values["max_torque"] or math.inf,
-                robot.effort_limit,
-            ),
-            PROFILES[values["profile"]],
-            MotionLimits(**motion),
-            self._period,
-            values["estimation_time"],
-        )
+        self.controller = build_controller(robot, self.config)
         n = robot.n
         self._joints = JointReader(robot.joint_names, ["position", "velocity"], complete=True)
         self._references = JointReader(robot.joint_names, ["position", "velocity"])
@@ -164,7 +123,7 @@ class CoordinatedControlNode(RobotNode):
         self._wrench_message = MessageTemplate(wrench)
         self._wrench_message.feed("wrench.force.x", self._wrench)
         try:
-            self._goals.require_suited(law)
+            self._goals.require_suited(self.controller.law)
         except PlanningError as error:
             self._status.refused(str(error))
 
@@ -293,7 +252,7 @@ class CoordinatedControlNode(RobotNode):
         return JointReference(
             self._references.values["position"].copy(),
             (before + held) / 2,
-            (held - before) / self._period,
+            (held - before) / self.config.control_period,
         )
 
     def _given_base(self, raw: bytes) -> PoseReference | None:
