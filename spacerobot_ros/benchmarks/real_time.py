@@ -20,7 +20,7 @@ import numpy as np
 from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
-from spacerobot_ros.nodes.planner.gait_flight import ANSWERED
+from spacerobot_ros.nodes.planner.node import ANSWERED
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.session.processes import ProcessStack
 from spacerobot_ros.session.run import ros, stop_on_signals

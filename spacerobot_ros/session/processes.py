@@ -28,9 +28,9 @@ from spacerobot_ros.model.robot_source import RobotConfig, robot_of
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.node import spin_until
-from spacerobot_ros.nodes.planner.plan_work import PLANNED
 from spacerobot_ros.parameters import configured, declared
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.executive import PLANNED
 from spacerobot_ros.session.description import parameter_records, scenario_record
 from spacerobot_ros.session.kills import NEEDS_PROCESSES, KillTimeline
 from spacerobot_ros.session.mission_client import Operator

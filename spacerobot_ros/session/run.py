@@ -26,7 +26,7 @@ from spacerobot_ros.session.scenario import Scenario
 from spacerobot_ros.session.stack import FlightStack
 
 _NO_GAIT = (
-    *("state", "goal", "corrections", "method"),
+    *("state", "goal", "goal_id", "corrections", "method"),
     *("manoeuvre_time_s", "ends_at_s"),
 )
 """Values of the planner's status that do not describe its gait."""

@@ -114,7 +114,7 @@ class FlightStack:
     @property
     def plan_time(self) -> float:
         """Wall time that planning took, s."""
-        return self.planner.plan_time if self.planner is not None else 0.0
+        return self.planner.statistics.plan_time_s if self.planner is not None else 0.0
 
     def start(self, goal: Goal | None) -> None:
         """Activate everything and send the goal, if any; the plant's first state is planned from.

@@ -105,7 +105,7 @@ def test_a_goal_that_is_refused_in_flight_leaves_the_earlier_one(flight: Flight)
     flight.ticks(5)
     flight.send(FAR)
     refused = flight.wait("refused")
-    assert "The earlier goal is still flown." in refused.message
+    assert "The earlier goal is still pursued." in refused.message
     assert values_of(flight.wait("reached"))["corrections"] == "0"
     assert flight.error_to(NEAR)[0] < 1e-3
 

@@ -25,7 +25,7 @@ def test_a_goal_is_met_within_tolerance(harness: Harness) -> None:
     values = values_of(status)
     assert status.level == DiagnosticStatus.OK
     assert status.name == "/planner"
-    assert_one_sentence(status.message, "met")
+    assert_one_sentence(status.message, "reached")
     assert float(values["position_error_m"]) == pytest.approx(distance, rel=1e-3, abs=1e-9)
     assert float(values["attitude_error_rad"]) == pytest.approx(angle, rel=1e-3, abs=1e-9)
     assert [float(x) for x in values["goal"].split()[:3]] == TURNED[0]
@@ -63,7 +63,7 @@ def test_the_pose_that_is_already_there_is_reached(harness: Harness) -> None:
     flight = Flight(harness)
     status = flight.decide(HERE)
     assert flight.states[-1] == "reached"
-    assert_one_sentence(status.message, "met")
+    assert_one_sentence(status.message, "reached")
     (schedule,) = flight.probe.messages["gait_schedule"]
     assert len(schedule.points) <= 2
     flight.ticks(5)

@@ -196,7 +196,7 @@ def test_a_goal_that_is_missed_fails_with_a_sentence(harness: Harness) -> None:
     flight.planner.set_parameters([Parameter("attitude_tolerance", value=1e-9)])
     status = flight.wait("failed")
     assert status.level == DiagnosticStatus.ERROR
-    assert_one_sentence(status.message, "not met", "0 correction(s)")
+    assert_one_sentence(status.message, "not reached", "0 correction(s)")
     flight.ticks(10)
     assert list(flight.probe.last("joint_states").velocity) == [0.0] * 3
 

@@ -15,7 +15,7 @@ from support.random_messages import few
 from trajectory_msgs.msg import JointTrajectory
 
 from spacerobot_ros.bag import message_definition
-from spacerobot_ros.nodes.planner.trajectory_message import serialised_trajectory
+from spacerobot_ros.nodes.planner.messages import serialised_trajectory
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
 
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from sensor_msgs.msg import JointState
 
 from spacerobot_ros.errors import CommandError
-from spacerobot_ros.nodes.common.cdr import MessageTemplate, TemplateReader
+from spacerobot_ros.nodes.common.cdr import TemplateReader
 
 Quantity = Literal["position", "velocity", "effort"]
 
@@ -111,22 +111,3 @@ class JointReader:
             ]
         else:
             self._order = np.array([self._index.get(name, 0) for name in names], dtype=np.intp)
-
-
-class JointCommand:
-    """A command for every joint, serialised once and patched in place.
-
-    ``position`` and ``velocity`` (n,) are what the next message carries.
-    """
-
-    def __init__(self, joint_names: Sequence[str]) -> None:
-        zeros = [0.0] * len(joint_names)
-        self._template = MessageTemplate(
-            JointState(name=list(joint_names), position=zeros, velocity=zeros, effort=zeros)
-        )
-        self.position, self.velocity = np.array(zeros), np.array(zeros)
-        if zeros:
-            self._template.feed("position", self.position)
-            self._template.feed("velocity", self.velocity)
-        self.serialised = self._template.serialised
-        """The message with a stamp; see :meth:`MessageTemplate.serialised`."""

@@ -1,10 +1,7 @@
-"""The robot, the goal and the planned path as markers for RViz and Foxglove."""
+"""The robot as markers for RViz and Foxglove."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from geometry_msgs.msg import Point
 from rclpy.node import Node
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -12,8 +9,6 @@ from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shap
 from spacerobot_ros.model.rotations import quaternion_from_matrix
 from spacerobot_ros.nodes.common.cdr import MessageTemplate, stamp_bytes
 from spacerobot_ros.nodes.common.node import STREAM
-from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.core.schedule import BasePath
 
 _KINDS = {
     "box": Marker.CUBE,
@@ -69,26 +64,3 @@ class LinkMarkers:
             target[:3] = r_WB + R_WB @ (link_r[:, index] + R_BL @ pose.r)
             target[3:] = quaternion_from_matrix(R_WB @ R_BL @ pose.R)
         self._publisher.publish(self._template.serialised(stamp_bytes(time_ns)))
-
-
-def goal_markers(
-    goal: Goal, path: BasePath, base_shapes: Sequence[Shape], frame: str
-) -> MarkerArray:
-    """Return the base as a ghost at the goal, and the planned path of the base as a line."""
-    markers: list[Marker] = []
-    for shape in base_shapes:
-        marker = shape_marker(shape, frame, "goal", len(markers))
-        marker.color.a = 0.25
-        marker.pose.position.x, marker.pose.position.y, marker.pose.position.z = (
-            goal.position.tolist()
-        )
-        o = marker.pose.orientation
-        o.x, o.y, o.z, o.w = goal.quaternion.tolist()
-        markers.append(marker)
-    line = Marker(ns="planned_path", id=len(markers), type=Marker.LINE_STRIP, action=Marker.ADD)
-    line.header.frame_id = frame
-    line.scale.x = 0.005
-    line.color.r, line.color.g, line.color.b, line.color.a = 0.95, 0.6, 0.1, 1.0
-    line.pose.orientation.w = 1.0
-    line.points = [Point(x=x, y=y, z=z) for x, y, z in path.position.tolist()]
-    return MarkerArray(markers=[*markers, line])

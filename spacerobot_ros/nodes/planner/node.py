@@ -1,124 +1,165 @@
-"""The planner node: goal poses in, joint velocities out."""
+"""The planner node: goal poses in, joint velocities out. It only converts messages."""
 
 from __future__ import annotations
 
 import sys
+from threading import Thread
 from typing import Any, ClassVar
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.nodes.common.cdr import stamp_bytes
 from spacerobot_ros.nodes.common.goal_messages import goal_of, shape_of
-from spacerobot_ros.nodes.common.joint_command import JointReader
-from spacerobot_ros.nodes.common.node import STREAM, run_node
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, run_node
 from spacerobot_ros.nodes.common.robot_node import RobotNode
-from spacerobot_ros.nodes.planner.gait_flight import ANSWERED
-from spacerobot_ros.nodes.planner.goal_pursuit import GoalPursuit
-from spacerobot_ros.nodes.planner.plan_topics import PlanTopics
-from spacerobot_ros.nodes.planner.status import PlannerState, PlannerStatus
-from spacerobot_ros.planning import Goal
+from spacerobot_ros.nodes.common.state_synchroniser import Pairing, StateSynchroniser
+from spacerobot_ros.nodes.planner.messages import (
+    StateReader,
+    goal_markers,
+    path_message,
+    serialised_trajectory,
+    setpoint_template,
+    status_message,
+)
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile
+from spacerobot_ros.planning.execution.executive import (
+    Executive,
+    Notice,
+    ScheduleStart,
+    Severity,
+    Transition,
+)
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
+from spacerobot_ros.planning.execution.status import (
+    PlannerState,
+    PlannerStatistics,
+    PlannerStatus,
+    goal_values,
+)
+from spacerobot_ros.planning.execution.worker import LONGEST_END
+
+ANSWERED = "{:d} commands were published."
+"""What a planner logs when it is deactivated."""
 
 
 class PlannerNode(RobotNode):
-    """Turns goal poses into gaits and streams their velocities, one command for every state.
+    """Turns goal poses into gaits and publishes their velocities, one command for every state.
 
     A goal is planned from the next measured state. When its schedule has ended the measured pose
-    is compared with the goal, and the rest is planned again until the tolerance is met or
-    ``max_corrections`` are used up; the pieces of a gait that its method plans one by one (a
-    *partial* schedule) do not count. A new goal replaces the one that is being flown. When a joint
-    does not follow, the rest is planned with the joints that remain.
+    is compared with the goal, and the remaining motion is planned again until the goal is reached
+    within tolerance or ``max_corrections`` are used up; the pieces of a gait that its method plans
+    one by one (a *partial* schedule) do not count. A new goal replaces the present one. When a
+    joint does not follow, the remaining motion is planned with the other joints.
+
+    All this is decided by an :class:`~spacerobot_ros.planning.execution.executive.Executive`.
     """
 
     Config: ClassVar = PlannerConfig
+    config: PlannerConfig
 
     def __init__(self, name: str = "planner", **kwargs: Any) -> None:
         self._running = False
+        self._executive: Executive | None = None
         super().__init__(name, **kwargs)
 
     @property
-    def plan_time(self) -> float:
-        """Wall time that planning took for the present goal, s."""
-        return self._pursuit.plan_time if self._robot is not None else 0.0
+    def statistics(self) -> PlannerStatistics:
+        """What the planner has done so far."""
+        return PlannerStatistics() if self._executive is None else self._executive.statistics
 
     # -- life ---------------------------------------------------------------------------------
 
     def configure(self) -> None:
         """Create the topics; without a robot of its own the planner waits for robot_description."""
-        self._waiting: Goal | None = None
-        """A goal that has come before the robot."""
+        config = self.config
+        self._waiting: IdentifiedGoal | None = None
+        """A goal that was received before the robot."""
         self._goal_shape: Array | None = None
-        self._odom_raw = self._joints_raw = b""
-        self._odom_fresh = self._joints_fresh = False
-        to_plant = self.parameters["output"] == "commands"
-        topic = "joint_commands" if to_plant else "joint_reference"
+        self._goal_ids = GoalIds()
+        self._goal_file = GoalFile(config.resume_file)
+        self._states = StateSynchroniser(pose_required=False)
+        self._announcement: Thread | None = None
+        self._executive = None
+        topic = "joint_commands" if config.output == "commands" else "joint_reference"
         self._commands = self.send_raw(JointState, topic)
-        self._plan_topics = PlanTopics(self, str(self.parameters["world_frame"]))
-        self._status = PlannerStatus(self)
-        self._memory = GoalFile(str(self.parameters["resume_file"]))
+        self._schedule_topic = self.create_publisher(JointTrajectory, "gait_schedule", LATCHED)
+        self._path_topic = self.create_publisher(Path, "planned_path", LATCHED)
+        self._markers_topic = self.create_publisher(MarkerArray, "markers", STREAM)
+        self._status_topic = self.create_publisher(DiagnosticStatus, "planner/status", LATCHED)
         self.find_robot()
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal, STREAM)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
         self.create_subscription(Odometry, "odom", self._on_odom, STREAM, raw=True)
         self.create_subscription(JointState, "joint_states", self._on_joints, STREAM, raw=True)
         self.create_service(Trigger, "~/abort", self._on_abort)
+        self.create_service(Trigger, "~/statistics", self._on_statistics)
 
     def activate(self) -> None:
-        """Answer states with commands from now on."""
-        found = self._memory.load().get(BASE)
-        kept = found.goal if found is not None else None
+        """Answer states with commands from now on; resume the goal on file, if there is one."""
+        resumed = self._goal_file.load().get(BASE)
         self._running = True
-        if kept is None:
-            self._status.publish(PlannerState.IDLE, "Waiting for a goal pose.")
+        if resumed is None:
+            self._publish_status(PlannerStatus(PlannerState.IDLE, "Waiting for a goal pose."))
         else:
-            self._propose(kept)
-            self._status.publish(PlannerState.PLANNING, "Going on to an earlier goal.", goal=kept)
+            self._propose(resumed)
+            self._publish_waiting(resumed, "Resuming an earlier goal.")
         # A lockstep plant may have been waiting for an answer since before.
         self._on_part()
 
     def deactivate(self) -> None:
-        """Give up the present goal and command nothing any more."""
-        if self._running and self._robot is not None:
-            self.get_logger().info(ANSWERED.format(self._pursuit.answers))
-            self._pursuit.drop()
-        self._running = False
+        """Give up the present goal and command nothing any more; the goal file stays."""
+        if self._running and self._executive is not None:
+            self.get_logger().info(ANSWERED.format(self.statistics.commands_published))
+            self._executive.stop()
+            self._publish_outputs(self._executive)
+            if self._announcement is not None:
+                self._announcement.join(LONGEST_END)
+        self._running, self._waiting = False, None
 
     def _use(self, robot: SpaceRobot) -> None:
+        self._executive = executive = Executive(robot, self.config, goal_file=self._goal_file)
         self._robot = robot
-        self._joints = JointReader(robot.joint_names, ["position"], complete=True)
-        self._pursuit = GoalPursuit(self, robot, self._status, self._plan_topics, self._memory)
+        self._measured = StateReader(robot.joint_names)
+        self._setpoint = setpoint_template(robot.joint_names, executive.setpoint)
         if self._waiting is not None:
-            self._pursuit.propose(self._waiting)
+            executive.propose(self._waiting)
+            self._waiting = None
 
-    # -- topics -------------------------------------------------------------------------------
+    def parameters_changed(self) -> None:
+        """Plan and evaluate with the new tolerances."""
+        if self._executive is not None:
+            self._executive.config = self.config
+
+    # -- goals --------------------------------------------------------------------------------
 
     def _on_goal(self, message: PoseStamped) -> None:
         if not self._running:
             return
+        goal_id = self._goal_ids.of(message.header.stamp.sec, message.header.stamp.nanosec)
         try:
-            frame = str(self.parameters["world_frame"])
-            goal = goal_of(message, frame, shape=self._goal_shape)
+            goal = goal_of(message, self.config.world_frame, shape=self._goal_shape)
         except PlanningError as error:
-            self._status.publish(PlannerState.REFUSED, str(error))
+            self._publish_status(PlannerStatus(PlannerState.REFUSED, str(error), goal_id=goal_id))
             return
-        self._propose(goal)
-        if self._robot is None:
-            self._status.publish(
-                PlannerState.PLANNING, "The goal waits for a robot on robot_description."
-            )
+        identified = IdentifiedGoal(goal, goal_id)
+        self._propose(identified)
+        if self._executive is None:
+            self._publish_waiting(identified, "The goal waits for a robot on robot_description.")
 
-    def _propose(self, goal: Goal) -> None:
-        """Plan for a goal from the next state that is measured."""
-        if self._robot is None:
-            self._waiting = goal
+    def _propose(self, identified: IdentifiedGoal) -> None:
+        if self._executive is None:
+            self._waiting = identified
         else:
-            self._pursuit.propose(goal)
+            self._executive.propose(identified)
 
     def _on_goal_shape(self, message: JointState) -> None:
         """Keep the shape that goals from now on are to end in, for methods that take one."""
@@ -127,54 +168,117 @@ class PlannerNode(RobotNode):
         try:
             self._goal_shape = shape_of(message, self._robot.joint_names)
         except PlanningError as error:
-            self._status.publish(PlannerState.REFUSED, str(error))
+            self._publish_status(PlannerStatus(PlannerState.REFUSED, str(error)))
+
+    def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        sentence = None
+        if self._executive is not None:
+            sentence = self._executive.abort()
+            self._publish_outputs(self._executive)
+        self._waiting = None
+        self._goal_file.delete()
+        response.success = sentence is not None
+        response.message = sentence or "There is no goal to abort."
+        return response
+
+    def _on_statistics(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = True, self.statistics.to_json()
+        return response
+
+    # -- states -------------------------------------------------------------------------------
 
     def _on_odom(self, raw: bytes) -> None:
-        self._odom_raw = raw
-        self._odom_fresh = True
-        # In flight it is looked at with the joints, if at all.
-        if self._joints_fresh or (self._robot is not None and self._pursuit.wants_pose):
-            self._on_part()
+        self._states.put_odom(raw)
+        self._on_part()
 
     def _on_joints(self, raw: bytes) -> None:
-        self._joints_raw = raw
-        self._joints_fresh = True
+        self._states.put_joint_states(raw)
         self._on_part()
 
     def _on_part(self) -> None:
         """Answer a state once, as soon as its joints are there; only plans need its pose."""
-        if not self._running or self._robot is None:
+        executive = self._executive
+        if not self._running or executive is None:
             return
-        # Header first in both messages: bytes 4 to 12 are the stamp.
-        together = self._odom_raw[4:12] == self._joints_raw[4:12]
-        if self._joints_fresh:
-            self._joints_fresh = False
-            self._answer(posed=together and self._odom_fresh)
-        elif together and self._odom_fresh:
-            # What was answered without the pose is planned from when the next joints come.
-            self._pursuit.observe(self._odom_raw, self._joints_raw)
-        self._odom_fresh = self._odom_fresh and not together
-
-    def _answer(self, *, posed: bool) -> None:
-        """Answer one state with one command of the same stamp; ``posed``: odom is there too."""
+        states, measured = self._states, self._measured
+        pairing = states.ready()
+        # A state that was answered without its pose is planned from when the next joints come.
+        if pairing is None or (pairing is Pairing.LATE_POSE and not executive.measuring):
+            return
+        odom = None if pairing is Pairing.WITHOUT_POSE else states.odom
         try:
-            stamp = self._joints.accept(self._joints_raw)
+            measured.accept(states.joint_states, odom)
         except CommandError as error:
             self.get_logger().error(f"joint_states: {error}.", throttle_duration_sec=5.0)
             return
-        q = self._joints.values["position"]
-        command = self._pursuit.answer(stamp, q, self._odom_raw, self._joints_raw, posed)
-        self._commands.take(command)
+        if pairing is Pairing.LATE_POSE:
+            executive.observe(measured)
+        else:
+            executive.update(measured)
+            self._publish_outputs(executive)
+            self._commands.take(self._setpoint.serialised(stamp_bytes(measured.stamp_ns)))
+        if measured.base_error is not None:
+            self.get_logger().error(f"odom: {measured.base_error}.", throttle_duration_sec=5.0)
+            measured.base_error = None
 
-    def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        message = self._pursuit.abort() if self._robot is not None else ""
-        self._waiting = None
-        self._memory.delete()
-        response.success = bool(message)
-        response.message = message or "Nothing is flown."
-        if message:
-            self._status.publish(PlannerState.ABORTED, f"Aborted on request. {message}")
-        return response
+    # -- outputs ------------------------------------------------------------------------------
+
+    def _publish_outputs(self, executive: Executive) -> None:
+        """Publish and log what the executive hands out."""
+        logger = self.get_logger()
+        for output in executive.take_outputs():
+            match output:
+                case PlannerStatus():
+                    self._publish_status(output)
+                case ScheduleStart():
+                    self._announce(output)
+                # Three calls: rclpy refuses one that changes its severity.
+                case Notice(Severity.INFO, sentence):
+                    logger.info(sentence)
+                case Notice(Severity.WARNING, sentence):
+                    logger.warning(sentence)
+                case Notice(Severity.ERROR, sentence):
+                    logger.error(sentence)
+                case Transition(source, event, target):
+                    logger.debug(f"{source.value} -> {target.value}: {event.value}")
+
+    def _publish_waiting(self, identified: IdentifiedGoal, sentence: str) -> None:
+        self._publish_status(
+            PlannerStatus(
+                PlannerState.PLANNING,
+                sentence,
+                goal_id=identified.goal_id,
+                goal=goal_values(identified.goal),
+            )
+        )
+
+    def _publish_status(self, status: PlannerStatus) -> None:
+        """Publish a status and log its sentence."""
+        self._status_topic.publish(status_message(status, self.get_fully_qualified_name()))
+        if status.state.level:
+            self.get_logger().warning(status.sentence)
+        else:
+            self.get_logger().info(status.sentence)
+
+    def _announce(self, start: ScheduleStart) -> None:
+        """Publish a schedule, its path and its goal; beside the flight where plans are made so."""
+        if not self.config.plan_in_background:
+            self._publish_schedule(start)
+            return
+        if self._announcement is not None:
+            self._announcement.join(LONGEST_END)
+        # Serialising a long schedule takes longer than a tick, and nothing waits for it.
+        self._announcement = Thread(target=self._publish_schedule, args=(start,), daemon=True)
+        self._announcement.start()
+
+    def _publish_schedule(self, start: ScheduleStart) -> None:
+        schedule, stamp, frame = start.schedule, start.stamp_ns, self.config.world_frame
+        assert self._robot is not None
+        base = self._robot.description
+        self._schedule_topic.publish(serialised_trajectory(schedule, stamp, base.base_link))
+        self._path_topic.publish(path_message(schedule.path, stamp, frame))
+        shapes = base.links[0].shapes
+        self._markers_topic.publish(goal_markers(schedule.goal, schedule.path, shapes, frame))
 
 
 def main() -> None:

@@ -86,6 +86,11 @@ class PlannerConfig(BelievedRobotConfig):
     options: Mapping[str, Any] = registered(METHODS)
 
     @property
+    def control_period(self) -> float:
+        """How long a command is held, s: a whole number of nanoseconds."""
+        return round(1e9 / self.tick_rate) / 1e9
+
+    @property
     def tolerance(self) -> Tolerance:
         """How near to the goal is near enough."""
         return Tolerance(self.position_tolerance, self.attitude_tolerance, self.joint_tolerance)

@@ -1,0 +1,731 @@
+"""What becomes of the goals of a planner: an explicit state machine, free of ROS.
+
+A node gives it goals (:meth:`Executive.propose`) and measured states (:meth:`Executive.update`),
+and gets a setpoint for every state and outputs to publish (:meth:`Executive.take_outputs`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import NamedTuple, Protocol
+
+from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.goal import POSE, Controlled, PoseError, RobotState
+from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.core.schedule import GaitSchedule
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.state_average import StateAverage
+from spacerobot_ros.planning.execution.status import (
+    PlannerState,
+    PlannerStatistics,
+    PlannerStatus,
+    goal_values,
+    remaining_error,
+)
+from spacerobot_ros.planning.execution.tracker import Setpoint, TrackingError, TrajectoryTracker
+from spacerobot_ros.planning.execution.worker import (
+    Braking,
+    Planned,
+    PlanningTask,
+    PlanningWorker,
+    Refused,
+    Worker,
+)
+
+
+class Phase(Enum):
+    """What an executive is doing."""
+
+    IDLE = "idle"
+    """There is no goal; the joints rest."""
+
+    MEASURING = "measuring"
+    """A new goal waits for measured states to plan from; the joints rest."""
+
+    PLANNING = "planning"
+    """A plan is being made."""
+
+    EXECUTING = "executing"
+    """A schedule is tracked."""
+
+    BRAKING = "braking"
+    """The joints brake along the planned path."""
+
+    EVALUATING = "evaluating"
+    """A schedule has ended; measured states are compared with the goal. The joints rest."""
+
+
+class Event(Enum):
+    """Why the phase of an executive changes."""
+
+    NEW_GOAL = "new goal"
+    """There is a new goal to plan for."""
+
+    PLAN_REQUESTED = "plan requested"
+    """The measured state is known, and a plan from it is requested (:class:`PlanReason`)."""
+
+    PLANNED = "planned"
+    """The plan is there."""
+
+    REFUSED = "refused"
+    """There is no plan, for a reason."""
+
+    SCHEDULE_ENDED = "schedule ended"
+    """The schedule that was tracked is over."""
+
+    AT_REST = "at rest"
+    """The braking is over."""
+
+    TRACKING_ERROR = "tracking error"
+    """The base is off its predicted path, and plans are made from rest."""
+
+    JOINTS_STUCK = "joints stuck"
+    """Joints do not follow."""
+
+    REACHED = "reached"
+    """The goal is reached within tolerance."""
+
+    FAILED = "failed"
+    """The goal is not reached, and no correction is left or the measured state is not finite."""
+
+    ABORTED = "aborted"
+    """The goal is given up on request."""
+
+    DEACTIVATED = "deactivated"
+    """Everything is given up at once."""
+
+
+class Transition(NamedTuple):
+    """A change of phase, and why."""
+
+    source: Phase
+    event: Event
+    target: Phase
+
+
+_TABLE: dict[tuple[Phase, Event], tuple[Phase, ...]] = {
+    (Phase.IDLE, Event.NEW_GOAL): (Phase.MEASURING,),
+    (Phase.MEASURING, Event.NEW_GOAL): (Phase.MEASURING,),
+    (Phase.MEASURING, Event.PLAN_REQUESTED): (Phase.PLANNING,),
+    (Phase.MEASURING, Event.ABORTED): (Phase.IDLE,),
+    (Phase.PLANNING, Event.PLANNED): (Phase.EXECUTING,),
+    (Phase.PLANNING, Event.REFUSED): (
+        *(Phase.IDLE, Phase.MEASURING, Phase.EXECUTING, Phase.BRAKING, Phase.EVALUATING),
+    ),
+    (Phase.PLANNING, Event.ABORTED): (Phase.IDLE,),
+    (Phase.EXECUTING, Event.NEW_GOAL): (Phase.BRAKING,),
+    (Phase.EXECUTING, Event.PLAN_REQUESTED): (Phase.PLANNING,),
+    (Phase.EXECUTING, Event.SCHEDULE_ENDED): (Phase.EVALUATING, Phase.MEASURING),
+    (Phase.EXECUTING, Event.TRACKING_ERROR): (Phase.BRAKING,),
+    (Phase.EXECUTING, Event.JOINTS_STUCK): (Phase.EVALUATING, Phase.MEASURING),
+    (Phase.EXECUTING, Event.ABORTED): (Phase.BRAKING,),
+    (Phase.BRAKING, Event.PLAN_REQUESTED): (Phase.PLANNING,),
+    (Phase.BRAKING, Event.AT_REST): (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING),
+    (Phase.BRAKING, Event.JOINTS_STUCK): (Phase.EVALUATING, Phase.MEASURING),
+    (Phase.BRAKING, Event.ABORTED): (Phase.BRAKING,),
+    (Phase.EVALUATING, Event.NEW_GOAL): (Phase.MEASURING,),
+    (Phase.EVALUATING, Event.PLAN_REQUESTED): (Phase.PLANNING,),
+    (Phase.EVALUATING, Event.REACHED): (Phase.IDLE,),
+    (Phase.EVALUATING, Event.FAILED): (Phase.IDLE,),
+    (Phase.EVALUATING, Event.ABORTED): (Phase.IDLE,),
+    **{(phase, Event.DEACTIVATED): (Phase.IDLE,) for phase in Phase},
+}
+
+TRANSITIONS: frozenset[Transition] = frozenset(
+    Transition(source, event, target)
+    for (source, event), targets in _TABLE.items()
+    for target in targets
+)
+"""Every transition that is allowed; ``docs/planner_state_machine.md`` shows them."""
+
+
+class IllegalTransitionError(RuntimeError):
+    """A defect: a transition that the table does not allow."""
+
+
+class PlanReason(Enum):
+    """Why a plan was requested."""
+
+    NEW_GOAL = "new goal"
+    """A goal, from rest."""
+
+    BLEND = "blend"
+    """A goal while the joints move: they brake along the planned path first."""
+
+    CORRECTION = "correction"
+    """The schedule has ended, and the goal is not reached."""
+
+    CONTINUATION = "continuation"
+    """The schedule was partial on purpose: this is its next piece."""
+
+    TRACKING_ERROR = "tracking error"
+    """The base is off its predicted path; the joints brake along that path first."""
+
+    REPLAN = "replan"
+    """The schedule was braked: off its path, or for a new goal that was refused then."""
+
+    STUCK_JOINTS = "stuck joints"
+    """Joints do not follow; the plan is made with the others."""
+
+
+class Severity(Enum):
+    """How grave a notice is."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A sentence for the log."""
+
+    severity: Severity
+    sentence: str
+
+
+@dataclass(frozen=True)
+class ScheduleStart:
+    """A schedule that is tracked from a stamp on, ns."""
+
+    schedule: GaitSchedule
+    stamp_ns: int
+
+
+Output = PlannerStatus | ScheduleStart | Notice | Transition
+"""What an executive hands out beside setpoints, in order."""
+
+
+class BaseMeasurement(NamedTuple):
+    """The rest of a measured state: ``pose`` (7,), ``twist`` (6,) of the base, ``qdot`` (n,)."""
+
+    pose: Array
+    twist: Array
+    qdot: Array
+
+
+class MeasuredState(Protocol):
+    """A measured state: the joints always, the base where it is measured at the same time."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """When it was measured, ns."""
+
+    @property
+    def q(self) -> Array:
+        """Shape (n,), m or rad."""
+
+    def base(self) -> BaseMeasurement | None:
+        """Return the rest of the state; None where the base was not measured with the joints."""
+
+
+@dataclass
+class _Pursuit:
+    """A goal that was accepted, and what was done for it so far."""
+
+    identified: IdentifiedGoal
+    schedule: GaitSchedule
+    """The schedule that was executed last."""
+    corrections: int = 0
+    manoeuvre_time: float = 0.0
+    """Duration of all its schedules, s."""
+    ends_at: float = 0.0
+    """Simulated time at which the last one ends, s."""
+    next_plan: PlanReason = PlanReason.CORRECTION
+    """Why the next plan is made, if one has to be."""
+    stuck_at: dict[str, float] | None = field(default_factory=dict)
+    """Where the stuck joints are; None: to be measured."""
+    required: frozenset[Controlled] = frozenset()
+    """Parts of the goal that plans without the stuck joints must control."""
+
+
+@dataclass(frozen=True)
+class _Ticket:
+    """A plan that was requested: what for and why, and how far the robot was from the goal."""
+
+    identified: IdentifiedGoal
+    reason: PlanReason
+    tracking_error: TrackingError | None = None
+    remaining: PoseError | None = None
+
+
+class Executive:
+    """Brings one robot to one goal after the other, and answers every state with a setpoint.
+
+    With a worker that plans at once, the measured state waits for its plan, and a plan that is
+    requested while the joints move begins with their braking. With one that plans in the
+    background, the joints brake to rest before a plan is requested, and hold their shape until it
+    is there.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    config
+        Of the planner.
+    worker
+        Makes the plans; None: a :class:`PlanningWorker`.
+    goal_file
+        Where the present goal is saved; None: nowhere.
+
+    Raises
+    ------
+    ParameterError
+        An option of the gait method does not go with the robot or with another option.
+    """
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        config: PlannerConfig,
+        worker: Worker | None = None,
+        goal_file: GoalFile | None = None,
+    ) -> None:
+        self._robot, self.config = robot, config
+        """``config`` may be replaced: tolerances and corrections then apply from now on."""
+        self._worker = worker or PlanningWorker(robot, config)
+        self._file = goal_file or GoalFile("")
+        self._average = StateAverage(robot, config.averaging, config.rest_tolerance)
+        self._tracker = TrajectoryTracker(robot, config)
+        self._phase = Phase.IDLE
+        self._proposed: IdentifiedGoal | None = None
+        """A goal that is to be planned for."""
+        self._ticket: _Ticket | None = None
+        """The plan that is being made."""
+        self._pursuit: _Pursuit | None = None
+        """The goal that is executed or evaluated."""
+        self._outputs: list[Output] = []
+        self._plan_time, self._plans, self._commands = 0.0, 0, 0
+        self._stamp_ns = 0
+
+    @property
+    def phase(self) -> Phase:
+        """What is being done."""
+        return self._phase
+
+    @property
+    def setpoint(self) -> Setpoint:
+        """What :meth:`update` returns every time; its arrays stay in place."""
+        return self._tracker.setpoint
+
+    @property
+    def measuring(self) -> bool:
+        """Whether a base that is measured now will be planned from, or evaluated."""
+        return self._proposed is not None or self._phase is Phase.EVALUATING
+
+    @property
+    def statistics(self) -> PlannerStatistics:
+        """What was done so far."""
+        return PlannerStatistics(self._plan_time, self._plans, self._commands)
+
+    def take_outputs(self) -> Sequence[Output]:
+        """Return what is to be published since the last call, in order."""
+        if not self._outputs:
+            return ()
+        outputs, self._outputs = self._outputs, []
+        return outputs
+
+    # -- what comes from outside --------------------------------------------------------------
+
+    def propose(self, identified: IdentifiedGoal) -> None:
+        """Plan for a goal from the states that are measured next; it replaces any other."""
+        self._proposed = identified
+        self._average.restart()
+        if self._phase in (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING):
+            self._go(Event.NEW_GOAL, Phase.MEASURING)
+
+    def abort(self) -> str | None:
+        """Give up all goals and come to rest.
+
+        Returns what the joints do then, as a sentence; None where nothing was done for any goal.
+        """
+        goal_id, sentence = self._goal_id(), "The joints rest."
+        self._file.delete()
+        match self._phase:
+            case Phase.IDLE:
+                return None
+            case Phase.EXECUTING | Phase.BRAKING:
+                self._tracker.brake(self._stamp_ns)
+                duration = self.config.abort_time
+                sentence = f"The joints brake along the planned path within {duration:g} s."
+                self._go(Event.ABORTED, Phase.BRAKING)
+            case Phase.MEASURING | Phase.PLANNING | Phase.EVALUATING:
+                waits_only = self._phase is Phase.MEASURING and self._pursuit is None
+                self._go(Event.ABORTED, Phase.IDLE)
+                if waits_only:
+                    self._proposed = None
+                    return None
+                self._worker.cancel()
+        self._proposed = self._ticket = self._pursuit = None
+        self._outputs.append(
+            PlannerStatus(PlannerState.ABORTED, f"Aborted on request. {sentence}", goal_id=goal_id)
+        )
+        return sentence
+
+    def stop(self) -> None:
+        """Give up everything at once and wait for the worker to end; the goal file stays."""
+        self._tracker.stop()
+        self._worker.close()
+        self._proposed = self._ticket = self._pursuit = None
+        self._go(Event.DEACTIVATED, Phase.IDLE)
+
+    def observe(self, measured: MeasuredState) -> None:
+        """Take note of a base that was measured for a state after it was answered."""
+        if self.measuring:
+            if self._tracker.active:
+                # Of a robot that moves only the last state counts.
+                self._average.restart()
+            self._add(measured)
+
+    def update(self, measured: MeasuredState) -> Setpoint:
+        """Return the setpoint for a measured state; see :attr:`setpoint`."""
+        stamp, q, tracker = measured.stamp_ns, measured.q, self._tracker
+        self._stamp_ns = stamp
+        if tracker.ended(stamp, q):
+            self._on_end()
+        match self._phase:
+            case Phase.PLANNING:
+                self._take_result()
+            case Phase.MEASURING | Phase.EVALUATING:
+                self._measure_at_rest(measured)
+            case Phase.EXECUTING | Phase.BRAKING if self._proposed is not None:
+                self._measure_in_motion(measured)
+            case Phase.EXECUTING if tracker.check_due(stamp):
+                self._check_tracking(measured)
+        if tracker.active:
+            stuck = tracker.track(stamp, q)
+            if stuck and self._pursuit is not None:
+                self._on_stuck(stuck)
+        if not tracker.active:
+            tracker.hold(q)
+        self._commands += 1
+        return tracker.setpoint
+
+    # -- measuring ----------------------------------------------------------------------------
+
+    def _add(self, measured: MeasuredState) -> bool:
+        """Add a state to the average; return whether its base was measured."""
+        base = measured.base()
+        if base is None:
+            return False
+        self._average.add(base.pose, base.twist, measured.q, base.qdot)
+        return True
+
+    def _measure_at_rest(self, measured: MeasuredState) -> None:
+        """Plan for a new goal, or evaluate the present one, once the state is known."""
+        if self._worker.busy:
+            # A plan that was cancelled has yet to end: it uses the functions of the robot.
+            self._worker.poll()
+            return
+        self._add(measured)
+        if not self._average.complete:
+            return
+        if self._phase is Phase.MEASURING:
+            self._plan_for_new_goal()
+        # Where that was refused the state is still known, unless it took time.
+        if self._phase is Phase.EVALUATING:
+            self._evaluate()
+        self._average.restart()
+
+    def _measure_in_motion(self, measured: MeasuredState) -> None:
+        """Plan for a new goal from the state now, or from rest if the plan will take time."""
+        if self._worker.background:
+            if self._phase is Phase.EXECUTING:
+                self._brake_for_replan(Event.NEW_GOAL)
+            return
+        base = measured.base()
+        if base is not None:
+            self._average.restart()
+            self._average.add(base.pose, base.twist, measured.q, base.qdot)
+        if self._average.count:
+            self._plan_for_new_goal()
+            self._average.restart()
+
+    def _check_tracking(self, measured: MeasuredState) -> None:
+        """Plan again when the base is too far off the path that was predicted."""
+        pursuit = self._pursuit
+        assert pursuit is not None
+        self._average.restart()
+        if pursuit.corrections >= self.config.max_corrections or not self._add(measured):
+            return
+        try:
+            state = self._average.state()
+        except PlanningError as reason:
+            self._notice(Severity.WARNING, f"The path is not known: {reason}")
+            return
+        error = self._tracker.error(state)
+        if error is None:
+            return
+        if self._worker.background:
+            self._correct_tracking(pursuit, error)
+            self._brake_for_replan(Event.TRACKING_ERROR)
+        else:
+            ticket = _Ticket(pursuit.identified, PlanReason.TRACKING_ERROR, tracking_error=error)
+            self._request(ticket, state)
+
+    def _correct_tracking(self, pursuit: _Pursuit, error: TrackingError) -> None:
+        pursuit.corrections += 1
+        self._notice(Severity.WARNING, f"{error}: the remaining motion is planned again.")
+
+    # -- planning -----------------------------------------------------------------------------
+
+    def _plan_for_new_goal(self) -> None:
+        assert self._proposed is not None
+        reason = PlanReason.BLEND if self._tracker.active else PlanReason.NEW_GOAL
+        ticket = _Ticket(self._proposed, reason)
+        self._proposed = None
+        self._plan_time, self._plans = 0.0, 0
+        try:
+            state = self._average.state()
+        except PlanningError as refusal:
+            self._go(Event.PLAN_REQUESTED, Phase.PLANNING)
+            self._conclude_plan(ticket, Refused(str(refusal)))
+        else:
+            self._request(ticket, state)
+
+    def _request(self, ticket: _Ticket, state: RobotState) -> None:
+        """Have a plan made from a measured state; what is tracked brakes first."""
+        follower = self._tracker.braked(self._stamp_ns)
+        pursuit = self._pursuit
+        if ticket.reason in (PlanReason.NEW_GOAL, PlanReason.BLEND):
+            pursuit = None
+        stuck = self._stuck_at(pursuit, state)
+        request = PlanRequest(
+            state,
+            ticket.identified.goal,
+            self.config.tolerance,
+            correction=ticket.reason in (PlanReason.CORRECTION, PlanReason.CONTINUATION),
+            previous=None if pursuit is None else pursuit.schedule,
+        )
+        self._ticket = ticket
+        self._go(Event.PLAN_REQUESTED, Phase.PLANNING)
+        self._worker.submit(
+            PlanningTask(
+                request,
+                stuck,
+                frozenset() if pursuit is None else pursuit.required,
+                None if follower is None else Braking(follower, self._stamp_ns),
+            )
+        )
+        self._take_result()
+
+    def _stuck_at(self, pursuit: _Pursuit | None, state: RobotState) -> dict[str, float]:
+        """Return where the joints are that the present goal is pursued without."""
+        if pursuit is None:
+            return {}
+        if pursuit.stuck_at is None:
+            names = self._robot.joint_names
+            pursuit.stuck_at = {names[i]: float(state.q[i]) for i in self._tracker.stuck}
+        return pursuit.stuck_at
+
+    def _take_result(self) -> None:
+        """Act on the result of the plan that is being made, if it is there."""
+        result = self._worker.poll()
+        if result is None:
+            return
+        ticket, self._ticket = self._ticket, None
+        assert ticket is not None
+        self._plan_time += result.wall_time
+        self._plans += 1
+        self._notice(Severity.INFO, PLANNED.format(result.wall_time))
+        self._conclude_plan(ticket, result)
+
+    def _conclude_plan(self, ticket: _Ticket, result: Planned | Refused) -> None:
+        """Execute a plan, or say why there is none: it depends on why it was requested."""
+        pursuit = self._pursuit
+        match ticket.reason, result:
+            case PlanReason.NEW_GOAL | PlanReason.BLEND, Planned(schedule=schedule):
+                self._accept(_Pursuit(ticket.identified, schedule))
+                self._execute(schedule)
+            case PlanReason.NEW_GOAL | PlanReason.BLEND, Refused(reason=reason):
+                earlier = " The earlier goal is still pursued." if pursuit is not None else ""
+                self._report(PlannerState.REFUSED, f"{reason}{earlier}", ticket.identified)
+                self._go(Event.REFUSED, self._phase_without_plan())
+            case PlanReason.TRACKING_ERROR, Planned(schedule=schedule):
+                assert pursuit is not None
+                assert ticket.tracking_error is not None
+                self._correct_tracking(pursuit, ticket.tracking_error)
+                self._execute(schedule)
+            case PlanReason.TRACKING_ERROR, Refused(reason=reason):
+                self._notice(
+                    Severity.WARNING,
+                    f"{ticket.tracking_error}, and the remaining motion cannot be planned again: "
+                    f"{reason}",
+                )
+                self._go(Event.REFUSED, self._phase_without_plan())
+            # CORRECTION, CONTINUATION, REPLAN, STUCK_JOINTS: what remains after a schedule.
+            case _, Planned(schedule=schedule):
+                self._execute(schedule, ticket.remaining)
+            case _, Refused(reason=reason):
+                assert ticket.remaining is not None
+                self._fail(ticket.remaining, f", and {reason}", Event.REFUSED)
+
+    def _phase_without_plan(self) -> Phase:
+        """Return what is done where there is no plan."""
+        if self._tracker.active:
+            return Phase.BRAKING if self._tracker.braking else Phase.EXECUTING
+        return self._phase_at_rest()
+
+    def _phase_at_rest(self) -> Phase:
+        """Return what is done when the joints have come to rest."""
+        if self._proposed is not None:
+            return Phase.MEASURING
+        return Phase.IDLE if self._pursuit is None else Phase.EVALUATING
+
+    # -- executing ----------------------------------------------------------------------------
+
+    def _accept(self, pursuit: _Pursuit) -> None:
+        """Pursue a new goal, with all joints."""
+        self._pursuit, self._tracker.stuck = pursuit, []
+        try:
+            self._file.save({BASE: pursuit.identified})
+        except ParameterError as error:
+            self._notice(Severity.ERROR, f"{error} The goal is pursued, but would not be resumed.")
+
+    def _execute(self, schedule: GaitSchedule, remaining: PoseError | None = None) -> None:
+        """Track a schedule for the present goal; ``remaining`` is where it begins from."""
+        pursuit = self._pursuit
+        assert pursuit is not None
+        self._tracker.start(schedule, self._stamp_ns)
+        pursuit.schedule = schedule
+        pursuit.manoeuvre_time += schedule.duration
+        pursuit.ends_at = self._stamp_ns / 1e9 + schedule.duration
+        pursuit.next_plan = PlanReason.CONTINUATION if schedule.partial else PlanReason.CORRECTION
+        self._go(Event.PLANNED, Phase.EXECUTING)
+        self._report(
+            PlannerState.EXECUTING,
+            f"Executing a {schedule.method} gait of {schedule.duration:.6g} s.",
+            pursuit.identified,
+            pursuit,
+            remaining,
+            schedule,
+        )
+        self._outputs.append(ScheduleStart(schedule, self._stamp_ns))
+
+    def _brake_for_replan(self, event: Event) -> None:
+        """Come to rest along the planned path: in the background plans are made from rest."""
+        assert self._pursuit is not None
+        self._pursuit.next_plan = PlanReason.REPLAN
+        self._tracker.brake(self._stamp_ns)
+        self._average.restart()
+        self._go(event, Phase.BRAKING)
+
+    def _on_end(self) -> None:
+        """End what was tracked; its result is evaluated unless its goal was given up."""
+        at_rest = self._phase is Phase.BRAKING
+        self._tracker.stop(at_last_shape=not at_rest)
+        self._average.restart()
+        self._go(Event.AT_REST if at_rest else Event.SCHEDULE_ENDED, self._phase_at_rest())
+
+    def _on_stuck(self, stuck: Sequence[int]) -> None:
+        """Stop, and plan the remaining motion with the joints that are not stuck."""
+        pursuit, tracker = self._pursuit, self._tracker
+        assert pursuit is not None
+        tracker.stuck += stuck
+        tracker.stop()
+        pursuit.stuck_at = None
+        pursuit.required = pursuit.schedule.controls & POSE
+        pursuit.next_plan = PlanReason.STUCK_JOINTS
+        self._average.restart()
+        self._go(Event.JOINTS_STUCK, self._phase_at_rest())
+        names = ", ".join(self._robot.joint_names[i] for i in tracker.stuck)
+        self._notice(Severity.WARNING, f"Stuck: {names}. The remaining motion is planned without.")
+
+    # -- evaluating ---------------------------------------------------------------------------
+
+    def _evaluate(self) -> None:
+        """Compare the measured pose with the goal; plan the remaining motion, or be done."""
+        pursuit = self._pursuit
+        assert pursuit is not None
+        goal, controls = pursuit.identified.goal, pursuit.schedule.controls
+        try:
+            state = self._average.state()
+        except PlanningError as reason:
+            self._report(PlannerState.FAILED, str(reason), pursuit.identified)
+            self._forget_pursuit(Event.FAILED)
+            return
+        error = PoseError.between(state.position, state.quaternion, goal, state.q)
+        if self.config.tolerance.admits(error, controls):
+            sentence = f"The goal is reached: {remaining_error(error, controls)}."
+            self._report(PlannerState.REACHED, sentence, pursuit.identified, pursuit, error)
+            self._forget_pursuit(Event.REACHED)
+            return
+        if pursuit.next_plan is PlanReason.CORRECTION:
+            if pursuit.corrections >= self.config.max_corrections:
+                self._fail(error, f" after {pursuit.corrections} correction(s).", Event.FAILED)
+                return
+            pursuit.corrections += 1
+        self._request(_Ticket(pursuit.identified, pursuit.next_plan, remaining=error), state)
+
+    def _fail(self, remaining: PoseError, why: str, event: Event) -> None:
+        """Report that the present goal is not reached; ``why`` ends the sentence."""
+        pursuit = self._pursuit
+        assert pursuit is not None
+        where = remaining_error(remaining, pursuit.schedule.controls)
+        sentence = f"The goal is not reached: {where}{why}"
+        self._report(PlannerState.FAILED, sentence, pursuit.identified, pursuit, remaining)
+        self._forget_pursuit(event)
+
+    def _forget_pursuit(self, event: Event) -> None:
+        """Be done with the present goal: nothing is to be resumed."""
+        self._file.delete()
+        self._pursuit = None
+        self._go(event, self._phase_at_rest())
+
+    # -- outputs ------------------------------------------------------------------------------
+
+    def _go(self, event: Event, target: Phase) -> None:
+        """Change the phase; every change comes through here."""
+        transition = Transition(self._phase, event, target)
+        if transition not in TRANSITIONS:
+            raise IllegalTransitionError(
+                f"{self._phase.name} may not become {target.name} by {event.name}."
+            )
+        self._phase = target
+        self._outputs.append(transition)
+
+    def _notice(self, severity: Severity, sentence: str) -> None:
+        self._outputs.append(Notice(severity, sentence))
+
+    def _report(
+        self,
+        state: PlannerState,
+        sentence: str,
+        identified: IdentifiedGoal,
+        pursuit: _Pursuit | None = None,
+        remaining: PoseError | None = None,
+        schedule: GaitSchedule | None = None,
+    ) -> None:
+        """Report on a goal: with what its pursuit has taken, its error, and its schedule."""
+        self._outputs.append(
+            PlannerStatus(
+                state,
+                sentence,
+                goal_id=identified.goal_id,
+                goal=goal_values(identified.goal),
+                corrections=0 if pursuit is None else pursuit.corrections,
+                position_error_m=None if remaining is None else remaining.distance,
+                attitude_error_rad=None if remaining is None else remaining.angle,
+                manoeuvre_time_s=0.0 if pursuit is None else pursuit.manoeuvre_time,
+                ends_at_s=0.0 if pursuit is None else pursuit.ends_at,
+                method="" if schedule is None else schedule.method,
+                duration_s=0.0 if schedule is None else schedule.duration,
+                notes={} if schedule is None else schedule.notes,
+            )
+        )
+
+    def _goal_id(self) -> str:
+        """Return the id of the latest goal, empty where there is none."""
+        if self._proposed is not None:
+            return self._proposed.goal_id
+        current = self._ticket or self._pursuit
+        return "" if current is None else current.identified.goal_id
+
+
+PLANNED = "Planned in {:.6f} s."
+"""What is logged of every plan."""

@@ -1,0 +1,297 @@
+"""Tracks schedules: from a schedule and the measured shape to the setpoint of every tick."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import attitude_error
+from spacerobot_ros.planning.core.goal import RobotState
+from spacerobot_ros.planning.core.schedule import GaitSchedule
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.stuck_joints import StuckJointWatch
+
+_AT_END = 1e-6
+"""A schedule has ended when every joint is this near its last position, m or rad."""
+
+_LONGEST_SETTLING = 5.0
+"""... or this long after its last tick, s."""
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """What the joints are commanded; the arrays are the tracker's own and change in place.
+
+    ``position`` (n,) is the wanted shape now, in m or rad, ``velocity`` (n,) what is held until the
+    next tick, in m/s or rad/s.
+    """
+
+    position: Array
+    velocity: Array
+
+
+@dataclass(frozen=True)
+class TrackingError:
+    """How far the base is off the path that its schedule predicts: m, rad."""
+
+    distance: float
+    angle: float
+
+    def __str__(self) -> str:
+        return f"Off the path by {self.distance:.3g} m and {self.angle:.3g} rad"
+
+
+class ScheduleFollower:
+    """Follows one schedule by its stamps, so that a missed tick delays nothing that follows.
+
+    Parameters
+    ----------
+    schedule
+        What to follow.
+    start_ns
+        Stamp of its first tick, ns.
+    shape_gain
+        Feedback from shape error to velocity, 1/s; it makes up for what the plant did not do.
+    deadband
+        Shape errors up to this are noise and not fed back, m or rad.
+    """
+
+    def __init__(
+        self, schedule: GaitSchedule, start_ns: int, shape_gain: float, deadband: float = 0.0
+    ) -> None:
+        self.schedule = schedule
+        self._start_ns = start_ns
+        self._period_ns = round(schedule.control_period * 1e9)
+        self._last_tick = schedule.ticks
+        self._end_ns = start_ns + self._last_tick * self._period_ns
+        self._gain = min(shape_gain, 1.0 / schedule.control_period)
+        self._positions = schedule.positions
+        # At rest after the last tick. The part of the feedback that is known beforehand is added
+        # here: qdot = qdot_k + gain (q_k - q), and q alone is measured.
+        velocities = np.vstack([schedule.velocities, np.zeros(len(schedule.joint_names))])
+        self._feedforward = velocities + self._gain * self._positions
+        self._velocities, self._deadband = velocities, deadband
+
+    def ended(self, stamp_ns: int, q: Array) -> bool:
+        """Whether the schedule is over and the shape ``q`` (n,) has reached its end."""
+        late = stamp_ns - self._end_ns
+        if late < 0:
+            return False
+        far = np.abs(self._positions[-1] - q).max(initial=0.0) > max(_AT_END, self._deadband)
+        return not far or late > _LONGEST_SETTLING * 1e9
+
+    def braking(self, stamp_ns: int, duration: float) -> BrakingFollower:
+        """Return what brakes along this schedule to rest within ``duration`` s from now."""
+        return BrakingFollower(self.schedule, self._start_ns, stamp_ns, duration, self._gain)
+
+    def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
+        """Write the wanted shape now (n,) and the velocities to hold from now (n,)."""
+        k = (stamp_ns - self._start_ns) // self._period_ns
+        k = 0 if k < 0 else min(k, self._last_tick)
+        position[:] = self._positions[k]
+        if self._deadband:
+            error = position - q
+            error -= np.clip(error, -self._deadband, self._deadband)
+            velocity[:] = self._velocities[k] + self._gain * error
+            return
+        np.multiply(q, -self._gain, out=velocity)
+        velocity += self._feedforward[k]
+
+
+class BrakingFollower:
+    """Continues along a schedule ever more slowly, to rest on its path.
+
+    The gait's time runs at the rate ``1 - t/T``: the shape stays on the gait's path, and so does
+    the base, which at zero momentum follows the path of the shape and not its speed.
+
+    Parameters
+    ----------
+    schedule
+        What was followed.
+    start_ns
+        Stamp of its first tick, ns.
+    stamp_ns
+        When the braking begins, ns.
+    duration
+        T, s; the gait continues for half of it.
+    shape_gain
+        Feedback from shape error to velocity, 1/s.
+    """
+
+    def __init__(
+        self,
+        schedule: GaitSchedule,
+        start_ns: int,
+        stamp_ns: int,
+        duration: float,
+        shape_gain: float,
+    ) -> None:
+        self.schedule = schedule
+        self._begin = (stamp_ns - start_ns) / 1e9
+        self._stamp_ns, self._duration = stamp_ns, duration
+        self._gain = min(shape_gain, 1.0 / schedule.control_period)
+
+    def ended(self, stamp_ns: int, q: Array) -> bool:
+        """Whether the shape is at rest."""
+        return (stamp_ns - self._stamp_ns) / 1e9 >= self._duration
+
+    def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
+        """Write the wanted shape now (n,) and the velocities to hold from now (n,)."""
+        since = (stamp_ns - self._stamp_ns) / 1e9
+        position[:] = self._shape(since)
+        tick = self.schedule.control_period
+        velocity[:] = (self._shape(since + tick) - position) / tick + self._gain * (position - q)
+
+    def shapes(self, stamp_ns: int) -> Array:
+        """Return the wanted shapes (N + 1, n) at the ticks from now until the rest."""
+        tick = self.schedule.control_period
+        since = (stamp_ns - self._stamp_ns) / 1e9
+        ticks = max(1, math.ceil((self._duration - since) / tick - 1e-9))
+        return np.array([self._shape(since + k * tick) for k in range(ticks + 1)])
+
+    def _shape(self, since: float) -> Array:
+        tau = min(since / self._duration, 1.0)
+        ticks = (self._begin + self._duration * (tau - tau**2 / 2)) / self.schedule.control_period
+        positions = self.schedule.positions
+        k = min(max(int(ticks), 0), len(positions) - 1)
+        ahead = positions[min(k + 1, len(positions) - 1)] - positions[k]
+        return np.asarray(positions[k] + (ticks - k) * ahead)
+
+
+class TrackingErrorCheck:
+    """Compares measured poses with a predicted base path, at the path's own instants.
+
+    Parameters
+    ----------
+    schedule
+        What is tracked.
+    start_ns
+        Stamp of its first tick, ns.
+    position, attitude
+        Largest distance and angle that are near enough, m and rad; 0: any.
+    """
+
+    def __init__(
+        self, schedule: GaitSchedule, start_ns: int, position: float, attitude: float
+    ) -> None:
+        self._path = schedule.path
+        self._position, self._attitude = position or np.inf, attitude or np.inf
+        self._stamps = start_ns + (schedule.path.time * 1e9).round().astype(np.int64)
+        self._slack = round(schedule.control_period * 0.5e9)
+        self._next = 0
+        self._used = position > 0 or attitude > 0
+
+    def due(self, stamp_ns: int) -> bool:
+        """Whether the path predicts a pose for this time."""
+        if not self._used:
+            return False
+        stamps = self._stamps
+        while self._next < len(stamps) and stamps[self._next] < stamp_ns - self._slack:
+            self._next += 1
+        return self._next < len(stamps) and stamps[self._next] <= stamp_ns + self._slack
+
+    def error(self, position: Array, quaternion: Array) -> TrackingError | None:
+        """Return the tracking error of a pose that is due, None if it is small enough."""
+        k = self._next
+        turn = attitude_error(quaternion, self._path.quaternion[k])
+        distance = float(np.linalg.norm(position - self._path.position[k]))
+        angle = float(np.linalg.norm(turn))
+        too_far = distance > self._position or angle > self._attitude
+        return TrackingError(distance, angle) if too_far else None
+
+
+class TrajectoryTracker:
+    """Tracks one schedule after the other, and holds the shape in between.
+
+    Parameters
+    ----------
+    robot
+        Whose joints are commanded.
+    config
+        Of the planner.
+    """
+
+    def __init__(self, robot: SpaceRobot, config: PlannerConfig) -> None:
+        self.setpoint = Setpoint(np.zeros(robot.n), np.zeros(robot.n))
+        self.stuck: list[int] = []
+        """Joints that do not follow; they are commanded to rest."""
+        self._config = config
+        # A controller closes its own loop round the reference.
+        self._commands_plant = config.output == "commands"
+        self._follower: ScheduleFollower | BrakingFollower | None = None
+        self._holding = False
+        """Whether the position of the setpoint is the shape to hold."""
+        band = 2 * config.shape_deadband
+        self._watch = StuckJointWatch(robot.n, config.stuck_ticks, config.control_period, band)
+
+    @property
+    def active(self) -> bool:
+        """Whether a schedule is tracked, or braked along."""
+        return self._follower is not None
+
+    @property
+    def braking(self) -> bool:
+        """Whether the joints brake along a schedule."""
+        return isinstance(self._follower, BrakingFollower)
+
+    def start(self, schedule: GaitSchedule, stamp_ns: int) -> None:
+        """Track a schedule from now on."""
+        config = self._config
+        gain = config.shape_gain if self._commands_plant else 0.0
+        self._follower = ScheduleFollower(schedule, stamp_ns, gain, config.shape_deadband)
+        self._check = TrackingErrorCheck(
+            schedule, stamp_ns, config.drift_position, config.drift_attitude
+        )
+        self._watch.restart()
+
+    def braked(self, stamp_ns: int) -> BrakingFollower | None:
+        """Return how the joints would brake from now on; None where they rest."""
+        if isinstance(self._follower, ScheduleFollower):
+            return self._follower.braking(stamp_ns, self._config.abort_time)
+        return self._follower
+
+    def brake(self, stamp_ns: int) -> None:
+        """Brake along the planned path from now on."""
+        self._follower = self.braked(stamp_ns)
+
+    def ended(self, stamp_ns: int, q: Array) -> bool:
+        """Whether the schedule is over, or the braking."""
+        return self._follower is not None and self._follower.ended(stamp_ns, q)
+
+    def stop(self, *, at_last_shape: bool = False) -> None:
+        """Track nothing more; hold the schedule's last shape, or the one that is measured next."""
+        if at_last_shape and isinstance(self._follower, ScheduleFollower):
+            self.setpoint.position[:] = self._follower.schedule.positions[-1]
+            self._holding = True
+        else:
+            self._holding = False
+        self._follower = None
+
+    def check_due(self, stamp_ns: int) -> bool:
+        """Whether the pose at this time is to be compared with the predicted one."""
+        return isinstance(self._follower, ScheduleFollower) and self._check.due(stamp_ns)
+
+    def error(self, state: RobotState) -> TrackingError | None:
+        """Return the tracking error of a state that is due, None if it is small enough."""
+        return self._check.error(state.position, state.quaternion)
+
+    def track(self, stamp_ns: int, q: Array) -> list[int]:
+        """Write the setpoint for the shape ``q`` (n,) now; return which joints are found stuck."""
+        assert self._follower is not None
+        position, velocity = self.setpoint.position, self.setpoint.velocity
+        self._follower.command(stamp_ns, q, position, velocity)
+        if self.stuck:
+            velocity[self.stuck] = 0.0
+        return self._watch.look(q, position, velocity)
+
+    def hold(self, q: Array) -> None:
+        """Write the setpoint that keeps the shape, where nothing is tracked."""
+        # A reference must stay where it is; a plant makes rest of the shape that it has.
+        if self._commands_plant or not self._holding:
+            self.setpoint.position[:] = q
+            self._holding = True
+        self.setpoint.velocity[:] = 0.0

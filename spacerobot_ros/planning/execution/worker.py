@@ -1,0 +1,263 @@
+"""Makes plans: at once while time stands still, or in a thread while states are answered."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from threading import Thread
+from typing import Protocol
+
+import numpy as np
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
+from spacerobot_ros.planning.core.goal import Controlled, RobotState
+from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
+from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.tracker import BrakingFollower
+from spacerobot_ros.planning.methods.registry import build_method
+from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
+
+LONGEST_END = 1.5
+"""Wall s that a thread may take to end after its cancellation."""
+
+
+@dataclass(frozen=True)
+class Braking:
+    """What brakes before a planned gait begins, and from when on, ns."""
+
+    follower: BrakingFollower
+    stamp_ns: int
+
+
+@dataclass(frozen=True)
+class PlanningTask:
+    """A plan to make.
+
+    Attributes
+    ----------
+    request
+        What is planned from the measured state.
+    stuck
+        Joints to plan without, by name, and where they are, m or rad.
+    required
+        Parts of the goal that a plan without them must control.
+    braking
+        What is tracked and brakes first; None: the joints rest.
+    """
+
+    request: PlanRequest
+    stuck: Mapping[str, float] = field(default_factory=dict)
+    required: frozenset[Controlled] = frozenset()
+    braking: Braking | None = None
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A plan that was made, and the wall time that this took, s."""
+
+    schedule: GaitSchedule
+    wall_time: float
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Why no plan was made, as a sentence, and the wall time that this took, s."""
+
+    reason: str
+    wall_time: float = 0.0
+
+
+class Worker(Protocol):
+    """What an executive has its plans made by; see :class:`PlanningWorker`."""
+
+    @property
+    def background(self) -> bool:
+        """Whether plans take time in which states are answered."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether a plan is being made, or its result waits, or it has yet to end."""
+
+    def submit(self, task: PlanningTask) -> None:
+        """Make a plan; one at a time."""
+
+    def poll(self) -> Planned | Refused | None:
+        """Return the result once it is there, None before and for a plan that was cancelled."""
+
+    def cancel(self) -> None:
+        """Have the plan that is being made end without a result."""
+
+    def close(self) -> None:
+        """Cancel, and wait until nothing goes on any more."""
+
+
+class PlanningWorker:
+    """Plans with the method of a planner, one plan at a time.
+
+    With ``plan_in_background`` a thread plans: CasADi and numpy release Python's lock for most of
+    it. The thread uses the robot's functions, whose buffers are shared: as long as the worker is
+    :attr:`busy`, nothing else may use them.
+
+    Parameters
+    ----------
+    robot
+        For which is planned.
+    config
+        Of the planner.
+    method
+        What plans with all joints; None: the method that the configuration names.
+
+    Raises
+    ------
+    ParameterError
+        An option does not go with the robot or with another option.
+    """
+
+    def __init__(
+        self, robot: SpaceRobot, config: PlannerConfig, method: GaitMethod | None = None
+    ) -> None:
+        self._robot, self._config = robot, config
+        self._method = method or build_method(
+            config.method, robot, config.control_period, config.integration_step, config.options
+        )
+        self._remaining: tuple[PlanningTask, GaitMethod] | None = None
+        """The method without some joints that was built last, and the task that needed it."""
+        self._job: _Job | None = None
+
+    @property
+    def background(self) -> bool:
+        """Whether plans are made in a thread."""
+        return self._config.plan_in_background
+
+    @property
+    def busy(self) -> bool:
+        """Whether a plan is being made, or its result waits, or it has yet to end."""
+        return self._job is not None
+
+    def submit(self, task: PlanningTask) -> None:
+        """Make a plan: at once, or in a thread."""
+        assert self._job is None, "one plan at a time"
+        self._job = job = _Job(self, task)
+        if self.background:
+            job.start()
+        else:
+            job.run()
+
+    def poll(self) -> Planned | Refused | None:
+        """Return the result once it is there, None before and for a plan that was cancelled.
+
+        A defect of the method is raised here.
+        """
+        job = self._job
+        if job is None or not job.done:
+            return None
+        self._job = None
+        if job.defect is not None and not job.cancellation.requested:
+            raise job.defect
+        return None if job.cancellation.requested else job.result
+
+    def cancel(self) -> None:
+        """Have the plan that is being made end without a result."""
+        if self._job is not None:
+            self._job.cancellation.cancel()
+
+    def close(self) -> None:
+        """Cancel, and wait until nothing goes on in the background."""
+        self.cancel()
+        if self._job is not None and self._job.is_alive():
+            # It would crash a process that ends, in the middle of CasADi.
+            self._job.join(LONGEST_END)
+
+    def plan(self, task: PlanningTask, cancellation: Cancellation) -> GaitSchedule:
+        """Make a plan at once.
+
+        Raises
+        ------
+        PlanningError
+            There is none; the sentence says why.
+        """
+        method = self._method_for(task)
+        if task.braking is None:
+            return method.plan(task.request, cancellation)
+        return self._blended(task.braking, task.request, method, cancellation)
+
+    def _method_for(self, task: PlanningTask) -> GaitMethod:
+        if not task.stuck:
+            return self._method
+        if self._remaining is not None:
+            earlier, method = self._remaining
+            if (earlier.stuck, earlier.required) == (task.stuck, task.required):
+                return method
+        config = self._config
+        method = RemainingJointsGait(
+            self._robot,
+            config.control_period,
+            config.integration_step,
+            stuck=task.stuck,
+            method=config.method,
+            options=config.options,
+            required=task.required,
+        )
+        self._remaining = task, method
+        return method
+
+    def _blended(
+        self,
+        braking: Braking,
+        request: PlanRequest,
+        method: GaitMethod,
+        cancellation: Cancellation,
+    ) -> GaitSchedule:
+        """Return one schedule: braking to rest, then what is planned from there.
+
+        No joint velocity jumps. Where the base will be at rest is predicted.
+        """
+        state, period = request.state, braking.follower.schedule.control_period
+        shapes = braking.follower.shapes(braking.stamp_ns)
+        shapes[0] = state.q
+        prediction = BasePrediction(self._robot, period, self._config.integration_step)
+        attitudes = prediction.attitudes(shapes, state.quaternion, state.angular_momentum)
+        times: Array = period * np.arange(len(shapes), dtype=float)
+        positions = prediction.positions(state, times, shapes, attitudes)
+        at_rest: RobotState = replace(
+            state, position=positions[-1], quaternion=attitudes[-1], q=shapes[-1].copy()
+        )
+        gait = method.plan(replace(request, state=at_rest), cancellation)
+        path = BasePath(
+            np.append(times[:-1], times[-1] + gait.path.time),
+            np.vstack([positions[:-1], gait.path.position]),
+            np.vstack([attitudes[:-1], gait.path.quaternion]),
+        )
+        return replace(gait, positions=np.vstack([shapes[:-1], gait.positions]), path=path)
+
+
+class _Job(Thread):
+    """One plan in the making, and what has come of it."""
+
+    def __init__(self, worker: PlanningWorker, task: PlanningTask) -> None:
+        super().__init__(daemon=True)
+        self.cancellation = Cancellation()
+        self.result: Planned | Refused | None = None
+        self.defect: BaseException | None = None
+        self.done = False
+        self._worker, self._task = worker, task
+
+    def run(self) -> None:
+        """Plan; an exception that is no refusal is kept for the thread that polls."""
+        began = time.perf_counter()
+        try:
+            schedule = self._worker.plan(self._task, self.cancellation)
+            self.result = Planned(schedule, time.perf_counter() - began)
+        except PlanningCancelled:
+            pass
+        except PlanningError as refusal:
+            self.result = Refused(str(refusal), time.perf_counter() - began)
+        except BaseException as defect:
+            self.defect = defect
+        self.done = True
