@@ -14,22 +14,16 @@ from spacerobot_ros.bag.reader import Bag, read_bag
 from spacerobot_ros.bag.salvage import is_complete, salvage_bag
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.topics import TOPICS
 
 Array = NDArray[np.float64]
 
 _STATE = ("odom", "joint_states", "momentum")
 
 
-def pose_fields(path: str) -> list[str]:
-    """Return the fields of a geometry_msgs/Pose at a path: position, quaternion (x, y, z, w)."""
-    return [f"{path}.position.{x}" for x in "xyz"] + [f"{path}.orientation.{x}" for x in "xyzw"]
-
-
-ODOMETRY_POSE = pose_fields("pose.pose")
-ODOMETRY_TWIST = [f"twist.twist.{part}.{x}" for part in ("linear", "angular") for x in "xyz"]
-POSE = pose_fields("pose")
-WRENCH = [f"wrench.{part}.{x}" for part in ("force", "torque") for x in "xyz"]
-"""Fields of the messages, for :meth:`TopicSeries.table`."""
+def columns(topic: str, path: str) -> list[str]:
+    """Return the paths of the numbers of a state topic below a path, for ``TopicSeries.table``."""
+    return next(field.columns for field in TOPICS[topic].state if field.path == path)
 
 
 class RecordedRobot:
@@ -47,21 +41,20 @@ class RecordedRobot:
         self.bag = bag
         self.namespace = namespace
 
-    def get(self, name: str, type_name: str | None = None) -> TopicSeries | None:
-        """Return a topic; None where it has no message, or is not of ``type_name``."""
+    def get(self, name: str) -> TopicSeries | None:
+        """Return a topic of the stack; None where it has no message, or is of another type."""
         topic = f"{self.namespace}/{name}"
-        kind = self.bag.topics.get(topic)
-        if kind is None or type_name not in (None, kind) or not self.bag.message_count(topic):
+        if self.bag.topics.get(topic) != TOPICS[name].type or not self.bag.message_count(topic):
             return None
         return self.bag[topic]
 
     def __getitem__(self, name: str) -> TopicSeries:
-        """Return a topic.
+        """Return a topic of the stack.
 
         Raises
         ------
         RecordingError
-            It has no message, or is damaged.
+            It has no message, is of another type, or is damaged.
         """
         series = self.get(name)
         if series is None:
@@ -82,7 +75,7 @@ class RecordedRobot:
         attached = self.bag.attachments.get(f"{name}.urdf")
         if attached is not None:
             return attached
-        series = self.get("robot_description", "std_msgs/msg/String")
+        series = self.get("robot_description")
         return None if series is None else str(series.field("data")[-1]).encode()
 
 
@@ -139,7 +132,7 @@ def _last_state(robot: RecordedRobot) -> LastState:
             f"The bag {robot.bag.path} holds no state of which all parts are there."
         )
     k, j = (int(np.flatnonzero(series.stamp_ns == common[-1])[-1]) for series in (odom, joints))
-    pose = odom.table(ODOMETRY_POSE)[k]
+    pose = odom.table(columns("odom", "pose.pose"))[k]
     return LastState(
         time_ns=int(common[-1]),
         position=pose[:3],

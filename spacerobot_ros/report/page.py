@@ -6,8 +6,8 @@ import base64
 from collections.abc import Sequence
 from html import escape
 
-from spacerobot_ros.report.animation import Player
 from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.meshcat import Player
 from spacerobot_ros.report.style import Plate
 from spacerobot_ros.report.tables import (
     Table,

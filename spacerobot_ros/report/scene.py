@@ -14,9 +14,9 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
 )
 from spacerobot_ros.report.flight import Flight, Target
-from spacerobot_ros.report.keyframes import FULL_CYCLES, KeyFrames, key_frames
 from spacerobot_ros.report.meshcat import (
     Command,
+    Scene,
     clip,
     line,
     matrix_of,
@@ -26,9 +26,56 @@ from spacerobot_ros.report.meshcat import (
     set_transform,
     solid,
 )
-from spacerobot_ros.report.signals import Indices, Signal
+from spacerobot_ros.report.signals import Cycles, Indices, Signal, simplified
 from spacerobot_ros.report.solids import SolidRobot, link_color
 from spacerobot_ros.report.style import FAINT, GHOST, PALETTE
+
+FULL_CYCLES = 3
+"""Cycles at the beginning and at the end of a gait that are shown as they were."""
+
+_MOST = 1000
+_MOST_INSTANTS = 300
+"""Instants of equal phase between the cycles that are shown in full."""
+
+
+@dataclass(frozen=True)
+class KeyFrames:
+    """States to show: their ``indices``, ascending, with the first and the last of the recording.
+
+    ``error``: how far, in tolerances, a state that is meant to be seen is from the line between
+    the key frames around it. ``every``: between the cycles shown in full, one state is shown every
+    so many cycles, always at the same phase; 0 where there are no such.
+    """
+
+    indices: Indices
+    error: float
+    every: int = 0
+
+
+def key_frames(motion: Signal, cycles: Cycles | None) -> KeyFrames:
+    """Choose at most a thousand key frames between which linear interpolation is good enough.
+
+    Parameters
+    ----------
+    motion
+        What is to be seen, (N, k), each column divided by its tolerance.
+    cycles
+        The equal cycles in it. Between the first and the last few of them, states of equal phase
+        stand for the rest: sampled anyhow, fast loops would look like slow ones.
+    """
+    shown, every = np.arange(len(motion)), 0
+    if cycles is not None and cycles.count > 2 * FULL_CYCLES:
+        start = cycles.start + FULL_CYCLES * cycles.period
+        count = cycles.count - 2 * FULL_CYCLES
+        end = start + count * cycles.period
+        every = max(1, -(-count // _MOST_INSTANTS))
+        instants = start + cycles.period * np.arange(0, count + 1, every)
+        full = (motion.time <= start) | (motion.time >= end - 1e-9)
+        places = np.searchsorted(motion.time, instants - 1e-9)
+        shown = np.union1d(np.flatnonzero(full), np.minimum(places, len(motion) - 1))
+    chosen, error = simplified(Signal(motion.time[shown], motion.values[shown]), _MOST)
+    return KeyFrames(shown[chosen], error, every)
+
 
 _POSITION_TOLERANCE = 0.001
 """Of what is drawn between key frames, as a part of the size of the picture."""
@@ -43,15 +90,6 @@ _FIELD_OF_VIEW = 30.0
 
 _AXES = ("#d55e00", "#009e73", "#0072b2")
 WORLD, ROBOT = "/flight", "/flight/robot"
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What the viewer is told, the spans of time to look at (name, start, end), and a caption."""
-
-    commands: list[Command]
-    parts: list[tuple[str, float, float]]
-    caption: str
 
 
 def scene_of(flight: Flight) -> Scene | str:

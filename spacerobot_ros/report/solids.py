@@ -1,18 +1,168 @@
-"""A robot as faces and edges in space, from the boxes, cylinders and spheres of its URDF."""
+"""Pictures of a robot: the solids of its URDF in a parallel projection, hidden surfaces removed."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 from matplotlib.colors import to_rgb
 
 from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
 from spacerobot_ros.model.kinematics import tree_kinematics
-from spacerobot_ros.report.render import Edge, Face
 from spacerobot_ros.report.style import colour
+
+Image = npt.NDArray[np.float32]
+
+_OVERSAMPLING = 2
+_EDGE_WIDTH = 3
+"""Of a drawn edge, in pixels before they are averaged."""
+
+_FLAT = 1e-6
+
+
+@dataclass(frozen=True)
+class Face:
+    """A convex flat polygon (k, 3) in the world with its outward normal (3,) and its colour."""
+
+    corners: Array
+    normal: Array
+    fill: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A line (k, 3) in the world, seen where one of the two surfaces beside it is.
+
+    ``normals`` (k - 1, 2, 3) are those of the surfaces; with none it is seen from everywhere.
+    """
+
+    line: Array
+    normals: Array
+    fill: tuple[float, float, float]
+
+
+class View:
+    """A parallel projection from azimuth and elevation (deg): world points to the paper."""
+
+    def __init__(self, azimuth: float = -58.0, elevation: float = 24.0) -> None:
+        a, e = math.radians(azimuth), math.radians(elevation)
+        self.toward = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
+        right = np.array([-math.sin(a), math.cos(a), 0.0])
+        self.paper = np.array([right, np.cross(self.toward, right)])
+        light = self.toward + np.array([0.35, -0.1, 0.9])
+        self._light = light / np.linalg.norm(light)
+
+    def __call__(self, points: Array) -> Array:
+        """Return points (..., 3) on the paper (..., 2)."""
+        return np.asarray(points @ self.paper.T)
+
+    def shade(self, face: Face) -> Array:
+        """Return the colour of a face under the light of this view."""
+        return np.array(face.fill) * (0.72 + 0.28 * max(float(face.normal @ self._light), 0.0))
+
+
+class Canvas:
+    """Pixels over a rectangle of the paper, ``low`` to ``high`` (2,) in m.
+
+    Parameters
+    ----------
+    view
+        The projection.
+    low, high
+        Corners of the rectangle.
+    width
+        Pixels across.
+    """
+
+    def __init__(self, view: View, low: Array, high: Array, width: int) -> None:
+        self._view = view
+        self._low = low
+        self._scale = width * _OVERSAMPLING / float(high[0] - low[0])
+        rows = round(width * float(high[1] - low[1]) / float(high[0] - low[0]))
+        size = (rows * _OVERSAMPLING, width * _OVERSAMPLING)
+        self._depth = np.full(size, -np.inf)
+        self._pixels = np.zeros((*size, 4), np.float32)
+
+    def draw(self, faces: list[Face], edges: list[Edge]) -> None:
+        """Draw faces, and edges over them where nothing hides them."""
+        for face in faces:
+            if face.normal @ self._view.toward > _FLAT:
+                self._fill(face)
+        for edge in edges:
+            self._line(edge)
+
+    def image(self) -> Image:
+        """Return what was drawn as (rows, columns, 4), the top row first, transparent elsewhere."""
+        n = _OVERSAMPLING
+        total = sum(self._pixels[i::n, j::n] for i in range(n) for j in range(n))
+        image = np.asarray(total, np.float32)
+        image[..., :3] /= np.maximum(image[..., 3:], 1.0)
+        image[..., 3] /= n * n
+        return image[::-1]
+
+    def _place(self, points: Array) -> Array:
+        """World points (k, 3) to column, row and nearness (k, 3)."""
+        at = (self._view(points) - self._low) * self._scale
+        return np.column_stack([at, points @ self._view.toward])
+
+    def _fill(self, face: Face) -> None:
+        corners = self._place(face.corners)
+        rows, columns = self._depth.shape
+        bottom = max(math.ceil(float(corners[:, 1].min()) - 0.5), 0)
+        top = min(math.floor(float(corners[:, 1].max()) - 0.5) + 1, rows)
+        if bottom >= top:
+            return
+        # The face covers one run of pixels in each row.
+        y = np.arange(bottom, top) + 0.5
+        left, right = np.full(len(y), np.inf), np.full(len(y), -np.inf)
+        for (ax, ay, _), (bx, by, _) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            if ay != by:
+                met = (y >= min(ay, by)) & (y <= max(ay, by))
+                x = ax + (y[met] - ay) * ((bx - ax) / (by - ay))
+                left[met] = np.minimum(left[met], x)
+                right[met] = np.maximum(right[met], x)
+        first = np.ceil(np.clip(left - 0.5, 0, columns)).astype(int)
+        last = np.floor(np.clip(right - 0.5, -1, columns - 1)).astype(int)
+        counts = np.maximum(last - first + 1, 0)
+        row = np.repeat(np.arange(bottom, top), counts)
+        column = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts - first, counts)
+        depth = self._plane(face, column + 0.5, row + 0.5)
+        nearer = depth > self._depth[row, column]
+        row, column = row[nearer], column[nearer]
+        self._depth[row, column] = depth[nearer]
+        self._pixels[row, column] = [*self._view.shade(face), 1.0]
+
+    def _plane(self, face: Face, x: npt.NDArray[Any], y: npt.NDArray[Any]) -> Array:
+        """Nearness of the plane of a face at places in pixels."""
+        across, up = self._view.paper @ face.normal
+        offset = float(face.normal @ face.corners[0]) - self._low @ (across, up)
+        depth = offset - (across * x + up * y) / self._scale
+        return np.asarray(depth / float(face.normal @ self._view.toward))
+
+    def _line(self, edge: Edge) -> None:
+        at = self._place(edge.line)
+        # An edge lies in the surfaces beside it: it is drawn a little nearer.
+        at[:, 2] += 2.0 * _EDGE_WIDTH / self._scale
+        rows, columns = self._depth.shape
+        brush = np.arange(_EDGE_WIDTH) - (_EDGE_WIDTH - 1) / 2
+        offsets = np.stack(np.meshgrid(brush, brush), axis=-1).reshape(-1, 1, 2)
+        for k in range(len(at) - 1):
+            if len(edge.normals) and not (edge.normals[k] @ self._view.toward > _FLAT).any():
+                continue
+            count = max(2, math.ceil(float(np.abs(at[k + 1, :2] - at[k, :2]).max())) + 1)
+            points = np.linspace(at[k], at[k + 1], count)
+            places = np.floor(points[:, :2] + offsets).astype(int).reshape(-1, 2)
+            depth = np.tile(points[:, 2], len(offsets))
+            known = ((places >= 0) & (places < (columns, rows))).all(axis=1)
+            column, row = places[known].T
+            seen = depth[known] > self._depth[row, column]
+            self._pixels[row[seen], column[seen]] = [*edge.fill, 1.0]
+
 
 _BASE = "#c4c9d2"
 EDGE = "#3d4450"

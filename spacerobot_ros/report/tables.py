@@ -10,7 +10,7 @@ import numpy as np
 
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning import PoseError
-from spacerobot_ros.report.figures import joint_unit
+from spacerobot_ros.report.figures_time import joint_unit
 from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.session.scenario import Published
 
@@ -116,10 +116,10 @@ def joint_table(flight: Flight) -> Table | None:
         joint = flight.joint(name)
         unit = joint_unit(flight, name)
         first, last = flight.shape.values[[0, -1], i]
-        stroke = limit = share = peak_text = _ABSENT
+        limits = limit = share = peak_text = _ABSENT
         if joint is not None:
             if math.isfinite(joint.limits.lower) and math.isfinite(joint.limits.upper):
-                stroke = f"{joint.limits.lower:.5g} to {joint.limits.upper:.5g}"
+                limits = f"{joint.limits.lower:.5g} to {joint.limits.upper:.5g}"
             if math.isfinite(joint.limits.velocity):
                 limit = f"{joint.limits.velocity:.5g} {unit}/s"
         if len(flight.rates):
@@ -129,10 +129,10 @@ def joint_table(flight: Flight) -> Table | None:
                 share = f"{100 * peak / joint.limits.velocity:.1f} %"
         kind = joint.kind.value if joint is not None else _ABSENT
         rows.append(
-            (name, kind, unit, _number(first), _number(last), stroke, peak_text, limit, share)
+            (name, kind, unit, _number(first), _number(last), limits, peak_text, limit, share)
         )
-    head = ["Joint", "Type", "Unit", "Start", "Final", "Stroke", "Peak_velocity", "Limit", "Used"]
-    return Table(tuple(word.replace("_", " ") for word in head), rows, (3, 4, 5, 6, 7, 8))
+    head = ["Joint", "Type", "Unit", "Start", "Final", "Limits", "Peak velocity", "Limit", "Used"]
+    return Table(tuple(head), rows, (3, 4, 5, 6, 7, 8))
 
 
 def published_table(flight: Flight) -> Table | None:

@@ -8,31 +8,32 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.report.animation import player_of
-from spacerobot_ros.report.figures import (
+from spacerobot_ros.report.figures_shape import cycles_plate, loops_plate
+from spacerobot_ros.report.figures_space import (
+    configurations_plate,
+    draw_goal_and_path,
+    draw_robot,
+    path_plate,
+    view_of,
+)
+from spacerobot_ros.report.figures_time import (
     NO_STATES,
     attitude_group,
     attitude_plate,
     draw_whole,
+    efforts_plate,
+    errors_plate,
     momentum_plate,
     position_group,
     position_plate,
+    rates_plate,
     shape_groups,
     shape_plate,
+    twist_plate,
 )
-from spacerobot_ros.report.figures_control import efforts_plate, errors_plate, twist_plate
-from spacerobot_ros.report.figures_cycles import cycles_plate
-from spacerobot_ros.report.figures_joints import loops_plate, rates_plate
-from spacerobot_ros.report.figures_path import path_plate
-from spacerobot_ros.report.figures_scene import (
-    configurations_plate,
-    draw_goal_and_path,
-    draw_robot,
-    view_of,
-)
-from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.flight import Flight, read_flight
+from spacerobot_ros.report.meshcat import player_of
 from spacerobot_ros.report.page import page
-from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.report.scene import scene_of
 from spacerobot_ros.report.style import (
     WIDTH,

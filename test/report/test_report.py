@@ -33,9 +33,9 @@ from support.html_page import Page, leave_blank
 
 from spacerobot_ros.bag import RecordingError
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.report import figures_scene, write_picture, write_report
-from spacerobot_ros.report.figures import shape_plate
-from spacerobot_ros.report.reading import read_flight
+from spacerobot_ros.report import figures_space, write_picture, write_report
+from spacerobot_ros.report.figures_time import shape_plate
+from spacerobot_ros.report.flight import read_flight
 from spacerobot_ros.report.style import Plate, paper_style
 
 FIGURES = [
@@ -58,7 +58,7 @@ def numbers_in(text: str) -> list[float]:
 def _coarse_pictures() -> Iterator[None]:
     """Draw robots with few pixels: what is tested is that they are drawn."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(figures_scene, "PIXELS", 120)
+        patch.setattr(figures_space, "PIXELS", 120)
         yield
 
 
@@ -175,7 +175,7 @@ def test_joints_stand_beside_their_limits(flown: Page, story: Story) -> None:
         assert cells["Joint"] == f"joint_{joint}"
         assert cells["Unit"] == ("m" if joint == 0 else "rad")
         assert float(cells["Final"]) == pytest.approx(last, abs=1e-5)
-        assert cells["Stroke"] == "-1.5 to 1.5"
+        assert cells["Limits"] == "-1.5 to 1.5"
         assert numbers_in(cells["Peak velocity"]) == [pytest.approx(peak, abs=1e-5)]
         assert numbers_in(cells["Used"]) == [pytest.approx(100 * peak / 0.8, abs=0.06)]
 

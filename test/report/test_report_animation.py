@@ -15,12 +15,10 @@ from support.html_page import leave_blank
 
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
-from spacerobot_ros.report import animation, write_report
-from spacerobot_ros.report.flight import Flight
-from spacerobot_ros.report.keyframes import key_frames
-from spacerobot_ros.report.meshcat import Command
-from spacerobot_ros.report.reading import read_flight
-from spacerobot_ros.report.scene import Scene, scene_of
+from spacerobot_ros.report import meshcat, write_report
+from spacerobot_ros.report.flight import Flight, read_flight
+from spacerobot_ros.report.meshcat import Command, Scene
+from spacerobot_ros.report.scene import key_frames, scene_of
 from spacerobot_ros.report.signals import Cycles, Signal
 
 N = 6
@@ -154,7 +152,7 @@ def test_a_gait_can_be_looked_at_in_parts(tmp_path: Path) -> None:
 def test_without_the_viewer_a_sentence_says_so(
     bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(animation, "viewer_script", lambda: None)
+    monkeypatch.setattr(meshcat, "viewer_script", lambda: None)
     leave_blank(monkeypatch)
     write_report(bag, tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")

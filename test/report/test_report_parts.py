@@ -8,8 +8,8 @@ from support.flight_bags import TICK, cyclic_shapes, rates_of
 
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
-from spacerobot_ros.report.render import Canvas, Edge, Face, View
 from spacerobot_ros.report.signals import Signal, envelope, find_cycles, rotvecs
+from spacerobot_ros.report.solids import Canvas, Edge, Face, View
 
 
 def test_what_is_behind_is_hidden() -> None:

@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 import pytest
 from matplotlib.figure import Figure
 
-from spacerobot_ros.report import figures_scene
+from spacerobot_ros.report import figures_space
 
 
 def leave_blank(patch: pytest.MonkeyPatch) -> None:
@@ -19,7 +19,7 @@ def leave_blank(patch: pytest.MonkeyPatch) -> None:
         stream.write(b'<svg xmlns="http://www.w3.org/2000/svg"/>')
 
     patch.setattr(Figure, "savefig", savefig)
-    patch.setattr(figures_scene, "PIXELS", 20)
+    patch.setattr(figures_space, "PIXELS", 20)
 
 
 class Page(HTMLParser):

@@ -1,21 +1,28 @@
-"""Figures over time: base pose, shape, and the momentum ledger.
+"""Figures over time: base pose, joints, output errors, wrench and efforts, momentum.
 
-Each function returns a plate, or one sentence on why the bag has no such figure.
+Each function returns a plate, one sentence on why the bag has no such figure, or None where the
+flight is of another kind.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from matplotlib.axes import Axes
 
-from spacerobot_ros.model.description import JointKind
-from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.model.description import Joint, JointKind
+from spacerobot_ros.model.rotations import (
+    quaternion_inverse,
+    quaternion_multiply,
+    rotvecs_from_quaternions,
+)
+from spacerobot_ros.report.flight import Flight, Target
 from spacerobot_ros.report.signals import Cycles, Signal
 from spacerobot_ros.report.style import (
     FAINT,
+    INK,
     MUTED,
     PALETTE,
     SLICES,
@@ -41,6 +48,9 @@ SHOWN_CYCLES = 3
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 _DECADES = 4
 _JOINTS_A_PANEL = 6
+_SMALLEST = 1e-9
+"""Forces and torques that are rounding errors, N or N m."""
+
 BAND = (
     "Where a trace has more samples than the picture has columns, the band spans the smallest and "
     "the largest value in each slice of time."
@@ -88,24 +98,57 @@ def attitude_group(flight: Flight) -> Group:
 
 def shape_groups(flight: Flight) -> list[Group]:
     """Return the joint positions, those of one unit and at most six joints together."""
-    units = [joint_unit(flight, name) for name in flight.joint_names]
+
+    def bounds(joint: Joint) -> list[float]:
+        return [joint.limits.lower, joint.limits.upper]
+
+    units = {"m": "m", "rad": "rad"}
+    return _joint_groups(
+        flight, flight.shape, "joint position", units, bounds, most=_JOINTS_A_PANEL
+    )
+
+
+def _joint_groups(
+    flight: Flight,
+    signal: Signal,
+    label: str,
+    units: dict[str, str],
+    bounds: Callable[[Joint], list[float]],
+    most: int,
+) -> list[Group]:
+    """Group the columns of a signal of all joints by their unit, given that of their position."""
+    unknown = " or ".join(units.values())
+    each = [units.get(joint_unit(flight, name), unknown) for name in flight.joint_names]
     groups = []
-    for unit in dict.fromkeys(units):
-        members = [i for i, other in enumerate(units) if other == unit]
-        for first in range(0, len(members), _JOINTS_A_PANEL):
-            chosen = members[first : first + _JOINTS_A_PANEL]
+    for unit in dict.fromkeys(each):
+        members = [i for i, other in enumerate(each) if other == unit]
+        for first in range(0, len(members), most):
+            chosen = members[first : first + most]
             names = [flight.joint_names[i] for i in chosen]
-            signal = Signal(flight.shape.time, flight.shape.values[:, chosen])
             limits = [
                 (k, bound)
                 for k, name in enumerate(names)
                 if (joint := flight.joint(name)) is not None
-                for bound in (joint.limits.lower, joint.limits.upper)
+                for bound in bounds(joint)
             ]
+            part = Signal(signal.time, signal.values[:, chosen])
             colours = [colour(i) for i in chosen]
-            labels = [short(name) for name in names]
-            groups.append(Group(signal, labels, "joint position", unit, colours, limits=limits))
+            groups.append(Group(part, list(map(short, names)), label, unit, colours, limits=limits))
     return groups
+
+
+def _axis_groups(signal: Signal, parts: Sequence[tuple[str, str]]) -> list[Group]:
+    """Return a group of x, y and z for each label and unit, from columns side by side."""
+    return [
+        Group(
+            Signal(signal.time, signal.values[:, 3 * k : 3 * k + 3]),
+            list("xyz"),
+            label,
+            unit,
+            PALETTE[:3],
+        )
+        for k, (label, unit) in enumerate(parts)
+    ]
 
 
 def joint_unit(flight: Flight, name: str) -> str:
@@ -144,6 +187,53 @@ def shape_plate(flight: Flight) -> Plate | str:
     return time_plate(flight, "shape", "Shape", "Joint positions", shape_groups(flight))
 
 
+def rates_plate(flight: Flight) -> Plate | str:
+    """Joint velocities, one panel a joint."""
+    if not flight.joint_names:
+        return NO_JOINTS
+    if not len(flight.rates):
+        return "The bag holds no joint velocities."
+    names, cycles = flight.joint_names, flight.cycles
+    height = 1.0 if len(names) <= 4 else 0.75
+    widths = [1.0] if cycles is None else [2.2, 1.0]
+    figure, panels = sheet([widths] * len(names), [height] * len(names), gap=0.36)
+    dense = []
+    for i, (row, name) in enumerate(zip(panels, names, strict=True)):
+        signal = Signal(flight.rates.time, flight.rates.values[:, i : i + 1])
+        spans = [(0.0, flight.end)]
+        if cycles is not None:
+            spans.append(cycles.last(SHOWN_CYCLES))
+        joint = flight.joint(name)
+        limit = joint.limits.velocity if joint is not None else np.inf
+        unit = f"{joint_unit(flight, name)}/s"
+        for axes, (start, end) in zip(row, spans, strict=True):
+            set_range(axes, signal.values, [limit, -limit])
+            low, high = axes.get_ylim()
+            for bound in (limit, -limit):
+                if low < bound < high:
+                    axes.axhline(bound, color=MUTED, lw=1.0, ls=(0, DOTS), zorder=1.8)
+            part = signal.between(start, end)
+            dense.append(draw_traces(axes, part, [colour(i)], min(1.0, 6 / len(names))))
+            last = i == len(names) - 1
+            set_time(axes, start, end, last)
+            if not last:
+                axes.tick_params(labelbottom=False)
+        peak = float(np.abs(signal.values).max())
+        text = f"peak {peak:.4g} {unit}"
+        if np.isfinite(limit) and limit > 0:
+            text += f", {100 * peak / limit:.3g} % of the limit {limit:.4g} {unit}"
+        row[0].set_title(name, color=colour(i))
+        row[0].set_title(text, loc="right", color=INK)
+        row[0].set_ylabel(unit)
+    if cycles is not None:
+        panels[0][1].set_title(f"last {SHOWN_CYCLES} cycles")
+    caption = "Velocity of each joint; dotted, its limit in the URDF, where that is in range."
+    if cycles is not None:
+        caption += f" Right: the last {SHOWN_CYCLES} of {cycles.count} cycles, to the same scale."
+    caption += f" {BAND}" if any(dense) else ""
+    return Plate("velocities", "Joint velocities", caption, svg_of(figure))
+
+
 def draw_whole(axes: Axes, flight: Flight, group: Group, share: float = 1.0) -> bool:
     """Draw a group over the whole flight; return whether traces were summed up as bands."""
     colours = group.colours
@@ -171,9 +261,7 @@ def draw_whole(axes: Axes, flight: Flight, group: Group, share: float = 1.0) -> 
     legend_above(axes, keys)
     set_time(axes, 0.0, flight.end)
     axes.set_ylabel(f"{group.label} ({group.unit})")
-    ends = group.signal.values[-1].tolist()
-    labels = list(zip(ends, group.names, colours, strict=True))
-    end_labels(axes, labels)
+    _name_traces(axes, group.signal, group)
     return dense
 
 
@@ -225,10 +313,13 @@ def _first_part(axes: Axes, group: Group, cycles: Cycles) -> bool:
     set_time(axes, 0.0, end)
     axes.set_title(f"first {end:.4g} s")
     axes.set_ylabel(group.unit)
-    ends = part.values[-1].tolist()
-    labels = list(zip(ends, group.names, group.colours, strict=True))
-    end_labels(axes, labels)
+    _name_traces(axes, part, group)
     return dense
+
+
+def _name_traces(axes: Axes, part: Signal, group: Group) -> None:
+    ends = part.values[-1].tolist()
+    end_labels(axes, list(zip(ends, group.names, group.colours, strict=True)))
 
 
 def _last_cycles(axes: Axes, group: Group, cycles: Cycles) -> None:
@@ -242,13 +333,93 @@ def _last_cycles(axes: Axes, group: Group, cycles: Cycles) -> None:
     axes.set_ylabel(unit)
 
 
+def errors_plate(flight: Flight) -> Plate | None:
+    """Goal minus measured pose of base and end-effector, in the components under control."""
+    if not flight.outputs and not flight.tool_goals:
+        return None
+    groups = []
+    base = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
+    for part, pose, targets in (
+        ("base", base, flight.targets),
+        ("end_effector", flight.tool, flight.tool_targets),
+    ):
+        errors = pose_errors(pose, targets)
+        chosen = flight.controls(part)
+        name = part.replace("_", "-")
+        for unit, what, members in (("m", "position", (0, 1, 2)), ("rad", "attitude", (3, 4, 5))):
+            axes = [i for i in members if i in chosen]
+            if len(errors) and axes:
+                signal = Signal(errors.time, errors.values[:, axes])
+                names = ["xyz"[i % 3] for i in axes]
+                colours = [PALETTE[i % 3] for i in axes]
+                groups.append(Group(signal, names, f"{name} {what}", unit, colours))
+    if not groups:
+        return None
+    what = (
+        "Goal minus measured, in the world frame, for the components under control; attitude as "
+        "the remaining rotation vector"
+    )
+    return time_plate(flight, "errors", "Output errors", what, groups)
+
+
+def pose_errors(pose: Signal, targets: Sequence[Target]) -> Signal:
+    """Return the goal minus poses (N, 7) while there is one: position, rotation vector (M, 6)."""
+    times, values = [np.empty(0)], [np.empty((0, 6))]
+    for target in targets:
+        part = pose.between(target.start, target.end)
+        if len(part):
+            inverse = quaternion_inverse(part.values[:, 3:])
+            turn = quaternion_multiply(target.goal.quaternion, inverse)
+            left = target.goal.position - part.values[:, :3]
+            times.append(part.time)
+            values.append(np.hstack([left, rotvecs_from_quaternions(turn)]))
+    return Signal(np.concatenate(times), np.concatenate(values))
+
+
+def twist_plate(flight: Flight) -> Plate | None:
+    """Velocity and angular velocity of the base link.
+
+    None where it rests, and of a gait of many equal cycles: there it shakes.
+    """
+    if flight.cycles is not None or not flight.twist.values.any():
+        return None
+    groups = _axis_groups(flight.twist, (("velocity", "m/s"), ("rate", "rad/s")))
+    what = "Velocity of the base link's origin and its angular velocity, in the base link's frame"
+    return time_plate(flight, "twist", "Base velocity", what, groups)
+
+
+def efforts_plate(flight: Flight) -> Plate | None:
+    """Commanded thruster wrench and joint efforts."""
+
+    def bounds(joint: Joint) -> list[float]:
+        limit = joint.limits.effort
+        return [-limit, limit] if np.isfinite(limit) else []
+
+    wrench = _axis_groups(flight.wrench, (("thruster force", "N"), ("thruster torque", "N m")))
+    wrench = [g for g in wrench if np.abs(g.signal.values).max(initial=0.0) > _SMALLEST]
+    joints: list[Group] = []
+    if np.abs(flight.efforts.values).max(initial=0.0) > _SMALLEST:
+        units, count = {"m": "N", "rad": "N m"}, len(flight.joint_names)
+        joints = _joint_groups(flight, flight.efforts, "joints", units, bounds, most=count)
+    groups = wrench + joints
+    if not groups:
+        return None
+    what = (
+        "What was commanded: thruster force and torque at the base link's origin, in its frame, "
+        "and the efforts of the joints"
+    )
+    if not wrench:
+        what = "Commanded efforts of the joints; the thrusters gave nothing"
+    return time_plate(flight, "efforts", "Wrench and efforts", what, groups)
+
+
 def momentum_plate(flight: Flight) -> Plate | str:
     """Change of the total momenta, and the kinetic energy."""
     if not len(flight.momentum):
-        return "The bag holds no momentum ledger."
-    time, ledger = flight.momentum.time, flight.momentum.values
+        return "The bag holds no momentum."
+    time, balance = flight.momentum.time, flight.momentum.values
     changes = np.column_stack(
-        [np.linalg.norm(ledger[:, k : k + 3] - ledger[0, k : k + 3], axis=1) for k in (0, 3)]
+        [np.linalg.norm(balance[:, k : k + 3] - balance[0, k : k + 3], axis=1) for k in (0, 3)]
     )
     figure, ((above,), (below,)) = sheet([[1.0], [1.0]], [1.6, 1.1])
     largest = float(changes.max())
@@ -272,7 +443,7 @@ def momentum_plate(flight: Flight) -> Plate | str:
     above.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
     names = ("|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)")
     legend_above(above, [key(colour(i), name) for i, name in enumerate(names)])
-    energy = ledger[:, 6:7]
+    energy = balance[:, 6:7]
     set_range(below, np.append(energy, 0.0))
     dense = draw_traces(below, Signal(time, energy), [colour(2)])
     below.set_title("kinetic energy")
@@ -280,13 +451,13 @@ def momentum_plate(flight: Flight) -> Plate | str:
     set_time(below, 0.0, flight.end)
     largest_of = ", the largest in each slice of time" if len(time) > 2 * SLICES else ""
     caption = (
-        "The ledger that the plant keeps of the whole system. Top: how far the linear momentum p "
+        "The momentum balance of the whole system. Top: how far the linear momentum p "
         "and the angular momentum L about the centre of mass are from their values at the start, "
         f"what thrusters have put in taken off{largest_of}, on a logarithmic axis; less than it "
         "shows, and zero, lies on its lower edge. Bottom: kinetic energy."
     )
     caption += f" {BAND}" if dense else ""
-    return Plate("momentum", "Momentum ledger", caption, svg_of(figure))
+    return Plate("momentum", "Momentum balance", caption, svg_of(figure))
 
 
 def power_of_ten(value: float) -> str:
