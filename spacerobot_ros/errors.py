@@ -20,6 +20,10 @@ class PlanningError(SpaceRobotError):
     """A goal that is refused or cannot be reached; the sentence says why."""
 
 
+class GoalError(PlanningError):
+    """A goal that is none: not finite, no rotation, the wrong number of entries."""
+
+
 class RecordingError(SpaceRobotError):
     """A bag that cannot be written or read; the sentence says which, where and what to do."""
 

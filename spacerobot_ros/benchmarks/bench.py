@@ -12,6 +12,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +22,26 @@ from geometry_msgs.msg import PoseStamped
 from mcap.writer import CompressionType, Writer
 from nav_msgs.msg import Odometry
 from rclpy.experimental import EventsExecutor
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from spacerobot_ros.bag import BagWriter
 from spacerobot_ros.benchmarks.dynamics import dynamics_benchmark
-from spacerobot_ros.benchmarks.planning import planning_times
-from spacerobot_ros.benchmarks.replay import replay_spacing
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import c_compiler
+from spacerobot_ros.nodes import ReplayNode
+from spacerobot_ros.nodes.common.node import STREAM, spin_until
+from spacerobot_ros.planning import PlanRequest
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.session.run import ros
 from spacerobot_ros.session.scenario import load_scenario
-from spacerobot_ros.session.stack import FlightStack
+from spacerobot_ros.session.stack import InProcessStack
 from spacerobot_ros.simulation import VelocityPlant
+from spacerobot_ros.simulation.trials import state_of
 
 _ROUNDS = 5
 _TOPICS: tuple[tuple[str, type[Any], int, int], ...] = (
@@ -47,6 +52,22 @@ _TOPICS: tuple[tuple[str, type[Any], int, int], ...] = (
     ("joint_states", JointState, 3, 1),
 )
 """The plant's topics: name, type, length of its lists, and how many ticks from one to the next."""
+
+_GAITS = (
+    ("sliding_masses", "lie_bracket"),
+    ("arm_attitude", "area_loop"),
+    ("planar_chain", "square_path"),
+)
+"""Scenarios of the papers, and the methods that are theirs."""
+
+_PLANS = 5
+
+_PERIOD = 0.01
+_MESSAGES = 500
+_PATIENCE = 2.0
+"""Wall s for what is on its way when the replay has ended."""
+
+_REPLAYED = "/bench/joint_states"
 
 
 def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
@@ -66,7 +87,7 @@ def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
                 f"round: {stack_rates[-1]:8.0f} ticks/s with plant, planner and recorder, "
                 f"{peer_rates[-1]:8.0f} bare"
             )
-        spacing, worst_spacing = replay_spacing(Path(folder))
+        spacing, worst_spacing = _replay_spacing(Path(folder))
     stack_rate, peer_rate = statistics.median(stack_rates), statistics.median(peer_rates)
     unrecorded = statistics.median(bare_stack_rates)
     tick = _plant_tick()
@@ -90,7 +111,7 @@ def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
         f"{1e3 * worst_spacing:.1f} ms at most"
     )
     yield f"one plant tick alone: {1e6 * tick:.1f} us (compiler: {figures['compiler']})"
-    for name, first, later in planning_times():
+    for name, first, later in _planning_times():
         figures |= {f"plan_{name}_first_s": first, f"plan_{name}_s": later}
         yield f"planning by {name}: {1e3 * later:.0f} ms, the first time {1e3 * first:.0f} ms"
     dynamics = dynamics_benchmark()
@@ -119,7 +140,7 @@ def _dynamics_lines(figures: dict[str, float | str]) -> Iterator[str]:
 def _stack_rate(ticks: int, bag: Path | None) -> float:
     """Ticks a second of the first ``ticks`` of the sliding-mass flight, planning left out."""
     scenario = load_scenario("sliding_masses").with_overrides("planner", {"method": "lie_bracket"})
-    stack = FlightStack(scenario, bag)
+    stack = InProcessStack(scenario, bag)
     try:
         stack.start(stack.scenario.goal)
         first, began = 0, 0.0
@@ -216,3 +237,56 @@ def _plant_tick() -> float:
     for _ in range(repeats):
         plant.step(command)
     return (time.perf_counter() - began) / repeats
+
+
+def _planning_times() -> Iterator[tuple[str, float, float]]:
+    """Yield for each method its name, and the first and the median time of a plan, s.
+
+    ``area_loop`` plans one cycle at a time.
+    """
+    for scenario, name in _GAITS:
+        problem = load_scenario(scenario).problem()
+        method = problem.method(name)
+        request = PlanRequest(state_of(problem.plant()), problem.goal, problem.config.tolerance)
+        times = []
+        for _ in range(1 + _PLANS):
+            began = time.perf_counter()
+            method.plan(request)
+            times.append(time.perf_counter() - began)
+        yield name, times[0], statistics.median(times[1:])
+
+
+def _replay_spacing(folder: Path) -> tuple[float, float]:
+    """Return by how much the spacing of 500 messages, 100 a second, is missed at rate 1.
+
+    Returns the median and the largest error of the time from one message to the next, s.
+    """
+    bag = folder / "spacing.mcap"
+    with BagWriter(bag) as writer:
+        channel = writer.add_topic(_REPLAYED, "sensor_msgs/msg/JointState")
+        raw = serialize_message(JointState(name=["a", "b", "c"], position=[0.0] * 3))
+        for k in range(_MESSAGES):
+            stamp = round(k * _PERIOD * 1e9)
+            writer.write(channel, raw, stamp, stamp)
+    arrivals: list[float] = []
+    executor = EventsExecutor()
+    listener = rclpy.create_node("listener")
+    listener.create_subscription(
+        JointState, _REPLAYED, lambda _: arrivals.append(time.perf_counter()), STREAM, raw=True
+    )
+    replay = ReplayNode("replay", parameter_overrides=[Parameter("bag", value=str(bag))])
+    done = rclpy.task.Future()
+    replay.on_end = done.set_result
+    try:
+        for node in (listener, replay):
+            executor.add_node(node)
+        spin_until(executor, done)
+        patience = time.perf_counter() + _PATIENCE
+        while len(arrivals) < _MESSAGES and time.perf_counter() < patience:
+            executor.spin_once(timeout_sec=0.1)
+    finally:
+        for node in (listener, replay):
+            node.destroy_node()
+        executor.shutdown()
+    errors = [abs(later - earlier - _PERIOD) for earlier, later in pairwise(arrivals)]
+    return statistics.median(errors), max(errors)

@@ -22,7 +22,7 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.nodes.planner.node import ANSWERED
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.session.processes import ProcessStack
+from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.run import ros, stop_on_signals
 from spacerobot_ros.session.scenario import load_scenario
 
@@ -146,7 +146,7 @@ def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
         stop_on_signals() as stopped,
     ):
         bag = Path(folder, "flight.mcap")
-        stack = ProcessStack(scenario, bag)
+        stack = MultiProcessStack(scenario, bag)
         idle = _IdleProcess(1.0 / rate, duration)
         prioritised = _prioritise(stack)
         try:
@@ -225,7 +225,7 @@ def _figures(
     )
 
 
-def _prioritise(stack: ProcessStack) -> bool:
+def _prioritise(stack: MultiProcessStack) -> bool:
     """Have the kernel let the plant go first, then its commander; return whether it does."""
     try:
         for name, process in stack.processes.items():
@@ -279,7 +279,7 @@ def _wait_for_ticks(period: float, duration: float, sender: Connection) -> None:
     sender.send((late, worst))
 
 
-def _resident(stack: ProcessStack) -> float:
+def _resident(stack: MultiProcessStack) -> float:
     """Return the resident memory of the stack's processes, MiB."""
     return sum(
         int(line.split()[1]) / 1024

@@ -1,37 +1,43 @@
-"""The command `spacerobot analyze`."""
+"""The command ``spacerobot analyze``."""
 
 from __future__ import annotations
 
-import json
+import math
 from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from spacerobot_ros.cli.errors import sentences
+from spacerobot_ros.cli.options import PATH, json_option, write, write_json
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.resources import robot_file
+
+if TYPE_CHECKING:
+    from spacerobot_ros.model import SpaceRobot
+    from spacerobot_ros.planning.analysis import Analysis
+    from spacerobot_ros.planning.core.controllability import Controllability
+
+_MOST_ROWS = 12
+"""Joints that are listed; of more the rest is counted."""
 
 
-@click.command()
+@click.command("analyze")
 @click.argument("robot")
 @click.option("--shape", metavar="'Q1 Q2 ...'", help="Shape to look at, m or rad [the best].")
-@click.option(
-    "--picture", type=click.Path(path_type=Path), help="PNG to draw [out/ROBOT_curvature.png]."
-)
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the findings.")
-@sentences
-def analyze(robot: str, shape: str | None, picture: Path | None, json_file: Path | None) -> None:
+@click.option("--picture", type=PATH, help="PNG to draw [out/ROBOT_curvature.png].")
+@json_option("Write the findings.")
+def command(robot: str, shape: str | None, picture: Path | None, json_file: Path | None) -> None:
     """Say what loops of the joints of ROBOT (a name or a URDF file) can do, and draw it."""
-    from spacerobot_ros.session.analyze import analyze, json_of, lines_of
+    from spacerobot_ros.model import SpaceRobot
+    from spacerobot_ros.planning.analysis import analyze
+    from spacerobot_ros.resources import robot_file
 
     model = SpaceRobot.from_file(robot_file(robot))
-    found = analyze(model, None if shape is None else _numbers(shape))
+    found = analyze(model, None if shape is None else _parsed(shape))
     for line in lines_of(found):
         click.echo(line)
     if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps(json_of(found), indent=2) + "\n", encoding="utf-8")
+        write_json(json_file, json_of(found))
     from spacerobot_ros.report.analyze_figures import draw
 
     png = draw(found)
@@ -39,13 +45,137 @@ def analyze(robot: str, shape: str | None, picture: Path | None, json_file: Path
         click.echo(f"{'picture':<13}none: no loops of the joints turn the base")
         return
     target = picture or Path("out") / f"{model.description.name}_curvature.png"
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.write_bytes(png)
+    write(target, png)
     click.echo(f"{'picture':<13}{target}")
 
 
-def _numbers(text: str) -> list[float]:
+def _parsed(text: str) -> list[float]:
     try:
         return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
         raise ParameterError(f"--shape is '{text}'; it must be numbers, one a joint.") from None
+
+
+def lines_of(found: Analysis) -> list[str]:
+    """Return the findings as lines that fit a screen."""
+    robot = found.robot
+    base = robot.description.bodies[0].inertia.mass
+    n, name = robot.n, robot.description.name
+    lines = [f"{name}: {n} joint(s), {robot.total_mass:.6g} kg, of which the base {base:.6g} kg"]
+    lines += _joint_rows(robot)
+    lines += ["", *_rotation_lines(found)]
+    lines += [f"{'position':<13}{_position(found)}", ""]
+    for method, objection in found.objections.items():
+        lines.append(f"{method:<13}{'no: ' + objection if objection else 'yes'}")
+    lines.append(f"{'auto':<13}{found.chosen or 'no method suits this robot'}")
+    return lines
+
+
+def json_of(found: Analysis) -> dict[str, Any]:
+    """Return the findings as what JSON can hold; infinite condition numbers and limits are null."""
+    robot = found.robot
+    finite = _finite(found)
+    return {
+        "robot": robot.description.name,
+        "mass_kg": robot.total_mass,
+        "bodies": {body.name: body.inertia.mass for body in robot.description.bodies},
+        "joints": [
+            {
+                "name": joint.name,
+                "kind": joint.kind.value,
+                "lower": _number(joint.limits.lower),
+                "upper": _number(joint.limits.upper),
+                "velocity": _number(joint.limits.velocity),
+                "effort": _number(joint.limits.effort),
+            }
+            for joint in robot.description.movable_joints
+        ],
+        "shape": found.shape.tolist(),
+        "at_shape": _finding(found.at_shape),
+        "anywhere": _finding(found.anywhere),
+        "curvature_matrix": None if found.nominal is None else found.nominal.M.tolist(),
+        "condition_over_shapes": {
+            "shapes": len(found.conditions),
+            "spanning": len(finite),
+            "best": min(finite, default=None),
+            "median": median(finite) if finite else None,
+        },
+        "planar": _finding(found.planar),
+        "sliding": _finding(found.sliding),
+        "methods": {name: objection or None for name, objection in found.objections.items()},
+        "auto": found.chosen or None,
+    }
+
+
+def _joint_rows(robot: SpaceRobot) -> list[str]:
+    from spacerobot_ros.model.description import JointKind
+
+    joints, bodies = robot.description.movable_joints, robot.description.bodies[1:]
+    width = max([5, *(len(joint.name) for joint in joints[:_MOST_ROWS])])
+    head = f"{'joint':<{width}}  {'kind':<11}{'on':<16}{'stroke':>19}{'speed':>12}{'effort':>10}"
+    rows = [f"{head}{'mass':>12}"]
+    for joint, body in list(zip(joints, bodies, strict=True))[:_MOST_ROWS]:
+        unit, of_effort = ("m", "N") if joint.kind is JointKind.PRISMATIC else ("rad", "N m")
+        limits = joint.limits
+        stroke = f"{limits.lower:.4g} .. {limits.upper:.4g} {unit}"
+        if math.isinf(limits.lower):
+            stroke = "free"
+        speed, effort = f"{limits.velocity:.3g} {unit}/s", f"{limits.effort:.4g} {of_effort}"
+        rows.append(
+            f"{joint.name:<{width}}  {joint.kind.value:<11}{joint.parent[:15]:<16}{stroke:>19}"
+            f"{speed:>12}{effort:>10}{body.inertia.mass:>9.4g} kg"
+        )
+    if len(joints) > _MOST_ROWS:
+        rows.append(f"and {len(joints) - _MOST_ROWS} more")
+    return rows
+
+
+def _rotation_lines(found: Analysis) -> list[str]:
+    lines = [f"{'rotation':<13}{found.anywhere.sentence}"]
+    if found.planar.controllable:
+        lines = [f"{'rotation':<13}{found.planar.sentence}"]
+    if found.nominal is not None:
+        at, values = found.nominal, ", ".join(f"{x:.3g}" for x in found.nominal.singular_values)
+        names = ", ".join(found.robot.joint_names[i] for i in at.joints)
+        shape = ", ".join(f"{x:.4g}" for x in found.shape)
+        lines += [
+            f"{'at shape':<13}({shape}): rank {found.at_shape.rank}, condition {at.condition:.3g}",
+            f"{'':<13}singular values ({values}) rad a unit of area, joints {names}",
+        ]
+        finite = _finite(found)
+        lines.append(
+            f"{'shape space':<13}rank 3 at {len(finite)} of {len(found.conditions)} shapes; "
+            f"condition {min(finite):.3g} at best, {median(finite):.3g} the median"
+        )
+    return lines
+
+
+def _position(found: Analysis) -> str:
+    from spacerobot_ros.planning.core.controllability import sliders_of
+
+    count = len(sliders_of(found.robot))
+    if found.sliding.controllable:
+        return f"{count} sliders with independent slots put the base where it is to be (paper 1)"
+    return "follows from attitude and shape: the centre of mass rests"
+
+
+def _finding(found: Controllability) -> dict[str, Any]:
+    return {
+        "controllable": found.controllable,
+        "rank": found.rank,
+        "wanted": found.wanted,
+        "condition": _number(found.condition),
+        "singular_values": found.singular_values.tolist(),
+        "joints": list(found.joints),
+        "shape": found.shape.tolist(),
+        "sentence": found.sentence,
+    }
+
+
+def _finite(found: Analysis) -> list[float]:
+    """Return the condition numbers of the shapes where the brackets span all rotations."""
+    return [float(x) for x in found.conditions if math.isfinite(x)]
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

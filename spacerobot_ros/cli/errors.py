@@ -1,40 +1,59 @@
-"""How a command ends: its exit codes, and one sentence where its input is refused."""
+"""How a command ends: its exit codes, and one sentence where it does not succeed."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from functools import wraps
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import IntEnum
+from typing import NoReturn
 
 import click
 
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.errors import GoalError, PlanningError, SpaceRobotError
 
-GOAL_NOT_REACHED = 1
-BAD_INPUT = 2
+
+class ExitCode(IntEnum):
+    """What ends a command."""
+
+    DONE = 0
+    """The goal was reached within tolerance; the bag is as it should be; nothing was refused."""
+
+    NOT_REACHED = 1
+    """The goal was not reached or cannot be reached; the bag differs."""
+
+    BAD_INPUT = 2
+    """The input is refused, or what the command needs is not there."""
+
 
 _ROS = ("rclpy", "rosidl_parser", "ament_index_python")
 
 
-def sentences(command: Callable[..., None]) -> Callable[..., None]:
-    """End a command with one sentence and exit code 2 where its input is refused."""
+def fail(sentence: str = "") -> NoReturn:
+    """End a command that did what was asked, without success."""
+    if sentence:
+        click.echo(sentence, err=True)
+    sys.exit(ExitCode.NOT_REACHED)
 
-    @wraps(command)
-    def wrapped(*arguments: Any, **options: Any) -> None:
-        try:
-            command(*arguments, **options)
-        except SpaceRobotError as error:
-            click.echo(str(error), err=True)
-            sys.exit(BAD_INPUT)
-        except ImportError as error:
-            if error.name and error.name.split(".")[0] in _ROS:
-                click.echo(
-                    f"ROS 2 was not found ({error}); source its setup file, or install "
-                    "spacerobot_ros with its extra [jazzy].",
-                    err=True,
-                )
-                sys.exit(BAD_INPUT)
+
+@contextmanager
+def sentences() -> Iterator[None]:
+    """End the process with one sentence and its exit code where an exception of ours is raised.
+
+    A goal that a method cannot reach is no bad input; everything else that is refused is.
+    """
+    try:
+        yield
+    except SpaceRobotError as error:
+        out_of_reach = isinstance(error, PlanningError) and not isinstance(error, GoalError)
+        click.echo(str(error), err=True)
+        sys.exit(ExitCode.NOT_REACHED if out_of_reach else ExitCode.BAD_INPUT)
+    except ImportError as error:
+        if not error.name or error.name.split(".")[0] not in _ROS:
             raise
-
-    return wrapped
+        click.echo(
+            f"ROS 2 was not found ({error}); source its setup file, or install spacerobot_ros "
+            "with its extra [jazzy].",
+            err=True,
+        )
+        sys.exit(ExitCode.BAD_INPUT)

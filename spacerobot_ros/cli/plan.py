@@ -1,41 +1,50 @@
-"""The command `spacerobot plan`."""
+"""The command ``spacerobot plan``."""
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from spacerobot_ros.cli.errors import GOAL_NOT_REACHED, sentences
-from spacerobot_ros.cli.options import pose_option, rotvec_option, settings_option
-from spacerobot_ros.planning import METHODS
+from spacerobot_ros.cli.errors import fail
+from spacerobot_ros.cli.options import (
+    METHODS,
+    PATH,
+    Registered,
+    json_option,
+    pose_option,
+    rotvec_option,
+    settings_option,
+    write,
+    write_json,
+)
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 
 if TYPE_CHECKING:
-    from spacerobot_ros.session.plan import Problem
+    from spacerobot_ros.simulation.trials import Problem, Record, Trial
 
 
-@click.command()
+@click.command("plan")
 @click.argument("scenario", metavar="SCENARIO|ROBOT")
 @pose_option
 @rotvec_option
 @click.option(
     "--method",
-    type=click.Choice(sorted(METHODS)),
+    type=Registered(METHODS),
     default="optimal",
     show_default=True,
     help="Gait method.",
 )
 @settings_option
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write schedule, path.")
-@click.option("--picture", type=click.Path(path_type=Path), help="Draw both (PNG).")
+@json_option("Write schedule, path.")
+@click.option("--picture", type=PATH, help="Draw both (PNG).")
 @click.option("--compare", "comparing", is_flag=True, help="Fly every method, print a table.")
 @click.option("--random", "count", type=click.IntRange(min=1), help="Fly so many random goals.")
 @click.option(
@@ -47,9 +56,8 @@ if TYPE_CHECKING:
     show_default=True,
     help="... at most so far from the start.",
 )
-@click.option("--beside", type=click.Choice(sorted(METHODS)), help="... by this method too.")
-@sentences
-def plan(
+@click.option("--beside", type=Registered(METHODS), help="... by this method too.")
+def command(
     scenario: str,
     goal: tuple[float, ...] | None,
     goal_rotvec: tuple[float, ...] | None,
@@ -64,72 +72,161 @@ def plan(
 ) -> None:
     """Plan a gait without ROS, for a SCENARIO or a ROBOT, and fly it in the plant.
 
-    Exit code 0: it ends within tolerance; 1: it does not; 2: bad input, or the goal is refused.
+    Exit code 0: it ends within tolerance; 1: it does not, or the goal cannot be reached; 2: bad
+    input.
     """
-    from spacerobot_ros.session.plan import compare, json_of, problem, solve, table_of
+    from spacerobot_ros.simulation.trials import Trial, compare, try_method
 
-    asked = problem(scenario, goal, goal_rotvec, settings)
+    problem = problem_of(scenario, goal, goal_rotvec, settings)
     if count is not None:
-        _fly_random(asked, [method] if beside is None else [method, beside], count, within)
+        _try_random(problem, [method] if beside is None else [method, beside], count, within)
         return
+    found: Mapping[str, Trial | SpaceRobotError]
     with _progress():
-        if comparing:
-            answers = compare(asked)
-            for line in table_of(answers):
-                click.echo(line)
-            flown = [x for x in answers.values() if not isinstance(x, str)]
-            found = next((x for x in flown if x.method == method), None)
-        else:
-            found = solve(asked, method)
-    if found is None:
-        sys.exit(GOAL_NOT_REACHED)
-    left = f"{found.error.angle:.3g} rad and {found.error.distance:.3g} m from the goal"
+        found = compare(problem) if comparing else {method: try_method(problem, method)}
+    if comparing:
+        for line in _table(found):
+            click.echo(line)
+    trial = found.get(method)
+    if not isinstance(trial, Trial):
+        fail()
+    left = f"{trial.error.angle:.3g} rad and {trial.error.distance:.3g} m from the goal"
     if not comparing:
-        click.echo(f"{scenario}, {method}: {found.duration:.6g} s, ends {left}")
-        click.echo(f"planned in {found.plan_time:.3f} s")
+        click.echo(f"{scenario}, {method}: {trial.duration:.6g} s, ends {left}")
+        click.echo(f"planned in {trial.plan_time:.3f} s")
     if json_file is not None:
-        content = json_of(asked, found)
+        content = json_of(problem, trial)
         if comparing:
             content["compared"] = {
-                name: answer if isinstance(answer, str) else answer.duration
-                for name, answer in answers.items()
+                name: each.duration if isinstance(each, Trial) else str(each)
+                for name, each in found.items()
             }
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps(content) + "\n", encoding="utf-8")
+        write_json(json_file, content, indent=None)
         click.echo(f"json        {json_file}")
     if picture is not None:
         from spacerobot_ros.report.plan_figures import draw
 
-        picture.parent.mkdir(parents=True, exist_ok=True)
-        picture.write_bytes(draw(asked, found))
+        write(picture, draw(problem, trial))
         click.echo(f"picture     {picture}")
-    if not found.succeeded:
-        click.echo(f"The goal is not met within the planner's tolerance: {left}.", err=True)
-        sys.exit(GOAL_NOT_REACHED)
+    if not trial.reached:
+        fail(f"The goal is not met within the planner's tolerance: {left}.")
 
 
-def _fly_random(
-    asked: Problem, methods: list[str], count: int, within: tuple[float, float]
+def problem_of(
+    name: str,
+    goal: Sequence[float] | None = None,
+    goal_rotvec: Sequence[float] | None = None,
+    settings: Sequence[str] = (),
+) -> Problem:
+    """Return the planning problem of a scenario, or of a robot (a name or a URDF file) at rest.
+
+    ``goal`` (7,) and ``goal_rotvec`` (3,) replace the scenario's, ``settings`` are
+    ``planner.parameter=value`` and ``plant.parameter=value``.
+
+    Raises
+    ------
+    ParameterError
+        There is no such scenario or robot, or a parameter is refused.
+    GoalError
+        The goal is not finite.
+    """
+    from spacerobot_ros.session.scenario import parse_setting, scenario_or_robot
+
+    for text in settings:
+        node, _, _ = parse_setting(text)
+        if node not in ("plant", "planner"):
+            raise ParameterError(f"'{text}' sets a parameter of {node}, which plans nothing.")
+    scenario = scenario_or_robot(name).with_settings(settings).with_goal(goal, goal_rotvec)
+    return scenario.problem()
+
+
+def json_of(problem: Problem, trial: Trial) -> dict[str, Any]:
+    """Return what ``--json`` writes of a trial."""
+    from spacerobot_ros.model.rotations import rotvec_from_quaternion
+
+    goal, path = problem.goal, trial.path
+    return {
+        "scenario": problem.name,
+        "method": trial.method,
+        "goal": [*goal.position.tolist(), *goal.quaternion.tolist()],
+        "succeeded": trial.reached,
+        "manoeuvre_time_s": trial.duration,
+        "plan_time_s": trial.plan_time,
+        "final_position_m": trial.pose[:3].tolist(),
+        "final_attitude_rotvec_rad": rotvec_from_quaternion(trial.pose[3:]).tolist(),
+        "final_joint_positions": trial.positions[-1].tolist(),
+        "position_error_m": trial.error.distance,
+        "attitude_error_rad": trial.error.angle,
+        "notes": trial.pieces[-1].notes,
+        "schedule": {
+            "tick_period_s": problem.control_period,
+            "joint_names": list(problem.robot.joint_names),
+            "positions": trial.positions.tolist(),
+        },
+        "path": {
+            "time_s": path.time.tolist(),
+            "position_m": path.position.tolist(),
+            "quaternion": path.quaternion.tolist(),
+        },
+    }
+
+
+def _table(found: Mapping[str, Trial | SpaceRobotError]) -> Iterator[str]:
+    """Yield the lines of a comparison; errors that a method does not control are in brackets."""
+    yield f"{'method':<14}{'manoeuvre':>12}{'planned in':>12}{'attitude':>14}{'position':>14}"
+    yield f"{'':<14}{'s':>12}{'s':>12}{'rad off':>14}{'m off':>14}"
+    for name, trial in found.items():
+        if isinstance(trial, SpaceRobotError):
+            yield f"{name:<14}{trial}"
+            continue
+        angle, distance = (
+            f"{error:.3g}" if part in trial.controls else f"({error:.3g})"
+            for part, error in (("attitude", trial.error.angle), ("position", trial.error.distance))
+        )
+        times = f"{trial.duration:>12.6g}{trial.plan_time:>12.3f}"
+        yield f"{name:<14}{times}{angle:>14}{distance:>14}"
+
+
+def _try_random(
+    problem: Problem, methods: list[str], count: int, within: tuple[float, float]
 ) -> None:
-    """Print what becomes of random goals; the exit code says whether all flown ones are met."""
-    from spacerobot_ros.session.plan_random import HEADING, fly_goals, random_goals
+    """Print what becomes of random goals; the exit code says whether all flown ones are reached."""
+    from spacerobot_ros.simulation.trials import random_goals, try_goals
 
-    goals = random_goals(asked, count, within[0], math.radians(within[1]))
+    goals = random_goals(problem, count, within[0], math.radians(within[1]))
     show = partial(click.echo, err=True) if sys.stderr.isatty() else lambda line: None
-    records = fly_goals(asked, goals, methods, show)
-    click.echo(HEADING)
+    records = try_goals(problem, goals, methods, show)
+    click.echo(
+        f"{'method':<14}{'goals':>7}{'met':>7}{'missed':>8}{'refused':>9}{'shortest':>10}"
+        f"{'median':>10}{'longest':>10}{'planned in':>11}{'at most':>9}"
+    )
     for record in records:
-        click.echo(record.line())
+        click.echo(_row(record))
     for record in records:
         for reason in dict.fromkeys(record.refused):
             click.echo(f"{record.method} refused: {reason}")
     if records[0].missed:
-        sys.exit(GOAL_NOT_REACHED)
+        fail()
+
+
+def _row(record: Record) -> str:
+    import numpy as np
+
+    goals = record.reached + record.missed + len(record.refused)
+    counts = (
+        f"{record.method:<14}{goals:>7}{record.reached:>7}{record.missed:>8}"
+        f"{len(record.refused):>9}"
+    )
+    if not record.durations:
+        return counts
+    low, middle, high = np.quantile(record.durations, [0.0, 0.5, 1.0])
+    planned, longest = np.quantile(record.plan_times, [0.5, 1.0])
+    return f"{counts}{low:>10.4g}{middle:>10.4g}{high:>10.4g}{planned:>11.3g}{longest:>9.3g}"
 
 
 @contextmanager
 def _progress() -> Iterator[None]:
-    """Show what the methods say of their search, where somebody is looking."""
+    """Show what the methods log of their search, where somebody is looking."""
     log, handler = logging.getLogger("spacerobot_ros.planning"), logging.StreamHandler(sys.stderr)
     if not sys.stderr.isatty():
         yield

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.planning.analysis import Analysis
 from spacerobot_ros.planning.core.controllability import (
     curvature_matrices,
     curvatures,
@@ -32,7 +33,6 @@ from spacerobot_ros.report.style import (
     paper_style,
     png_of,
 )
-from spacerobot_ros.session.analyze import Analysis
 
 _PIXELS = 1600
 _FINE, _COARSE = 61, 37

@@ -18,33 +18,31 @@ from spacerobot_ros.report.style import (
     set_time,
     sheet,
 )
-from spacerobot_ros.session.plan import Planned, Problem, json_of
+from spacerobot_ros.simulation.trials import Problem, Trial
 
 _PIXELS = 1600
 _COMPONENTS = ("x", "y", "z")
 
 
-def draw(problem: Problem, planned: Planned) -> bytes:
+def draw(problem: Problem, trial: Trial) -> bytes:
     """Return the picture (PNG) of a plan and its goal."""
     with paper_style():
-        return png_of(_figure(problem, planned), _PIXELS)
+        return png_of(_figure(problem, trial), _PIXELS)
 
 
-def _figure(problem: Problem, planned: Planned) -> Figure:
-    content = json_of(problem, planned)
+def _figure(problem: Problem, trial: Trial) -> Figure:
     robot, goal = problem.robot, problem.goal
-    positions = np.array(content["schedule"]["positions"])
-    ticks = problem.tick_period * np.arange(len(positions), dtype=np.float64)
-    rates = np.diff(positions, axis=0) / problem.tick_period
-    path_time = np.array(content["path"]["time_s"])
-    base = np.array(content["path"]["position_m"])
-    turned = np.array([rotvec_from_quaternion(x) for x in content["path"]["quaternion"]])
+    positions = trial.positions
+    ticks = problem.control_period * np.arange(len(positions), dtype=np.float64)
+    rates = np.diff(positions, axis=0) / problem.control_period
+    path = trial.path
+    turned = np.array([rotvec_from_quaternion(x) for x in path.quaternion])
     names = robot.joint_names
     figure, rows = sheet([[1], [1], [1, 1]], [1.9, 1.9, 1.9], right=room_for(names) + 0.35)
     joints, speeds, (place, attitude) = rows[0][0], rows[1][0], rows[2]
     kinds = {joint.kind is JointKind.PRISMATIC for joint in robot.description.movable_joints}
     unit = "m, rad" if len(kinds) == 2 else "m" if kinds == {True} else "rad"
-    title = f"{planned.method}, {planned.duration:.6g} s: joints ({unit})"
+    title = f"{trial.method}, {trial.duration:.6g} s: joints ({unit})"
     _panel(joints, title, ticks, positions, names)
     # Held over a tick: steps.
     held = np.repeat(rates, 2, axis=0)
@@ -52,7 +50,7 @@ def _figure(problem: Problem, planned: Planned) -> Figure:
         speeds, f"held joint velocities ({unit} a second)", np.repeat(ticks, 2)[1:-1], held, names
     )
     for axes, what, values, wanted in (
-        (place, "base position (m) and goal", base, goal.position),
+        (place, "base position (m) and goal", path.position, goal.position),
         (
             attitude,
             "base attitude, rotation vector (rad), and goal",
@@ -60,7 +58,7 @@ def _figure(problem: Problem, planned: Planned) -> Figure:
             rotvec_from_quaternion(goal.quaternion),
         ),
     ):
-        _panel(axes, what, path_time, values, _COMPONENTS, wanted)
+        _panel(axes, what, path.time, values, _COMPONENTS, wanted)
         axes.set_xlabel("time (s)")
     return figure
 

@@ -1,4 +1,4 @@
-"""The nodes of a scenario, each in a process of its own: as users run them, without ros2 launch."""
+"""The stack with each node in a process of its own: as users run them, without ros2 launch."""
 
 from __future__ import annotations
 
@@ -11,30 +11,26 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import rclpy
 import yaml
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from rclpy.clock import Clock, ClockType
 from rclpy.experimental import EventsExecutor
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.model.robot_source import RobotConfig, robot_of
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.model.robot_source import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
-from spacerobot_ros.nodes.common.node import spin_until
-from spacerobot_ros.parameters import configured, declared
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.executive import PLANNED
-from spacerobot_ros.session.description import parameter_records, scenario_record
-from spacerobot_ros.session.kills import NEEDS_PROCESSES, KillTimeline
-from spacerobot_ros.session.mission_client import Operator
-from spacerobot_ros.session.scenario import COMMANDERS, Scenario
+from spacerobot_ros.session.mission_client import MissionClient
+from spacerobot_ros.session.scenario import COMMANDERS, Kill, Scenario
+from spacerobot_ros.session.stack import Stack
 
 _START = 60.0
 """Wall s within which every node must be there."""
@@ -51,22 +47,18 @@ _COMMANDS = ("joint_commands", "base_wrench", "joint_reference")
 _SETTLING = 1.0
 """Wall s for the recorder to take in what was published before time stood still."""
 
-_LOOK_PERIOD = 0.2
-
 _PLANNED = re.escape(PLANNED).replace(r"\{:\.6f\}", r"([\d.]+)")
 
 
-class ProcessStack:
-    """The processes of a scenario, and the operator of their flight in this one.
+class MultiProcessStack(Stack):
+    """The processes of a scenario, and in this one the client of their mission.
 
     Parameters
     ----------
-    scenario
-        What to run.
-    bag
-        File to record into; None records nothing.
+    scenario, bag
+        As of every stack.
     plant_waits
-        Whether the plant begins only with :meth:`start`, when everybody listens.
+        Whether the plant begins only with :meth:`start`, when all nodes are connected.
 
     Raises
     ------
@@ -74,55 +66,55 @@ class ProcessStack:
         A node ended at its start; the sentence is its own.
     """
 
+    can_kill: ClassVar[bool] = True
+
     def __init__(self, scenario: Scenario, bag: Path | None, *, plant_waits: bool = True) -> None:
-        if "time_mode" not in scenario.overrides.get("plant", {}):
-            scenario = scenario.with_overrides("plant", {"time_mode": "lockstep"})
-        if scenario.kills and scenario.lockstep:
-            raise ParameterError(NEEDS_PROCESSES.format(scenario.name))
-        self.scenario = scenario
+        super().__init__(scenario, bag)
         self._timeline = KillTimeline(scenario.kills)
-        self.time_ns = 0
+        self._time_ns = 0
         self._clock_seen = math.inf
-        self._bag = bag
         self._folder = tempfile.TemporaryDirectory(prefix="spacerobot_")
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._nodes = ["plant", *scenario.commanders, *(["recorder"] if bag is not None else [])]
-        names = None
+        names: Sequence[str] | None = None
         if scenario.goal.joint_positions is not None:
-            robot = robot_of(configured(RobotConfig, scenario.parameters("plant")))
+            robot = robot_of(scenario.plant)
             names = robot.joint_names if robot is not None else ()
-        self.operator = Operator(
+            if robot is not None:
+                scenario.require_shape_of(robot)
+        self.client = MissionClient(
             scenario.commanders[0],
-            str(scenario.parameter(scenario.commanders[0], "world_frame", "world")),
+            scenario.config(scenario.commanders[0]).world_frame,
             joint_names=None if names is None else lambda: names,
             end_effector=scenario.end_effector_goal is not None,
         )
-        node = self.operator.node
+        node = self.client.node
         node.create_subscription(ClockMessage, "/clock", self._on_clock, 10)
         self._change_state = node.create_client(ChangeState, "plant/change_state")
         self.executor = EventsExecutor()
         self.executor.add_node(node)
         try:
-            for name in self._nodes:
+            for name in self.names:
                 self.launch(name, autostart=name != "plant" or not plant_waits)
             if plant_waits:
                 self._transit(Transition.TRANSITION_CONFIGURE)
-            self._wait_for(self._met, "the nodes to find each other")
+            self._wait_for(self._connected, "the nodes to find each other")
         except BaseException:
             self.close()
             raise
 
     def launch(self, name: str, **parameters: Any) -> None:
         """Start one node of the scenario, for the first time or again, with more parameters."""
-        overrides = dict(self.scenario.overrides.get(name, {}))
+        overrides: dict[str, Any] = self.scenario.checked_overrides(name)
         if name == "recorder":
-            overrides["bag"] = str(self._bag)
+            overrides["bag"] = str(self.bag)
             record = Path(self._folder.name, "scenario.json")
-            record.write_text(json.dumps(self._records()), "utf-8")
+            records = self.scenario.records([other for other in self.names if other != name])
+            record.write_text(json.dumps(records), "utf-8")
             overrides["describe"] = str(record)
         elif self.scenario.kills and name in COMMANDERS:
             overrides.setdefault("resume_file", str(Path(self._folder.name, f"{name}_goal.json")))
         overrides |= parameters
+        overrides = {k: list(v) if isinstance(v, tuple) else v for k, v in overrides.items()}
         file = Path(self._folder.name, f"{name}.yaml")
         file.write_text(yaml.safe_dump({name: {"ros__parameters": overrides}}), "utf-8")
         said = Path(self._folder.name, f"{name}.txt").open("wb")  # noqa: SIM115
@@ -139,15 +131,6 @@ class ProcessStack:
                 start_new_session=True,
             )
 
-    def _records(self) -> dict[str, dict[str, str]]:
-        specs = {
-            name: declared(NODE_TYPES[name].Config) for name in self._nodes if name != "recorder"
-        }
-        return {
-            "scenario": scenario_record(self.scenario),
-            **parameter_records(self.scenario, specs),
-        }
-
     def said(self, name: str) -> str:
         """Return what a node has written to its standard output and error."""
         return Path(self._folder.name, f"{name}.txt").read_text("utf-8", errors="replace")
@@ -159,39 +142,34 @@ class ProcessStack:
             return 0.0
         return sum(float(text) for text in re.findall(_PLANNED, self.said("planner")))
 
+    @property
+    def time_ns(self) -> int:
+        """Simulated time that was last received, ns."""
+        return self._time_ns
+
     def start(self, goal: Goal | None) -> None:
         """Send the goal, if there is one, and let time run."""
         if goal is not None:
-            self.operator.send(goal, self.scenario.end_effector_goal)
+            self.client.send(goal, self.scenario.end_effector_goal)
         self._transit(Transition.TRANSITION_ACTIVATE)
 
     def spin(self, look: Callable[[], bool]) -> None:
         """Run until the goal is decided, or until ``look``, called five times a second, is true.
+
+        On the way nodes are killed and started as the scenario says.
 
         Raises
         ------
         SpaceRobotError
             A node has ended by itself.
         """
-        failures: list[SpaceRobotError] = []
 
-        def on_look() -> None:
-            try:
-                self._kill_and_restart()
-                self.require_alive()
-                stop = look()
-            except SpaceRobotError as error:
-                failures.append(error)
-                stop = True
-            if stop and not self.operator.done.done():
-                self.operator.done.set_result("stopped")
+        def supervise() -> bool:
+            self._kill_and_restart()
+            self.require_alive()
+            return look()
 
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        timer = self.operator.node.create_timer(_LOOK_PERIOD, on_look, clock=steady)
-        spin_until(self.executor, self.operator.done)
-        self.operator.node.destroy_timer(timer)
-        if failures:
-            raise failures[0]
+        self.client.follow(self.executor, supervise)
 
     def finish(self) -> None:
         """Stop time, then end every node, the recorder, whose bag is completed, last.
@@ -206,7 +184,7 @@ class ProcessStack:
         end = time.monotonic() + _SETTLING
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.05)
-        for name in self._nodes:
+        for name in self.names:
             if name in self._timeline.away:
                 continue
             code = self._end(name)
@@ -216,13 +194,13 @@ class ProcessStack:
                 )
 
     def close(self) -> None:
-        """End what still runs; safe to call twice."""
+        """End what still runs."""
         for process in self.processes.values():
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
         self.executor.shutdown()
-        self.operator.node.destroy_node()
+        self.client.node.destroy_node()
         self._folder.cleanup()
 
     def require_alive(self) -> None:
@@ -248,13 +226,13 @@ class ProcessStack:
     def _kill_and_restart(self) -> None:
         """Do to the nodes what the scenario says for this time."""
         # A killed plant has no clock: the wall's goes on for it.
-        factor = float(self.scenario.parameter("plant", "real_time_factor", 1.0))
+        factor = self.scenario.plant.real_time_factor
         since = factor * (time.monotonic() - self._clock_seen)
-        killed, started = self._timeline.due(self.time_ns / NANOSECONDS + since)
+        killed, started = self._timeline.due(self._time_ns / NANOSECONDS + since)
         for name in killed:
             self.kill(name)
         for name in started:
-            again = {"resume_bag": str(self._bag or ""), "autostart": True}
+            again = {"resume_bag": str(self.bag or ""), "autostart": True}
             self.launch(name, **(again if name == "plant" else {}))
 
     def _end(self, name: str) -> int:
@@ -272,16 +250,16 @@ class ProcessStack:
             return process.wait()
 
     def _on_clock(self, message: ClockMessage) -> None:
-        self.time_ns = message.clock.sec * NANOSECONDS + message.clock.nanosec
+        self._time_ns = message.clock.sec * NANOSECONDS + message.clock.nanosec
         self._clock_seen = time.monotonic()
 
-    def _met(self) -> bool:
-        """Whether commanders and recorder hear the plant and the operator, and are heard."""
-        node = self.operator.node
-        listeners = 2 if self._bag is not None else 1
+    def _connected(self) -> bool:
+        """Whether commanders and recorder receive plant and client, and the plant commands."""
+        node = self.client.node
+        listeners = 2 if self.bag is not None else 1
         return (
-            self.operator.heard(listeners)
-            and node.count_subscribers("odom") >= len(self._nodes) - 1
+            self.client.is_connected(listeners)
+            and node.count_subscribers("odom") >= len(self.names) - 1
             and all(
                 node.count_subscribers(topic) >= listeners
                 for topic in _COMMANDS
@@ -310,3 +288,30 @@ def _last_line(text: str) -> str:
     # A crash ends with pages of loaded modules.
     lines = [line for line in text.strip().splitlines() if not line.startswith("Extension mod")]
     return lines[-1] if lines else "it said nothing."
+
+
+class KillTimeline:
+    """Which node is to end and to start, as time goes on.
+
+    Parameters
+    ----------
+    kills
+        By time.
+    """
+
+    def __init__(self, kills: Sequence[Kill]) -> None:
+        self._waiting = list(kills)
+        self._away: list[Kill] = []
+
+    def due(self, time: float) -> tuple[list[str], list[str]]:
+        """Return the nodes to kill and those to start, by the simulated time in s."""
+        killed = [kill for kill in self._waiting if kill.at <= time]
+        started = [kill for kill in self._away if kill.until <= time]
+        self._waiting = [kill for kill in self._waiting if kill.at > time]
+        self._away = [kill for kill in self._away if kill.until > time] + killed
+        return [kill.node for kill in killed], [kill.node for kill in started]
+
+    @property
+    def away(self) -> set[str]:
+        """The nodes that were killed and are not started yet."""
+        return {kill.node for kill in self._away}

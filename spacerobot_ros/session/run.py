@@ -1,11 +1,10 @@
-"""Fly a scenario: compose the nodes, send the goal, record, measure, sum up."""
+"""Fly a scenario: start the nodes, send the goal, record, measure, sum up."""
 
 from __future__ import annotations
 
-import json
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,15 +14,16 @@ import numpy as np
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from spacerobot_ros.bag import Bag, read_bag
+from spacerobot_ros.bag import Bag, RecordingError, TopicSeries, read_bag
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.nodes.common.node import use_loopback_discovery, use_private_discovery
 from spacerobot_ros.nodes.plant.thruster_topics import PROPELLANT
-from spacerobot_ros.planning import PoseError
-from spacerobot_ros.session.measure import Measured
-from spacerobot_ros.session.processes import ProcessStack
+from spacerobot_ros.planning import Goal, PoseError
+from spacerobot_ros.session.mission_client import Outcome
+from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.scenario import Scenario
-from spacerobot_ros.session.stack import FlightStack
+from spacerobot_ros.session.stack import InProcessStack, Stack
 
 _NO_GAIT = (
     *("state", "goal", "goal_id", "corrections", "method"),
@@ -31,8 +31,80 @@ _NO_GAIT = (
 )
 """Values of the planner's status that do not describe its gait."""
 
+_POSE = [
+    *(f"pose.pose.position.{axis}" for axis in "xyz"),
+    *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
+]
+
 Progress = Callable[[float, float], None]
 """Called with simulated time and the time the present schedule ends, s."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Time series of a bag: ``time`` (N,) s, base ``position`` (N, 3) m and ``quaternion`` (N, 4),
+    ``joints`` and ``joint_rates`` (N, n), ``momentum`` (N, 7) as on the topic. Of imperfect sensors
+    they are the truth, which the plant publishes beside what is measured.
+    """
+
+    time: Array
+    position: Array
+    quaternion: Array
+    joint_names: list[str]
+    joints: Array
+    joint_rates: Array
+    momentum: Array
+    expected: Array
+    """Momenta (N, 6) by what the run began with and the thrusters gave."""
+    end_effector: tuple[Array, Array] | None = None
+    """Its last position (3,) and quaternion (4,), where it was published."""
+
+    @classmethod
+    def of(cls, bag: Bag, namespace: str = "") -> Measured:
+        """Take the series out of a bag.
+
+        Raises
+        ------
+        RecordingError
+            A topic is missing or empty.
+        """
+        topics = [f"{namespace}/{name}" for name in ("odom", "joint_states", "momentum")]
+        for topic in topics:
+            if not (_holds(bag, topic) or _holds(bag, f"{topic}_true")):
+                raise RecordingError(f"The bag holds no message on {topic}: no plant was recorded.")
+        time, pose = _truth(bag, topics[0], _POSE)
+        _, shapes = _truth(bag, topics[1], ["position", "velocity"])
+        momentum = bag[topics[2]]
+        n = shapes.shape[1] // 2
+        return cls(
+            time=time,
+            position=pose[:, :3],
+            quaternion=pose[:, 3:],
+            joint_names=list(next(bag[topics[1]].messages())[1].name),
+            joints=shapes[:, :n],
+            joint_rates=shapes[:, n:],
+            momentum=np.asarray(momentum.field("data")),
+            expected=_expected(bag, f"{namespace}/momentum_expected", momentum),
+            end_effector=_last_pose(bag, f"{namespace}/end_effector_pose"),
+        )
+
+    @property
+    def linear_drift(self) -> float:
+        """Largest change of the total linear momentum without thrust, kg m/s."""
+        return _largest_change(self.momentum[:, :3] - self.expected[:, :3])
+
+    @property
+    def angular_drift(self) -> float:
+        """Largest change of the total angular momentum without thrust, kg m^2/s."""
+        return _largest_change(self.momentum[:, 3:6] - self.expected[:, 3:6])
+
+    def rotvecs(self) -> Array:
+        """Return the attitude as exponential coordinates (N, 3), rad."""
+        return np.array([rotvec_from_quaternion(q) for q in self.quaternion])
+
+    def final_error(self, goal: Goal) -> PoseError:
+        """Return what the last pose leaves to the goal."""
+        return PoseError.between(self.position[-1], self.quaternion[-1], goal)
 
 
 @dataclass(frozen=True)
@@ -48,11 +120,6 @@ class RunResult:
         """Whether the goal was met within tolerance."""
         return bool(self.summary["succeeded"])
 
-    def write_json(self, path: Path) -> None:
-        """Write the summary."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(self.summary, indent=2) + "\n", encoding="utf-8")
-
 
 @contextmanager
 def ros(*, private: bool) -> Iterator[None]:
@@ -64,6 +131,17 @@ def ros(*, private: bool) -> Iterator[None]:
         yield
     finally:
         rclpy.try_shutdown()
+
+
+def make_stack(scenario: Scenario, bag: Path | None, *, processes: bool) -> Stack:
+    """Return the stack of a scenario, in this process or with a process for each node.
+
+    Raises
+    ------
+    SpaceRobotError
+        A parameter or the robot is refused, or a node does not start.
+    """
+    return MultiProcessStack(scenario, bag) if processes else InProcessStack(scenario, bag)
 
 
 def run_scenario(
@@ -80,29 +158,19 @@ def run_scenario(
     SpaceRobotError
         A parameter, the robot or the recording is refused.
     """
-    if processes:
-        return _run(scenario, bag, progress, ProcessStack, private=False)
-    return _run(scenario, bag, progress, FlightStack, private=scenario.lockstep)
-
-
-def _run(
-    scenario: Scenario,
-    bag: Path,
-    progress: Progress | None,
-    make: Callable[[Scenario, Path], FlightStack | ProcessStack],
-    *,
-    private: bool,
-) -> RunResult:
+    private = not processes and scenario.lockstep
     with ros(private=private), stop_on_signals() as stopped:
-        stack = make(scenario, bag)
+        stack = make_stack(scenario, bag, processes=processes)
         try:
             began = time.perf_counter()
             stack.start(scenario.goal)
-            ends_at = float(scenario.parameter("coordinated_control", "time_limit", 0.0))
+            time_limit = 0.0
+            if "coordinated_control" in scenario.commanders:
+                time_limit = scenario.controller.time_limit
 
             def look() -> bool:
                 if progress is not None:
-                    progress(stack.time_ns / 1e9, stack.operator.ends_at or ends_at)
+                    progress(stack.time_ns / 1e9, stack.client.ends_at or time_limit)
                 return stopped()
 
             stack.spin(look)
@@ -110,7 +178,7 @@ def _run(
             if progress is not None and not stopped():
                 progress(1.0, 1.0)
             stack.finish()
-            facts = _Facts.of(stack, wall_time, stopped=stopped())
+            facts = _Facts.of(stack, wall_time)
         finally:
             stack.close()
     return _summarise(scenario, bag, facts)
@@ -118,9 +186,9 @@ def _run(
 
 @dataclass(frozen=True)
 class _Facts:
-    """What the nodes said of the flight, and how long it took."""
+    """What the nodes reported of the flight, and how long it took."""
 
-    state: str
+    outcome: Outcome
     sentence: str
     method: str
     plan_time: float
@@ -131,25 +199,21 @@ class _Facts:
     end_effector_turns: bool
 
     @classmethod
-    def of(cls, stack: FlightStack | ProcessStack, wall_time: float, *, stopped: bool) -> _Facts:
-        scenario, operator = stack.scenario, stack.operator
-        status = operator.status
-        node, name = (
-            ("planner", "method")
-            if "planner" in scenario.commanders
-            else ("coordinated_control", "law")
-        )
+    def of(cls, stack: Stack, wall_time: float) -> _Facts:
+        scenario, client = stack.scenario, stack.client
+        status = client.status
+        plans = "planner" in scenario.commanders
+        method = client.gait.get("method") or status.get("method" if plans else "law")
+        outcome = client.outcome or Outcome.INTERRUPTED
         return cls(
-            state="interrupted" if stopped else status.get("state", ""),
-            sentence="" if stopped else operator.sentence,
-            method=operator.gait.get("method")
-            or status.get(name)
-            or str(scenario.parameter(node, name, "")),
+            outcome=outcome,
+            sentence="" if outcome is Outcome.INTERRUPTED else client.sentence,
+            method=method or (scenario.planner.method if plans else scenario.controller.law),
             plan_time=stack.plan_time,
             wall_time=wall_time,
             manoeuvre_time=float(status.get("manoeuvre_time_s", 0.0)),
             corrections=int(status.get("corrections", 0)),
-            gait=operator.gait,
+            gait=client.gait,
             end_effector_turns=any(key.startswith("error.end_effector.r") for key in status),
         )
 
@@ -187,9 +251,9 @@ def _summarise(scenario: Scenario, path: Path, facts: _Facts) -> RunResult:
         "peak_joint_velocities": np.abs(measured.joint_rates).max(axis=0).tolist(),
         "corrections": facts.corrections,
         "gait": {name: _numbers(text) for name, text in facts.gait.items() if name not in _NO_GAIT},
-        "state": facts.state,
+        "state": facts.outcome.value,
         "message": sentence,
-        "succeeded": facts.state == "reached",
+        "succeeded": facts.outcome is Outcome.REACHED,
     }
     if scenario.end_effector_goal is not None and measured.end_effector is not None:
         end = PoseError.between(*measured.end_effector, scenario.end_effector_goal)
@@ -201,6 +265,45 @@ def _summarise(scenario: Scenario, path: Path, facts: _Facts) -> RunResult:
     if propellant is not None:
         summary["propellant_kg"] = float(propellant)
     return RunResult(summary, sentence, measured)
+
+
+def _holds(bag: Bag, topic: str) -> bool:
+    return topic in bag.topics and bag.message_count(topic) > 0
+
+
+def _truth(bag: Bag, topic: str, fields: Sequence[str]) -> tuple[Array, Array]:
+    """Return times (N,) and fields (N, m): of ``<topic>_true`` from where that begins."""
+    times: list[Array] = []
+    rows: list[Array] = []
+    begin = np.inf
+    for name in (f"{topic}_true", topic):
+        if _holds(bag, name):
+            series = bag[name]
+            before = series.stamp < begin
+            values = np.column_stack([np.asarray(series.field(field)) for field in fields])
+            times.insert(0, series.stamp[before])
+            rows.insert(0, values[before])
+            begin = series.stamp[0]
+    return np.concatenate(times), np.concatenate(rows)
+
+
+def _expected(bag: Bag, topic: str, momentum: TopicSeries) -> Array:
+    """Where there are no thrusters nothing is published, and nothing is to change."""
+    if topic in bag.topics and bag.message_count(topic) == len(momentum):
+        return np.asarray(bag[topic].field("data"))
+    return np.zeros((len(momentum), 6))
+
+
+def _last_pose(bag: Bag, topic: str) -> tuple[Array, Array] | None:
+    if topic not in bag.topics or not bag.message_count(topic):
+        return None
+    series = bag[topic]
+    position = np.array([series.field(f"pose.position.{x}")[-1] for x in "xyz"])
+    return position, np.array([series.field(f"pose.orientation.{x}")[-1] for x in "xyzw"])
+
+
+def _largest_change(vectors: Array) -> float:
+    return float(np.linalg.norm(vectors - vectors[0], axis=1).max())
 
 
 def _last_diagnosis(bag: Bag, key: str) -> str | None:

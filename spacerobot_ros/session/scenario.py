@@ -2,25 +2,44 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.bag.config import RecorderConfig
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
+from spacerobot_ros.parameters import Value, configured, declared, values_of
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.resources import resource_names, share_directory
-from spacerobot_ros.session.kills import Kill, parse_kills
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.resources import resource_names, robot_file, share_directory
+from spacerobot_ros.simulation.building import initial_state
+from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.simulation.trials import Problem
 
-NODES = ("plant", "planner", "coordinated_control", "recorder")
-"""The nodes that a scenario may set parameters of."""
+CONFIGS: Mapping[str, type[Any]] = {
+    "plant": PlantConfig,
+    "planner": PlannerConfig,
+    "coordinated_control": ControllerConfig,
+    "recorder": RecorderConfig,
+}
+"""The nodes that a scenario may set parameters of, and what declares these parameters."""
+
+NODES = tuple(CONFIGS)
 
 COMMANDERS = ("planner", "coordinated_control")
 """Those of them that take goals; a scenario runs the ones its file has a section for."""
+
+_OF_EVERY_NODE = ("autostart", "use_sim_time")
+"""Parameters that a file may give a node beside those that its configuration declares."""
 
 _LARGEST_ANGLE = 2e6 * np.pi
 """A million turns: beyond them the digits of an angle are not its attitude's any more, rad."""
@@ -35,13 +54,18 @@ _KEYS = (
     *(f"{goal}_{part}" for goal in _GOALS for part in ("position", "orientation", "rotvec")),
 )
 
+_LOCKSTEP: Mapping[str, Mapping[str, Any]] = {"plant": {"time_mode": "lockstep"}}
+"""The overrides of a scenario that nothing else is asked of, whatever its file says."""
+
+_KILL = re.compile(r"(\S+) at (\S+)(?: until (\S+))?")
+
 
 @dataclass(frozen=True)
 class Published:
     """A figure that a publication prints for this scenario, to stand beside the measured one.
 
-    ``quantity`` is a key of the run's summary, or a value of the planner's status; ``note`` says
-    what is known about the printed figure (a misprint, an integration error).
+    ``quantity`` is a key of the run's summary, or a note of the gait in the planner's status;
+    ``note`` says what is known about the printed figure (a misprint, an integration error).
     """
 
     quantity: str
@@ -50,13 +74,32 @@ class Published:
 
 
 @dataclass(frozen=True)
-class Scenario:
-    """A parameter file and its goals; ``overrides``, parameters by node, go before the file's,
-    ``in_file``.
+class Kill:
+    """A node that ends by SIGKILL ``at`` a simulated time, and starts again at ``until``, s."""
 
-    ``published_method`` is the gait method that the published figures are of, empty: any.
-    ``goal`` is of the base, ``end_effector_goal`` of the end-effector; ``commanders`` are the nodes
-    that fly there, ``kills`` what happens to nodes on the way.
+    node: str
+    at: float
+    until: float
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """The nodes of a flight with their parameters, and the goals of the flight.
+
+    Attributes
+    ----------
+    name, path, description
+        Of the parameter file.
+    goal, end_effector_goal
+        Poses that the base and the end-effector are to reach.
+    commanders
+        The nodes that fly there.
+    published, published_method
+        Figures of a publication, and the gait method that they are of; empty: any.
+    kills
+        The nodes that end on the way, by time.
+    in_file, overrides
+        Parameters by node and full name; the overrides go before those of the file.
     """
 
     name: str
@@ -71,24 +114,119 @@ class Scenario:
     in_file: Mapping[str, Mapping[str, Any]]
     overrides: Mapping[str, Mapping[str, Any]]
 
+    def config(self, node: str) -> Any:
+        """Return the configuration of a node: defaults, the file's parameters, the overrides.
+
+        Raises
+        ------
+        ParameterError
+            The node has no such parameter, or a value is refused; the sentence names both.
+        """
+        known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
+        values = {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
+        for name, value in values.items():
+            if name not in (*known, *_OF_EVERY_NODE):
+                raise ParameterError(f"Node '{node}' has no parameter '{name}'.")
+            if isinstance(value, str) and name in known:
+                is_number = isinstance(known[name].default, (int, float))
+                values[name] = _number(value) if is_number else value
+        try:
+            return configured(CONFIGS[node], values)
+        except ParameterError as error:
+            raise ParameterError(f"Node '{node}': {error}") from error
+
+    @property
+    def plant(self) -> PlantConfig:
+        """The plant's configuration; see :meth:`config`."""
+        config: PlantConfig = self.config("plant")
+        return config
+
+    @property
+    def planner(self) -> PlannerConfig:
+        """The planner's configuration; see :meth:`config`."""
+        config: PlannerConfig = self.config("planner")
+        return config
+
+    @property
+    def controller(self) -> ControllerConfig:
+        """The controller's configuration; see :meth:`config`."""
+        config: ControllerConfig = self.config("coordinated_control")
+        return config
+
     @property
     def lockstep(self) -> bool:
-        """Whether the plant waits for commands instead of the wall clock (unless overridden)."""
-        return self.overrides.get("plant", {}).get("time_mode", "lockstep") == "lockstep"
+        """Whether the plant waits for commands instead of the wall clock."""
+        return self.plant.time_mode == "lockstep"
 
     @property
     def comparable(self) -> tuple[Published, ...]:
         """The published figures, where the method that they are of is flown."""
-        method = self.parameter("planner", "method", "")
-        return self.published if self.published_method in ("", method) else ()
+        return self.published if self.published_method in ("", self.planner.method) else ()
 
-    def parameter(self, node: str, name: str, default: Any) -> Any:
-        """Return what a node's parameter is set to, by the overrides or the file."""
-        return self.parameters(node).get(name, default)
+    def checked_overrides(self, node: str) -> dict[str, Value]:
+        """Return the overrides of a node in the types that it declares.
 
-    def parameters(self, node: str) -> dict[str, Any]:
-        """Return what is set of a node, by the overrides or the file."""
-        return {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
+        Raises
+        ------
+        ParameterError
+            A parameter of the node is refused, of the overrides or of the file.
+        """
+        values = values_of(self.config(node))
+        return {name: values[name] for name in self.overrides.get(node, {}) if name in values}
+
+    def records(self, nodes: Sequence[str]) -> dict[str, dict[str, str]]:
+        """Return what a bag keeps of the flight: metadata records by name.
+
+        ``scenario`` has name, description, goals and published figures, ``parameters/<node>`` every
+        parameter of a node as a JSON text.
+        """
+        goals = {"goal": self.goal, "end_effector_goal": self.end_effector_goal}
+        scenario = {"name": self.name, "description": self.description}
+        for name, goal in goals.items():
+            if goal is not None:
+                scenario[f"{name}_position"] = " ".join(map(repr, goal.position.tolist()))
+                scenario[f"{name}_orientation"] = " ".join(map(repr, goal.quaternion.tolist()))
+        scenario["published"] = json.dumps([asdict(row) for row in self.comparable])
+        parameters = {
+            f"parameters/{node}": {
+                name: json.dumps(value) for name, value in values_of(self.config(node)).items()
+            }
+            for node in nodes
+        }
+        return {"scenario": scenario, **parameters}
+
+    def problem(self) -> Problem:
+        """Return what is to be planned to reach the goal of the base.
+
+        Raises
+        ------
+        ParameterError
+            The scenario names no robot, or a parameter is refused.
+        GoalError
+            The shape of the goal is of another robot.
+        """
+        plant, planner = self.plant, self.planner
+        name = planner.robot or plant.robot
+        if not name:
+            raise ParameterError(f"The scenario '{self.name}' names no robot; see plant.robot.")
+        robot = SpaceRobot.from_file(robot_file(name))
+        self.require_shape_of(robot)
+        return Problem(self.name, robot, initial_state(values_of(plant)), self.goal, planner)
+
+    def require_shape_of(self, robot: SpaceRobot) -> None:
+        """Refuse a goal whose shape is of another robot.
+
+        Raises
+        ------
+        GoalError
+            It has more or fewer joint positions than the robot has joints.
+        """
+        shape = self.goal.joint_positions
+        if shape is not None and len(shape) != robot.n:
+            raise GoalError(
+                f"The goal shape has {len(shape)} joint position(s); robot "
+                f"'{robot.description.name}' has {robot.n} joints."
+            )
 
     def with_overrides(self, node: str, values: Mapping[str, Any]) -> Scenario:
         """Return the scenario with more parameters of one node set."""
@@ -116,6 +254,27 @@ class Scenario:
             node, name, value = parse_setting(text)
             scenario = scenario.with_overrides(node, {name: value})
         return scenario
+
+    def with_goal(
+        self, pose: Sequence[float] | None = None, rotvec: Sequence[float] | None = None
+    ) -> Scenario:
+        """Return the scenario with another pose (7,), and then another attitude (3,), if given.
+
+        The published figures, which belong to the published goal, go.
+
+        Raises
+        ------
+        GoalError
+            The pose or the rotation vector is not finite.
+        """
+        goal = self.goal
+        if pose is not None:
+            given = Goal.checked(pose[:3], pose[3:])
+            goal = replace(goal, position=given.position, quaternion=given.quaternion)
+        if rotvec is not None:
+            given = goal_from_rotvec(goal.position.tolist(), rotvec)
+            goal = replace(goal, quaternion=given.quaternion)
+        return self if goal is self.goal else replace(self, goal=goal, published=())
 
 
 def load_scenario(name: str) -> Scenario:
@@ -173,11 +332,40 @@ def load_scenario(name: str) -> Scenario:
         commanders=tuple(name for name in COMMANDERS if name in content) or ("planner",),
         published=_published(values.get("published", {}), path),
         published_method=str(values.get("published_method", "")),
-        kills=parse_kills(values.get("kills", []), ("plant", *COMMANDERS), f"the file {path}"),
+        kills=parse_kills(values.get("kills", []), f"the file {path}"),
         in_file={
-            node: content[node].get("ros__parameters", {}) for node in NODES if content.get(node)
+            node: _flat(content[node].get("ros__parameters", {}))
+            for node in NODES
+            if content.get(node)
         },
-        overrides={},
+        overrides=_LOCKSTEP,
+    )
+
+
+def scenario_or_robot(name: str) -> Scenario:
+    """Return a scenario, or one without goal and nodes of a robot alone (a name or a URDF file).
+
+    Raises
+    ------
+    ParameterError
+        There is no such scenario or robot, or its file is broken.
+    """
+    if name in scenario_names() or not (
+        name.endswith(".urdf") or name in resource_names("urdf", ".urdf")
+    ):
+        return load_scenario(name)
+    return Scenario(
+        name=name,
+        path=robot_file(name),
+        description="",
+        goal=Goal.checked([0, 0, 0], [0, 0, 0, 1]),
+        end_effector_goal=None,
+        commanders=(),
+        published=(),
+        published_method="",
+        kills=(),
+        in_file={"plant": {"robot": name}},
+        overrides=_LOCKSTEP,
     )
 
 
@@ -191,7 +379,7 @@ def goal_from_rotvec(position: Sequence[float], rotvec: Sequence[float]) -> Goal
 
     Raises
     ------
-    PlanningError
+    GoalError
         It is no goal, or the rotation vector is not three numbers of at most a million turns.
     """
     try:
@@ -199,7 +387,7 @@ def goal_from_rotvec(position: Sequence[float], rotvec: Sequence[float]) -> Goal
     except (TypeError, ValueError, OverflowError):
         vector = np.full(3, np.nan)
     if vector.shape != (3,) or not np.all(np.abs(vector) <= _LARGEST_ANGLE):
-        raise PlanningError(
+        raise GoalError(
             f"The rotation vector {rotvec} is not three finite numbers of at most "
             f"{_LARGEST_ANGLE:.2g} rad."
         )
@@ -224,13 +412,45 @@ def parse_setting(text: str) -> tuple[str, str, Any]:
         parsed = yaml.safe_load(value)
     except yaml.YAMLError:
         raise ParameterError(f"The value in '{text}' cannot be read.") from None
-    if isinstance(parsed, str):
-        # YAML wants a dot in 1e-3; people do not write it.
-        try:
-            return node, name, float(parsed)
-        except ValueError:
-            return node, name, parsed
-    return node, name, parsed
+    return node, name, _number(parsed) if isinstance(parsed, str) else parsed
+
+
+def parse_kills(lines: object, where: str) -> tuple[Kill, ...]:
+    """Read ``NODE at SECONDS [until SECONDS]``, a list of such lines, by time.
+
+    Raises
+    ------
+    ParameterError
+        A line is none, its node is none that may be killed, or its times are not in order.
+    """
+    if not isinstance(lines, list):
+        raise ParameterError(
+            f"'kills' in {where} is {lines!r}, not a list of lines NODE at SECONDS."
+        )
+    return tuple(sorted((_kill(line, where) for line in lines), key=lambda k: k.at))
+
+
+def _kill(line: object, where: str) -> Kill:
+    match = _KILL.fullmatch(" ".join(str(line).split()))
+    if match is None:
+        raise ParameterError(
+            f"The kill {str(line)!r} in {where} is not NODE at SECONDS [until SECONDS]."
+        )
+    node, at, until = match[1], match[2], match[3] or "inf"
+    if node not in ("plant", *COMMANDERS):
+        raise ParameterError(
+            f"The kill {str(line)!r} in {where} names '{node}'; it may name "
+            f"{', '.join(('plant', *COMMANDERS))}."
+        )
+    try:
+        kill = Kill(node, float(at), float(until))
+    except ValueError:
+        kill = Kill(node, 0.0, 0.0)
+    if not 0 <= kill.at < kill.until:
+        raise ParameterError(
+            f"The kill {str(line)!r} in {where} needs times in s, the second after the first."
+        )
+    return kill
 
 
 def _published(rows: Any, path: Path) -> tuple[Published, ...]:
@@ -253,5 +473,24 @@ def _goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
         if f"{name}_rotvec" in values:
             orientation = goal_from_rotvec(position, values[f"{name}_rotvec"]).quaternion
         return Goal.checked(position, orientation, values.get(f"{name}_joint_positions"))
-    except (PlanningError, ValueError, TypeError) as error:
+    except (GoalError, ValueError, TypeError) as error:
         raise ParameterError(f"The goal of the scenario file {path} is refused: {error}") from error
+
+
+def _flat(section: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return parameters by full name: a map within a section is a group of them."""
+    flat: dict[str, Any] = {}
+    for key, value in section.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def _number(text: str) -> float | str:
+    """Return the number in a text, if it is one: YAML wants a dot in 1e-3, people do not."""
+    try:
+        return float(text)
+    except ValueError:
+        return text

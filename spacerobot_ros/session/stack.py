@@ -1,11 +1,12 @@
-"""Plant, planner and recorder in one process and one executor."""
+"""The nodes of a scenario, running: what every stack offers, and the stack in one process."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 import rclpy
 from rclpy.clock import Clock, ClockType
@@ -23,31 +24,96 @@ from spacerobot_ros.nodes import (
     PlantNode,
     RecorderNode,
 )
-from spacerobot_ros.nodes.common.node import spin_until
-from spacerobot_ros.nodes.recorder import parameters_of
-from spacerobot_ros.parameters import declared
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.session.description import scenario_record
-from spacerobot_ros.session.kills import NEEDS_PROCESSES
-from spacerobot_ros.session.mission_client import Operator
-from spacerobot_ros.session.scenario import NODES, Scenario
+from spacerobot_ros.session.mission_client import MissionClient
+from spacerobot_ros.session.scenario import Scenario
 
 _DISCOVERY_TIMEOUT = 10.0
-_LOOK_PERIOD = 0.2
 
 
-class FlightStack:
-    """The nodes of a scenario, composed so that a run is repeatable to the last message.
-
-    Everything is connected before anything is published: nodes are configured, their endpoints
-    matched, the recorder and the planner activated, the goal sent, and the plant activated last.
+class Stack(ABC):
+    """The running nodes of a scenario, and the client of their mission.
 
     Parameters
     ----------
     scenario
-        What to compose.
+        What to run.
     bag
         File to record into; None records nothing.
+
+    Raises
+    ------
+    ParameterError
+        A parameter is refused, or the scenario kills nodes and this stack cannot.
+    """
+
+    can_kill: ClassVar[bool] = False
+    """Whether nodes may be killed and started again on the way."""
+
+    client: MissionClient
+
+    def __init__(self, scenario: Scenario, bag: Path | None) -> None:
+        if scenario.kills and (not self.can_kill or scenario.lockstep):
+            raise ParameterError(
+                f"The scenario '{scenario.name}' kills nodes on the way: fly it with --processes "
+                "and --realtime."
+            )
+        self.scenario, self.bag = scenario, bag
+        recorder = () if bag is None else ("recorder",)
+        self.names = ("plant", *scenario.commanders, *recorder)
+        """The nodes, in the order of their start."""
+        for name in self.names:
+            scenario.config(name)  # Refused here, before anything runs.
+
+    @property
+    @abstractmethod
+    def time_ns(self) -> int:
+        """Simulated time, ns."""
+
+    @property
+    @abstractmethod
+    def plan_time(self) -> float:
+        """Wall time that planning took, s."""
+
+    @abstractmethod
+    def start(self, goal: Goal | None) -> None:
+        """Send the goal, if there is one, and let time run."""
+
+    @abstractmethod
+    def spin(self, look: Callable[[], bool]) -> None:
+        """Run until the goal is decided, or until ``look``, called five times a second, is true.
+
+        Raises
+        ------
+        SpaceRobotError
+            A node has ended by itself.
+        """
+
+    @abstractmethod
+    def finish(self) -> None:
+        """Stop time, record what is still on its way, and complete the bag.
+
+        Raises
+        ------
+        SpaceRobotError
+            A node did not end well, or the bag could not be completed.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """End what still runs; safe to call twice."""
+
+
+class InProcessStack(Stack):
+    """Plant, commanders and recorder in one executor: a run is repeatable to the last message.
+
+    Everything is connected before anything is published: nodes are configured, their endpoints
+    matched, the recorder and the commanders activated, the goal sent, and the plant activated last.
+
+    Parameters
+    ----------
+    scenario, bag
+        As of every stack.
     context
         rclpy context to live in; None is the default one.
 
@@ -60,45 +126,39 @@ class FlightStack:
     def __init__(
         self, scenario: Scenario, bag: Path | None, context: rclpy.Context | None = None
     ) -> None:
-        if scenario.kills:
-            raise ParameterError(NEEDS_PROCESSES.format(scenario.name))
-        self.scenario = scenario
+        super().__init__(scenario, bag)
         self.executor = EventsExecutor(context=context) if context else EventsExecutor()
         self._nodes: list[Node] = []
-        overrides = {name: dict(scenario.overrides.get(name, {})) for name in NODES}
-        overrides["plant"].setdefault("time_mode", "lockstep")
-        if bag is not None:
-            overrides["recorder"]["bag"] = str(bag)
-        wanted = ["plant", *scenario.commanders, *(["recorder"] if bag is not None else [])]
         try:
-            nodes = {name: self._make(name, overrides[name], context) for name in wanted}
+            nodes = {name: self._make(name, context) for name in self.names}
             self.plant: PlantNode = nodes["plant"]
             self.commanders: list[FlightNode] = [nodes[name] for name in scenario.commanders]
             self.planner: PlannerNode | None = nodes.get("planner")
             self.controller: CoordinatedControlNode | None = nodes.get("coordinated_control")
             self.recorder: RecorderNode | None = nodes.get("recorder")
             for node in self.commanders:
-                # Their warnings are their status, which whoever runs the stack is told anyway.
+                # Their warnings are in their status, which is shown anyway.
                 node.get_logger().set_level(LoggingSeverity.ERROR)
             shaped = scenario.goal.joint_positions is not None
-            self.operator = Operator(
-                # Whoever plans decides; a controller alone decides for itself.
+            self.client = MissionClient(
+                # The planner decides; a controller alone decides for itself.
                 scenario.commanders[0],
-                str(self.commanders[0].parameters["world_frame"]),
+                scenario.config(scenario.commanders[0]).world_frame,
                 joint_names=(lambda: self.plant.plant.robot.joint_names) if shaped else None,
                 end_effector=scenario.end_effector_goal is not None,
                 on_end=self.plant.trigger_deactivate,
                 context=context,
             )
-            self._nodes.append(self.operator.node)
-            for name in wanted:
-                if name != "recorder":
-                    nodes[name].require(nodes[name].trigger_configure)
+            self._nodes.append(self.client.node)
+            running = {name: node for name, node in nodes.items() if name != "recorder"}
+            for node in running.values():
+                node.require(node.trigger_configure)
             if self.recorder is not None:
                 # Last, when every topic has its publisher.
-                self.recorder.watch(node for name, node in nodes.items() if name != "recorder")
+                self.recorder.watch(running.values())
                 self.recorder.require(self.recorder.trigger_configure)
-                self._describe(wanted, nodes)
+                for title, values in scenario.records(list(running)).items():
+                    self.recorder.describe(title, values)
             for node in self._nodes:
                 self.executor.add_node(node)
             self._connect()
@@ -121,45 +181,34 @@ class FlightStack:
 
         It happens at the next spin, inside a callback: what is published from a callback is
         delivered in the order of publication, what is published between spins is not.
+
+        Raises
+        ------
+        GoalError
+            The shape of the goal is of another robot.
         """
+        if goal is not None:
+            self.scenario.require_shape_of(self.plant.plant.robot)
 
         def launch() -> None:
-            self.operator.node.destroy_timer(timer)
+            self.client.node.destroy_timer(timer)
             if self.recorder is not None:
                 self.recorder.trigger_activate()
             for node in reversed(self.commanders):
                 node.trigger_activate()
             if goal is not None:
-                self.operator.send(goal, self.scenario.end_effector_goal)
+                self.client.send(goal, self.scenario.end_effector_goal)
             self.plant.trigger_activate()
 
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        timer = self.operator.node.create_timer(0.001, launch, clock=steady)
+        timer = self.client.node.create_timer(0.001, launch, clock=steady)
 
     def spin(self, look: Callable[[], bool]) -> None:
-        """Run until the goal is decided, or until ``look``, called five times a second, is true.
-
-        A busy events executor does not heed the time limit of a spin: the look is a timer's.
-        """
-
-        def on_look() -> None:
-            if look() and not self.operator.done.done():
-                self.plant.trigger_deactivate()
-                self.operator.done.set_result("stopped")
-
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        timer = self.operator.node.create_timer(_LOOK_PERIOD, on_look, clock=steady)
-        spin_until(self.executor, self.operator.done)
-        self.operator.node.destroy_timer(timer)
+        """Run until the goal is decided, or until ``look``, called five times a second, is true."""
+        self.client.follow(self.executor, look)
 
     def finish(self) -> None:
-        """Stop the plant, record what is still on its way, and complete the bag.
-
-        Raises
-        ------
-        SpaceRobotError
-            The bag could not be completed.
-        """
+        """Stop the plant, record what is still on its way, and complete the bag."""
         if self.plant.is_active:
             self.plant.trigger_deactivate()
         for node in self.commanders:
@@ -174,7 +223,7 @@ class FlightStack:
             raise self.recorder.failure or self.recorder.fault  # type: ignore[misc]
 
     def close(self) -> None:
-        """Destroy the nodes; safe to call twice and after a failed construction."""
+        """Destroy the nodes."""
         for node in self._nodes:
             if isinstance(node, RecorderNode):
                 node.cleanup()
@@ -182,40 +231,26 @@ class FlightStack:
         self._nodes.clear()
         self.executor.shutdown()
 
-    # -- composition --------------------------------------------------------------------------
-
-    def _make(
-        self, name: str, overrides: Mapping[str, Any], context: rclpy.Context | None
-    ) -> FlightNode:
-        try:
-            parameters = [Parameter(key, value=value) for key, value in overrides.items()]
-        except (TypeError, ValueError) as error:
-            raise ParameterError(f"A parameter of node '{name}' is refused: {error}.") from error
-        known = {spec.name for spec in declared(NODE_TYPES[name].Config)}
-        unknown = [key for key in overrides if key not in known]
-        if unknown:
-            raise ParameterError(f"Node '{name}' has no parameter '{unknown[0]}'.")
-        arguments = ["--ros-args", "--params-file", str(self.scenario.path)]
+    def _make(self, name: str, context: rclpy.Context | None) -> FlightNode:
+        overrides = self.scenario.checked_overrides(name)
+        if name == "recorder":
+            overrides["bag"] = str(self.bag)
         try:
             node = NODE_TYPES[name](
                 name,
                 autostart=False,
                 context=context,
-                cli_args=arguments,
+                cli_args=["--ros-args", "--params-file", str(self.scenario.path)],
                 use_global_arguments=False,
-                parameter_overrides=parameters,
+                parameter_overrides=[
+                    Parameter(key, value=list(value) if isinstance(value, tuple) else value)
+                    for key, value in overrides.items()
+                ],
             )
         except SpaceRobotError as error:
             raise ParameterError(f"Node '{name}': {error}") from error
         self._nodes.append(node)
         return node
-
-    def _describe(self, names: list[str], nodes: Mapping[str, FlightNode]) -> None:
-        assert self.recorder is not None
-        self.recorder.describe("scenario", scenario_record(self.scenario))
-        for name in names:
-            if name != "recorder":
-                self.recorder.describe(f"parameters/{name}", parameters_of(nodes[name]))
 
     def _connect(self) -> None:
         """Wait until every subscription in this process has met its publisher."""
@@ -229,7 +264,7 @@ class FlightStack:
             self.executor.spin_once(timeout_sec=0.01)
             if self.recorder is not None:
                 self.recorder.scan()
-        if self.operator.node.count_publishers("odom") > 1:
+        if self.client.node.count_publishers("odom") > 1:
             raise SpaceRobotError(
                 "Another plant already publishes 'odom' in this ROS domain; "
                 "set ROS_DOMAIN_ID to a number of its own for this run."

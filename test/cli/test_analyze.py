@@ -12,11 +12,12 @@ import pytest
 from click.testing import CliRunner, Result
 from support.random_robots import random_robot_urdf
 
+from spacerobot_ros.cli.analyze import json_of, lines_of
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import METHODS
+from spacerobot_ros.planning.analysis import analyze
 from spacerobot_ros.resources import resource_names, robot_file
-from spacerobot_ros.session.analyze import analyze, json_of, lines_of
 
 
 @pytest.fixture(autouse=True)

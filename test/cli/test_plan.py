@@ -11,8 +11,8 @@ from click.testing import CliRunner, Result
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.session.plan import problem
-from spacerobot_ros.session.plan_random import fly_goals, random_goals
+from spacerobot_ros.cli.plan import problem_of
+from spacerobot_ros.simulation.trials import random_goals, try_goals
 
 URDF = Path(__file__).parents[2] / "urdf"
 QUICK = ("--set", "planner.optimal.answers=1", "--set", "planner.optimal.intervals=30")
@@ -88,8 +88,6 @@ def test_many_goals_are_counted() -> None:
     [
         (["nowhere"], "There is no scenario 'nowhere'"),
         (["planar_chain", "--goal-rotvec", "nan", "0", "0"], "is not three finite numbers"),
-        (["planar_chain", "--goal-rotvec", "0.3", "0", "0"], "off any rotation about the axis"),
-        (["sliding_masses", "--goal", *"9000001"], "out of reach"),
         (["sliding_masses", "--set", "planner.optimal.speed=1"], "no parameter 'optimal.speed'"),
         (["sliding_masses", "--set", "planner.optimal.keep_axis=1"], "it must be a list"),
         (["sliding_masses", "--set", "planner.tick_rate=fast"], "it must be a number"),
@@ -99,6 +97,24 @@ def test_many_goals_are_counted() -> None:
 def test_bad_input_is_exit_2_and_one_sentence(arguments: list[str], sentence: str) -> None:
     result = plan(*arguments)
     assert result.exit_code == 2, result.output
+    assert sentence in result.output
+    assert len(result.output.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["sliding_masses", "--goal", *"9000001"], "out of reach"),
+        (["planar_chain", "--goal-rotvec", "0.3", "0", "0"], "off any rotation about the axis"),
+        (["planar_chain", "--method", "lie_bracket"], "slider"),
+    ],
+)
+def test_a_goal_that_cannot_be_reached_is_exit_1_and_one_sentence(
+    arguments: list[str], sentence: str
+) -> None:
+    """As `run` ends with the same goals."""
+    result = plan(*arguments)
+    assert result.exit_code == 1, result.output
     assert sentence in result.output
     assert len(result.output.strip().splitlines()) == 1
 
@@ -120,7 +136,7 @@ def test_random_goals_are_met(
 ) -> None:
     monkeypatch.delenv("SPACEROBOT_COMPILE")
     settings = [*options, "planner.optimal.answers=1", "planner.optimal.cache=0"]
-    asked = problem(robot, settings=settings)
-    goals = random_goals(asked, 20, within[0], np.radians(within[1]))
-    (record,) = fly_goals(asked, goals, ["optimal"])
-    assert (record.met, record.missed, record.refused) == (20, 0, [])
+    problem = problem_of(robot, settings=settings)
+    goals = random_goals(problem, 20, within[0], np.radians(within[1]))
+    (record,) = try_goals(problem, goals, ["optimal"])
+    assert (record.reached, record.missed, record.refused) == (20, 0, [])

@@ -85,7 +85,7 @@ def use(scenario: Scenario | None) -> None:
     assert np.all(np.isfinite(scenario.goal.position))
     assert np.all(np.isfinite(scenario.goal.quaternion))
     for node in NODES:
-        attempt("scenario", scenario.parameter, node, "robot", "")
+        attempt("scenario", scenario.config, node)
 
 
 @fuzz("scenario", st.sampled_from(FILES), CHANGES, fast=60, long=800)

@@ -76,17 +76,17 @@ def test_a_controller_killed_at_random_moments_goes_on(flight: Flight, tmp_path:
     def on_wrench(message: WrenchStamped) -> None:
         commanded[0] = nanoseconds(message.header.stamp)
 
-    stack.operator.node.create_subscription(WrenchStamped, "base_wrench", on_wrench, STREAM)
+    stack.client.node.create_subscription(WrenchStamped, "base_wrench", on_wrench, STREAM)
     stack.start(GOAL)
     flight.spin((tmp_path / "goals.json").exists, "the goal is flown")
     starts = [0.0]
     for _ in range(KILLS):
         flight.pass_time(rng.uniform(0.1, 2.0))
-        assert not flight.decided, f"in mid-manoeuvre: {stack.operator.sentence}"
+        assert not flight.decided, f"in mid-manoeuvre: {stack.client.sentence}"
         starts.append(flight.leave("coordinated_control", timeouts=4)[1])
         flight.spin(lambda: commanded[0] / 1e9 > starts[-1], "it commands again")
     flight.spin(lambda: flight.decided, "the goal is decided")
-    assert stack.operator.status["state"] == "reached", stack.operator.sentence
+    assert stack.client.status["state"] == "reached", stack.client.sentence
     assert not (tmp_path / "goals.json").exists()
     stack.finish()
     bag = read_bag(flight.bags[0])

@@ -12,9 +12,9 @@ from support.ros_harness import assert_one_sentence
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.resources import share_directory
-from spacerobot_ros.session.kills import KillTimeline, parse_kills
+from spacerobot_ros.session.processes import KillTimeline
 from spacerobot_ros.session.run import run_scenario
-from spacerobot_ros.session.scenario import load_scenario
+from spacerobot_ros.session.scenario import load_scenario, parse_kills
 from spacerobot_ros.verification.comparison import verify_bag
 
 # Whether the goal is met, and to how many m and rad of the truth; None: not the method's to meet.
@@ -105,13 +105,13 @@ def test_kills_need_processes_in_real_time(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_a_kill_that_is_none_is_refused(line: object) -> None:
     with pytest.raises(ParameterError) as caught:
-        parse_kills([line], ("plant", "planner"), "the file x.yaml")
+        parse_kills([line], "the file x.yaml")
     assert_one_sentence(str(caught.value), "the file x.yaml")
 
 
 def test_kills_come_in_their_order() -> None:
     lines = ["plant at 5 until 6", "planner  at 1 until 4.5", "planner at 7"]
-    kills = parse_kills(lines, ("plant", "planner"), "x.yaml")
+    kills = parse_kills(lines, "x.yaml")
     timeline = KillTimeline(kills)
     assert timeline.due(0.5) == ([], [])
     assert timeline.due(1.0) == (["planner"], [])

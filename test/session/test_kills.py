@@ -17,7 +17,7 @@ from support.killed_flight import (
 )
 
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.session.processes import ProcessStack
+from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.run import ros
 from spacerobot_ros.session.scenario import Scenario, load_scenario
 
@@ -52,7 +52,7 @@ def flight(ros_domain: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
             flight.stack.close()
 
 
-def after(stack: ProcessStack, time: float) -> Callable[[], bool]:
+def after(stack: MultiProcessStack, time: float) -> Callable[[], bool]:
     return lambda: stack.time_ns > round(time * 1e9)
 
 
@@ -61,20 +61,20 @@ def test_a_node_killed_at_random_moments_joins_in_again(flight: Flight, name: st
     rng = random.Random(name)
     stack = flight.stack
     stack.start(GOAL)
-    flight.spin(lambda: stack.operator.gait, "the goal is flown")
+    flight.spin(lambda: stack.client.gait, "the goal is flown")
     away: Away = []
     for _ in range(KILLS):
         flight.pass_time(rng.uniform(0.1, 2.0))
-        assert not flight.decided, f"in mid-manoeuvre: {stack.operator.sentence}"
+        assert not flight.decided, f"in mid-manoeuvre: {stack.client.sentence}"
         away.append(flight.leave(name))
         if name == "plant":
             flight.spin(after(stack, away[-1][1]), "time goes on")
         elif name == "planner":
-            flight.spin(lambda: stack.operator.node.count_publishers("joint_commands"), "it is up")
+            flight.spin(lambda: stack.client.node.count_publishers("joint_commands"), "it is up")
         else:
             flight.spin(flight.bags[-1].exists, "the next bag")
     flight.spin(lambda: flight.decided, "the goal is decided")
-    assert stack.operator.status["state"] == "reached", stack.operator.sentence
+    assert stack.client.status["state"] == "reached", stack.client.sentence
     stack.finish()
     bags = [whole(bag) for bag in flight.bags]
     last = bags[-1]["/odom"]

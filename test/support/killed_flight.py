@@ -11,7 +11,7 @@ import numpy as np
 
 from spacerobot_ros.bag import Bag, RecordingError, read_bag
 from spacerobot_ros.bag.salvage import salvage_bag
-from spacerobot_ros.session.processes import ProcessStack
+from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.scenario import Scenario
 
 KILLS = 20
@@ -37,7 +37,7 @@ class Flight:
         scenario = scenario.with_overrides("plant", plant).with_overrides(
             "recorder", {"flush_period": 0.1}
         )
-        self.stack = ProcessStack(scenario, self.bags[0])
+        self.stack = MultiProcessStack(scenario, self.bags[0])
 
     def restart(self, name: str) -> None:
         if name == "recorder":
@@ -69,7 +69,7 @@ class Flight:
 
     @property
     def decided(self) -> bool:
-        return bool(self.stack.operator.done.done())
+        return self.stack.client.outcome is not None
 
 
 def whole(path: Path) -> Bag:

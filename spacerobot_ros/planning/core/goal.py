@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import GoalError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import attitude_error, unit_quaternion
 
@@ -46,33 +46,31 @@ class Goal:
 
         Raises
         ------
-        PlanningError
+        GoalError
             They are no lists of finite numbers, absurdly large, or the quaternion is zero.
         """
         r = _numbers(position, "position")
         q = _numbers(quaternion, "orientation")
         if r.shape != (3,) or q.shape != (4,):
-            raise PlanningError("A goal has three numbers of position and four of orientation.")
+            raise GoalError("A goal has three numbers of position and four of orientation.")
         if not np.all(np.isfinite(r)):
-            raise PlanningError(f"The goal position {r.tolist()} is not finite.")
+            raise GoalError(f"The goal position {r.tolist()} is not finite.")
         if np.abs(r).max() > _FARTHEST:
-            raise PlanningError(
-                f"The goal position {r.tolist()} is farther than {_FARTHEST:g} m away."
-            )
+            raise GoalError(f"The goal position {r.tolist()} is farther than {_FARTHEST:g} m away.")
         if not np.all(np.isfinite(q)):
-            raise PlanningError(f"The goal orientation {q.tolist()} is not finite.")
+            raise GoalError(f"The goal orientation {q.tolist()} is not finite.")
         shape = None if joint_positions is None else _numbers(joint_positions, "shape")
         if shape is not None and not (
             shape.ndim == 1 and np.all(np.isfinite(shape)) and np.all(np.abs(shape) <= _FARTHEST)
         ):
-            raise PlanningError(
+            raise GoalError(
                 f"The goal shape {shape.tolist()} is not a list of finite joint positions "
                 f"of at most {_FARTHEST:g} m or rad."
             )
         try:
             return cls(r, unit_quaternion(q), shape)
         except ValueError:
-            raise PlanningError(
+            raise GoalError(
                 f"The goal orientation {q.tolist()} is a zero quaternion, not a rotation; "
                 "no rotation is (0, 0, 0, 1)."
             ) from None
@@ -82,7 +80,7 @@ def _numbers(given: npt.ArrayLike, what: str) -> Array:
     try:
         return np.asarray(given, dtype=float)
     except (TypeError, ValueError, OverflowError):
-        raise PlanningError(f"The goal {what} {given!r} is not a list of numbers.") from None
+        raise GoalError(f"The goal {what} {given!r} is not a list of numbers.") from None
 
 
 @dataclass(frozen=True)

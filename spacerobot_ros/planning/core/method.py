@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import GoalError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
@@ -152,14 +152,16 @@ class GaitMethod(ABC):
 
         Raises
         ------
+        GoalError
+            It is of another robot.
         PlanningError
-            It is of another robot or beyond the joint limits.
+            It is beyond the joint limits.
         """
         wanted, robot = goal.joint_positions, self.robot
         if wanted is None:
             return None
         if len(wanted) != robot.n:
-            raise PlanningError(
+            raise GoalError(
                 f"The goal shape has {len(wanted)} joint position(s); robot "
                 f"'{robot.description.name}' has {robot.n} joints."
             )

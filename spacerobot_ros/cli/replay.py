@@ -1,4 +1,4 @@
-"""The commands about bags: replay, verify, salvage."""
+"""The command ``spacerobot replay``."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ from typing import Any
 
 import click
 
-from spacerobot_ros.cli.errors import sentences
-
-DIFFERENT = 1
-
-_BAG = click.argument("bag", type=click.Path(path_type=Path))
+from spacerobot_ros.cli.options import bag_argument
 
 
-@click.command()
-@_BAG
+@click.command("replay")
+@bag_argument
 @click.option(
     "--rate", default=1.0, show_default=True, metavar="FACTOR", help="Bag time over wall time."
 )
@@ -38,8 +34,7 @@ _BAG = click.argument("bag", type=click.Path(path_type=Path))
 )
 @click.option("--paused", is_flag=True, help="Begin paused; see the services of the node.")
 @click.option("--wait", default=3.0, show_default=True, help="Longest wait for readers (s).")
-@sentences
-def replay(
+def command(
     bag: Path,
     rate: float,
     start: float,
@@ -74,51 +69,3 @@ def replay(
 
     given = [Parameter(name, value=value) for name, value in values.items()]
     sys.exit(run_node(lambda: ReplayNode(parameter_overrides=given), []))
-
-
-@click.command()
-@_BAG
-@click.option(
-    "--tolerance",
-    default=1e-9,
-    show_default=True,
-    type=click.FloatRange(min=0.0),
-    help="Deviation that is no difference (SI units; relative above 1).",
-)
-@sentences
-def verify(bag: Path, tolerance: float) -> None:
-    """Fly a BAG again by the commands in it, and compare what its plant published.
-
-    Exit code 0: all is as the commands make it; 1: it is not; 2: bad input.
-    """
-    from spacerobot_ros.verification.comparison import verify_bag
-
-    result = verify_bag(bag, tolerance)
-    click.echo(f"flown again {result.ticks} ticks, {result.duration:.9g} s")
-    click.echo(f"compared    {result.messages} messages")
-    where = result.largest_at
-    place = f", {where.field} of {where.topic} at {where.time:.9g} s" if where else ""
-    click.echo(f"largest     {result.largest:.3g}{place}")
-    if result.difference is not None:
-        click.echo(f"The bag differs: {result.difference}", err=True)
-        sys.exit(DIFFERENT)
-    click.echo("verified    every published state is what the commands make it")
-
-
-@click.command()
-@_BAG
-@click.option(
-    "--output", "-o", type=click.Path(path_type=Path), help="The new bag [BAG-salvaged.mcap]."
-)
-@sentences
-def salvage(bag: Path, output: Path | None) -> None:
-    """Make a complete bag of a BAG that was cut off or is damaged; that one stays as it is."""
-    from spacerobot_ros.bag.salvage import salvage_bag
-
-    saved = salvage_bag(bag, output)
-    click.echo(f"saved       {saved.messages} messages over {saved.duration:.9g} s")
-    click.echo(
-        f"lost        {saved.lost_bytes} bytes behind the last whole record, "
-        f"{saved.lost_chunks} damaged chunk(s)"
-    )
-    click.echo(f"bag         {saved.path}")

@@ -1,0 +1,38 @@
+"""The command ``spacerobot goal``: for machines without the ros2 command."""
+
+from __future__ import annotations
+
+import click
+
+from spacerobot_ros.cli.errors import fail
+
+
+@click.command("goal", context_settings={"ignore_unknown_options": True})
+@click.argument("pose", nargs=-1, type=float, metavar="X Y Z [QX QY QZ QW]")
+@click.option("--rotvec", nargs=3, type=float, metavar="RX RY RZ", help="Attitude instead (rad).")
+@click.option("--namespace", default="", help="Of the stack.")
+@click.option("--timeout", default=0.0, help="Wall time to wait for the end, s; 0: for ever.")
+def command(
+    pose: tuple[float, ...],
+    rotvec: tuple[float, float, float] | None,
+    namespace: str,
+    timeout: float,
+) -> None:
+    """Send a goal pose to a running stack and follow it until it is met or refused.
+
+    Exit code 0: the goal was reached; 1: it was not; 2: bad input.
+    """
+    if len(pose) not in (3, 7):
+        raise click.UsageError("A goal is X Y Z, or X Y Z QX QY QZ QW.")
+    from spacerobot_ros.planning import Goal
+    from spacerobot_ros.session.scenario import goal_from_rotvec
+
+    wanted = Goal.checked(pose[:3], pose[3:] or (0.0, 0.0, 0.0, 1.0))
+    if rotvec:
+        wanted = goal_from_rotvec(pose[:3], rotvec)
+    from spacerobot_ros.session.live import send_goal
+    from spacerobot_ros.session.mission_client import Outcome
+
+    outcome = send_goal(wanted, click.echo, namespace=namespace, timeout=timeout)
+    if outcome is not Outcome.REACHED:
+        fail()

@@ -1,0 +1,32 @@
+"""The command ``spacerobot report``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from spacerobot_ros.cli.options import PATH, bag_argument
+
+
+@click.command("report")
+@bag_argument
+@click.option("--output", "-o", type=PATH, help="HTML file [beside the bag].")
+@click.option("--picture", type=PATH, help="Also draw an overview (PNG).")
+@click.option(
+    "--beside",
+    multiple=True,
+    type=PATH,
+    metavar="BAG",
+    help="Another run to compare with: a row of numbers and its path. May be repeated.",
+)
+def command(bag: Path, output: Path | None, picture: Path | None, beside: tuple[Path, ...]) -> None:
+    """Make a picture report of a BAG."""
+    from spacerobot_ros.report import write_picture, write_report
+
+    target = output or bag.with_suffix(".html")
+    write_report(bag, target, beside)
+    click.echo(f"report      {target}")
+    if picture is not None:
+        write_picture(bag, picture)
+        click.echo(f"picture     {picture}")

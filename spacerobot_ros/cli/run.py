@@ -1,0 +1,167 @@
+"""The command ``spacerobot run``."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from spacerobot_ros.cli.errors import fail
+from spacerobot_ros.cli.options import (
+    LAWS,
+    METHODS,
+    PATH,
+    Registered,
+    json_option,
+    numbers,
+    pose_option,
+    rotvec_option,
+    settings_option,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from spacerobot_ros.session.scenario import Scenario
+
+
+@click.command("run")
+@click.argument("scenario")
+@pose_option
+@rotvec_option
+@click.option("--method", type=Registered(METHODS, LAWS), help="Gait method, or control law.")
+@settings_option
+@click.option("--bag", type=PATH, help="Bag to write [out/SCENARIO.mcap].")
+@json_option("Write the result.")
+@click.option("--report", type=PATH, help="Write a picture report (HTML).")
+@click.option(
+    "--realtime",
+    is_flag=False,
+    flag_value=1.0,
+    type=click.FloatRange(min=0.0, min_open=True),
+    metavar="[FACTOR]",
+    help="Run on the wall clock, FACTOR times as fast.",
+)
+@click.option("--processes", is_flag=True, help="Give each node a process of its own.")
+def command(
+    scenario: str,
+    goal: tuple[float, ...] | None,
+    goal_rotvec: tuple[float, ...] | None,
+    method: str | None,
+    settings: tuple[str, ...],
+    bag: Path | None,
+    json_file: Path | None,
+    report: Path | None,
+    realtime: float | None,
+    processes: bool,
+) -> None:
+    """Fly SCENARIO (a name or a parameter file) to its goal and record it.
+
+    Exit code 0: the goal was reached within tolerance; 1: it was not; 2: bad input.
+    """
+    chosen = _chosen(scenario, goal, goal_rotvec, method, settings, realtime)
+    from spacerobot_ros.session.run import run_scenario
+
+    path = bag or Path("out") / f"{chosen.name}.mcap"
+    with _progress(chosen.name) as progress:
+        result = run_scenario(chosen, path, progress, processes=processes)
+    if json_file is not None:
+        write_json(json_file, result.summary)
+    for line in (*_summary_lines(result.summary), *_published_lines(chosen, result.summary)):
+        click.echo(line)
+    if report is not None:
+        from spacerobot_ros.report import write_report
+
+        write_report(path, report)
+        click.echo(f"report      {report}")
+    if not result.succeeded:
+        fail(result.sentence)
+
+
+def _chosen(
+    name: str,
+    goal: tuple[float, ...] | None,
+    goal_rotvec: tuple[float, ...] | None,
+    method: str | None,
+    settings: tuple[str, ...],
+    realtime: float | None,
+) -> Scenario:
+    """Return the scenario with what the command line changes."""
+    from spacerobot_ros.control.laws.registry import LAWS
+    from spacerobot_ros.session.scenario import load_scenario
+
+    scenario = load_scenario(name).with_goal(goal, goal_rotvec)
+    if realtime is not None:
+        scenario = scenario.in_real_time(realtime)
+    scenario = scenario.with_settings(settings)
+    if method is not None:
+        if method in LAWS:
+            return scenario.with_overrides("coordinated_control", {"law": method})
+        return scenario.with_overrides("planner", {"method": method})
+    return scenario
+
+
+@contextmanager
+def _progress(label: str) -> Iterator[Callable[[float, float], None]]:
+    """Show simulated time against the end of the schedule, where somebody is looking."""
+    with click.progressbar(
+        length=1000, label=label, file=sys.stderr, hidden=not sys.stderr.isatty()
+    ) as bar:
+
+        def show(now: float, end: float) -> None:
+            share = min(now / end, 1.0) if end > 0 else 0.0
+            bar.update(max(0, int(1000 * share) - bar.pos))
+
+        yield show
+
+
+def _summary_lines(summary: dict[str, Any]) -> list[str]:
+    """Return the result as lines for people."""
+    degrees = math.degrees(summary["attitude_error_rad"])
+    return [
+        f"{summary['scenario']}, {summary['method']}: {summary['message']}",
+        f"position    ({numbers(summary['final_position_m'])}) m, "
+        f"{summary['position_error_m']:.3g} m from the goal",
+        f"attitude    ({numbers(summary['final_attitude_rotvec_rad'])}) rad, "
+        f"{summary['attitude_error_rad']:.3g} rad = {degrees:.3g} deg from the goal",
+        *_end_effector_line(summary),
+        f"shape       ({numbers(summary['final_joint_positions'])})",
+        f"manoeuvre   {summary['manoeuvre_time_s']:.6g} s, "
+        f"{summary['corrections']} correction(s), planned in {summary['plan_time_s']:.3f} s",
+        f"flight      {summary['ticks']} ticks in {summary['wall_time_s']:.2f} s: "
+        f"{summary['ticks_per_s']:.0f} ticks/s, {summary['real_time_factor']:.0f} times real time",
+        f"momentum    changed by at most {summary['linear_momentum_drift']:.1e} kg m/s and "
+        f"{summary['angular_momentum_drift']:.1e} kg m^2/s",
+        *_propellant_line(summary),
+        f"bag         {summary['bag']} ({summary['messages_recorded']} messages)",
+    ]
+
+
+def _end_effector_line(summary: dict[str, Any]) -> list[str]:
+    if "end_effector_position_error_m" not in summary:
+        return []
+    position = numbers(summary["end_effector_final_position_m"])
+    error = summary["end_effector_position_error_m"]
+    return [f"end-effector ({position}) m, {error:.3g} m from its goal"]
+
+
+def _propellant_line(summary: dict[str, Any]) -> list[str]:
+    used = summary.get("propellant_kg")
+    return [] if used is None else [f"propellant  {1e3 * used:.1f} g"]
+
+
+def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
+    """Return what a publication prints beside what was measured."""
+    lines = []
+    for row in scenario.comparable if summary["state"] in ("reached", "failed") else ():
+        measured = summary.get(row.quantity, summary["gait"].get(row.quantity))
+        if isinstance(measured, list):
+            printed, found = (f"({numbers(values, 4)})" for values in (row.printed, measured))
+            lines.append(f"  {row.quantity:<26}{printed:<30}{found}")
+            if row.note:
+                lines.append(f"    {row.note}")
+    return [f"  {'':<26}{'printed in the paper':<30}here", *lines] if lines else []

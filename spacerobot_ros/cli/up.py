@@ -1,0 +1,35 @@
+"""The command ``spacerobot up``: for machines without the ros2 command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from spacerobot_ros.cli.options import PATH, settings_option
+
+
+@click.command("up")
+@click.argument("scenario")
+@settings_option
+@click.option("--bag", type=PATH, help="Record into this bag.")
+@click.option(
+    "--rate",
+    default=1.0,
+    show_default=True,
+    type=click.FloatRange(min=0.0, min_open=True),
+    help="Simulated over wall time.",
+)
+@click.option("--processes", is_flag=True, help="Give each node a process of its own.")
+def command(
+    scenario: str, settings: tuple[str, ...], bag: Path | None, rate: float, processes: bool
+) -> None:
+    """Run the nodes of SCENARIO in real time until Ctrl-C; send goals by topic."""
+    from spacerobot_ros.session.scenario import load_scenario
+
+    chosen = load_scenario(scenario).in_real_time(rate).with_settings(settings)
+    from spacerobot_ros.session.live import keep_up
+
+    keep_up(chosen, bag, click.echo, processes=processes)
+    if bag is not None:
+        click.echo(f"bag         {bag}")

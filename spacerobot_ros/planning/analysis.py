@@ -1,0 +1,131 @@
+"""What a robot can do by moving its joints: its parts, what loops turn, which methods suit it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.controllability import (
+    Controllability,
+    brackets_anywhere,
+    brackets_at,
+    curvatures,
+    planar_chain,
+    sample_shapes,
+    sliding_masses,
+)
+from spacerobot_ros.planning.methods.auto import AutoGait
+from spacerobot_ros.planning.methods.nominal_shape import NominalShape, best_nominal, given_nominal
+from spacerobot_ros.planning.methods.registry import METHODS
+
+_SHAPES = 300
+"""Shapes over which conditioning is summed up."""
+
+_EDGE = 1.0
+"""Edges of the loops for which the nominal shape is the best, m or rad: those of area_loop."""
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """The findings about one robot.
+
+    Attributes
+    ----------
+    robot
+        The model.
+    shape
+        (n,) the shape that is looked at: as given, the best nominal one, or the middle.
+    nominal
+        The three joints and their M there; None with fewer than three joints, or where loops turn
+        the base about fewer than three axes everywhere.
+    at_shape, anywhere
+        What first-order brackets span at ``shape``, and at the best of many.
+    conditions
+        (300,) condition numbers of the best three brackets, shapes all over the shape space.
+    planar, sliding
+        The tests of papers 3 and 1.
+    objections
+        Why each method does not suit the robot, by name; "" if it does.
+    """
+
+    robot: SpaceRobot
+    shape: Array
+    nominal: NominalShape | None
+    at_shape: Controllability
+    anywhere: Controllability
+    conditions: Array
+    planar: Controllability
+    sliding: Controllability
+    objections: dict[str, str]
+
+    @property
+    def chosen(self) -> str:
+        """The method that ``auto`` tries first; "" if none suits."""
+        return next((name for name, objection in self.objections.items() if not objection), "")
+
+
+def analyze(robot: SpaceRobot, shape: Sequence[float] | None = None) -> Analysis:
+    """Return the findings about a robot, at a shape (n,) or the best one for loops.
+
+    Raises
+    ------
+    ParameterError
+        The shape is none of this robot.
+    """
+    given = None if shape is None else _checked(robot, shape)
+    anywhere = brackets_anywhere(robot)
+    nominal = None
+    if robot.n >= 3 and anywhere.controllable:
+        triples = list(itertools.combinations(range(robot.n), 3))
+        if given is None:
+            middle = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
+            nominal = best_nominal(robot, middle, triples, _EDGE)
+        else:
+            nominal = given_nominal(robot, given, triples, _EDGE)
+    planar = planar_chain(robot)
+    if given is None:
+        best = planar if planar.controllable else anywhere
+        given = best.shape if nominal is None else nominal.shape
+    return Analysis(
+        robot,
+        given,
+        nominal,
+        brackets_at(robot, given),
+        anywhere,
+        _conditions(robot),
+        planar,
+        sliding_masses(robot),
+        {
+            name: method.objection(robot)
+            for name, method in METHODS.items()
+            if method is not AutoGait
+        },
+    )
+
+
+def _checked(robot: SpaceRobot, shape: Sequence[float]) -> Array:
+    values = np.asarray(shape, dtype=float)
+    if values.shape != (robot.n,) or not np.all(np.isfinite(values)):
+        raise ParameterError(
+            f"The shape has {values.size} number(s), and a finite one is wanted for each of the "
+            f"{robot.n} joints of robot '{robot.description.name}': {', '.join(robot.joint_names)}."
+        )
+    return values
+
+
+def _conditions(robot: SpaceRobot) -> Array:
+    if robot.n < 3:
+        return np.full(_SHAPES, np.inf)
+    # The matrices of all triples at once: the best one at each shape.
+    K = curvatures(robot, sample_shapes(robot, _SHAPES))
+    i, j, k = np.array(list(itertools.combinations(range(robot.n), 3))).T
+    M = np.stack([K[:, :, i, j], K[:, :, j, k], K[:, :, k, i]], axis=-1).transpose(0, 2, 1, 3)
+    values = np.linalg.svd(M, compute_uv=False)
+    inverse = (values[..., 2] / np.maximum(values[..., 0], 1e-300)).max(axis=1)
+    return np.asarray(np.where(inverse > 1e-6, 1 / np.maximum(inverse, 1e-300), np.inf))

@@ -1,0 +1,271 @@
+"""Plans made without ROS and tried in the plant: one goal, every method, or many random goals."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from spacerobot_ros.errors import ParameterError, PlanningError, SpaceRobotError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
+from spacerobot_ros.planning import (
+    METHODS,
+    BasePath,
+    GaitMethod,
+    GaitSchedule,
+    Goal,
+    PlanRequest,
+    PoseError,
+    RobotState,
+    build_method,
+)
+from spacerobot_ros.planning.core.goal import Controlled
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.methods.optimal.reach import Turning
+from spacerobot_ros.simulation.building import period_ns
+from spacerobot_ros.simulation.initial_state import InitialState
+from spacerobot_ros.simulation.velocity_plant import VelocityPlant
+
+_MOST_PIECES = 1000
+"""Schedules that end short of the goal on purpose may follow each other this often."""
+
+_RANDOM_TOLERANCE = 1e-5
+"""A random goal is reached when the flight ends this near, rad and m."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is to be planned, and for what robot.
+
+    Attributes
+    ----------
+    name
+        For people: a scenario or a robot.
+    robot, initial
+        The model, and where it starts.
+    goal
+        Where it is to go.
+    config
+        The planner's parameters: control period, tolerance, options of the methods.
+    """
+
+    name: str
+    robot: SpaceRobot
+    initial: InitialState
+    goal: Goal
+    config: PlannerConfig
+
+    @property
+    def control_period(self) -> float:
+        """How long a command is held, s."""
+        return period_ns(self.config.tick_rate) / 1e9
+
+    def method(self, name: str) -> GaitMethod:
+        """Build a gait method with its options."""
+        step = self.config.integration_step
+        return build_method(name, self.robot, self.control_period, step, self.config.options)
+
+    def plant(self) -> VelocityPlant:
+        """Return the robot at the start."""
+        step = self.config.integration_step
+        return VelocityPlant(self.robot, self.control_period, self.initial, step)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The plan of a method for a problem, and how its flight in the plant ended.
+
+    Attributes
+    ----------
+    method
+        Name of the gait method.
+    pieces
+        The schedules flown one after the other: one, for a method that plans to the end.
+    error
+        What remained to the goal at ``pose``.
+    pose
+        (7,) of the base in W at the end: position (m) and quaternion.
+    limited
+        Ticks in which the plant limited a joint.
+    plan_time
+        Wall time of planning, s.
+    reached
+        Whether the goal was reached within the planner's tolerance.
+    controls
+        The parts of the goal that the schedules control.
+    """
+
+    method: str
+    pieces: Sequence[GaitSchedule]
+    error: PoseError
+    pose: Array
+    limited: int
+    plan_time: float
+    reached: bool
+    controls: frozenset[Controlled]
+
+    @property
+    def duration(self) -> float:
+        """Time that the manoeuvre takes, s."""
+        return sum(piece.duration for piece in self.pieces)
+
+    @property
+    def positions(self) -> Array:
+        """(N + 1, n) joint positions at the ticks, m or rad."""
+        first, *later = (piece.positions for piece in self.pieces)
+        return np.vstack([first, *(positions[1:] for positions in later)])
+
+    @property
+    def path(self) -> BasePath:
+        """The predicted path of the base, its time from the start of the first schedule."""
+        paths = [piece.path for piece in self.pieces]
+        starts = np.cumsum([0.0, *(piece.duration for piece in self.pieces[:-1])])
+        return BasePath(
+            np.concatenate([t + path.time for t, path in zip(starts, paths, strict=True)]),
+            np.vstack([path.position for path in paths]),
+            np.vstack([path.quaternion for path in paths]),
+        )
+
+
+def state_of(plant: VelocityPlant) -> RobotState:
+    """Return the state that a plant is in."""
+    return RobotState(
+        plant.pose[:3].copy(),
+        plant.pose[3:].copy(),
+        plant.q.copy(),
+        plant.expected_momenta[:3].copy(),
+        plant.expected_momenta[3:].copy(),
+    )
+
+
+def try_method(problem: Problem, name: str, method: GaitMethod | None = None) -> Trial:
+    """Plan by a method, ``method`` if it is built already, and fly the schedule in the plant.
+
+    Raises
+    ------
+    PlanningError
+        The method refuses the goal.
+    ParameterError
+        An option does not go with the robot.
+    """
+    plant, tolerance = problem.plant(), problem.config.tolerance
+    pieces: list[GaitSchedule] = []
+    began = time.perf_counter()
+    method = method or problem.method(name)
+    plan_time = time.perf_counter() - began
+    while not pieces or (pieces[-1].partial and len(pieces) < _MOST_PIECES):
+        began = time.perf_counter()
+        previous = pieces[-1] if pieces else None
+        schedule = method.plan(
+            PlanRequest(
+                state_of(plant),
+                problem.goal,
+                tolerance,
+                correction=previous is not None,
+                previous=previous,
+            )
+        )
+        plan_time += time.perf_counter() - began
+        for rates in schedule.velocities:
+            plant.step(rates)
+        pieces.append(schedule)
+        error = PoseError.between(plant.pose[:3], plant.pose[3:], problem.goal, plant.q)
+        reached = tolerance.admits(error, schedule.controls)
+        if reached:
+            break
+    limited = sum(int(counts.max(initial=0)) for counts in plant.limit_counts.values())
+    pose, controls = plant.pose.copy(), schedule.controls
+    return Trial(name, pieces, error, pose, limited, plan_time, reached, controls)
+
+
+def compare(problem: Problem) -> dict[str, Trial | SpaceRobotError]:
+    """Return the trial of every method by its name, or why the method refuses."""
+    found: dict[str, Trial | SpaceRobotError] = {}
+    for name, method in METHODS.items():
+        # That one only chooses among the others.
+        if name == "auto":
+            continue
+        try:
+            if objection := method.objection(problem.robot):
+                raise PlanningError(objection)
+            found[name] = try_method(problem, name)
+        except (ParameterError, PlanningError) as refusal:
+            found[name] = refusal
+    return found
+
+
+@dataclass
+class Record:
+    """How many random goals a method has reached.
+
+    ``reached`` and ``missed`` count the flights, ``refused`` has the sentences of the goals that
+    were not planned, ``durations`` and ``plan_times`` (s) are of all that were flown.
+    """
+
+    method: str
+    reached: int = 0
+    missed: int = 0
+    refused: list[str] = field(default_factory=list)
+    durations: list[float] = field(default_factory=list)
+    plan_times: list[float] = field(default_factory=list)
+
+
+def random_goals(problem: Problem, count: int, distance: float, angle: float) -> list[Goal]:
+    """Return goals within ``distance`` (m) and ``angle`` (rad) of the start, always the same ones.
+
+    Planar robots are asked to turn about their axis; others about any, evenly.
+    """
+    rng = np.random.default_rng(0)
+    start = problem.plant().pose
+    axes = Turning.of(problem.robot).axes
+    goals = []
+    for _ in range(count):
+        offset = rng.normal(size=3)
+        offset *= distance * rng.uniform() ** (1 / 3) / np.linalg.norm(offset)
+        axis = rng.normal(size=3)
+        if len(axes) == 1:
+            axis = axes[0] * math.copysign(1.0, axis[0])
+        turn = rng.uniform(0.0, angle) * axis / np.linalg.norm(axis)
+        attitude = quaternion_multiply(start[3:], quaternion_from_rotvec(turn))
+        goals.append(replace(problem.goal, position=start[:3] + offset, quaternion=attitude))
+    return goals
+
+
+def try_goals(
+    problem: Problem,
+    goals: Sequence[Goal],
+    methods: Sequence[str],
+    show: Callable[[str], None] = lambda line: None,
+) -> list[Record]:
+    """Plan every goal by every method, fly the plans in the plant, and count what comes of them."""
+    tight = replace(
+        problem.config,
+        position_tolerance=_RANDOM_TOLERANCE,
+        attitude_tolerance=_RANDOM_TOLERANCE,
+        joint_tolerance=_RANDOM_TOLERANCE,
+    )
+    problem = replace(problem, config=tight)
+    built = {name: problem.method(name) for name in methods}
+    records = [Record(name) for name in methods]
+    for number, goal in enumerate(goals, 1):
+        for record in records:
+            try:
+                trial = try_method(replace(problem, goal=goal), record.method, built[record.method])
+            except PlanningError as refusal:
+                record.refused.append(str(refusal))
+                show(f"goal {number}, {record.method}: {refusal}")
+                continue
+            record.reached += trial.reached
+            record.missed += not trial.reached
+            record.durations.append(trial.duration)
+            record.plan_times.append(trial.plan_time)
+            show(
+                f"goal {number}, {record.method}: {trial.duration:.6g} s, "
+                f"{trial.error.angle:.2g} rad and {trial.error.distance:.2g} m off"
+            )
+    return records
