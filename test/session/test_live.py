@@ -101,7 +101,7 @@ def test_goals_are_sent_to_a_robot_that_is_up(
     assert "stroke" in refused.stdout
     reached = spacerobot("goal", "-0.05", "0.02", "0", environment=environment, folder=tmp_path)
     assert reached.returncode == 0, reached.stdout + reached.stderr
-    assert "The goal is met" in reached.stdout
+    assert "The goal is reached" in reached.stdout
     # What is latched of the goal before is no answer to the next.
     again = spacerobot(
         *("goal", "0.02", "0", "0", "--rotvec", "0", "0", "0.01"),
@@ -109,11 +109,11 @@ def test_goals_are_sent_to_a_robot_that_is_up(
         folder=tmp_path,
     )
     assert again.returncode == 0, again.stdout + again.stderr
-    assert "Flying" in again.stdout
+    assert "Executing" in again.stdout
     robot.send_signal(signal.SIGINT)
     assert robot.wait(PATIENCE) == 0
     assert robot.stdout is not None
-    assert "The goal is met" in robot.stdout.read()
+    assert "The goal is reached" in robot.stdout.read()
     bag = read_bag(tmp_path / "up.mcap")
     last = [bag["/odom"].field(f"pose.pose.position.{x}")[-1] for x in "xyz"]
     np.testing.assert_allclose(last, [0.02, 0.0, 0.0], atol=1e-3)
