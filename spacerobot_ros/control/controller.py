@@ -163,8 +163,8 @@ class CoordinatedController:
         """Time since the base was measured last, s."""
         return self._estimator.elapsed if self._estimator is not None else 0.0
 
-    def arrived(self, time: float) -> bool:
-        """Whether the reference has come to its goal."""
+    def reference_at_rest(self, time: float) -> bool:
+        """Whether the reference has reached its goal at ``time`` (s)."""
         return self._profile is not None and time - self._began >= self._profile.duration
 
     def errors(self) -> Errors:

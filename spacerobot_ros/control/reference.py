@@ -125,6 +125,32 @@ class QuinticReference(ReferenceProfile):
         )
 
 
+class HeldVelocityReference:
+    """Joint references from commands whose velocities are held over a control period.
+
+    At the instant of a command the velocity jumps: the reference has the mean of the velocities
+    before and after, and the acceleration that leads from one to the other within a period.
+
+    Parameters
+    ----------
+    control_period
+        Time between two commands, s.
+    """
+
+    def __init__(self, control_period: float) -> None:
+        self._control_period = control_period
+        self._before: Array | None = None
+
+    def at_command(self, position: Array, velocity: Array) -> JointReference:
+        """Return the reference at the instant of a command of positions and velocities (n,)."""
+        held = velocity.copy()
+        before = self._before if self._before is not None else held
+        self._before = held
+        return JointReference(
+            position.copy(), (before + held) / 2, (held - before) / self._control_period
+        )
+
+
 PROFILES: dict[str, type[ReferenceProfile]] = {
     StepReference.name: StepReference,
     QuinticReference.name: QuinticReference,

@@ -80,6 +80,14 @@ class PoseReference:
     acceleration: Array = field(default_factory=_zero)
     angular_acceleration: Array = field(default_factory=_zero)
 
+    @classmethod
+    def with_body_twist(
+        cls, position: Array, quaternion_WB: Array, v_B: Array, omega_B: Array
+    ) -> PoseReference:
+        """Return the reference of a frame B whose velocities are given in B, as odometry is."""
+        R_WB = matrix_from_quaternion(quaternion_WB)
+        return cls(position, quaternion_WB, R_WB @ v_B, R_WB @ omega_B)
+
 
 @dataclass(frozen=True)
 class JointReference:

@@ -6,37 +6,34 @@ import sys
 from typing import Any, ClassVar
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from spacerobot_ros.control import (
-    ControlState,
-    JointReference,
-    PoseReference,
-    Reference,
-)
+from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
-from spacerobot_ros.control.state import NotFiniteError
-from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
+from spacerobot_ros.control.executive import END_EFFECTOR, GOAL_KEYS, ControlExecutive
+from spacerobot_ros.control.reference import HeldVelocityReference
+from spacerobot_ros.control.status import ControllerState, ControllerStatus
+from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import (
     NANOSECONDS,
     MessageTemplate,
     TemplateReader,
     stamp_bytes,
 )
+from spacerobot_ros.nodes.common.diagnostics import diagnostic_status
 from spacerobot_ros.nodes.common.goal_messages import goal_of
 from spacerobot_ros.nodes.common.joint_command import JointReader
-from spacerobot_ros.nodes.common.node import STREAM, run_node
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, run_node
 from spacerobot_ros.nodes.common.robot_node import RobotNode
 from spacerobot_ros.nodes.common.state_synchroniser import Pairing, StateSynchroniser
-from spacerobot_ros.nodes.controller.goals import END_EFFECTOR, ControlGoals, require_controlled
-from spacerobot_ros.nodes.controller.status import ControllerState, ControllerStatus
-from spacerobot_ros.planning.execution.goal_file import BASE
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
 
 JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
 """Topics of references from outside; where one has a publisher, every state waits for it."""
@@ -47,10 +44,12 @@ class CoordinatedControlNode(RobotNode):
 
     ``goal_pose`` is where the base is to be, ``end_effector/goal_pose`` where the end-effector is.
     Where a planner publishes ``joint_reference`` (or ``base_reference``), those are tracked. Until
-    there is a goal, the robot holds the pose of its first state.
+    there is a goal, the robot holds the pose of its first state. The node converts messages; what
+    becomes of goals is decided by :class:`ControlExecutive`.
     """
 
     Config: ClassVar = ControllerConfig
+    config: ControllerConfig
 
     def __init__(self, name: str = "coordinated_control", **kwargs: Any) -> None:
         self._running = False
@@ -61,97 +60,127 @@ class CoordinatedControlNode(RobotNode):
     def configure(self) -> None:
         """Create the topics; without a robot of its own the node waits for robot_description."""
         self._states = StateSynchroniser(pose_required=True)
-        self._hold = False
-        self._goals = ControlGoals(str(self.parameters["resume_file"]))
-        self._odom = TemplateReader(
-            Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
-        )
-        self._base_reference = TemplateReader(
-            Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
-        )
+        self._odom, self._base_reference = _odometry_reader(), _odometry_reader()
+        self._goal_file = GoalFile(self.config.resume_file, GOAL_KEYS)
+        self._goal_ids = GoalIds()
+        self._waiting: dict[str, IdentifiedGoal] = {}
+        """Goals that have come before the robot."""
         self._joint_commands = self.send_raw(JointState, "joint_commands")
         self._base_wrench = self.send_raw(WrenchStamped, "base_wrench")
-        self._status = ControllerStatus(self)
+        self._status = self.create_publisher(DiagnosticStatus, "controller/status", LATCHED)
         self.find_robot()
-        self.create_subscription(PoseStamped, "goal_pose", self._on_base_goal, STREAM)
-        self.create_subscription(
-            PoseStamped, "end_effector/goal_pose", self._on_end_effector_goal, STREAM
-        )
+        for topic, key in (("goal_pose", BASE), ("end_effector/goal_pose", END_EFFECTOR)):
+            self.create_subscription(
+                PoseStamped, topic, lambda message, key=key: self._on_goal(key, message), STREAM
+            )
         self.create_subscription(Odometry, "odom", self._on_odom, STREAM, raw=True)
         self.create_subscription(JointState, "joint_states", self._on_joints, STREAM, raw=True)
-        self.create_subscription(JointState, JOINT_REFERENCE, self._on_reference, STREAM, raw=True)
-        self.create_subscription(
-            Odometry, BASE_REFERENCE, self._on_base_reference, STREAM, raw=True
-        )
+        for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
+            self.create_subscription(
+                kind, topic, lambda raw, topic=topic: self._on_reference(topic, raw), STREAM,
+                raw=True,
+            )  # fmt: skip
         self.create_service(Trigger, "~/abort", self._on_abort)
 
     def activate(self) -> None:
-        """Answer states with commands from now on; go on to goals that an earlier end cut off."""
-        if self._goals.recall(None if self._robot is None else self.controller.law):
+        """Answer states with commands from now on; resume goals that an earlier end cut off."""
+        saved = self._goal_file.load()
+        if self._robot is None:
+            self._waiting = saved
+        else:
+            self._executive.resume(saved)
+        if saved:
             self.get_logger().info("Going on to an earlier goal.")
         self._running = True
         for topic in (JOINT_REFERENCE, BASE_REFERENCE):
             self._states.require(topic, required=self.count_publishers(topic) > 0)
-        self._status.begin()
         # A lockstep plant may have been waiting for an answer since before.
         self._on_part()
 
     def deactivate(self) -> None:
-        """Command nothing any more; goals are forgotten, but for the file."""
+        """Command nothing any more; goals are dropped, but not those in the file."""
         self._running = False
-        self._goals.drop()
+        self._waiting = {}
         if self._robot is not None:
-            self.controller.forget()
+            self._executive.reset()
 
     def _use(self, robot: SpaceRobot) -> None:
         self._robot = robot
-        self.controller = build_controller(robot, self.config)
-        n = robot.n
+        self._executive = ControlExecutive(
+            build_controller(robot, self.config),
+            self.config,
+            self._publish_status,
+            self._goal_file,
+            self.get_logger().error,
+        )
         self._joints = JointReader(robot.joint_names, ["position", "velocity"], complete=True)
         self._references = JointReader(robot.joint_names, ["position", "velocity"])
-        self._reference_rate: Any = None
-        self._effort, self._wrench = np.zeros(n), np.zeros(6)
-        names = list(robot.joint_names)
-        zeros = [0.0] * n
+        self._held_velocities = HeldVelocityReference(self.config.control_period)
+        self._effort, self._wrench = np.zeros(robot.n), np.zeros(6)
+        names, zeros = list(robot.joint_names), [0.0] * robot.n
         self._joint_message = MessageTemplate(
             JointState(name=names, position=zeros, velocity=zeros, effort=zeros)
         )
-        if n:
+        if robot.n:
             self._joint_message.feed("effort", self._effort)
         wrench = WrenchStamped()
         wrench.header.frame_id = robot.base_link
         self._wrench_message = MessageTemplate(wrench)
         self._wrench_message.feed("wrench.force.x", self._wrench)
-        try:
-            self._goals.require_suited(self.controller.law)
-        except PlanningError as error:
-            self._status.refused(str(error))
+        waiting, self._waiting = self._waiting, {}
+        for key, goal in waiting.items():
+            self._submit(key, goal)
 
     def parameters_changed(self) -> None:
-        """Take over new gains."""
+        """Use new gains, tolerances and times."""
         if self._robot is not None:
-            self.controller.set_gains(self.config.gains)
+            self._executive.configure(self.config)
 
-    # -- topics -------------------------------------------------------------------------------
+    # -- goals and statuses -------------------------------------------------------------------
 
-    def _on_base_goal(self, message: PoseStamped) -> None:
-        self._on_goal(BASE, message)
-
-    def _on_end_effector_goal(self, message: PoseStamped) -> None:
-        self._on_goal(END_EFFECTOR, message)
-
-    def _on_goal(self, group: str, message: PoseStamped) -> None:
+    def _on_goal(self, key: str, message: PoseStamped) -> None:
         if not self._running:
             return
+        stamp = message.header.stamp
+        goal_id = self._goal_ids.of(stamp.sec, stamp.nanosec)
+        what = f"The goal of the {key.replace('_', '-')}"
         try:
-            frame = str(self.parameters["world_frame"])
-            goal = goal_of(message, frame, f"The goal of the {group.replace('_', '-')}")
-            if self._robot is not None:
-                require_controlled(self.controller.law, group)
+            goal = goal_of(message, self.config.world_frame, what)
         except PlanningError as error:
-            self._status.refused(str(error))
+            self._refuse(error, goal_id)
             return
-        self._goals.give(group, goal)
+        identified = IdentifiedGoal(goal, goal_id)
+        if self._robot is None:
+            self._waiting[key] = identified
+        else:
+            self._submit(key, identified)
+
+    def _submit(self, key: str, goal: IdentifiedGoal) -> None:
+        try:
+            self._executive.submit(key, goal)
+        except PlanningError as error:
+            self._refuse(error, goal.goal_id)
+
+    def _refuse(self, error: PlanningError, goal_id: str) -> None:
+        if self._robot is None:
+            self._publish_status(ControllerStatus(ControllerState.REFUSED, str(error), goal_id))
+        else:
+            self._executive.refuse(str(error), goal_id)
+
+    def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = self._running and self._robot is not None
+        response.message = "The robot holds where it is."
+        if response.success:
+            self._executive.abort()
+        return response
+
+    def _publish_status(self, status: ControllerStatus) -> None:
+        name, level = self.get_fully_qualified_name(), bytes([status.state.level])
+        self._status.publish(diagnostic_status(name, level, status.sentence, status.to_values()))
+        if status.state.level:
+            self.get_logger().warning(status.sentence, throttle_duration_sec=5.0)
+
+    # -- states -------------------------------------------------------------------------------
 
     def _on_odom(self, raw: bytes) -> None:
         self._states.put_odom(raw)
@@ -165,12 +194,8 @@ class CoordinatedControlNode(RobotNode):
         self._states.put_joint_states(raw)
         self._on_part()
 
-    def _on_reference(self, raw: bytes) -> None:
-        self._states.put_required(JOINT_REFERENCE, raw)
-        self._on_part()
-
-    def _on_base_reference(self, raw: bytes) -> None:
-        self._states.put_required(BASE_REFERENCE, raw)
+    def _on_reference(self, topic: str, raw: bytes) -> None:
+        self._states.put_required(topic, raw)
         self._on_part()
 
     def _on_part(self) -> None:
@@ -180,32 +205,14 @@ class CoordinatedControlNode(RobotNode):
             if pairing is not None:
                 self._on_state(pairing)
 
-    def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._running and self._robot is not None
-        response.message = "The robot holds where it is."
-        if response.success:
-            self._hold = True
-            self._goals.drop()
-            self._goals.forget()
-        return response
-
-    # -- flying -------------------------------------------------------------------------------
-
     def _on_state(self, pairing: Pairing, *, send: bool = True) -> None:
         """Answer one state with one command of the same stamp."""
         try:
             stamp = self._joints.accept(self._states.joint_states)
             q, qdot = self._joints.values["position"], self._joints.values["velocity"]
+            measured = self._measured(q, qdot) if pairing is Pairing.WHOLE else None
             now = stamp / NANOSECONDS
-            state = self._measured(q, qdot) if pairing is Pairing.WHOLE else None
-            if state is not None:
-                self._take_goals(now, state)
-            base, joints = self._states.latest(BASE_REFERENCE), self._states.latest(JOINT_REFERENCE)
-            if base or joints:
-                self.controller.follow(
-                    Reference(base=self._given_base(base), joints=self._given_joints(joints))
-                )
-            result = self.controller.command(now, state, q, qdot)
+            result = self._executive.command(now, measured, q, qdot, self._reference())
         except (CommandError, NotFiniteError) as error:
             self.get_logger().error(f"The state is refused: {error}", throttle_duration_sec=5.0)
             return
@@ -215,55 +222,40 @@ class CoordinatedControlNode(RobotNode):
             stamped = stamp_bytes(stamp)
             self._base_wrench.take(self._wrench_message.serialised(stamped))
             self._joint_commands.take(self._joint_message.serialised(stamped))
-        if self._status.update(now, self.controller, result):
-            self._goals.forget()
+        self._executive.evaluate(now, result)
 
-    def _measured(self, q: Any, qdot: Any) -> ControlState:
-        self._odom.accept(self._states.odom)
-        pose = self._odom.floats("pose.pose.position.x")
-        twist = self._odom.floats("twist.twist.linear.x")
+    def _measured(self, q: Array, qdot: Array) -> ControlState:
+        pose, twist = _pose_and_twist(self._odom, self._states.odom)
         return ControlState(pose[:3], pose[3:], twist[:3], twist[3:], q, qdot)
 
-    def _take_goals(self, now: float, state: ControlState) -> None:
-        if self._hold:
-            self._hold = False
-            link = self.controller.law.outputs.selection.end_effector_link
-            assert self._robot is not None
-            here = Reference.present(self._robot, state, link)
-            self.controller.set_goals(
-                now, state, base=here.base, end_effector=here.end_effector, joints=state.q.copy()
+    def _reference(self) -> Reference | None:
+        """Return the reference from outside for this state; None if there is none."""
+        base, joints = self._states.latest(BASE_REFERENCE), self._states.latest(JOINT_REFERENCE)
+        if not base and not joints:
+            return None
+        base_reference, joint_reference = None, None
+        if base:
+            pose, twist = _pose_and_twist(self._base_reference, base)
+            base_reference = PoseReference.with_body_twist(pose[:3], pose[3:], twist[:3], twist[3:])
+        if joints:
+            self._references.accept(joints)
+            values = self._references.values
+            joint_reference = self._held_velocities.at_command(
+                values["position"], values["velocity"]
             )
-            self._status.state(ControllerState.ABORTED, "Aborted on request; the robot holds.")
-        if self._goals.take(self.controller, now, state):
-            self._status.started(now)
-            try:
-                self._goals.keep(self.controller)
-            except ParameterError as error:
-                self.get_logger().error(f"{error} The goal is flown, but would not be resumed.")
+        return Reference(base=base_reference, joints=joint_reference)
 
-    def _given_joints(self, raw: bytes) -> JointReference | None:
-        """Return the joint reference of this tick, whose velocities are held over it."""
-        if not raw:
-            return None
-        self._references.accept(raw)
-        held = self._references.values["velocity"].copy()
-        before = self._reference_rate if self._reference_rate is not None else held
-        self._reference_rate = held
-        return JointReference(
-            self._references.values["position"].copy(),
-            (before + held) / 2,
-            (held - before) / self.config.control_period,
-        )
 
-    def _given_base(self, raw: bytes) -> PoseReference | None:
-        """Return the base reference of this tick; an Odometry's twist is in the base."""
-        if not raw:
-            return None
-        self._base_reference.accept(raw)
-        pose = self._base_reference.floats("pose.pose.position.x")
-        twist = self._base_reference.floats("twist.twist.linear.x")
-        R_WB = matrix_from_quaternion(pose[3:])
-        return PoseReference(pose[:3], pose[3:], R_WB @ twist[:3], R_WB @ twist[3:])
+_POSE, _TWIST = "pose.pose.position.x", "twist.twist.linear.x"
+
+
+def _odometry_reader() -> TemplateReader[Odometry]:
+    return TemplateReader(Odometry, lambda _: {_POSE: 7, _TWIST: 6})
+
+
+def _pose_and_twist(reader: TemplateReader[Odometry], raw: bytes) -> tuple[Array, Array]:
+    reader.accept(raw)
+    return reader.floats(_POSE), reader.floats(_TWIST)
 
 
 def main() -> None:

@@ -1,0 +1,322 @@
+"""The goals of coordinated control: accepted, pursued, reached or failed, aborted, saved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.controller import CoordinatedController, Errors, Mode
+from spacerobot_ros.control.limits import Saturated
+from spacerobot_ros.control.state import ControlState, PoseReference, Reference
+from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
+from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.goal import Goal
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
+
+END_EFFECTOR = "end_effector"
+"""Key of the goal of the end-effector; that of the base is ``base``."""
+
+GOAL_KEYS = (BASE, END_EFFECTOR)
+"""What goal poses may be for."""
+
+
+class ControlExecutive:
+    """Decides what a :class:`CoordinatedController` pursues, and reports what becomes of it.
+
+    For every state the owner calls :meth:`command`, sends the result to the actuators, and then
+    calls :meth:`evaluate`. The state of the goal is one of
+
+    * ``HOLDING``: no goal was accepted; the robot holds the pose of its first state.
+    * ``TRACKING``: a goal is pursued. ``REACHED`` once all errors have stayed within the tolerances
+      for the settling time after the reference has come to rest; ``FAILED`` if that does not happen
+      within the time limit. Either way the robot goes on to hold the goal.
+    * ``ABORTED``: the goal was given up; the robot holds where it was at the next measured state.
+
+    While the base is not measured, the reported state is ``ESTIMATING`` or ``STOPPED`` instead, and
+    the state of the goal stays as it is. ``REFUSED`` is reported of a single goal and is no state.
+
+    Parameters
+    ----------
+    controller
+        The controller.
+    config
+        Tolerances, times and gains; :meth:`configure` changes them.
+    report
+        Called with every status: whenever the state changes, when commands begin or cease to be
+        limited, and every ``status_period``.
+    goal_file
+        Where the present goals are saved for a controller that is restarted.
+    warn
+        Called with a sentence where the goals cannot be saved.
+    """
+
+    def __init__(
+        self,
+        controller: CoordinatedController,
+        config: ControllerConfig,
+        report: Callable[[ControllerStatus], None],
+        goal_file: GoalFile | None = None,
+        warn: Callable[[str], None] = lambda sentence: None,
+    ) -> None:
+        self.controller = controller
+        self._config = config
+        self._report, self._warn = report, warn
+        self._file = goal_file if goal_file is not None else GoalFile("", GOAL_KEYS)
+        self.reset()
+
+    def reset(self) -> None:
+        """Drop goals and measurements: the next state is the first. The goal file stays."""
+        self.controller.forget()
+        self._pending: dict[str, IdentifiedGoal] = {}
+        """Goals that are accepted and wait for the next measured state."""
+        self._abort_requested = False
+        self._goal_state = self._reported_state = ControllerState.HOLDING
+        self._goal_id = ""
+        self._started = 0.0
+        """Time at which the goal was begun, s."""
+        self._within_since: float | None = None
+        """Time since which all errors are within the tolerances, s."""
+        self._next_report = 0.0
+        self._limited = False
+        self._command_report: CommandReport | None = None
+
+    def configure(self, config: ControllerConfig) -> None:
+        """Use other tolerances, times and gains from the next state on."""
+        self._config = config
+        self.controller.set_gains(config.gains)
+
+    @property
+    def state(self) -> ControllerState:
+        """The state that is reported."""
+        match self.controller.mode:
+            case Mode.MEASURED:
+                return self._goal_state
+            case Mode.ESTIMATED:
+                return ControllerState.ESTIMATING
+            case Mode.STOPPED:
+                return ControllerState.STOPPED
+
+    # -- goals --------------------------------------------------------------------------------
+
+    def submit(self, key: str, goal: IdentifiedGoal) -> None:
+        """Accept a goal of the ``base`` or the ``end_effector``, pursued from the next state on.
+
+        What is controlled beside it keeps its goal.
+
+        Raises
+        ------
+        PlanningError
+            The law does not control it, or its shape has another number of joints.
+        """
+        law = self.controller.law
+        if not getattr(law.outputs.selection, key):
+            raise PlanningError(
+                f"The law '{law.name}' does not control the {key.replace('_', '-')} of this robot; "
+                f"its outputs are {', '.join(law.outputs.labels)}."
+            )
+        shape = goal.goal.joint_positions
+        if shape is not None and len(shape) != law.robot.n:
+            raise PlanningError(
+                f"A shape of {len(shape)} joints is no goal of robot "
+                f"'{law.robot.description.name}', which has {law.robot.n}."
+            )
+        self._pending.pop(key, None)
+        self._pending[key] = goal
+
+    def refuse(self, sentence: str, goal_id: str = "") -> None:
+        """Report that a goal is refused; an earlier one is still pursued."""
+        self._publish(ControllerState.REFUSED, sentence, goal_id)
+
+    def resume(self, saved: Mapping[str, IdentifiedGoal]) -> None:
+        """Accept the goals that an earlier controller saved.
+
+        Raises
+        ------
+        ParameterError
+            They are goals of another robot or law; none is accepted.
+        """
+        try:
+            for key, goal in saved.items():
+                self.submit(key, goal)
+        except PlanningError as error:
+            self._pending.clear()
+            raise ParameterError(
+                f"Parameter 'resume_file' holds goals of another robot or law: {error}"
+            ) from error
+
+    def abort(self) -> None:
+        """Give up every goal; from the next measured state on the robot holds where it is then."""
+        self._goal_id = self._latest_id()
+        self._pending.clear()
+        self._abort_requested = True
+        self._file.delete()
+
+    # -- states -------------------------------------------------------------------------------
+
+    def command(
+        self,
+        time: float,
+        measured: ControlState | None,
+        q: Array,
+        qdot: Array,
+        reference: Reference | None = None,
+    ) -> Saturated:
+        """Return the actuation for a state; see :meth:`CoordinatedController.command`.
+
+        ``reference`` is what a planner gives for this state; what it lacks is held.
+
+        Raises
+        ------
+        NotFiniteError
+            A measurement is not finite.
+        """
+        if measured is not None:
+            if self._abort_requested:
+                self._hold(time, measured)
+            if self._pending:
+                self._begin(time, measured)
+        if reference is not None:
+            self.controller.follow(reference)
+        return self.controller.command(time, measured, q, qdot)
+
+    def evaluate(self, time: float, result: Saturated) -> None:
+        """Evaluate the errors after the command ``result``, and report what is due."""
+        if self.controller.mode is Mode.MEASURED and self._goal_state is ControllerState.TRACKING:
+            self._goal_state = self._outcome(time)
+            if self._goal_state.decided:
+                self._file.delete()
+        state = self.state
+        if (
+            state is self._reported_state
+            and result.limited == self._limited
+            and time < self._next_report
+        ):
+            return
+        self._next_report = time + self._config.status_period
+        self._reported_state, self._limited = state, result.limited
+        self._command_report = _command_report(self.controller, result)
+        self._publish(state, self._sentence(state), self._goal_id)
+
+    def _hold(self, time: float, state: ControlState) -> None:
+        """Abort: hold everything where it is."""
+        law = self.controller.law
+        here = Reference.present(law.robot, state, law.outputs.selection.end_effector_link)
+        self.controller.set_goals(
+            time, state, base=here.base, end_effector=here.end_effector, joints=state.q.copy()
+        )
+        self._abort_requested = False
+        self._goal_state = self._reported_state = ControllerState.ABORTED
+        self._publish(ControllerState.ABORTED, self._sentence(ControllerState.ABORTED))
+
+    def _begin(self, time: float, state: ControlState) -> None:
+        """Start towards the goals that are pending."""
+        self._goal_id = self._latest_id()
+        goals = {key: pending.goal for key, pending in self._pending.items()}
+        self._pending.clear()
+        poses = {key: PoseReference(goal.position, goal.quaternion) for key, goal in goals.items()}
+        shapes = [g.joint_positions for g in goals.values() if g.joint_positions is not None]
+        self.controller.set_goals(
+            time,
+            state,
+            base=poses.get(BASE),
+            end_effector=poses.get(END_EFFECTOR),
+            joints=shapes[0] if shapes else None,
+        )
+        self._goal_state = ControllerState.TRACKING
+        self._started = self._next_report = time
+        self._within_since = None
+        try:
+            self._file.save(self._pursued())
+        except ParameterError as error:
+            self._warn(f"{error} The goal is pursued, but would not be resumed.")
+
+    def _pursued(self) -> dict[str, IdentifiedGoal]:
+        """Return where the controller brings all that it controls: whole goals to resume with."""
+        goal, selection = self.controller.goal, self.controller.law.outputs.selection
+        shape = goal.joints.q if goal.joints is not None and selection.joints else None
+        poses = {BASE: goal.base, END_EFFECTOR: goal.end_effector}
+        return {
+            key: IdentifiedGoal(Goal(pose.position, pose.quaternion, shape), self._goal_id)
+            for key, pose in poses.items()
+            if pose is not None and getattr(selection, key)
+        }
+
+    def _outcome(self, time: float) -> ControllerState:
+        """Return what has become of the goal that is pursued."""
+        config = self._config
+        within = self.controller.reference_at_rest(time) and _within(
+            self.controller.errors(), config
+        )
+        if not within:
+            self._within_since = None
+        elif self._within_since is None:
+            self._within_since = time
+        if (
+            self._within_since is not None
+            and time - self._within_since >= config.settle_time - _ROUNDING
+        ):
+            return ControllerState.REACHED
+        if config.time_limit and time - self._started >= config.time_limit - _ROUNDING:
+            return ControllerState.FAILED
+        return ControllerState.TRACKING
+
+    def _latest_id(self) -> str:
+        """Return the id of the goal that was accepted last."""
+        return next(reversed(self._pending.values())).goal_id if self._pending else self._goal_id
+
+    # -- status -------------------------------------------------------------------------------
+
+    def _publish(self, state: ControllerState, sentence: str, goal_id: str | None = None) -> None:
+        about = self._goal_id if goal_id is None else goal_id
+        self._report(ControllerStatus(state, sentence, about, self._command_report))
+
+    def _sentence(self, state: ControllerState) -> str:
+        errors = self.controller.errors()
+        remaining = f"{errors.position:.3g} m, {errors.attitude:.3g} rad"
+        match state:
+            case ControllerState.HOLDING:
+                return f"Holding; off by {remaining}."
+            case ControllerState.TRACKING:
+                return f"Flying to the goal; {remaining} from the reference."
+            case ControllerState.REACHED:
+                return f"The goal is met: {remaining} from it."
+            case ControllerState.FAILED:
+                return f"The goal is not met in time: {remaining} from it."
+            case ControllerState.ABORTED:
+                return "Aborted on request; the robot holds."
+            case ControllerState.ESTIMATING:
+                elapsed = self.controller.estimated_for
+                return f"The base is not measured; it is estimated since {elapsed:.3g} s."
+            case ControllerState.STOPPED:
+                return "The base is not measured any more: thrusters off, joints brought to rest."
+            case ControllerState.REFUSED:
+                raise ValueError("a refusal has a sentence of its own")
+
+
+_ROUNDING = 1e-9
+"""By how much sums of control periods may be off a time, s."""
+
+
+def _within(errors: Errors, config: ControllerConfig) -> bool:
+    return (
+        errors.position <= config.position_tolerance
+        and errors.attitude <= config.attitude_tolerance
+        and errors.joints <= config.joint_tolerance
+    )
+
+
+def _command_report(controller: CoordinatedController, result: Saturated) -> CommandReport:
+    status, loss = controller.law.status, result.loss
+    return CommandReport(
+        law=controller.law.name,
+        singular=status.singular,
+        smallest_singular_value=status.smallest_singular_value,
+        damping=status.damping,
+        lost_force_N=float(np.linalg.norm(loss.wrench_B[:3])),
+        lost_torque_Nm=float(np.linalg.norm(loss.wrench_B[3:])),
+        lost_effort=float(np.abs(loss.tau).max(initial=0.0)),
+        errors=controller.labelled_errors(),
+    )

@@ -1,0 +1,146 @@
+"""What a controller reports: what became of its goal, and how well its last command was defined."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+from spacerobot_ros.errors import SpaceRobotError
+
+_ERROR = "error."
+"""Prefix of the keys of output errors."""
+
+
+class ControllerState(str, Enum):
+    """The value of ``state`` in controller/status."""
+
+    HOLDING = "holding"
+    TRACKING = "tracking"
+    REACHED = "reached"
+    FAILED = "failed"
+    REFUSED = "refused"
+    ABORTED = "aborted"
+    ESTIMATING = "estimating"
+    STOPPED = "stopped"
+
+    @property
+    def decided(self) -> bool:
+        """Whether nothing more will happen for the goal that the status is about."""
+        return self in (
+            ControllerState.REACHED,
+            ControllerState.FAILED,
+            ControllerState.REFUSED,
+            ControllerState.ABORTED,
+        )
+
+    @property
+    def level(self) -> int:
+        """Level of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR."""
+        match self:
+            case ControllerState.FAILED | ControllerState.REFUSED | ControllerState.STOPPED:
+                return 2
+            case ControllerState.ABORTED | ControllerState.ESTIMATING:
+                return 1
+            case _:
+                return 0
+
+
+@dataclass(frozen=True)
+class CommandReport:
+    """How a command came about.
+
+    Attributes
+    ----------
+    law
+        Name of the control law.
+    singular, smallest_singular_value, damping
+        See :class:`spacerobot_ros.control.LawStatus`.
+    lost_force_N, lost_torque_Nm, lost_effort
+        What the actuators' limits took from it: norms for the thrusters, the largest of the joints
+        (N or N m).
+    errors
+        Error of each output by its label, m or rad.
+    """
+
+    law: str
+    singular: bool
+    smallest_singular_value: float
+    damping: float
+    lost_force_N: float
+    lost_torque_Nm: float
+    lost_effort: float
+    errors: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ControllerStatus:
+    """A status of the controller, as controller/status carries it.
+
+    Attributes
+    ----------
+    state
+        What became of the goal.
+    sentence
+        The same for people.
+    goal_id
+        Which goal the status is about; empty: none, or one whose id is not known.
+    command
+        About the last command; None before the first.
+    """
+
+    state: ControllerState
+    sentence: str = ""
+    goal_id: str = ""
+    command: CommandReport | None = None
+
+    def to_values(self) -> dict[str, str]:
+        """Return the status as the key-value pairs of a DiagnosticStatus; numbers have 6 digits."""
+        values = {"state": self.state.value}
+        if self.goal_id:
+            values["goal_id"] = self.goal_id
+        if self.command is not None:
+            values["law"] = self.command.law
+            values["singular"] = str(self.command.singular).lower()
+            values.update((name, f"{getattr(self.command, name):.6g}") for name in _NUMBERS)
+            values.update(
+                (f"{_ERROR}{label}", f"{error:.6g}") for label, error in self.command.errors.items()
+            )
+        return values
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, str], sentence: str = "") -> ControllerStatus:
+        """Return the status that :meth:`to_values` has turned into these pairs.
+
+        Raises
+        ------
+        SpaceRobotError
+            They are no status of a controller.
+        """
+        try:
+            command = None
+            if "law" in values:
+                command = CommandReport(
+                    law=values["law"],
+                    singular=values["singular"] == "true",
+                    **{name: float(values[name]) for name in _NUMBERS},
+                    errors={
+                        key.removeprefix(_ERROR): float(value)
+                        for key, value in values.items()
+                        if key.startswith(_ERROR)
+                    },
+                )
+            state = ControllerState(values["state"])
+            return cls(state, sentence, values.get("goal_id", ""), command)
+        except (KeyError, ValueError) as error:
+            raise SpaceRobotError(f"This is no status of a controller: {error}.") from error
+
+
+_NUMBERS = (
+    "smallest_singular_value",
+    "damping",
+    "lost_force_N",
+    "lost_torque_Nm",
+    "lost_effort",
+)
+"""Values of a command report that are one number each."""
