@@ -1,11 +1,16 @@
 """Installation by `pip install .` and, in a ROS 2 workspace, by `colcon build`."""
 
 import os
+import re
 from glob import glob
 
 from setuptools import find_packages, setup
 
 NAME = "spacerobot_ros"
+
+# Stands in package.xml, where ROS's tools read it.
+with open("package.xml", encoding="utf-8") as manifest:
+    VERSION = re.findall("<version>(.*)</version>", manifest.read())[0]
 
 
 def files(pattern: str) -> list[str]:
@@ -37,7 +42,7 @@ DOCS = [
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version=VERSION,
     description=(
         "A ROS 2 flight stack for free-floating space robots: "
         "plant, gait planner, coordinated control, MCAP recorder."

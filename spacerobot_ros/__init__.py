@@ -1,4 +1,4 @@
-"""A ROS 2 flight stack for free-floating space robots."""
+"""A ROS 2 flight stack for free-floating and free-flying space robots."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from spacerobot_ros.bag import read_bag
     from spacerobot_ros.planning import plan
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = ["__version__", "plan", "read_bag"]
 
