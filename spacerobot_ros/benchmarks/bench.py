@@ -34,7 +34,8 @@ from spacerobot_ros.benchmarks.dynamics import dynamics_benchmark
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import c_compiler
 from spacerobot_ros.nodes import ReplayNode
-from spacerobot_ros.nodes.common.node import STREAM, spin_until
+from spacerobot_ros.nodes.common.node import STREAM
+from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import PlanRequest
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.session.run import ros

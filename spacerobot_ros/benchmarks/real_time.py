@@ -49,7 +49,7 @@ _STATES = ("/clock", "/odom", "/joint_states", "/momentum")
 class RealTimeFigures:
     """What a flight in real time came to.
 
-    Deadlines (:class:`~spacerobot_ros.nodes.plant.deadlines.Deadlines`): one a tick for the
+    Deadlines (:class:`~spacerobot_ros.simulation.time_modes.RealTime`): one a tick for the
     plant and one a state for its commander. Lost are messages that were published and are not in
     the bag; memory is the resident set of all processes. The idle process does nothing but wait for
     the same ticks: when it is late, the machine was.

@@ -65,7 +65,7 @@ def command(
     from rclpy.parameter import Parameter
 
     from spacerobot_ros.nodes import ReplayNode
-    from spacerobot_ros.nodes.common.node import run_node
+    from spacerobot_ros.nodes.common.process import run_node
 
     given = [Parameter(name, value=value) for name, value in values.items()]
     sys.exit(run_node(lambda: ReplayNode(parameter_overrides=given), []))

@@ -25,10 +25,9 @@ from spacerobot_ros.bag import BagWriter, QosProfile, Recording, RecordingState
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns
-from spacerobot_ros.nodes.common.diagnostics import diagnostic_status
-from spacerobot_ros.nodes.common.message_types import message_class
-from spacerobot_ros.nodes.common.node import STREAM, FlightNode, run_node
-from spacerobot_ros.nodes.common.raw_stream import RawInput, RawStream, Take
+from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
+from spacerobot_ros.nodes.common.node import STREAM, FlightNode, RawInput, RawStream, Take
+from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.topics import NOT_RECORDED
 
 _CLOCK = "/clock"

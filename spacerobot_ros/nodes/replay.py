@@ -20,8 +20,9 @@ from spacerobot_ros.bag.config import ReplayConfig
 from spacerobot_ros.bag.playback import ReaderWait, renamed
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS, raw_publish
-from spacerobot_ros.nodes.common.message_types import message_class
-from spacerobot_ros.nodes.common.node import STREAM, FlightNode, run_node
+from spacerobot_ros.nodes.common.messages import message_class
+from spacerobot_ros.nodes.common.node import STREAM, FlightNode
+from spacerobot_ros.nodes.common.process import run_node
 
 _READER_CHECK = 0.05
 """Wall s between two looks for readers."""

@@ -14,7 +14,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, spin_until
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM
+from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal
 
 STATUS = {"planner": "planner/status", "coordinated_control": "controller/status"}

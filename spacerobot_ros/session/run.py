@@ -17,8 +17,8 @@ from rclpy.signals import SignalHandlerOptions
 from spacerobot_ros.bag import Bag, RecordingError, TopicSeries, read_bag
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
-from spacerobot_ros.nodes.common.node import use_loopback_discovery, use_private_discovery
-from spacerobot_ros.nodes.plant.thruster_topics import PROPELLANT
+from spacerobot_ros.nodes.common.process import use_loopback_discovery, use_private_discovery
+from spacerobot_ros.nodes.plant.diagnostics import PROPELLANT
 from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.session.mission_client import Outcome
 from spacerobot_ros.session.processes import MultiProcessStack

@@ -21,7 +21,7 @@ from spacerobot_ros.parameters import Value, configured, declared, values_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.resources import resource_names, robot_file, share_directory
-from spacerobot_ros.simulation.building import initial_state
+from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.trials import Problem
 
@@ -211,7 +211,7 @@ class Scenario:
             raise ParameterError(f"The scenario '{self.name}' names no robot; see plant.robot.")
         robot = SpaceRobot.from_file(robot_file(name))
         self.require_shape_of(robot)
-        return Problem(self.name, robot, initial_state(values_of(plant)), self.goal, planner)
+        return Problem(self.name, robot, InitialState.of(plant), self.goal, planner)
 
     def require_shape_of(self, robot: SpaceRobot) -> None:
         """Refuse a goal whose shape is of another robot.

@@ -7,6 +7,13 @@ from dataclasses import dataclass
 from spacerobot_ros.model.robot_source import RobotConfig
 from spacerobot_ros.parameters import group, parameter
 
+_SECOND = 10**9
+
+
+def period_ns(tick_rate: float) -> int:
+    """Return the duration of a tick in ns: stamps are whole multiples of it."""
+    return round(_SECOND / tick_rate)
+
 
 @dataclass(frozen=True)
 class SensorConfig:
@@ -116,3 +123,13 @@ class PlantConfig(RobotConfig):
         texts=True,
     )
     sensors: SensorConfig = group(SensorConfig())
+
+    @property
+    def period_ns(self) -> int:
+        """Duration of a tick, ns."""
+        return period_ns(self.tick_rate)
+
+    @property
+    def tick_period(self) -> float:
+        """Duration of a tick, s."""
+        return self.period_ns / _SECOND

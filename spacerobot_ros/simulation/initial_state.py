@@ -10,6 +10,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion, unit_quaternion
+from spacerobot_ros.simulation.config import PlantConfig
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,25 @@ class InitialState:
     angular_momentum: Array = field(default_factory=lambda: np.zeros(3))
     joint_velocities: Array | None = None
     center_of_mass: Array | None = None
+
+    @classmethod
+    def of(cls, config: PlantConfig) -> InitialState:
+        """Return where a configuration has a run start; an empty list leaves a choice open.
+
+        Raises
+        ------
+        ParameterError
+            The position is given twice.
+        """
+        return cls(
+            position=np.array(config.initial_position or (0.0, 0.0, 0.0)),
+            quaternion=np.array(config.initial_orientation or (0.0, 0.0, 0.0, 1.0)),
+            joint_positions=_optional(config.initial_joint_positions),
+            linear_momentum=np.array(config.linear_momentum or (0.0, 0.0, 0.0)),
+            angular_momentum=np.array(config.angular_momentum or (0.0, 0.0, 0.0)),
+            joint_velocities=_optional(config.initial_joint_velocities),
+            center_of_mass=_optional(config.initial_center_of_mass),
+        )
 
     def __post_init__(self) -> None:
         if self.center_of_mass is not None and np.any(self.position):
@@ -117,6 +137,10 @@ class InitialState:
         if not np.all(np.isfinite(r_WC_W)):
             raise ParameterError("The initial position must be finite.")
         return r_WC_W
+
+
+def _optional(values: tuple[float, ...]) -> Array | None:
+    return np.array(values) if values else None
 
 
 def _of_joints(robot: SpaceRobot, given: Array, what: str) -> Array:

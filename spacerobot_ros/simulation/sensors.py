@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
-from spacerobot_ros.simulation.faults import GROUPS, KINDS, POSE_AXES, Fault
-from spacerobot_ros.simulation.faults_plant import FaultyPlant
+from spacerobot_ros.simulation.config import SensorConfig
+from spacerobot_ros.simulation.faults import KINDS, POSE_AXES, Fault, FaultyPlant
 
 _NOISES = {
     "position": "position_noise",
@@ -23,33 +20,7 @@ _NOISES = {
     "joints": "joint_noise",
     "joint_rates": "joint_rate_noise",
 }
-"""The parameter of each group's noise."""
-
-
-@dataclass(frozen=True)
-class SensorModel:
-    """How the sensors of a robot with n joints err without faults; nothing by default.
-
-    ``noise`` is 1 sigma of every component by group (:data:`GROUPS`): position (m, in W), attitude
-    (rad, rotation vector in B), velocity (m/s) and angular velocity (rad/s, both in B), joints (m
-    or rad) and their rates. The biases are those of position and attitude (6,) and of the joints
-    (n,), empty: none.
-    """
-
-    noise: Mapping[str, float] = field(default_factory=dict)
-    pose_bias: Sequence[float] = (0.0,) * 6
-    joint_bias: Sequence[float] = ()
-    seed: int = 0
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> SensorModel:
-        """Return the model that the parameters ``sensors.*`` of a plant describe."""
-        return cls(
-            {group: values[f"sensors.{name}"] for group, name in _NOISES.items()},
-            [*values["sensors.position_bias"], *values["sensors.attitude_bias"]],
-            values["sensors.joint_bias"],
-            values["sensors.seed"],
-        )
+"""The parameter of the noise of each group (:data:`~spacerobot_ros.simulation.faults.GROUPS`)."""
 
 
 class Sensors:
@@ -63,8 +34,8 @@ class Sensors:
     ----------
     plant
         Whose state is measured, and whose faults the sensors share.
-    model
-        How they err.
+    config
+        How they err without faults.
     tick_period
         s.
 
@@ -74,22 +45,22 @@ class Sensors:
         The bias of the joints has the wrong length.
     """
 
-    def __init__(self, plant: FaultyPlant, model: SensorModel, tick_period: float) -> None:
+    def __init__(self, plant: FaultyPlant, config: SensorConfig, tick_period: float) -> None:
         n = plant.robot.n
-        if len(model.joint_bias) not in (0, n):
+        if len(config.joint_bias) not in (0, n):
             raise ParameterError(
-                f"Parameter 'sensors.joint_bias' has {len(model.joint_bias)} number(s); the robot "
+                f"Parameter 'sensors.joint_bias' has {len(config.joint_bias)} number(s); the robot "
                 f"has {n} joints."
             )
-        self._plant, self._model, self._tick_period = plant, model, tick_period
-        self._rng = np.random.default_rng(model.seed)
+        self._plant, self._config, self._tick_period = plant, config, tick_period
+        self._rng = np.random.default_rng(config.seed)
         self._joint_index = {name: i for i, name in enumerate(plant.robot.joint_names)}
         self.pose, self.twist = plant.pose.copy(), plant.twist.copy()
         self.q, self.qdot = plant.q.copy(), plant.qdot.copy()
         self.dropout = False
         """Whether the pose was not measured at all."""
         self._pose_bias, self._joint_bias = np.zeros(6), np.zeros(n)
-        self._noise = dict.fromkeys(GROUPS, 0.0)
+        self._noise = dict.fromkeys(_NOISES, 0.0)
         self._delay = 0
         self._past: deque[tuple[Array, Array]] = deque([(self.pose, self.twist)], maxlen=1)
         self._adopt(plant.active)
@@ -133,10 +104,11 @@ class Sensors:
     def _adopt(self, faults: tuple[Fault, ...]) -> None:
         """Take over the sensors' share of the faults that are active now."""
         self._faults = faults
-        model = self._model
-        self._pose_bias[:] = model.pose_bias
-        self._joint_bias[:] = model.joint_bias if len(model.joint_bias) else 0.0
-        variances = {group: model.noise.get(group, 0.0) ** 2 for group in GROUPS}
+        config = self._config
+        self._pose_bias[:3] = config.position_bias or 0.0
+        self._pose_bias[3:] = config.attitude_bias or 0.0
+        self._joint_bias[:] = config.joint_bias or 0.0
+        variances = {group: getattr(config, name) ** 2 for group, name in _NOISES.items()}
         self.dropout, delay = False, 0.0
         for fault in faults:
             if fault.kind == "sensor_bias" and fault.target in POSE_AXES:

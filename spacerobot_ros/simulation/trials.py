@@ -27,7 +27,7 @@ from spacerobot_ros.planning import (
 from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.reach import Turning
-from spacerobot_ros.simulation.building import period_ns
+from spacerobot_ros.simulation.config import period_ns
 from spacerobot_ros.simulation.initial_state import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 

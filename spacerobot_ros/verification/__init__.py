@@ -1,1 +1,1 @@
-"""Re-simulation: the plant of a bag stepped again under the commands in the bag."""
+"""Verification: the plant of a bag re-simulated under the commands in the bag."""

@@ -1,35 +1,50 @@
-"""Flies the plant of a bag again, under the commands in the bag, and compares what it publishes."""
+"""Re-simulates the plant of a bag under the commands in it, and compares what it published."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spacerobot_ros.bag.reader import read_bag
-from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.building import build_plant
-from spacerobot_ros.verification.recorded_flight import (
-    RecordedFlight,
-    read_flight,
-    usable_parameters,
-)
-from spacerobot_ros.verification.resimulation import Reflight, fly_again
-from spacerobot_ros.verification.state_topics import StateTopic, state_topics
+from spacerobot_ros.simulation.commands import CommandValidator, Refusal
+from spacerobot_ros.simulation.reported_state import ReportedState
+from spacerobot_ros.topics import TOPICS, Topic, state_topics
+from spacerobot_ros.verification.recorded_flight import RecordedFlight, read_flight
 
 TOLERANCE = 1e-9
 """Deviation that is no difference, absolute below 1 (SI units) and relative above."""
 
 _SECOND = 1e9
-_DEFAULT_END_EFFECTOR = "end_effector"
+
+_EXPLAINING = ("joint_states", "odom")
+"""Topics in which a difference is looked for first, because it explains those in the others."""
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Difference:
-    """A number in the bag that is not what the commands make of it, or the largest deviation."""
+    """A number in the bag that is not what the commands make of it, or the largest deviation.
+
+    Attributes
+    ----------
+    time
+        Simulated time, s.
+    topic, field
+        Which number it is.
+    recorded, expected
+        Its value in the bag, and in the re-simulation.
+    remark
+        What is known of the commands that led to it; a clause in brackets, or empty.
+    """
 
     time: float
     topic: str
@@ -47,9 +62,19 @@ class Difference:
 
 @dataclass(frozen=True)
 class Verification:
-    """What comes of a bag: ticks flown again, messages compared, the first difference if any.
+    """What comes of a bag.
 
-    `largest` is the largest deviation before that difference, as a share of the tolerance's scale.
+    Attributes
+    ----------
+    ticks, duration
+        How much was re-simulated; the duration in s of simulated time.
+    messages
+        How many messages were compared.
+    largest, largest_at
+        The largest deviation before the first difference, as a share of max(1, expected value), and
+        where it is.
+    difference
+        The first difference, if there is one.
     """
 
     ticks: int
@@ -60,66 +85,78 @@ class Verification:
     difference: Difference | None
 
 
+def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Verification:
+    """Re-simulate a bag from its first state, and look for the first difference.
+
+    Parameters
+    ----------
+    path
+        As for :func:`~spacerobot_ros.bag.read_bag`.
+    tolerance
+        Deviation that is no difference, absolute below 1 (SI units) and relative above.
+
+    Raises
+    ------
+    RecordingError
+        There is no such bag, it is damaged, or it holds no flight in lockstep.
+    SpaceRobotError
+        Its robot or its plant's parameters are refused.
+    """
+    flight = read_flight(read_bag(path))
+    published = _published(flight)
+    first = min(int(p.ticks.min()) for p in published)
+    last = max(int(p.ticks.max()) for p in published)
+    resimulation = _resimulate(flight, _initial(first, published, flight), first, last)
+    published = [p for p in published if p.topic in resimulation.topics]
+    if first > 0:
+        # What the flight begins from is given, and what moved it there is not in the bag.
+        published = [p.after(first) for p in published]
+    _require_no_reset(flight, published, resimulation)
+    return _Comparison(flight, published, resimulation, tolerance).result()
+
+
+# -- what the bag holds -----------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class _Published:
-    """The messages of one topic: ticks (N,), numbers (N, m)."""
+    """The messages of one topic: ticks (N,), numbers (N, m), and what each number is called."""
 
-    topic: StateTopic
+    topic: Topic
     name: str
     ticks: NDArray[np.int64]
-    values: NDArray[np.float64]
+    values: Floats
+    labels: list[str]
 
     def after(self, tick: int) -> _Published:
         """Leave out what came until then."""
         kept = self.ticks > tick
         return replace(self, ticks=self.ticks[kept], values=self.values[kept])
 
+    def expected(self, states: dict[str, Floats], rows: NDArray[np.int64]) -> Floats:
+        """Return what the re-simulation has for each message, shaped as the values.
 
-def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Verification:
-    """Fly a bag again from its first state, and look for the first difference.
-
-    Args:
-        path: as for `read_bag`.
-        tolerance: deviation that is no difference, absolute below 1 and relative above.
-
-    Returns:
-        What came of it.
-
-    Raises:
-        RecordingError: there is no such bag, it is damaged, or it holds no flight in lockstep.
-        SpaceRobotError: its robot or its plant's parameters are refused.
-    """
-    flight = read_flight(read_bag(path))
-    link = _end_effector(flight)
-    names = flight.robot.link_names
-    published = _published(flight, names[link] if link is not None else "")
-    first = min(int(p.ticks.min()) for p in published)
-    last = max(int(p.ticks.max()) for p in published)
-    initial = _initial(first, published, flight)
-    with usable_parameters(flight.bag):
-        plant = build_plant(flight.robot, flight.values, initial)
-    if first > 0:
-        # What the flight begins from is given, and what moved it there is not in the bag.
-        published = [p.after(first) for p in published]
-    again = fly_again(flight, plant, link, first, last)
-    _require_no_reset(flight, published, again)
-    return _Comparison(flight, published, again, tolerance).result()
+        A quaternion has the sign of the recorded one, which means nothing.
+        """
+        expected = np.hstack([states[each.quantity][rows] for each in self.topic.state])
+        start = 0
+        for each in self.topic.state:
+            if each.quaternion is not None:
+                q = slice(start + each.quaternion, start + each.quaternion + 4)
+                opposite = np.sum(expected[:, q] * self.values[:, q], axis=1) < 0
+                expected[opposite, q] *= -1.0
+            start += states[each.quantity].shape[1]
+        return expected
 
 
-def _end_effector(flight: RecordedFlight) -> int | None:
-    links = list(flight.robot.link_names)
-    name = flight.values.get("end_effector_frame") or _DEFAULT_END_EFFECTOR
-    return links.index(name) if name in links else None
-
-
-def _published(flight: RecordedFlight, end_effector: str) -> list[_Published]:
+def _published(flight: RecordedFlight) -> list[_Published]:
     """Read the state topics; the plant stamps those without a header like its odometry."""
-    bag, period = flight.bag, flight.period_ns
+    bag, period, names = flight.bag, flight.config.period_ns, flight.robot.joint_names
     published: list[_Published] = []
-    clock = bag[f"{flight.prefix}/odom"].stamp_ns
-    for topic in state_topics(flight.robot.joint_names, end_effector):
-        name = f"{flight.prefix}/{topic.name}"
-        if bag.topics.get(name) != topic.type_name or not bag.message_count(name):
+    clock = bag[f"{flight.namespace}/odom"].stamp_ns
+    for topic in sorted(state_topics(), key=_rank):
+        name = f"{flight.namespace}/{topic.name}"
+        if not topic.verified or bag.topics.get(name) != topic.type or not bag.message_count(name):
             continue
         series = bag[name]
         stamps = series.stamp_ns
@@ -134,11 +171,25 @@ def _published(flight: RecordedFlight, end_effector: str) -> list[_Published]:
             )
         if topic.name == "joint_states":
             _require_joints(flight, next(series.messages())[1].name)
-        published.append(_Published(topic, name, ticks, topic.recorded(series)))
+        labels = [each.labels(names) for each in topic.state]
+        table = np.hstack(
+            [
+                series.table(each.columns, len(words))
+                for each, words in zip(topic.state, labels, strict=True)
+            ]
+        )
+        # A message with another number of values than it should have.
+        table[np.isnan(table).any(axis=1)] = np.nan
+        flat = [label for words in labels for label in words]
+        published.append(_Published(topic, name, ticks, table, flat))
     return published
 
 
-def _require_joints(flight: RecordedFlight, names: list[str]) -> None:
+def _rank(topic: Topic) -> int:
+    return _EXPLAINING.index(topic.name) if topic.name in _EXPLAINING else len(_EXPLAINING)
+
+
+def _require_joints(flight: RecordedFlight, names: Sequence[str]) -> None:
     if list(names) != list(flight.robot.joint_names):
         raise RecordingError(
             f"The joint states in the bag {flight.bag.path} are of {', '.join(names)}; its robot "
@@ -164,46 +215,131 @@ def _initial(
         position=parts["odom"][0][:3],
         quaternion=parts["odom"][0][3:7],
         joint_positions=np.clip(joints[:n], flight.robot.lower, flight.robot.upper),
-        joint_velocities=joints[n : 2 * n] if flight.values["actuation"] == "effort" else None,
+        joint_velocities=joints[n : 2 * n] if flight.config.actuation == "effort" else None,
         linear_momentum=parts["momentum"][0][:3],
         angular_momentum=parts["momentum"][0][3:6],
     )
 
 
-def _require_no_reset(flight: RecordedFlight, published: list[_Published], again: Reflight) -> None:
+# -- re-simulation ----------------------------------------------------------------------------
+
+
+@dataclass
+class _Resimulation:
+    """What came of the commands.
+
+    ``states`` are the quantities of the topics, (ticks + 1, size) each, from tick ``first`` to tick
+    ``end``; ``stopped`` says why the plant went no further, ``latched`` in which tick a fault
+    latched, after which nothing moved. ``given`` are the ticks with a command for the joints,
+    ``refusals`` those whose command was refused, with its topic.
+    """
+
+    topics: list[Topic]
+    first: int
+    end: int
+    states: dict[str, Floats]
+    given: frozenset[int]
+    stopped: str = ""
+    latched: int | None = None
+    refusals: dict[int, tuple[str, Refusal]] = field(default_factory=dict)
+
+
+def _resimulate(
+    flight: RecordedFlight, initial: InitialState | None, first: int, last: int
+) -> _Resimulation:
+    """Step the plant of a flight from tick ``first`` to tick ``last``, or as far as it goes.
+
+    Raises
+    ------
+    RecordingError
+        The sensors err, and the first state is not the very first one.
+    SpaceRobotError
+        The plant's parameters are refused.
+    """
+    plant = build_plant(flight.robot, flight.config, initial)
+    state = ReportedState(plant, flight.config)
+    commands = CommandValidator(plant, flight.config)
+    if first and state.sensors.used:
+        raise RecordingError(
+            f"The bag {flight.bag.path} begins in mid-flight, where the noise of its sensors is "
+            "not known."
+        )
+    plant.tick = first
+    recorded = [flight.commands(source) for source in commands.sources]
+    topics = [topic for topic in state.topics if topic.verified]
+    states = {
+        each.quantity: np.empty((last - first + 1, state.quantities[each.quantity].size))
+        for topic in topics
+        for each in topic.state
+    }
+    done = _Resimulation(topics, first, last, states, frozenset(recorded[0]))
+    for tick in range(first, last + 1):
+        state.update()
+        for quantity, rows in states.items():
+            rows[tick - first] = state.quantities[quantity]
+        if tick == last:
+            break
+        for text in flight.injections.get(tick, ()):
+            with suppress(ParameterError):
+                plant.inject(text)  # One that is refused changes nothing.
+        now = tick * flight.config.period_ns
+        for source, by_tick in zip(commands.sources, recorded, strict=True):
+            if tick in by_tick:
+                refusal = commands.offer(source, now, by_tick[tick], now)
+                if refusal is not None:
+                    done.refusals.setdefault(tick, (source.topic, refusal))
+            elif not state.sensors.dropout:  # To a lost pose nobody need answer.
+                source.rest()
+        if commands.fault and done.latched is None:
+            done.latched = tick
+        try:
+            plant.step(*commands.begin_step())
+        except SpaceRobotError as error:
+            done.end, done.stopped = tick, str(error)
+            break
+    return done
+
+
+def _require_no_reset(
+    flight: RecordedFlight, published: list[_Published], resimulation: _Resimulation
+) -> None:
     """Refuse a bag in which a state is published a second time, and is the initial one again."""
     for p in published:
         if p.topic.name != "joint_states" or not p.values.shape[1]:
             continue
-        begun = np.concatenate([again.states[part][0] for part in p.topic.parts])
-        back = np.isclose(p.values, begun, atol=TOLERANCE).all(axis=1)
+        begun = p.expected(resimulation.states, np.zeros(len(p.ticks), dtype=np.int64))
+        near = np.isclose(p.values, begun, atol=TOLERANCE)
+        back: NDArray[np.bool_] = np.all(near, axis=1)
         repeated = np.flatnonzero((np.diff(p.ticks) <= 0) & back[1:] & ~back[:-1])
         if repeated.size:
-            time = p.ticks[repeated[0] + 1] * flight.period_ns / _SECOND
+            time = p.ticks[repeated[0] + 1] * flight.config.period_ns / _SECOND
             raise RecordingError(
                 f"In the bag {flight.bag.path} the plant was reset at {time:.9g} s; only flights "
                 "without a reset can be verified."
             )
 
 
+# -- comparison -------------------------------------------------------------------------------
+
+
 class _Comparison:
-    """The published states beside those of the flight by the recorded commands."""
+    """The published states beside those of the re-simulation."""
 
     def __init__(
         self,
         flight: RecordedFlight,
         published: list[_Published],
-        again: Reflight,
+        resimulation: _Resimulation,
         tolerance: float,
     ) -> None:
-        self._flight, self._again, self._tolerance = flight, again, tolerance
+        self._flight, self._done, self._tolerance = flight, resimulation, tolerance
+        self._period = flight.config.period_ns
         self._pairs = [(p, *self._deviation(p)) for p in published]
 
     def result(self) -> Verification:
         """Find the first difference and, before it, the largest deviation."""
         difference = self._first_difference()
-        period = self._flight.period_ns
-        end = np.inf if difference is None else round(difference.time * _SECOND / period)
+        end = np.inf if difference is None else round(difference.time * _SECOND / self._period)
         largest, largest_at = 0.0, None
         for p, expected, deviation in self._pairs:
             before = p.ticks < end
@@ -212,25 +348,22 @@ class _Comparison:
                 row, column = map(int, np.unravel_index(int(counted.argmax()), counted.shape))
                 largest = float(counted.max())
                 largest_at = self._at(p, expected, row, column)
+        ticks = self._done.end - self._done.first
         return Verification(
-            ticks=self._again.end - self._again.first,
-            duration=(self._again.end - self._again.first) * period / _SECOND,
+            ticks=ticks,
+            duration=ticks * self._period / _SECOND,
             messages=sum(len(p.ticks) for p, _, _ in self._pairs),
             largest=largest,
             largest_at=largest_at,
             difference=difference,
         )
 
-    def _deviation(self, p: _Published) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _deviation(self, p: _Published) -> tuple[Floats, Floats]:
         """Return what is expected, and how far from it the bag is, both shaped as its values."""
-        rows = np.minimum(p.ticks, self._again.end) - self._again.first
-        expected = np.hstack([self._again.states[part][rows] for part in p.topic.parts])
-        if p.topic.quaternion is not None:
-            q = slice(p.topic.quaternion, p.topic.quaternion + 4)
-            opposite = np.sum(expected[:, q] * p.values[:, q], axis=1) < 0
-            expected[opposite, q] *= -1.0
+        rows = np.minimum(p.ticks, self._done.end) - self._done.first
+        expected = p.expected(self._done.states, rows)
         deviation = np.abs(p.values - expected) / np.maximum(1.0, np.abs(expected))
-        deviation[p.ticks > self._again.end] = np.nan
+        deviation[p.ticks > self._done.end] = np.nan
         return expected, deviation
 
     def _first_difference(self) -> Difference | None:
@@ -249,17 +382,12 @@ class _Comparison:
         return found[1] if found else None
 
     def _at(
-        self,
-        p: _Published,
-        expected: NDArray[np.float64],
-        row: int,
-        column: int,
-        remark: str = "",
+        self, p: _Published, expected: Floats, row: int, column: int, remark: str = ""
     ) -> Difference:
         return Difference(
-            float(p.ticks[row] * self._flight.period_ns / _SECOND),
+            float(p.ticks[row] * self._period / _SECOND),
             p.name,
-            p.topic.labels[column],
+            p.labels[column],
             float(p.values[row, column]),
             float(expected[row, column]),
             remark,
@@ -267,19 +395,20 @@ class _Comparison:
 
     def _remark(self, tick: int) -> str:
         """Say what is known of the commands that led to a tick, beside their numbers."""
-        again = self._again
-        if tick > again.end:
-            return f" (its plant had stopped: {again.stopped.rstrip('.')})"
-        if again.latched is not None and tick > again.latched:
-            time = f"{again.latched * self._flight.period_ns / _SECOND:.9g} s"
+        done, before = self._done, tick - 1
+        if tick > done.end:
+            return f" (its plant had stopped: {done.stopped.rstrip('.')})"
+        if done.latched is not None and tick > done.latched:
+            time = self._time(done.latched)
             return f" (a fault latched at {time}; rearming is not in a bag)"
-        before = tick - 1
-        time = f"{before * self._flight.period_ns / _SECOND:.9g} s"
-        for channel in self._flight.channels:
-            command = channel.commands.get(before)
-            if command is not None and command.refusal:
-                return f" (that on {channel.topic} stamped {time} is refused: {command.refusal})"
-        first = self._flight.channels[0]
-        if tick > again.first and before not in first.commands:
-            return f" (no message on {first.topic} is stamped {time})"
+        if before in done.refusals:
+            topic, refusal = done.refusals[before]
+            name = f"{self._flight.namespace}/{topic}"
+            return f" (that on {name} stamped {self._time(before)} is refused: {refusal.clause})"
+        if tick > done.first and before not in done.given:
+            name = f"{self._flight.namespace}/{TOPICS['joint_commands'].name}"
+            return f" (no message on {name} is stamped {self._time(before)})"
         return ""
+
+    def _time(self, tick: int) -> str:
+        return f"{tick * self._period / _SECOND:.9g} s"

@@ -12,9 +12,12 @@ from sensor_msgs.msg import JointState
 from support.fuzzing import NUMBERS, TEXTS, damaged, fuzz
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.nodes.common.cdr import UnreadableError
-from spacerobot_ros.nodes.plant.command_channel import CommandChannel, JointChannel, WrenchChannel
+from spacerobot_ros.nodes.plant.command_messages import CommandReader, command_reader
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Reason
+from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.verification.recorded_flight import read_command
 
 NAMES = st.one_of(
     st.sampled_from(["slider_1", "slider_2", "slider_3"]),
@@ -60,48 +63,61 @@ GOOD_WRENCH = WrenchStamped()
 GOOD_WRENCH.wrench.torque.z = 0.5
 
 
-def assert_good_passes(channel: CommandChannel, good: object, values: list[float]) -> None:
-    stamp, refused = channel.check(bytes(serialize_message(good)))
-    assert (stamp, refused) == (0, None)
-    channel.take(stamp)
-    assert channel.command.tolist() == values
+class Commanded:
+    """A source of commands with its reader and validator, in a plant that takes any stamp."""
+
+    def __init__(self, actuation: str, number: int) -> None:
+        # In real time without a timeout a stamp is only compared with the one in force.
+        config = PlantConfig(actuation=actuation, command_timeout=0.0)
+        self.commands = CommandValidator(build_plant(robot(), config), config)
+        self.source: CommandSource = self.commands.sources[number]
+        self.reader: CommandReader = command_reader(self.source, robot())
+
+    def accepts(self, raw: bytes) -> bool:
+        """Return whether the source accepts some bytes; what it accepts is finite."""
+        refusal = self.reader.offer(self.commands, raw, 0)
+        self.stamp = self.source.stamp_ns
+        self.source.stamp_ns = -float("inf")
+        if refusal is not None:
+            assert refusal.clause
+            assert "\n" not in refusal.clause
+            return False
+        assert np.all(np.isfinite(self.source.command))
+        return True
+
+    def assert_good_passes(self, good: object, values: list[float]) -> None:
+        assert self.accepts(bytes(serialize_message(good)))
+        assert self.stamp == 0
+        assert self.source.command.tolist() == values
 
 
-def check(channel: CommandChannel, raw: bytes) -> bool:
-    """Return whether a channel takes some bytes; what it takes is finite."""
-    try:
-        stamp, refused = channel.check(raw)
-    except UnreadableError:
-        return False
-    assert isinstance(stamp, int)
-    if refused is not None:
-        assert refused[1]
-        assert "\n" not in refused[1]
-        return False
-    channel.take(stamp)
-    assert np.all(np.isfinite(channel.command))
-    return True
+def joints() -> Commanded:
+    return Commanded("velocity", 0)
+
+
+def wrench() -> Commanded:
+    return Commanded("effort", 1)
 
 
 @fuzz("joint command", joint_commands(), fast=60, long=1200)
 def test_joint_commands_are_taken_by_name_or_refused(message: JointState) -> None:
-    channel = JointChannel(robot(), "velocity")
-    if check(channel, bytes(serialize_message(message))):
+    given = joints()
+    if given.accepts(bytes(serialize_message(message))):
         meant = dict(zip(message.name, message.velocity, strict=True))
-        assert channel.command.tolist() == [meant.get(n, 0.0) for n in robot().joint_names]
-    assert_good_passes(channel, GOOD, [0.1, 0.2, -0.3])
+        assert given.source.command.tolist() == [meant.get(n, 0.0) for n in robot().joint_names]
+    given.assert_good_passes(GOOD, [0.1, 0.2, -0.3])
 
 
 @fuzz("wrench", wrenches(), fast=60, long=800)
 def test_wrenches_are_taken_in_their_frame_or_refused(message: WrenchStamped) -> None:
-    channel = WrenchChannel(robot())
-    taken = check(channel, bytes(serialize_message(message)))
+    given = wrench()
+    taken = given.accepts(bytes(serialize_message(message)))
     if message.header.frame_id not in ("", robot().base_link):
         assert not taken
     if taken:
         force = message.wrench.force
-        assert channel.command[:3].tolist() == [force.x, force.y, force.z]
-    assert_good_passes(channel, GOOD_WRENCH, [0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
+        assert given.source.command[:3].tolist() == [force.x, force.y, force.z]
+    given.assert_good_passes(GOOD_WRENCH, [0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
 
 
 @fuzz(
@@ -114,14 +130,14 @@ def test_wrenches_are_taken_in_their_frame_or_refused(message: WrenchStamped) ->
 def test_damaged_joint_commands_mean_what_any_reader_takes_them_for(
     raw: bytes, learned: bool
 ) -> None:
-    channel = JointChannel(robot(), "velocity")
+    given = joints()
     if learned:
-        assert_good_passes(channel, GOOD, [0.1, 0.2, -0.3])
-    if check(channel, raw):
+        given.assert_good_passes(GOOD, [0.1, 0.2, -0.3])
+    if given.accepts(raw):
         message = deserialize_message(raw, JointState)
         meant = dict(zip(message.name, message.velocity, strict=True))
-        assert channel.command.tolist() == [meant.get(n, 0.0) for n in robot().joint_names]
-    assert_good_passes(channel, GOOD, [0.1, 0.2, -0.3])
+        assert given.source.command.tolist() == [meant.get(n, 0.0) for n in robot().joint_names]
+    given.assert_good_passes(GOOD, [0.1, 0.2, -0.3])
 
 
 @fuzz(
@@ -132,10 +148,42 @@ def test_damaged_joint_commands_mean_what_any_reader_takes_them_for(
     long=800,
 )
 def test_damaged_wrenches_mean_what_any_reader_takes_them_for(raw: bytes, learned: bool) -> None:
-    channel = WrenchChannel(robot())
+    given = wrench()
     if learned:
-        assert_good_passes(channel, GOOD_WRENCH, [0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
-    if check(channel, raw):
+        given.assert_good_passes(GOOD_WRENCH, [0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
+    if given.accepts(raw):
         torque = deserialize_message(raw, WrenchStamped).wrench.torque
-        assert channel.command[3:].tolist() == [torque.x, torque.y, torque.z]
-    assert_good_passes(channel, GOOD_WRENCH, [0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
+        assert given.source.command[3:].tolist() == [torque.x, torque.y, torque.z]
+    given.assert_good_passes(GOOD_WRENCH, [0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
+
+
+@fuzz("node and bag", joint_commands(), st.booleans(), fast=80, long=1500)
+def test_node_and_bag_judge_joint_commands_alike(message: JointState, refuse: bool) -> None:
+    assert_judged_alike(message, JointState, 0, "refuse" if refuse else "clip")
+
+
+@fuzz("node and bag, wrench", wrenches(), fast=40, long=800)
+def test_node_and_bag_judge_wrenches_alike(message: WrenchStamped) -> None:
+    assert_judged_alike(message, WrenchStamped, 1, "clip")
+
+
+def assert_judged_alike(message: object, kind: type, number: int, beyond_limits: str) -> None:
+    """Offer one message as bytes and as a decoded message, in lockstep at its own stamp."""
+    config = PlantConfig(
+        actuation="effort" if number else "velocity",
+        time_mode="lockstep",
+        beyond_limits=beyond_limits,
+        latched_faults="malformed beyond_limits",
+    )
+    by_node, by_bag = (CommandValidator(build_plant(robot(), config), config) for _ in range(2))
+    raw = bytes(serialize_message(message))
+    decoded = deserialize_message(raw, kind)
+    stamp = decoded.header.stamp.sec * 10**9 + decoded.header.stamp.nanosec
+    source, again = by_node.sources[number], by_bag.sources[number]
+    refusal = command_reader(source, robot()).offer(by_node, raw, stamp)
+    assert by_bag.offer(again, stamp, read_command(decoded, again, robot()), stamp) == refusal
+    assert by_bag.counts == by_node.counts
+    assert by_bag.fault == by_node.fault
+    assert (refusal is not None and refusal.reason is not Reason.NOT_FINITE) == bool(by_node.fault)
+    for one, other in zip(by_node.begin_step(), by_bag.begin_step(), strict=True):
+        np.testing.assert_array_equal(one, other)

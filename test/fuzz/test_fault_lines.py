@@ -11,6 +11,7 @@ from support.fuzzing import NUMBERS, TEXTS, attempt, fuzz
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import (
     GROUPS,
     KINDS,
@@ -54,14 +55,6 @@ LINES = st.one_of(
     ),
     TEXTS,
 )
-VALUES: dict[str, object] = {
-    "tick_rate": 20.0,
-    "integration_step": 0.0,
-    "initial_position": [0.0, 0.0, 0.0],
-    "initial_orientation": [0.0, 0.0, 0.0, 1.0],
-    "linear_momentum": [0.0, 0.0, 0.0],
-    "angular_momentum": [0.0, 0.0, 0.0],
-}
 
 
 @fuzz("fault line", LINES, st.booleans(), fast=100, long=1500)
@@ -99,7 +92,7 @@ def test_a_plant_under_any_faults_stays_finite_or_says_why_it_stops(
 ) -> None:
     if not _ROBOT:
         _ROBOT.append(SpaceRobot.from_file(robot_file("sliding_masses")))
-    plant = build_plant(_ROBOT[0], {**VALUES, "actuation": actuation, "faults": []})
+    plant = build_plant(_ROBOT[0], PlantConfig(actuation=actuation))
     for line in lines:
         attempt("faulty plant", plant.inject, line)
     commands = [np.full(3, 0.1), *([np.zeros(6)] if actuation == "effort" else [])]

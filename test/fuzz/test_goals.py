@@ -13,7 +13,7 @@ from support.fuzzing import NUMBERS, TEXTS, VALUES, attempt, fuzz
 from support.planners import planner_of
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.nodes.common.goal_messages import goal_of, shape_of
+from spacerobot_ros.nodes.common.messages import goal_of, shape_of
 from spacerobot_ros.planning import Goal, RobotState, Tolerance
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.session.scenario import goal_from_rotvec

@@ -11,7 +11,8 @@ from sensor_msgs.msg import JointState
 from support.ros_harness import DEEP, Harness
 
 from spacerobot_ros.nodes import PlantNode
-from spacerobot_ros.nodes.plant.deadlines import Deadlines
+from spacerobot_ros.nodes.plant.diagnostics import timing_status
+from spacerobot_ros.simulation.time_modes import RealTime
 
 MS = 1_000_000
 
@@ -21,17 +22,18 @@ def values(status: DiagnosticStatus) -> dict[str, str]:
 
 
 def test_what_is_late_is_counted_with_the_worst() -> None:
-    deadlines = Deadlines("plant: timing", 10 * MS)
-    # Ticks are due at 10, 20, 30 ms; the third is taken 4 ms after the fourth is due.
-    for now, due in ((10, 10), (29, 20), (44, 30)):
-        deadlines.tick(now * MS, due * MS, due * MS)
+    time = RealTime(10 * MS)
+    time.start(0, 0)
+    # Ticks are due at 20, 30, 40 ms; the third is taken 4 ms after the fourth is due.
+    for tick, now in ((1, 20), (2, 39), (3, 54)):
+        time.count_tick(now * MS, tick)
     # The states of 10, 20, 30 ms are to be answered by 20, 30, 40 ms.
-    for now, due in ((19, 10), (33, 20), (47, 30)):
-        deadlines.answer(now * MS, due * MS, due * MS)
-    said = deadlines.status()
-    assert said.level == DiagnosticStatus.WARN
-    assert values(said) == {
-        "tick_rate_Hz": "68.1818",
+    for now, stamp in ((19, 10), (33, 20), (47, 30)):
+        time.count_command(now * MS, stamp * MS)
+    status = timing_status("plant: timing", time)
+    assert status.level == DiagnosticStatus.WARN
+    assert values(status) == {
+        "tick_rate_Hz": "55.5556",
         "ticks": "3",
         "ticks_late": "1",
         "worst_tick_ms": "4.000",
@@ -40,15 +42,32 @@ def test_what_is_late_is_counted_with_the_worst() -> None:
         "worst_command_ms": "7.000",
         "command_age_s": "0",
     }
-    assert deadlines.status().level == DiagnosticStatus.OK, "nothing new is late"
+    assert timing_status("plant: timing", time).level == DiagnosticStatus.OK, "nothing new is late"
 
 
 def test_a_command_in_force_counts_once() -> None:
-    deadlines = Deadlines("plant: timing", 10 * MS)
+    time = RealTime(10 * MS)
+    time.start(0, 0)
     for now in (15, 18, 95):
-        deadlines.answer(now * MS, 10 * MS, 10 * MS)
-    assert values(deadlines.status())["commands"] == "1"
-    assert deadlines.answers_late == 0
+        time.count_command(now * MS, 10 * MS)
+    timing = time.report()
+    assert timing.commands == 1
+    assert timing.commands_late == 0
+
+
+def test_a_late_plant_catches_up_in_small_steps_and_gives_up_what_is_far_behind() -> None:
+    time = RealTime(20 * MS, factor=2.0)
+    time.start(5 * MS, 100)
+    assert time.period == pytest.approx(0.01)
+    assert time.due(14 * MS, 100) == 0
+    assert time.due(16 * MS, 100) == 1
+    assert time.due(46 * MS, 100) == 2, "commands get a word in between"
+    # 30 ticks behind, of which 10 are made up: time goes on as if the others had never been due.
+    assert time.due(306 * MS, 100) == 2
+    assert time.ticks_lost == 20
+    assert [time.due(306 * MS, tick) for tick in (108, 109, 110)] == [2, 1, 0]
+    assert time.due(316 * MS, 110) == 1
+    assert time.ticks_lost == 20
 
 
 def real_time_plant(harness: Harness, **parameters: Any) -> PlantNode:

@@ -18,7 +18,7 @@ from spacerobot_ros.planning import Goal, RobotState, Tolerance, method_options
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
-from spacerobot_ros.simulation.faults_plant import FaultyPlant
+from spacerobot_ros.simulation.faults import FaultyPlant
 
 TICK = 0.05
 SERVICER = (share_directory() / "urdf" / "servicer.urdf").read_text("utf-8")

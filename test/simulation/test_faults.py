@@ -14,8 +14,7 @@ from support.ros_harness import assert_one_sentence
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
-from spacerobot_ros.simulation.faults import FaultTimeline, Targets, parse_fault
-from spacerobot_ros.simulation.faults_plant import FaultyPlant
+from spacerobot_ros.simulation.faults import FaultTimeline, FaultyPlant, Targets, parse_fault
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.thrusters import thrusters_in, with_thrusters
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -11,8 +13,9 @@ from support.oracles import Array
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
-from spacerobot_ros.simulation.faults_plant import FaultyPlant
-from spacerobot_ros.simulation.sensors import SensorModel, Sensors
+from spacerobot_ros.simulation.config import SensorConfig
+from spacerobot_ros.simulation.faults import FaultyPlant
+from spacerobot_ros.simulation.sensors import Sensors
 
 TICK = 0.05
 URDF = (share_directory() / "urdf" / "three_joint_arm.urdf").read_text("utf-8")
@@ -27,10 +30,10 @@ START = InitialState(
 class Flight:
     """A plant, its sensors, and everything they said beside the truth."""
 
-    def __init__(self, model: SensorModel, *faults: str, ticks: int, moving: bool = True) -> None:
+    def __init__(self, config: SensorConfig, *faults: str, ticks: int, moving: bool = True) -> None:
         inner = VelocityPlant(robot_of(URDF), TICK, START)
         self.plant = FaultyPlant(inner, faults, TICK, wrench=False)
-        self.sensors = Sensors(self.plant, model, TICK)
+        self.sensors = Sensors(self.plant, config, TICK)
         self.dropouts: list[bool] = []
         measured: list[Array] = []
         true: list[Array] = []
@@ -67,10 +70,19 @@ SIGMAS = {
     "joints": 4e-3,
     "joint_rates": 5e-3,
 }
+NOISY = SensorConfig(
+    position_noise=SIGMAS["position"],
+    attitude_noise=SIGMAS["attitude"],
+    velocity_noise=SIGMAS["velocity"],
+    angular_velocity_noise=SIGMAS["angular_velocity"],
+    joint_noise=SIGMAS["joints"],
+    joint_rate_noise=SIGMAS["joint_rates"],
+    seed=3,
+)
 
 
 def test_perfect_sensors_do_nothing_at_all() -> None:
-    flight = Flight(SensorModel(), ticks=5)
+    flight = Flight(SensorConfig(), ticks=5)
     assert not flight.sensors.used
     # They have not even looked.
     np.testing.assert_array_equal(flight.measured, np.tile(flight.true[0], (5, 1)))
@@ -78,7 +90,7 @@ def test_perfect_sensors_do_nothing_at_all() -> None:
 
 def test_every_component_has_its_noise_and_no_mean() -> None:
     ticks = 3000
-    flight = Flight(SensorModel(SIGMAS, seed=3), ticks=ticks)
+    flight = Flight(NOISY, ticks=ticks)
     assert flight.sensors.used
     np.testing.assert_allclose(np.linalg.norm(flight.measured[:, 3:7], axis=1), 1.0, atol=1e-12)
     for group, errors in flight.errors().items():
@@ -91,22 +103,26 @@ def test_every_component_has_its_noise_and_no_mean() -> None:
 
 
 def test_one_noise_leaves_the_rest_exact() -> None:
-    flight = Flight(SensorModel({"attitude": 1e-3}), ticks=20)
+    flight = Flight(SensorConfig(attitude_noise=1e-3), ticks=20)
     errors = flight.errors()
     assert np.abs(errors.pop("attitude")).min() > 0.0
     assert all(not error.any() for error in errors.values())
 
 
 def test_a_seed_is_a_flight() -> None:
-    once, again, other = (Flight(SensorModel(SIGMAS, seed=s), ticks=50) for s in (5, 5, 6))
+    once, again, other = (Flight(replace(NOISY, seed=s), ticks=50) for s in (5, 5, 6))
     np.testing.assert_array_equal(once.measured, again.measured)
     np.testing.assert_array_equal(once.true, other.true)
     assert np.abs(once.measured - other.measured).max() > 1e-3
 
 
 def test_biases_are_added_and_attitudes_turned_in_the_base() -> None:
-    model = SensorModel(pose_bias=[0.1, 0.0, -0.2, 0.0, 0.01, 0.0], joint_bias=[0.0, 0.003, -0.004])
-    flight = Flight(model, "sensor_bias position_y 0.5 at 0.5", ticks=20)
+    config = SensorConfig(
+        position_bias=(0.1, 0.0, -0.2),
+        attitude_bias=(0.0, 0.01, 0.0),
+        joint_bias=(0.0, 0.003, -0.004),
+    )
+    flight = Flight(config, "sensor_bias position_y 0.5 at 0.5", ticks=20)
     errors = flight.errors()
     step = np.where(np.arange(20) >= 10, 0.5, 0.0)
     np.testing.assert_allclose(errors["position"][:, [0, 2]], np.tile([0.1, -0.2], (20, 1)))
@@ -117,7 +133,7 @@ def test_biases_are_added_and_attitudes_turned_in_the_base() -> None:
 
 def test_faults_of_sensors_come_and_go() -> None:
     flight = Flight(
-        SensorModel({"position": 3e-3}),
+        SensorConfig(position_noise=3e-3),
         "sensor_noise position 4e-3 at 50 until 100",
         "sensor_dropout odom at 10 until 11",
         "sensor_bias elbow_pitch 0.2 at 20 until 21",
@@ -133,7 +149,7 @@ def test_faults_of_sensors_come_and_go() -> None:
 
 
 def test_a_late_pose_is_that_of_as_many_ticks_before() -> None:
-    flight = Flight(SensorModel(), "sensor_delay odom 0.2 at 1 until 3", ticks=80)
+    flight = Flight(SensorConfig(), "sensor_delay odom 0.2 at 1 until 3", ticks=80)
     pose, late = flight.true[:, :13], flight.measured[:, :13]
     np.testing.assert_array_equal(late[:20], pose[:20])
     # As long as less is known of the past, it is the oldest that is.
@@ -146,4 +162,4 @@ def test_a_late_pose_is_that_of_as_many_ticks_before() -> None:
 
 def test_a_bias_of_other_joints_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"'sensors.joint_bias' has 2 number.*has 3 joints"):
-        Flight(SensorModel(joint_bias=[0.1, 0.2]), ticks=1)
+        Flight(SensorConfig(joint_bias=(0.1, 0.2)), ticks=1)

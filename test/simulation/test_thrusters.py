@@ -15,7 +15,7 @@ from spacerobot_ros.errors import CommandError, ParameterError, RobotDescription
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.simulation import EffortPlant, InitialState
-from spacerobot_ros.simulation.faults_plant import FaultyPlant
+from spacerobot_ros.simulation.faults import FaultyPlant
 from spacerobot_ros.simulation.thrusters import ThrusterPlant, thrusters_in, with_thrusters
 
 ROOT = Path(__file__).parents[2]

@@ -9,11 +9,12 @@ client, other strings) the reader deserialises it the ordinary way and learns th
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message, serialize_message
 from rosidl_parser.definition import (
@@ -23,9 +24,11 @@ from rosidl_parser.definition import (
     BasicType,
     NamespacedType,
 )
+from sensor_msgs.msg import JointState
 
 from spacerobot_ros.errors import CommandError
 from spacerobot_ros.model.description import Array as FloatArray
+from spacerobot_ros.simulation.commands import joint_order, require_values
 
 _ENCAPSULATION = 4
 _BYTE_ORDER = 2
@@ -41,6 +44,9 @@ _AFTER_STAMP = _ENCAPSULATION + _TIME.size
 NANOSECONDS = 1_000_000_000
 
 M = TypeVar("M")
+
+Quantity = Literal["position", "velocity", "effort"]
+"""The numbers of a JointState."""
 
 
 class UnreadableError(CommandError):
@@ -272,3 +278,91 @@ class TemplateReader(Generic[M]):
         }
         self._remember_stretches(raw)
         self.changes += 1
+
+
+class JointReader:
+    """Takes one quantity of JointState messages into the order of the model's joints.
+
+    Joints that a message does not name are left out (zero).
+
+    Parameters
+    ----------
+    joint_names
+        The model's joints.
+    quantities
+        What to read; the first is required in every message.
+    complete
+        Whether every joint must be named, as in a measured state.
+    """
+
+    def __init__(
+        self,
+        joint_names: Sequence[str],
+        quantities: Sequence[Quantity],
+        *,
+        complete: bool = False,
+    ) -> None:
+        self._complete, self._joints, self._quantities = complete, list(joint_names), quantities
+        self._reader = TemplateReader(JointState, self._spans)
+        self._changes = 0
+        self._problem = ""
+        self._order: npt.NDArray[np.intp] | None = None
+        self._copies: list[tuple[memoryview, slice]] = []
+        self.values = {name: np.zeros(len(joint_names)) for name in quantities}
+
+    def accept(self, raw: bytes) -> int:
+        """Read a message into ``values`` and return its stamp in ns.
+
+        Raises
+        ------
+        CommandError
+            A joint is unknown or named twice, or a length is wrong.
+        """
+        self._reader.accept(raw)
+        if self._reader.changes != self._changes:
+            self._changes = self._reader.changes
+            self._check()
+        if self._problem:
+            raise CommandError(self._problem)
+        for target, place in self._copies:
+            target[:] = raw[place]
+        if self._order is not None:
+            for name, values in self.values.items():
+                if self._reader.has(name):
+                    values[self._order] = self._reader.floats(name)
+        return self._reader.stamp_ns
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the last message given to :meth:`accept`, refused or not, ns."""
+        return self._reader.stamp_ns
+
+    def _spans(self, message: JointState) -> dict[str, int]:
+        return {name: len(getattr(message, name)) for name in self._quantities}
+
+    def _check(self) -> None:
+        """Check names and lengths, once for every layout."""
+        message = self._reader.prototype
+        assert message is not None
+        names = list(message.name)
+        self._problem, self._order, self._copies = "", None, []
+        for values in self.values.values():
+            values[:] = 0.0
+        try:
+            order = joint_order(self._joints, names, complete=self._complete)
+            for i, quantity in enumerate(self._quantities):
+                count = len(getattr(message, quantity))
+                if count or i == 0:
+                    require_values(names, quantity, count)
+        except CommandError as error:
+            self._problem = str(error)
+            return
+        # Joints in the model's order, as the stack's own nodes send them, are copied as bytes.
+        if names == self._joints:
+            self._copies = [
+                (values.data.cast("B"), self._reader.place(name))
+                for name, values in self.values.items()
+                if self._reader.has(name)
+            ]
+        else:
+            self._order = order

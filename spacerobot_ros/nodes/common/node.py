@@ -1,34 +1,37 @@
-"""What all nodes of the stack share: managed life, parameters, services, a clean end."""
+"""What all nodes of the stack share: managed life, parameters, raw streams, their robot."""
 
 from __future__ import annotations
 
-import gc
-import os
-import signal
+import math
 import sys
-import time
 import traceback
-from collections.abc import Callable
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
-import rclpy
 from lifecycle_msgs.msg import State
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.duration import Duration
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
+from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
-from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
+from std_msgs.msg import String
 
-from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.nodes.common.parameters import check_changes, declare
-from spacerobot_ros.nodes.common.raw_stream import RawInput, RawOutput, RawStream, Take
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.robot_source import robot_from_text, robot_of
+from spacerobot_ros.nodes.common.cdr import raw_publish
 from spacerobot_ros.parameters import Parameter, Value, configured, declared
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
@@ -46,11 +49,58 @@ AUTOSTART = Parameter(
 )
 """A parameter of every node."""
 
+_LARGEST_FLOAT = sys.float_info.max
+_INTEGERS = -(2**63), 2**63 - 1
+"""Bounds that descriptors can hold."""
 
-_LONGEST_DELIVERY = 1.0
-"""Wall s after a signal in which readers may still confirm what they were sent."""
+Take = Callable[[bytes], None]
 
-_DISCOVERY_CHOICES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
+
+class RawStream:
+    """The messages of one topic that pass through a node.
+
+    A subscription of its own is dear for somebody who is in the same process and wants every
+    message: the middleware copies each one, queues it, and wakes the executor for it.
+
+    Parameters
+    ----------
+    topic
+        Its full name.
+    take
+        What is done with each message.
+    """
+
+    def __init__(self, topic: str, take: Take) -> None:
+        self.topic = topic
+        self.take = self._take = take
+        """``take`` is what the owner calls with each message; look it up every time."""
+
+    def listen(self, listener: Take) -> None:
+        """Have every message shown to a listener, before it is taken; one listener at a time."""
+        act = self._take
+
+        def take(raw: bytes) -> None:
+            listener(raw)
+            act(raw)
+
+        self.take = take
+
+    def unlisten(self) -> None:
+        """Show messages to nobody any more."""
+        self.take = self._take
+
+
+class RawOutput(RawStream):
+    """What one publisher publishes: ``take`` sends a message on its way."""
+
+    def __init__(self, publisher: Publisher) -> None:
+        super().__init__(publisher.topic_name, raw_publish(publisher))
+        self.readers: Callable[[], int] = publisher.get_subscription_count
+        """Returns how many subscriptions it is matched with."""
+
+
+class RawInput(RawStream):
+    """What a node takes of a topic, whoever publishes it: ``take`` is the node's callback."""
 
 
 class FlightNode(LifecycleNode):
@@ -241,74 +291,104 @@ class FlightNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
 
-def use_loopback_discovery() -> None:
-    """Keep discovery on this machine unless the user chose otherwise."""
-    if not any(os.environ.get(name) for name in _DISCOVERY_CHOICES):
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+class RobotNode(FlightNode):
+    """A node that can do nothing without a robot, and may be given it after its start."""
+
+    _robot: SpaceRobot | None = None
+
+    def find_robot(self) -> None:
+        """Use the robot that the parameters name; without one wait for robot_description.
+
+        Raises
+        ------
+        SpaceRobotError
+            The robot is refused.
+        """
+        # What was built for the robot before belongs to topics that are gone.
+        self._robot = None
+        robot = robot_of(self.config)
+        if robot is None:
+            self.create_subscription(String, "robot_description", self._on_description, LATCHED)
+        else:
+            self._use(robot)
+
+    @abstractmethod
+    def _use(self, robot: SpaceRobot) -> None:
+        """Build what depends on the robot."""
+
+    @abstractmethod
+    def _on_part(self) -> None:
+        """Answer a state that may have waited for the robot."""
+
+    def _on_description(self, message: String) -> None:
+        if self._robot is None:
+            try:
+                self._use(robot_from_text(message.data, self.config))
+            except SpaceRobotError as error:
+                self.get_logger().error(f"robot_description: {error}")
+                return
+            self._on_part()
 
 
-def use_private_discovery() -> None:
-    """Keep discovery in this process unless the user chose a range or a domain.
+def descriptor(parameter: Parameter) -> ParameterDescriptor:
+    """Return what ``ros2 param describe`` shows."""
+    unit = f" [{parameter.unit}]" if parameter.unit else ""
+    choices = ", ".join(parameter.choices)
+    described = ParameterDescriptor(
+        name=parameter.name,
+        description=f"{parameter.description}{unit}",
+        read_only=parameter.read_only,
+        additional_constraints=f"one of: {choices}" if choices else "",
+    )
+    low = max(parameter.minimum, -_LARGEST_FLOAT)
+    high = min(parameter.maximum, _LARGEST_FLOAT)
+    if math.isinf(parameter.minimum) and math.isinf(parameter.maximum):
+        return described
+    if isinstance(parameter.default, float):
+        described.floating_point_range = [
+            FloatingPointRange(from_value=float(low), to_value=float(high))
+        ]
+    elif isinstance(parameter.default, int) and not isinstance(parameter.default, bool):
+        least, most = (int(min(max(b, _INTEGERS[0]), _INTEGERS[1])) for b in (low, high))
+        described.integer_range = [IntegerRange(from_value=least, to_value=most)]
+    return described
 
-    Two lockstep stacks that hear each other would refuse each other's commands.
+
+def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
+    """Declare parameters on a node and return their checked values.
+
+    A whole number is accepted where a real one is wanted (``rate: 20``).
+
+    Raises
+    ------
+    ParameterError
+        A given value is refused; the sentence names the parameter.
     """
-    if not any(os.environ.get(name) for name in (*_DISCOVERY_CHOICES, "ROS_DOMAIN_ID")):
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "OFF"
-    use_loopback_discovery()
+    values = {}
+    for parameter in parameters:
+        name = parameter.name
+        # First without a type, to see what was given whatever its type; then as it should be.
+        node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True))
+        given = node.get_parameter(name).value
+        node.undeclare_parameter(name)
+        value = parameter.default if given is None else parameter.checked(given)
+        stored = list(value) if isinstance(value, tuple) else value
+        if value == ():
+            # rclpy cannot tell the type of an empty list: declare the type and leave it unset.
+            kind = RosParameter.Type
+            stored = kind.STRING_ARRAY if parameter.texts else kind.DOUBLE_ARRAY
+        node.declare_parameter(name, stored, descriptor(parameter), ignore_override=True)
+        values[name] = value
+    return values
 
 
-def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = None) -> int:
-    """Run one node in its own process until SIGINT or SIGTERM.
-
-    Returns the exit code: 0 after a signal, 2 when the node cannot start (the sentence is on
-    standard error), the node's own when it ends by itself.
-    """
-    use_loopback_discovery()
-    try:
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:  # The middleware's errors: arguments, parameter files.
-        print(f"ROS 2 does not start: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    stop = rclpy.task.Future()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set_result(None))
-    node = None
-    try:
-        try:
-            node = factory()
-        except SpaceRobotError as error:
-            print(f"{error}", file=sys.stderr)
-            return 2
-        node.on_end = stop.set_result
-        # What is there now stays; going through it again in flight would take tens of ms.
-        gc.collect()
-        gc.freeze()
-        executor = EventsExecutor()
-        executor.add_node(node)
-        spin_until(executor, stop)
-        node.drain(executor)
-        _deliver(node)
-        node.trigger_shutdown()
-        return stop.result() or 0
-    finally:
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-
-
-def _deliver(node: FlightNode) -> None:
-    """Wait until readers have what was published: it would go with the process."""
-    end = time.monotonic() + _LONGEST_DELIVERY
-    for publisher in node.publishers:
-        left = end - time.monotonic()
-        if left > 0 and publisher.get_subscription_count():
-            publisher.wait_for_all_acked(Duration(seconds=left))
-
-
-def spin_until(executor: EventsExecutor, done: rclpy.task.Future) -> None:
-    """Spin until the future is done, letting Python's signal handlers run.
-
-    The events executor is deaf to signals in a spin without a time limit.
-    """
-    while not done.done():
-        executor.spin_until_future_complete(done, timeout_sec=0.5)
+def check_changes(parameters: Sequence[Parameter], changes: Sequence[RosParameter]) -> str:
+    """Return why a change while running is refused, or an empty text."""
+    by_name = {parameter.name: parameter for parameter in parameters}
+    for change in changes:
+        if change.name in by_name:
+            try:
+                by_name[change.name].checked(change.value)
+            except ParameterError as error:
+                return str(error)
+    return ""

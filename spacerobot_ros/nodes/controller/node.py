@@ -23,15 +23,14 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import (
     NANOSECONDS,
+    JointReader,
     MessageTemplate,
     TemplateReader,
     stamp_bytes,
 )
-from spacerobot_ros.nodes.common.diagnostics import diagnostic_status
-from spacerobot_ros.nodes.common.goal_messages import goal_of
-from spacerobot_ros.nodes.common.joint_command import JointReader
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, run_node
-from spacerobot_ros.nodes.common.robot_node import RobotNode
+from spacerobot_ros.nodes.common.messages import diagnostic_status, goal_of
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, RobotNode
+from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.state_synchroniser import Pairing, StateSynchroniser
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
 

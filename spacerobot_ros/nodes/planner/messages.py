@@ -18,10 +18,14 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from spacerobot_ros.errors import CommandError
 from spacerobot_ros.model.description import Shape
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS, Layout, MessageTemplate, TemplateReader
-from spacerobot_ros.nodes.common.diagnostics import diagnostic_status
-from spacerobot_ros.nodes.common.joint_command import JointReader
-from spacerobot_ros.nodes.common.markers import shape_marker
+from spacerobot_ros.nodes.common.cdr import (
+    NANOSECONDS,
+    JointReader,
+    Layout,
+    MessageTemplate,
+    TemplateReader,
+)
+from spacerobot_ros.nodes.common.messages import diagnostic_status, shape_marker
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
 from spacerobot_ros.planning.execution.executive import BaseMeasurement
 from spacerobot_ros.planning.execution.status import PlannerStatus

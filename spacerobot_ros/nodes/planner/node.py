@@ -18,9 +18,9 @@ from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import stamp_bytes
-from spacerobot_ros.nodes.common.goal_messages import goal_of, shape_of
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, run_node
-from spacerobot_ros.nodes.common.robot_node import RobotNode
+from spacerobot_ros.nodes.common.messages import goal_of, shape_of
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, RobotNode
+from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.state_synchroniser import Pairing, StateSynchroniser
 from spacerobot_ros.nodes.planner.messages import (
     StateReader,

@@ -1,4 +1,4 @@
-"""The plant node: a free-floating robot behind ROS topics."""
+"""The plant node: a robot that floats in space, behind ROS topics."""
 
 from __future__ import annotations
 
@@ -10,33 +10,25 @@ from rclpy.clock import Clock, ClockType
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from spacerobot_ros.bag.recorded_robot import last_state
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import robot_of
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, run_node
-from spacerobot_ros.nodes.plant.actuation import CHANNELS
-from spacerobot_ros.nodes.plant.command_channel import CommandChannel
-from spacerobot_ros.nodes.plant.command_gate import CommandGate
-from spacerobot_ros.nodes.plant.command_intake import CommandIntake
-from spacerobot_ros.nodes.plant.deadlines import Deadlines
+from spacerobot_ros.nodes.common.node import STREAM, FlightNode
+from spacerobot_ros.nodes.common.process import run_node
+from spacerobot_ros.nodes.plant.command_messages import CommandReader, command_reader
 from spacerobot_ros.nodes.plant.diagnostics import PlantReport
-from spacerobot_ros.nodes.plant.plant_topics import PlantTopics
-from spacerobot_ros.nodes.plant.resumption import resumed
-from spacerobot_ros.nodes.plant.thruster_topics import ThrusterTopics
-from spacerobot_ros.simulation.brakes import JointBrakes
-from spacerobot_ros.simulation.building import PLANTS, build_plant, period_ns
+from spacerobot_ros.nodes.plant.publisher import LinkMarkers, StatePublisher
+from spacerobot_ros.simulation import InitialState
+from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.simulation.sensors import SensorModel, Sensors
-from spacerobot_ros.simulation.thrusters import thrusters_in
+from spacerobot_ros.simulation.reported_state import ReportedState
+from spacerobot_ros.simulation.time_modes import Lockstep, PlantState, RealTime
 
-_LATE_JOINER_CHECK = 0.1
-"""How often a waiting lockstep plant looks for new subscribers, wall s."""
-
-_LONGEST_LAG = 10
-"""Ticks that a real-time plant may be late and still make up; what is beyond is lost for good."""
-
-_CATCH_UP = 2
-"""Ticks that a late plant takes at once: commands must get a word in between."""
+_LOOK_PERIOD = 0.1
+"""How often a plant looks for new subscribers and commanders, wall s."""
 
 
 class PlantNode(FlightNode):
@@ -48,9 +40,11 @@ class PlantNode(FlightNode):
     """
 
     Config: ClassVar = PlantConfig
+    config: PlantConfig
 
     def __init__(self, name: str = "plant", **kwargs: Any) -> None:
-        self._running = self._paused = False
+        self._active = PlantState.INACTIVE
+        self._when_active = PlantState.RUNNING
         self._tick = 0
         super().__init__(name, **kwargs)
 
@@ -64,57 +58,44 @@ class PlantNode(FlightNode):
         """Simulated time of that tick, ns."""
         return self._tick * self._period_ns
 
+    @property
+    def state(self) -> PlantState:
+        """What the plant does with time and with commands."""
+        latched = self._active is PlantState.RUNNING and self._commands.fault
+        return PlantState.LATCHED if latched else self._active
+
     # -- life ---------------------------------------------------------------------------------
 
     def configure(self) -> None:
         """Build the plant and its topics; nothing is published yet."""
-        values: dict[str, Any] = self.parameters
-        robot = robot_of(self.config)
+        config = self.config
+        robot = robot_of(config)
         if robot is None:
             raise ParameterError(
                 "The plant needs a robot: set parameter 'robot' to a URDF file or the name of a "
                 "robot of this package, or 'robot_description' to a URDF text."
             )
-        self._lockstep = values["time_mode"] == "lockstep"
-        self._period_ns = period_ns(values["tick_rate"])
-        initial, tick = resumed(values, self.get_namespace(), robot)
-        self.plant = build_plant(robot, values, initial)
-        self._tick = self.plant.tick = tick
-        self._looked_at = -1
-        self._sensors = Sensors(self.plant, SensorModel.of(values), self._period_ns / NANOSECONDS)
-        self._topics = PlantTopics(
-            self,
-            self.plant,
-            self._sensors,
-            values["world_frame"],
-            values["end_effector_frame"],
-            thrusters=PLANTS[values["actuation"]].thrusters,
-        )
-        self._gate = CommandGate(values["latched_faults"])
-        self._report = PlantReport(self, self.plant, self._gate)
-        thrusters = thrusters_in(self.plant)
-        self._thrusters = ThrusterTopics(self, thrusters) if thrusters is not None else None
-        if self._thrusters is not None:
-            self._report.others.append(self._thrusters.status)
-        self._intake = CommandIntake(
-            self, CHANNELS[values["actuation"]](robot), self._gate, self._report, values
-        )
-        self._deadlines: Deadlines | None = None
-        if not self._lockstep:
-            self._pace_ns = self._period_ns / values["real_time_factor"]
-            name = f"{self.get_fully_qualified_name()}: timing"
-            self._deadlines = Deadlines(name, self._pace_ns)
-            self._report.others.append(self._deadlines.status)
-        # Velocity servos stop at once; motors have to be told how.
-        self._brakes = None
-        if values["actuation"] == "effort":
-            self._brakes = JointBrakes(self.plant, self._period_ns / NANOSECONDS)
-        self._pose_ticks = self._ticks(values["base_pose_period"]) or 1
-        self._marker_ticks = self._ticks(values["marker_period"])
-        self._report_ticks = self._ticks(values["diagnostics_period"])
-        self._description = self.create_publisher(String, "robot_description", LATCHED)
-        for channel in self._intake.channels:
-            self.take_raw(channel.message_type, channel.topic, partial(self._on_command, channel))
+        self._period_ns = config.period_ns
+        initial, self._tick = self._resumed(robot)
+        self.plant = build_plant(robot, config, initial)
+        self.plant.tick = self._tick
+        self._reported = ReportedState(self.plant, config)
+        self._commands = CommandValidator(self.plant, config)
+        self._lockstep: Lockstep | None = None
+        self._real_time: RealTime | None = None
+        if config.time_mode == "lockstep":
+            self._lockstep = Lockstep(self._commands)
+        else:
+            self._real_time = RealTime(self._period_ns, config.real_time_factor)
+        self._publisher = StatePublisher(self, robot, self._reported, config.world_frame)
+        self._markers = LinkMarkers(self, self.plant, config.world_frame)
+        self._report = PlantReport(self, self.plant, self._commands, self._real_time)
+        self._pose_ticks = self._ticks(config.base_pose_period) or 1
+        self._marker_ticks = self._ticks(config.marker_period)
+        self._report_ticks = self._ticks(config.diagnostics_period)
+        for source in self._commands.sources:
+            reader = command_reader(source, robot)
+            self.take_raw(reader.message_type, source.topic, partial(self._on_command, reader))
         self.create_subscription(String, "fault_injection", self._on_fault, STREAM)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
@@ -123,39 +104,65 @@ class PlantNode(FlightNode):
 
     def activate(self) -> None:
         """Publish the robot and its present state, and from now on step."""
-        self._running = True
-        self._description.publish(String(data=self.plant.robot.description.urdf))
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        if self._lockstep:
+        self._active = self._when_active
+        self._publisher.publish_description()
+        self._steady = steady = Clock(clock_type=ClockType.STEADY_TIME)
+        if self._real_time is None:
             self._look_round()
-            self._own_timers = [
-                self.create_timer(_LATE_JOINER_CHECK, self._on_late_joiner_check, clock=steady)
-            ]
+            self._wall_timers = [self.create_timer(_LOOK_PERIOD, self._on_look_round, clock=steady)]
         else:
-            self._steady = steady
-            self._origin_ns = steady.now().nanoseconds - self._tick * self._pace_ns
-            self._own_timers = [
-                self.create_timer(self._pace_ns / NANOSECONDS, self._on_wall_tick, clock=steady),
-                self.create_timer(_LATE_JOINER_CHECK, self._intake.count_commanders, clock=steady),
+            self._real_time.start(steady.now().nanoseconds, self._tick)
+            self._wall_timers = [
+                self.create_timer(self._real_time.period, self._on_wall_tick, clock=steady),
+                self.create_timer(_LOOK_PERIOD, self._count_commanders, clock=steady),
             ]
         self._publish()
 
     def deactivate(self) -> None:
         """Stop time; nothing is commanded when it goes on."""
-        if self._running:
-            for timer in self._own_timers:
-                self.destroy_timer(timer)
-        self._running = False
-        self._intake.rest()
+        if self._active is PlantState.INACTIVE:
+            return
+        for timer in self._wall_timers:
+            self.destroy_timer(timer)
+        self._active = PlantState.INACTIVE
+        self._commands.rest()
+
+    def _resumed(self, robot: SpaceRobot) -> tuple[InitialState | None, int]:
+        """Return the state to start from (None: the configuration's) and its tick.
+
+        Raises
+        ------
+        ParameterError
+            The bag is of another robot.
+        RecordingError
+            It cannot be read, or holds no state.
+        """
+        path = self.config.resume_bag
+        if not path:
+            return None, 0
+        state = last_state(path, self.get_namespace().rstrip("/"))
+        if state.joint_names != list(robot.joint_names):
+            raise ParameterError(
+                f"Parameter 'resume_bag' is '{path}', a bag of a robot with the joints "
+                f"{', '.join(state.joint_names)}; this one has {', '.join(robot.joint_names)}."
+            )
+        # Servos hold the rates that they are commanded: only motors leave joints moving.
+        moving = self.config.actuation == "effort"
+        initial = InitialState(
+            position=state.position,
+            quaternion=state.quaternion,
+            joint_positions=state.joints,
+            linear_momentum=state.momenta[:3],
+            angular_momentum=state.momenta[3:],
+            joint_velocities=state.rates if moving else None,
+        )
+        return initial, round(state.time_ns / self._period_ns)
 
     # -- time ---------------------------------------------------------------------------------
 
     def _step(self) -> None:
-        commands = self._intake.begin_step()
-        if self._brakes is not None and self._intake.joints_rest:
-            commands[0][:] = self._brakes.efforts()
         try:
-            limited = self.plant.step(*commands)
+            limited = self.plant.step(*self._commands.begin_step())
         except SpaceRobotError as error:
             self.get_logger().error(f"The plant stops at {self.time_ns / NANOSECONDS:g} s: {error}")
             self.trigger_deactivate()
@@ -167,12 +174,11 @@ class PlantNode(FlightNode):
 
     def _publish(self) -> None:
         now = self._tick * self._period_ns
-        self._sensors.measure()
-        self._topics.publish(now, with_pose=self._tick % self._pose_ticks == 0)
-        if self._thrusters is not None:
-            self._thrusters.publish(now)
+        if self._reported.update():
+            self._publisher.rebuild()
+        self._publisher.publish(now, all_topics=self._tick % self._pose_ticks == 0)
         if self._marker_ticks and self._tick % self._marker_ticks == 0:
-            self._topics.publish_markers(now)
+            self._markers.publish(now)
         if self._report_ticks and self._tick % self._report_ticks == 0:
             self._report.publish(now)
 
@@ -180,55 +186,54 @@ class PlantNode(FlightNode):
         return max(1, round(seconds * NANOSECONDS / self._period_ns)) if seconds else 0
 
     def _on_wall_tick(self) -> None:
-        if not self._running or self._paused:
+        real_time = self._real_time
+        assert real_time is not None
+        if self._active is not PlantState.RUNNING:
             return
-        now = self._steady.now().nanoseconds
-        behind = int((now - self._origin_ns) / self._pace_ns) - self._tick
-        if behind > _LONGEST_LAG:
-            self._report.deadlines_missed += behind - _LONGEST_LAG
-            self._origin_ns += (behind - _LONGEST_LAG) * self._pace_ns
-        for _ in range(min(behind, _CATCH_UP)):
-            assert self._deadlines is not None
-            now = self._steady.now().nanoseconds
-            due = self._origin_ns + (self._tick + 1) * self._pace_ns
-            self._deadlines.tick(now, due, self.time_ns)
-            self._intake.drop_old(self.time_ns)
+        for _ in range(real_time.due(self._steady.now().nanoseconds, self._tick)):
+            real_time.count_tick(self._steady.now().nanoseconds, self._tick)
+            for source in self._commands.drop_old(self.time_ns):
+                self._report.timed_out(source, self.config.command_timeout)
             self._step()
 
-    def _on_late_joiner_check(self) -> None:
+    def _on_look_round(self) -> None:
         """A lockstep plant waits for ever if nobody saw its last state: show it to newcomers."""
-        if self._paused:
-            return  # Who comes now is shown the state after the pause.
+        if self._active is not PlantState.RUNNING:
+            return  # A subscriber that comes now is shown the state after the pause.
         before = self._readers
         self._look_round()
         if self._readers > before:
-            self._topics.publish(self.time_ns, with_pose=True)
-        waited, self._looked_at = self._looked_at == self._tick, self._tick
-        if waited and self._sensors.dropout:
-            # Who needs odom cannot know that none comes before another state does.
+            self._publisher.publish(self.time_ns, all_topics=True)
+        assert self._lockstep is not None
+        if self._lockstep.looks(self._tick, pose_lost=self._reported.sensors.dropout):
             self._step()
-        else:
-            self._step_if_complete()
 
     def _look_round(self) -> None:
         """See who listens and who commands."""
-        self._readers = self._topics.readers()
-        self._intake.look_round()
+        self._readers = self._publisher.readers()
+        self._count_commanders()
+        self._commands.require_commanded()
+
+    def _count_commanders(self) -> None:
+        for source in self._commands.sources:
+            source.commanders = self.count_publishers(source.topic)
 
     # -- commands -----------------------------------------------------------------------------
 
-    def _on_command(self, channel: CommandChannel, raw: bytes) -> None:
-        if not self._running:
+    def _on_command(self, reader: CommandReader, raw: bytes) -> None:
+        if self._active is PlantState.INACTIVE:
             return
-        if self._intake.accept(channel, raw, self.time_ns):
+        refusal = reader.offer(self._commands, raw, self._tick * self._period_ns)
+        if refusal is not None:
+            self._report.refused(reader.source, refusal)
+        if self._real_time is None:
             self._step_if_complete()
-        elif self._deadlines is not None and channel is self._intake.channels[0]:
+        elif reader.source is self._commands.sources[0]:
             now = self._steady.now().nanoseconds
-            due = self._origin_ns + channel.stamp_ns * self._pace_ns / self._period_ns
-            self._deadlines.answer(now, due, channel.stamp_ns)
+            self._real_time.count_command(now, reader.source.stamp_ns)
 
     def _step_if_complete(self) -> None:
-        if not self._paused and self._intake.complete:
+        if self._active is PlantState.RUNNING and self._commands.complete:
             self._step()
 
     def _on_fault(self, message: String) -> None:
@@ -242,22 +247,22 @@ class PlantNode(FlightNode):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.plant.reset()
-        self._intake.rest()
+        self._commands.rest()
         response.success = True
         response.message = "The robot is back in its initial state; time goes on."
-        if self._running:
+        if self._active is not PlantState.INACTIVE:
             self._publish()
         return response
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._intake.latch("aborted on request")
+        self._commands.latch("aborted on request")
+        self._report.latched()
         response.success = True
         response.message = "The joints come to rest; nothing moves until '~/rearm' is called."
         return response
 
     def _on_rearm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        fault = self._gate.fault
-        self._gate.rearm()
+        fault = self._commands.rearm()
         response.success = True
         response.message = (
             f"Commands pass again after: {fault}." if fault else "No fault was latched."
@@ -265,15 +270,17 @@ class PlantNode(FlightNode):
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        resumed = self._paused and not request.data
-        self._paused = bool(request.data)
-        if resumed and self._running:
-            if self._lockstep:
+        self._when_active = PlantState.PAUSED if request.data else PlantState.RUNNING
+        before = self._active
+        if before is not PlantState.INACTIVE:
+            self._active = self._when_active
+        if (before, self._active) == (PlantState.PAUSED, PlantState.RUNNING):
+            if self._real_time is None:
                 self._step_if_complete()
             else:
-                self._origin_ns = self._steady.now().nanoseconds - self._tick * self._pace_ns
+                self._real_time.start(self._steady.now().nanoseconds, self._tick)
         response.success = True
-        response.message = "paused" if self._paused else "running"
+        response.message = self._when_active.value
         return response
 
 

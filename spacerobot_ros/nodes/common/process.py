@@ -1,0 +1,96 @@
+"""A node in a process of its own, and what every process of the stack does about discovery."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+
+import rclpy
+from rclpy.duration import Duration
+from rclpy.experimental import EventsExecutor
+from rclpy.signals import SignalHandlerOptions
+
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.nodes.common.node import FlightNode
+
+_LONGEST_DELIVERY = 1.0
+"""Wall s after a signal in which readers may still confirm what they were sent."""
+
+_DISCOVERY_CHOICES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
+
+
+def use_loopback_discovery() -> None:
+    """Keep discovery on this machine unless the user chose otherwise."""
+    if not any(os.environ.get(name) for name in _DISCOVERY_CHOICES):
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+def use_private_discovery() -> None:
+    """Keep discovery in this process unless the user chose a range or a domain.
+
+    Two lockstep stacks that hear each other would refuse each other's commands.
+    """
+    if not any(os.environ.get(name) for name in (*_DISCOVERY_CHOICES, "ROS_DOMAIN_ID")):
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "OFF"
+    use_loopback_discovery()
+
+
+def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = None) -> int:
+    """Run one node in its own process until SIGINT or SIGTERM.
+
+    Returns the exit code: 0 after a signal, 2 when the node cannot start (the sentence is on
+    standard error), the node's own when it ends by itself.
+    """
+    use_loopback_discovery()
+    try:
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # The middleware's errors: arguments, parameter files.
+        print(f"ROS 2 does not start: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    stop = rclpy.task.Future()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set_result(None))
+    node = None
+    try:
+        try:
+            node = factory()
+        except SpaceRobotError as error:
+            print(f"{error}", file=sys.stderr)
+            return 2
+        node.on_end = stop.set_result
+        # What is there now stays; going through it again in flight would take tens of ms.
+        gc.collect()
+        gc.freeze()
+        executor = EventsExecutor()
+        executor.add_node(node)
+        spin_until(executor, stop)
+        node.drain(executor)
+        _deliver(node)
+        node.trigger_shutdown()
+        return stop.result() or 0
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _deliver(node: FlightNode) -> None:
+    """Wait until readers have what was published: it would go with the process."""
+    end = time.monotonic() + _LONGEST_DELIVERY
+    for publisher in node.publishers:
+        left = end - time.monotonic()
+        if left > 0 and publisher.get_subscription_count():
+            publisher.wait_for_all_acked(Duration(seconds=left))
+
+
+def spin_until(executor: EventsExecutor, done: rclpy.task.Future) -> None:
+    """Spin until the future is done, letting Python's signal handlers run.
+
+    The events executor is deaf to signals in a spin without a time limit.
+    """
+    while not done.done():
+        executor.spin_until_future_complete(done, timeout_sec=0.5)

@@ -1,0 +1,142 @@
+"""The state of a plant as messages, each serialised once and patched in place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
+from visualization_msgs.msg import Marker, MarkerArray
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Pose
+from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
+from spacerobot_ros.nodes.common.cdr import MessageTemplate, stamp_bytes
+from spacerobot_ros.nodes.common.messages import message_class, shape_marker
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, RawOutput
+from spacerobot_ros.simulation.plant import Plant
+from spacerobot_ros.simulation.reported_state import ReportedState
+from spacerobot_ros.topics import TOPICS, Topic
+
+
+class StatePublisher:
+    """Publishes the state topics that the table of topics lists for a plant.
+
+    Parameters
+    ----------
+    node
+        The node that owns the publishers.
+    robot
+        Whose state it is.
+    state
+        What it reports.
+    world_frame
+        Name of the inertial frame.
+    """
+
+    def __init__(
+        self, node: FlightNode, robot: SpaceRobot, state: ReportedState, world_frame: str
+    ) -> None:
+        self._node, self._robot, self._state, self._world = node, robot, state, world_frame
+        self._outputs: dict[str, RawOutput] = {}
+        self._description = node.create_publisher(String, "robot_description", LATCHED)
+        self.rebuild()
+
+    def rebuild(self) -> None:
+        """Publish from now on what the state reports now."""
+        clock = TOPICS["/clock"]
+        streams = [
+            (topic, self._output(topic), self._template(topic))
+            for topic in (clock, *self._state.topics)
+        ]
+        self._all = [(output, template) for _, output, template in streams]
+        self._every_tick = [
+            (output, template) for topic, output, template in streams if topic.every_tick
+        ]
+        (self._odom,) = (template for topic, _, template in streams if topic.name == "odom")
+
+    def publish_description(self) -> None:
+        """Publish the URDF."""
+        self._description.publish(String(data=self._robot.description.urdf))
+
+    def publish(self, time_ns: int, *, all_topics: bool) -> None:
+        """Publish the state, stamped ``time_ns``.
+
+        ``all_topics``: those too that are not published in every tick.
+        """
+        lost = self._odom if self._state.sensors.dropout else None
+        stamp = stamp_bytes(time_ns)
+        for output, template in self._all if all_topics else self._every_tick:
+            if template is not lost:
+                output.take(template.serialised(stamp))
+
+    def readers(self) -> int:
+        """Return how many subscriptions the state topics have now."""
+        return sum(output.readers() for output in self._outputs.values())
+
+    def _output(self, topic: Topic) -> RawOutput:
+        if topic.name not in self._outputs:
+            self._outputs[topic.name] = self._node.send_raw(message_class(topic.type), topic.name)
+        return self._outputs[topic.name]
+
+    def _template(self, topic: Topic) -> MessageTemplate:
+        """Return the message of a topic, fed with the quantities that it carries."""
+        message = message_class(topic.type)()
+        names = list(self._state.names(topic))
+        if topic.state and hasattr(message, "header"):
+            base = self._robot.base_link
+            message.header.frame_id = base if topic.frame == "base" else self._world
+        for field in topic.state:
+            if not field.members:
+                setattr(message, field.path, [0.0] * len(field.entries or names))
+        match message:
+            case Odometry():
+                message.child_frame_id = self._robot.base_link
+            case JointState():
+                message.name = names
+            case Float64MultiArray():
+                words = topic.state[0].entries
+                dimension = MultiArrayDimension(
+                    label=" ".join(words), size=len(words), stride=len(words)
+                )
+                message.layout.dim = [dimension]
+        template = MessageTemplate(message)
+        for field in topic.state:
+            values = self._state.quantities[field.quantity]
+            if values.size:
+                template.feed(field.columns[0], values)
+        return template
+
+
+class LinkMarkers:
+    """All visuals of a robot as one marker array in the world frame.
+
+    World poses, not link frames: a viewer then needs no transforms.
+    """
+
+    def __init__(self, node: FlightNode, plant: Plant, world_frame: str) -> None:
+        self._plant = plant
+        self._poses: list[tuple[int, Pose]] = []
+        markers: list[Marker] = []
+        for index, link in enumerate(plant.robot.description.links):
+            for shape in link.shapes:
+                markers.append(shape_marker(shape, world_frame, link.name, len(markers)))
+                self._poses.append((index, shape.pose))
+        self._publisher: Any = node.create_publisher(MarkerArray, "markers", STREAM)
+        self._template = MessageTemplate(MarkerArray(markers=markers))
+        self._targets = [
+            self._template.floats(f"markers[{i}].pose.position.x", 7) for i in range(len(markers))
+        ]
+
+    def publish(self, time_ns: int) -> None:
+        """Publish every shape where it is."""
+        if not self._targets:
+            return
+        plant = self._plant
+        R_WB, r_WB = matrix_from_quaternion(plant.pose[3:]), plant.pose[:3]
+        for (index, pose), target in zip(self._poses, self._targets, strict=True):
+            R_BL = plant.link_R[:, 3 * index : 3 * index + 3]
+            target[:3] = r_WB + R_WB @ (plant.link_r[:, index] + R_BL @ pose.r)
+            target[3:] = quaternion_from_matrix(R_WB @ R_BL @ pose.R)
+        self._publisher.publish(self._template.serialised(stamp_bytes(time_ns)))

@@ -1,0 +1,400 @@
+"""Which commands reach the actuators of a plant: the one rule set, for its node and for bags.
+
+A command comes from a *source* (one topic) with a stamp and values. In lockstep the command of a
+tick is the first one that is stamped with it; a refused one makes it a tick at rest. In real time
+the last accepted command holds until it is older than the timeout.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
+from spacerobot_ros.control.laws.law import Gains
+from spacerobot_ros.control.state import ControlState, JointReference, Reference
+from spacerobot_ros.errors import CommandError, ParameterError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.simulation.plant import Plant
+
+NEVER = -math.inf
+"""The stamp of no command."""
+
+_SECOND = 10**9
+
+_START = 1.0
+"""How long a stamp of zero is that of the first state where commands never grow old, s."""
+
+_BRAKING_RATE = 20.0
+"""Joint rates decay as exp(-20 t/s) while the motors are strong enough."""
+
+_LARGEST_RATE_PER_TICK = 0.5
+"""A held effort must not stop a joint in less than two ticks: it would swing back."""
+
+Quantity = Literal["velocity", "effort", "wrench"]
+
+
+class Reason(str, Enum):
+    """Why a command is refused; the value is the word for it in parameters and diagnostics."""
+
+    MALFORMED = "malformed"
+    """Unknown or missing joints, wrong lengths, another frame."""
+    NOT_FINITE = "not_finite"
+    STALE = "stale"
+    EARLY = "early"
+    """Stamped ahead of the plant's time."""
+    OUT_OF_ORDER = "out_of_order"
+    """Stamped before the command that is in force."""
+    BEYOND_LIMITS = "beyond_limits"
+    SECOND_COMMANDER = "second_commander"
+    """Another commander has already answered the same state."""
+    LATCHED = "latched"
+    """A fault is latched: nothing moves until it is rearmed."""
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a command was refused.
+
+    Attributes
+    ----------
+    reason
+        The kind of it.
+    clause
+        What goes after "was refused:", with numbers and names.
+    latches
+        Whether this refusal has latched a fault, after which nothing moves until it is rearmed.
+    """
+
+    reason: Reason
+    clause: str
+    latches: bool = False
+
+
+def joint_order(
+    joints: Sequence[str], named: Sequence[str], *, complete: bool = False
+) -> npt.NDArray[np.intp]:
+    """Return which of the robot's joints each name of a message is.
+
+    Parameters
+    ----------
+    joints
+        Names of the robot's joints.
+    named
+        Those of the message.
+    complete
+        Whether every joint must be named, as in a measured state.
+
+    Raises
+    ------
+    CommandError
+        A joint is unknown, missing or named twice.
+    """
+    index = {name: i for i, name in enumerate(joints)}
+    unknown = [name for name in named if name not in index]
+    if unknown:
+        raise CommandError(f"joint '{unknown[0]}' is unknown; the robot has {', '.join(joints)}")
+    if complete and len(set(named)) < len(index):
+        missing = next(name for name in index if name not in named)
+        raise CommandError(f"joint '{missing}' is missing")
+    if len(set(named)) != len(named):
+        raise CommandError(f"a joint is named twice in {list(named)}")
+    return np.array([index[name] for name in named], dtype=np.intp)
+
+
+def require_values(named: Sequence[str], quantity: str, count: int) -> None:
+    """Refuse a message with another number of values than joints.
+
+    Raises
+    ------
+    CommandError
+        It is one.
+    """
+    if count != len(named):
+        raise CommandError(f"{len(named)} joint(s) are named but {count} {quantity} value(s) given")
+
+
+def require_frame(frame: str, base_link: str) -> None:
+    """Refuse a wrench that is not in the frame of the base link; an empty name is that frame.
+
+    Raises
+    ------
+    CommandError
+        It is one.
+    """
+    if frame not in ("", base_link):
+        raise CommandError(f"the wrench is in frame '{frame}'; it is taken in '{base_link}'")
+
+
+class CommandSource:
+    """One topic that commands a plant.
+
+    Attributes
+    ----------
+    topic
+        Its name below the robot's namespace.
+    quantity
+        What its commands are.
+    command
+        (size,) what the actuators are to do now: joint by joint (m/s, rad/s, N or N m), or force
+        (N) over torque (N m) at the origin of the base link, base components.
+    stamp_ns
+        When the command in force was stamped; :data:`NEVER` while there is none.
+    arrived
+        Whether the command of this tick has come, accepted or not (lockstep).
+    resting
+        Whether the last command was taken back, so that joints are to come to rest.
+    required
+        Whether a lockstep plant waits for its commands.
+    commanders
+        How many publish on the topic, as far as is known.
+    """
+
+    def __init__(self, topic: str, quantity: Quantity, limits: Array) -> None:
+        self.topic, self.quantity, self._limits = topic, quantity, limits
+        self.command: Array = np.zeros(len(limits))
+        self.stamp_ns: float = NEVER
+        self.arrived = self.resting = False
+        self.required = True
+        self.commanders = 1
+
+    def rest(self) -> None:
+        """Command nothing from now on."""
+        self.command[:] = 0.0
+        self.stamp_ns = NEVER
+        self.resting = True
+
+    def accept(self, values: Array, stamp_ns: float) -> None:
+        """Put a command into force."""
+        self.command[:] = values
+        self.stamp_ns = stamp_ns
+        self.arrived = True
+        self.resting = False
+
+    def unsound(self, values: Array, *, clips: bool) -> Refusal | None:
+        """Return why values are refused whenever they come, if they are."""
+        # A sum is finite only if every term is; for a few numbers a list is summed fastest.
+        if not math.isfinite(sum(values.tolist())):
+            return Refusal(Reason.NOT_FINITE, f"a value is not finite: {values.tolist()}")
+        if not clips and np.any(np.abs(values) > self._limits):
+            limits = f"{values.tolist()} is beyond the limits {self._limits.tolist()}"
+            return Refusal(Reason.BEYOND_LIMITS, limits)
+        return None
+
+
+class CommandValidator:
+    """Decides which commands drive a plant, counts those that it refuses, and latches faults.
+
+    Parameters
+    ----------
+    plant
+        What is commanded.
+    config
+        Its configuration: time mode, timeout, limits, and which reasons latch.
+
+    Raises
+    ------
+    ParameterError
+        ``latched_faults`` has a word that is no reason.
+    """
+
+    def __init__(self, plant: Plant, config: PlantConfig) -> None:
+        robot = plant.robot
+        self.sources = [CommandSource("joint_commands", "velocity", robot.velocity_limit)]
+        """Those whose commands are the arguments of a step, in that order: the joints' first."""
+        self._brakes: _JointBrakes | None = None
+        if config.actuation == "effort":
+            self.sources = [
+                CommandSource("joint_commands", "effort", robot.effort_limit),
+                CommandSource("base_wrench", "wrench", np.full(6, np.inf)),
+            ]
+            # Velocity servos stop at once; motors have to brake.
+            self._brakes = _JointBrakes(plant, config.tick_period)
+        self._commands = [source.command for source in self.sources]
+        self._lockstep = config.time_mode == "lockstep"
+        self._timeout = config.command_timeout
+        self._clips = config.beyond_limits == "clip"
+        self._one_commander = config.second_commander == "refuse"
+        self._latching = _latching(config.latched_faults)
+        self.counts: Counter[Reason] = Counter()
+        """How many commands were refused, by reason."""
+        self.fault = ""
+        """Why nothing moves; empty while commands pass."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether every command that a lockstep plant waits for is there."""
+        # Twice as fast as all() over a generator, and asked every tick.
+        for source in self.sources:  # noqa: SIM110
+            if source.required and not source.arrived:
+                return False
+        return True
+
+    def offer(
+        self, source: CommandSource, stamp_ns: int, values: Array | CommandError, now_ns: int
+    ) -> Refusal | None:
+        """Accept or refuse a command.
+
+        Parameters
+        ----------
+        source
+            Where it came from.
+        stamp_ns
+            Its stamp.
+        values
+            What it commands; an error, if its message is malformed.
+        now_ns
+            Simulated time of the plant's state.
+
+        Returns
+        -------
+        Refusal or None
+            Why it is refused; None if it is in force now.
+        """
+        if self._lockstep:
+            if stamp_ns != now_ns or source.arrived:
+                return self._refuse(source, _not_this_tick(stamp_ns, now_ns))
+            refusal = self._unsound(source, values)
+        else:
+            if not stamp_ns and now_ns > (self._timeout or _START) * _SECOND:
+                stamp_ns = now_ns  # An unset stamp means now; at the start it is the first state's.
+            refusal = self._untimely(source, stamp_ns, now_ns) or self._unsound(source, values)
+        if refusal is None and self.fault:
+            refusal = Refusal(Reason.LATCHED, self.fault)
+        if refusal is None:
+            assert not isinstance(values, CommandError)
+            source.accept(values, stamp_ns)
+            return None
+        refusal = self._refuse(source, refusal)
+        if self._lockstep:
+            # Time must go on for the others: a bad command is a tick at rest.
+            source.rest()
+            source.arrived = True
+        return refusal
+
+    def unreadable(self, source: CommandSource, error: CommandError) -> Refusal:
+        """Refuse bytes that are no message: they have no stamp, and so answer no tick."""
+        return self._refuse(source, Refusal(Reason.MALFORMED, str(error)))
+
+    def begin_step(self) -> list[Array]:
+        """Return the commands to step under, a writable array for each source."""
+        for source in self.sources:
+            source.arrived = False
+        if self._brakes is not None and self.sources[0].resting:
+            self._commands[0][:] = self._brakes.efforts()
+        return self._commands
+
+    def rest(self) -> None:
+        """Command nothing any more."""
+        for source in self.sources:
+            source.rest()
+            source.arrived = False
+
+    def latch(self, sentence: str) -> None:
+        """Bring everything to rest until :meth:`rearm`; the first fault stays the one shown."""
+        self.fault = self.fault or sentence
+        for source in self.sources:
+            source.rest()
+
+    def rearm(self) -> str:
+        """Let commands pass again; return the fault that was latched, empty if there was none."""
+        fault, self.fault = self.fault, ""
+        return fault
+
+    def require_commanded(self) -> None:
+        """Wait for wrenches only while somebody publishes them; joints are always waited for."""
+        for source in self.sources[1:]:
+            source.required = source.commanders > 0
+            if not source.required:
+                # Nobody is left who could turn the thrusters off.
+                source.rest()
+                source.arrived = False
+
+    def drop_old(self, now_ns: int) -> list[CommandSource]:
+        """Bring to rest what nobody has commanded for the timeout; return those sources."""
+        silent = []
+        for source in self.sources:
+            age = now_ns - source.stamp_ns
+            if self._timeout and source.stamp_ns != NEVER and age > self._timeout * _SECOND:
+                source.rest()
+                silent.append(source)
+        return silent
+
+    def _unsound(self, source: CommandSource, values: Array | CommandError) -> Refusal | None:
+        if isinstance(values, CommandError):
+            return Refusal(Reason.MALFORMED, str(values))
+        return source.unsound(values, clips=self._clips)
+
+    def _untimely(self, source: CommandSource, stamp_ns: int, now_ns: int) -> Refusal | None:
+        """Return why a command does not belong to this moment of real time, if it does not."""
+        age = (now_ns - stamp_ns) / _SECOND
+        if self._timeout and age > self._timeout:
+            return Refusal(Reason.STALE, f"it is {age:.3g} s old")
+        if self._timeout and -age > self._timeout:
+            return Refusal(Reason.EARLY, f"it is {-age:.3g} s ahead of time")
+        late = (source.stamp_ns - stamp_ns) / _SECOND
+        if late > 0:
+            return Refusal(Reason.OUT_OF_ORDER, f"it is {late:.3g} s older than the one in force")
+        if late == 0 and source.commanders > 1 and self._one_commander:
+            return Refusal(
+                Reason.SECOND_COMMANDER,
+                f"the same state was answered before, and {source.commanders} nodes command",
+            )
+        return None
+
+    def _refuse(self, source: CommandSource, refusal: Refusal) -> Refusal:
+        """Count a refused command; where its reason latches, everything comes to rest."""
+        self.counts[refusal.reason] += 1
+        if refusal.reason not in self._latching or self.fault:
+            return refusal
+        self.latch(f"a command on '{source.topic}' was refused: {refusal.clause}")
+        return Refusal(refusal.reason, refusal.clause, latches=True)
+
+
+def _not_this_tick(stamp_ns: int, now_ns: int) -> Refusal:
+    early = stamp_ns > now_ns
+    return Refusal(
+        Reason.EARLY if early else Reason.STALE,
+        f"it is {'ahead of time' if early else 'stale'}: stamped {stamp_ns / _SECOND:.9g} s, the "
+        f"plant is at {now_ns / _SECOND:.9g} s",
+    )
+
+
+def _latching(words: str) -> frozenset[Reason]:
+    known = [reason.value for reason in Reason if reason is not Reason.LATCHED]
+    for word in words.split():
+        if word not in known:
+            raise ParameterError(
+                f"Parameter 'latched_faults' has '{word}'; it takes {', '.join(known)}, separated "
+                "by spaces."
+            )
+    return frozenset(Reason(word) for word in words.split())
+
+
+class _JointBrakes:
+    """Motor efforts against the joint rates of a plant: inner forces, which leave its momenta."""
+
+    def __init__(self, plant: Plant, tick_period: float) -> None:
+        robot: SpaceRobot = plant.robot
+        rate = min(_BRAKING_RATE, _LARGEST_RATE_PER_TICK / tick_period)
+        outputs = ComputedTorqueLaw.default_outputs(robot, "")
+        # Only the damping acts: the reference is always where the joints are.
+        self._law = ComputedTorqueLaw(robot, outputs, Gains.uniform(1.0, rate))
+        self._plant = plant
+
+    def efforts(self) -> Array:
+        """Return the efforts (n,) to hold for the next tick, N or N m, before limits."""
+        plant = self._plant
+        state = ControlState(
+            plant.pose[:3], plant.pose[3:], plant.twist[:3], plant.twist[3:], plant.q, plant.qdot
+        )
+        return self._law.command(state, Reference(joints=JointReference.at_rest(plant.q))).tau

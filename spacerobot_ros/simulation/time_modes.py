@@ -1,0 +1,169 @@
+"""Who drives the time of a plant: its commanders (lockstep), or the wall clock (real time)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from spacerobot_ros.simulation.commands import CommandValidator
+
+_SECOND = 1e9
+
+_LONGEST_LAG = 10
+"""Ticks that a real-time plant may be late and still make up; what is beyond is lost for good."""
+
+_CATCH_UP = 2
+"""Ticks that a late plant takes at once: commands must get a word in between."""
+
+
+class PlantState(str, Enum):
+    """What a plant does with time and with commands."""
+
+    INACTIVE = "inactive"
+    """It publishes nothing and takes no command."""
+    RUNNING = "running"
+    PAUSED = "paused"
+    """Time stands still; commands are taken."""
+    LATCHED = "latched"
+    """Time goes on with everything at rest, until the fault is rearmed."""
+
+
+class Lockstep:
+    """Steps as soon as every command of a tick is there.
+
+    Parameters
+    ----------
+    commands
+        The commands of the plant.
+    """
+
+    def __init__(self, commands: CommandValidator) -> None:
+        self._commands = commands
+        self._looked_at = -1
+
+    @property
+    def may_step(self) -> bool:
+        """Whether the commands of this tick are complete."""
+        return self._commands.complete
+
+    def looks(self, tick: int, *, pose_lost: bool) -> bool:
+        """Return whether a plant that looks round now and then is to step.
+
+        To a state without a pose nobody need answer: a commander cannot know that none comes before
+        it sees another state. So the plant steps without a command if it was still waiting in the
+        same tick when it looked last.
+        """
+        waited, self._looked_at = self._looked_at == tick, tick
+        return (waited and pose_lost) or self.may_step
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How well a plant in real time keeps to the clock, and its commander to the plant.
+
+    Attributes
+    ----------
+    tick_rate
+        Ticks a second of wall time since the last report.
+    ticks, ticks_late, worst_tick
+        Ticks taken; those taken after the next one was due; by how much at most, s.
+    commands, commands_late, worst_command
+        States that were answered; those answered after the tick that follows them was due; by how
+        much at most, s.
+    command_age
+        Simulated time since the state that the command in force answers, s.
+    worse
+        Whether more was late than at the last report.
+    """
+
+    tick_rate: float
+    ticks: int
+    ticks_late: int
+    worst_tick: float
+    commands: int
+    commands_late: int
+    worst_command: float
+    command_age: float
+    worse: bool
+
+
+class RealTime:
+    """Says when ticks are due by the wall clock, and counts ticks and commands that are late.
+
+    A tick has missed its deadline when it is taken after the next one is due; a command, when it
+    comes after the tick that follows the state it answers is due.
+
+    Parameters
+    ----------
+    period_ns
+        Simulated duration of a tick, ns.
+    factor
+        Simulated over wall time.
+    """
+
+    def __init__(self, period_ns: int, factor: float = 1.0) -> None:
+        self._period, self._pace = period_ns, period_ns / factor
+        self._origin = 0.0
+        self.ticks_lost = 0
+        """Ticks that were not taken in time and are not made up."""
+        self._ticks = self._ticks_late = self._answers = self._answers_late = 0
+        self._worst_tick = self._worst_answer = 0.0
+        self._reported = 0, 0
+        self._ticks_reported, self._reported_at, self._now = 0, 0, 0
+        self._state_ns, self._answered_ns = 0, 0.0
+
+    @property
+    def period(self) -> float:
+        """Wall time of a tick, s."""
+        return self._pace / _SECOND
+
+    def start(self, now_ns: int, tick: int) -> None:
+        """Let time go on from a tick, whose state is due now."""
+        self._origin = now_ns - tick * self._pace
+
+    def due(self, now_ns: int, tick: int) -> int:
+        """Return how many ticks are to be taken now, after ``tick``; forget those lost for good."""
+        behind = int((now_ns - self._origin) / self._pace) - tick
+        if behind > _LONGEST_LAG:
+            self.ticks_lost += behind - _LONGEST_LAG
+            self._origin += (behind - _LONGEST_LAG) * self._pace
+        return min(behind, _CATCH_UP)
+
+    def count_tick(self, now_ns: int, tick: int) -> None:
+        """Count that the tick after ``tick`` is taken now."""
+        self._ticks += 1
+        self._now, self._state_ns = now_ns, tick * self._period
+        late = now_ns - (self._origin + (tick + 2) * self._pace)
+        if late > 0:
+            self._ticks_late += 1
+            self._worst_tick = max(self._worst_tick, late)
+
+    def count_command(self, now_ns: int, stamp_ns: float) -> None:
+        """Count that the command in force answers the state of that stamp (simulated time)."""
+        if stamp_ns <= self._answered_ns:
+            return  # A command that was refused has changed nothing.
+        self._answered_ns = stamp_ns
+        self._answers += 1
+        late = now_ns - (self._origin + (stamp_ns / self._period + 1) * self._pace)
+        if late > 0:
+            self._answers_late += 1
+            self._worst_answer = max(self._worst_answer, late)
+
+    def report(self) -> Timing:
+        """Return all that was counted, and the rate of ticks since the last call."""
+        late = self._ticks_late, self._answers_late
+        worse, self._reported = late != self._reported, late
+        elapsed = (self._now - self._reported_at) / _SECOND
+        rate = (self._ticks - self._ticks_reported) / elapsed if elapsed > 0 else 0.0
+        self._ticks_reported, self._reported_at = self._ticks, self._now
+        return Timing(
+            tick_rate=rate,
+            ticks=self._ticks,
+            ticks_late=self._ticks_late,
+            worst_tick=self._worst_tick / _SECOND,
+            commands=self._answers,
+            commands_late=self._answers_late,
+            worst_command=self._worst_answer / _SECOND,
+            command_age=(self._state_ns - self._answered_ns) / _SECOND,
+            worse=worse,
+        )
