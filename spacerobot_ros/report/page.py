@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from html import escape
+from importlib.resources import files
 
 from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.report.meshcat import Player
@@ -17,76 +18,6 @@ from spacerobot_ros.report.tables import (
     result_table,
     runs_table,
 )
-
-_CSS = """
-:root { color-scheme: light; --ink: #1f2328; --muted: #5b6472; --line: #dfe3e8; --wash: #f6f7f9;
-  --tone: #0072b2; }
-* { box-sizing: border-box; }
-body { margin: 0; background: #fff; color: var(--ink); line-height: 1.5; font-size: 16px;
-  font-family: system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "Noto Sans",
-  "Liberation Sans", sans-serif; }
-main { max-width: 1000px; margin: 0 auto; padding: 2.5rem 1.25rem 3rem; }
-h1 { font-size: 2rem; line-height: 1.2; font-weight: 650; margin: 0 0 .35rem; }
-h2 { font-size: 1.25rem; font-weight: 650; margin: 2.75rem 0 .75rem; padding-bottom: .3rem;
-  border-bottom: 1px solid var(--line); }
-p { margin: .5rem 0; max-width: 46em; }
-.facts { color: var(--muted); }
-.facts span + span::before { content: "\\00b7"; margin: 0 .5em; }
-.outcome { margin: 1.5rem 0 0; padding: .8rem 1rem; max-width: none; background: var(--wash);
-  border-left: 4px solid var(--tone); font-size: 1.05rem; }
-.outcome.reached { --tone: #009e73; }
-.outcome.failed, .outcome.refused { --tone: #d55e00; }
-.outcome.aborted { --tone: #e69f00; }
-.outcome b { color: var(--tone); filter: brightness(.8); margin-right: .5em; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: .92rem; margin: .5rem 0;
-  font-variant-numeric: tabular-nums; }
-th, td { text-align: left; vertical-align: top; padding: .42rem .9rem .42rem 0;
-  border-bottom: 1px solid var(--line); }
-thead th { font-weight: 600; color: var(--muted); white-space: nowrap; }
-tbody th { font-weight: 600; white-space: nowrap; }
-th.number, td.number { text-align: right; white-space: nowrap; }
-#published td:nth-child(2), #published td:nth-child(3) { white-space: nowrap; }
-#published td:last-child { min-width: 15em; }
-tr > :last-child { padding-right: 0; }
-figure { margin: 1.75rem 0 2.5rem; }
-figure img { display: block; width: 100%; min-width: 640px; height: auto; }
-figcaption { margin-top: .5rem; color: var(--muted); font-size: .92rem; max-width: 60em; }
-figcaption b { color: var(--ink); }
-.missing { color: var(--muted); font-style: italic; }
-details { margin-top: .75rem; font-size: .92rem; }
-summary { cursor: pointer; color: var(--muted); }
-code { font-family: ui-monospace, "Liberation Mono", Menlo, monospace; font-size: .95em; }
-footer { margin-top: 3rem; color: var(--muted); font-size: .88rem; }
-.tiles { display: grid; gap: .6rem; margin: 1.25rem 0; padding: 0;
-  grid-template-columns: repeat(auto-fit, minmax(min(10.5rem, 45%), 1fr)); }
-.tiles div { border: 1px solid var(--line); border-radius: 6px; padding: .5rem .75rem; }
-.tiles dt { color: var(--muted); font-size: .82rem; }
-.tiles dd { margin: 0; font-size: 1.12rem; font-weight: 600; font-variant-numeric: tabular-nums;
-  overflow-wrap: anywhere; }
-.tiles small { display: block; color: var(--muted); font-weight: 400; font-size: .8rem; }
-#animation { margin: 1.5rem 0 2rem; }
-#stage { position: relative; border: 1px solid var(--line); border-radius: 6px; overflow: hidden;
-  background: var(--wash); }
-#pane { width: 100%; height: clamp(300px, 62vh, 640px); }
-#stage .dg.main, #stage .dg .close-button { max-width: 100%; }
-#stage .dg.main .close-button { background: transparent; color: var(--muted); }
-#bar { display: flex; flex-wrap: wrap; gap: .5rem .75rem; align-items: center; margin-top: .6rem; }
-#bar button, #bar select { font: inherit; font-size: .9rem; color: var(--ink); background: #fff;
-  border: 1px solid var(--line); border-radius: 6px; padding: .35rem .7rem; min-height: 2.3rem; }
-#bar button { min-width: 5em; cursor: pointer; }
-#time { flex: 1 1 14rem; min-width: 10rem; accent-color: var(--tone); }
-#now { min-width: 9.5em; font-variant-numeric: tabular-nums; font-size: .9rem; }
-.caption { color: var(--muted); font-size: .92rem; max-width: 60em; }
-.caption b { color: var(--ink); }
-#animation > .missing { display: none; }
-.without #stage, .without #bar, .without .caption { display: none; }
-#animation.without > .missing { display: block; }
-@media (max-width: 600px) { main { padding: 1.25rem .9rem 2rem; } h1 { font-size: 1.5rem; }
-  #pane { height: 70vw; } .tiles dd { font-size: 1rem; } }
-@media print { #animation { display: none; } }
-@media print { figure { break-inside: avoid; } main { max-width: none; padding: 0; } }
-"""
 
 _SCROLL = '<div class="scroll">'
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -118,13 +49,14 @@ def page(
         *_parameters(flight),
         _footer(flight),
     ]
+    css = files("spacerobot_ros.report").joinpath("page.css").read_text(encoding="utf-8")
     policy = "; ".join(filter(None, (_POLICY, player.policy)))
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<link rel="icon" href="data:,">\n'
-        f"<title>{escape(title)}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n<main>\n"
+        f"<title>{escape(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n<main>\n"
         + "\n".join(part for part in body if part)
         + f"\n</main>\n{player.scripts}\n</body>\n</html>\n"
     )
