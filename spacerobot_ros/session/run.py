@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,8 @@ import numpy as np
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from spacerobot_ros.bag import Bag, RecordingError, TopicSeries, read_bag
+from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
+from spacerobot_ros.bag.recorded_robot import columns
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.nodes.common.process import use_loopback_discovery, use_private_discovery
@@ -30,11 +31,6 @@ _NO_GAIT = (
     *("manoeuvre_time_s", "ends_at_s"),
 )
 """Values of the planner's status that do not describe its gait."""
-
-_POSE = [
-    *(f"pose.pose.position.{axis}" for axis in "xyz"),
-    *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
-]
 
 Progress = Callable[[float, float], None]
 """Called with simulated time and the time the present schedule ends, s."""
@@ -68,24 +64,31 @@ class Measured:
         RecordingError
             A topic is missing or empty.
         """
-        topics = [f"{namespace}/{name}" for name in ("odom", "joint_states", "momentum")]
-        for topic in topics:
-            if not (_holds(bag, topic) or _holds(bag, f"{topic}_true")):
-                raise RecordingError(f"The bag holds no message on {topic}: no plant was recorded.")
-        time, pose = _truth(bag, topics[0], _POSE)
-        _, shapes = _truth(bag, topics[1], ["position", "velocity"])
-        momentum = bag[topics[2]]
-        n = shapes.shape[1] // 2
+        robot = RecordedRobot(bag, namespace)
+        names = robot.joint_names
+        n = len(names)
+        time, pose = robot.truth("odom", columns("odom", "pose.pose"))
+        _, shapes = robot.truth("joint_states", ["position", "velocity"], 2 * n)
+        momentum = np.asarray(robot["momentum"].field("data"))
+        expected, tool = robot.get("momentum_expected"), robot.get("end_effector_pose")
+        last = tool.table(columns("end_effector_pose", "pose"))[-1] if tool is not None else None
+        if expected is not None and len(expected) != len(momentum):
+            expected = None
         return cls(
             time=time,
             position=pose[:, :3],
             quaternion=pose[:, 3:],
-            joint_names=list(next(bag[topics[1]].messages())[1].name),
+            joint_names=names,
             joints=shapes[:, :n],
             joint_rates=shapes[:, n:],
-            momentum=np.asarray(momentum.field("data")),
-            expected=_expected(bag, f"{namespace}/momentum_expected", momentum),
-            end_effector=_last_pose(bag, f"{namespace}/end_effector_pose"),
+            momentum=momentum,
+            # Without thrusters nothing is published, and nothing is to change.
+            expected=(
+                np.asarray(expected.field("data"))
+                if expected is not None
+                else np.zeros((len(momentum), 6))
+            ),
+            end_effector=(last[:3], last[3:]) if last is not None else None,
         )
 
     @property
@@ -97,10 +100,6 @@ class Measured:
     def angular_drift(self) -> float:
         """Largest change of the total angular momentum without thrust, kg m^2/s."""
         return _largest_change(self.momentum[:, 3:6] - self.expected[:, 3:6])
-
-    def rotvecs(self) -> Array:
-        """Return the attitude as exponential coordinates (N, 3), rad."""
-        return np.array([rotvec_from_quaternion(q) for q in self.quaternion])
 
     def final_error(self, goal: Goal) -> PoseError:
         """Return what the last pose leaves to the goal."""
@@ -265,41 +264,6 @@ def _summarise(scenario: Scenario, path: Path, facts: _Facts) -> RunResult:
     if propellant is not None:
         summary["propellant_kg"] = float(propellant)
     return RunResult(summary, sentence, measured)
-
-
-def _holds(bag: Bag, topic: str) -> bool:
-    return topic in bag.topics and bag.message_count(topic) > 0
-
-
-def _truth(bag: Bag, topic: str, fields: Sequence[str]) -> tuple[Array, Array]:
-    """Return times (N,) and fields (N, m): of ``<topic>_true`` from where that begins."""
-    times: list[Array] = []
-    rows: list[Array] = []
-    begin = np.inf
-    for name in (f"{topic}_true", topic):
-        if _holds(bag, name):
-            series = bag[name]
-            before = series.stamp < begin
-            values = np.column_stack([np.asarray(series.field(field)) for field in fields])
-            times.insert(0, series.stamp[before])
-            rows.insert(0, values[before])
-            begin = series.stamp[0]
-    return np.concatenate(times), np.concatenate(rows)
-
-
-def _expected(bag: Bag, topic: str, momentum: TopicSeries) -> Array:
-    """Where there are no thrusters nothing is published, and nothing is to change."""
-    if topic in bag.topics and bag.message_count(topic) == len(momentum):
-        return np.asarray(bag[topic].field("data"))
-    return np.zeros((len(momentum), 6))
-
-
-def _last_pose(bag: Bag, topic: str) -> tuple[Array, Array] | None:
-    if topic not in bag.topics or not bag.message_count(topic):
-        return None
-    series = bag[topic]
-    position = np.array([series.field(f"pose.position.{x}")[-1] for x in "xyz"])
-    return position, np.array([series.field(f"pose.orientation.{x}")[-1] for x in "xyzw"])
 
 
 def _largest_change(vectors: Array) -> float:

@@ -287,3 +287,31 @@ def test_the_topics_of_one_robot_are_found_by_their_names(tmp_path: Path) -> Non
     assert RecordedRobot(bag).get("odom") is None, "it is of another type"
     with pytest.raises(RecordingError, match="nothing is on /craft/odom"):
         craft["odom"]
+
+
+def test_the_truth_is_what_was_measured_until_it_is_published(tmp_path: Path) -> None:
+    def states(writer: BagWriter, topic: str, values: dict[int, float]) -> None:
+        channel = writer.add_topic(topic, "sensor_msgs/msg/JointState")
+        for second, value in values.items():
+            header = Header(stamp=Time(sec=second))
+            message = JointState(header=header, position=[value], velocity=[-value])
+            writer.write(channel, serialize_message(message), second, second)
+
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        states(writer, "/joint_states", {0: 0.1, 1: 1.1, 2: 2.1, 3: 3.1})
+        states(writer, "/joint_states_true", {2: 2.0, 3: 3.0})
+        states(writer, "/perfect/joint_states", {0: 5.0})
+        states(writer, "/alone/joint_states_true", {0: 6.0})
+    bag = read_bag(tmp_path / "a.mcap")
+
+    def truth(namespace: str) -> list[list[float]]:
+        time, values = RecordedRobot(bag, namespace).truth(
+            "joint_states", ["position", "velocity"], 2
+        )
+        return np.column_stack([time, values]).tolist()
+
+    assert truth("") == [[0, 0.1, -0.1], [1, 1.1, -1.1], [2, 2.0, -2.0], [3, 3.0, -3.0]]
+    assert truth("/perfect") == [[0, 5.0, -5.0]]
+    assert truth("/alone") == [[0, 6.0, -6.0]]
+    with pytest.raises(RecordingError, match="nothing is on /nobody/joint_states"):
+        truth("/nobody")
