@@ -102,7 +102,7 @@ def json_of(found: Analysis) -> dict[str, Any]:
         },
         "planar": _finding(found.planar),
         "sliding": _finding(found.sliding),
-        "methods": {name: objection or None for name, objection in found.objections.items()},
+        "methods": found.objections,
         "auto": found.chosen or None,
     }
 
@@ -163,7 +163,7 @@ def _finding(found: Controllability) -> dict[str, Any]:
     return {
         "controllable": found.controllable,
         "rank": found.rank,
-        "wanted": found.wanted,
+        "wanted": found.needed,
         "condition": _number(found.condition),
         "singular_values": found.singular_values.tolist(),
         "joints": list(found.joints),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.controllability import (
@@ -16,11 +16,12 @@ from spacerobot_ros.planning.core.controllability import (
     brackets_anywhere,
     brackets_at,
     curvatures,
-    planar_chain,
     sample_shapes,
     sliding_masses,
 )
+from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.methods.auto import AutoGait
+from spacerobot_ros.planning.methods.geometric_phase import planar_chain
 from spacerobot_ros.planning.methods.nominal_shape import NominalShape, best_nominal, given_nominal
 from spacerobot_ros.planning.methods.registry import METHODS
 
@@ -40,7 +41,7 @@ class Analysis:
     robot
         The model.
     shape
-        (n,) the shape that is looked at: as given, the best nominal one, or the middle.
+        (n,) the shape that is examined: as given, the best nominal one, or the middle.
     nominal
         The three joints and their M there; None with fewer than three joints, or where loops turn
         the base about fewer than three axes everywhere.
@@ -51,7 +52,7 @@ class Analysis:
     planar, sliding
         The tests of papers 3 and 1.
     objections
-        Why each method does not suit the robot, by name; "" if it does.
+        Why each method does not suit the robot, by name; None if it does.
     """
 
     robot: SpaceRobot
@@ -62,7 +63,7 @@ class Analysis:
     conditions: Array
     planar: Controllability
     sliding: Controllability
-    objections: dict[str, str]
+    objections: dict[str, str | None]
 
     @property
     def chosen(self) -> str:
@@ -102,11 +103,20 @@ def analyze(robot: SpaceRobot, shape: Sequence[float] | None = None) -> Analysis
         planar,
         sliding_masses(robot),
         {
-            name: method.objection(robot)
+            name: _objection(method, robot)
             for name, method in METHODS.items()
             if method is not AutoGait
         },
     )
+
+
+def _objection(method: type[GaitMethod], robot: SpaceRobot) -> str | None:
+    """Return why a method plans no goal of a robot; None if it plans some."""
+    try:
+        method.require_suitable(robot)
+    except PlanningError as refusal:
+        return str(refusal)
+    return None
 
 
 def _checked(robot: SpaceRobot, shape: Sequence[float]) -> Array:

@@ -19,9 +19,8 @@ from spacerobot_ros.planning.core.controllability import (
     curvatures,
     shape_box,
 )
-from spacerobot_ros.planning.methods.curvature_peak import curvature_peaks
-from spacerobot_ros.planning.methods.edge_path import PLANES
-from spacerobot_ros.planning.methods.geometric_phase import PhasePlane, PlanarPhase
+from spacerobot_ros.planning.methods.geometric_phase import PhasePlane, PlanarPhase, curvature_peaks
+from spacerobot_ros.planning.methods.nominal_shape import PLANES
 from spacerobot_ros.report.style import (
     FAINT,
     INK,

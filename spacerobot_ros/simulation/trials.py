@@ -26,7 +26,7 @@ from spacerobot_ros.planning import (
 )
 from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.methods.optimal.reach import Turning
+from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
 from spacerobot_ros.simulation.config import period_ns
 from spacerobot_ros.simulation.initial_state import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
@@ -191,8 +191,7 @@ def compare(problem: Problem) -> dict[str, Trial | SpaceRobotError]:
         if name == "auto":
             continue
         try:
-            if objection := method.objection(problem.robot):
-                raise PlanningError(objection)
+            method.require_suitable(problem.robot)
             found[name] = try_method(problem, name)
         except (ParameterError, PlanningError) as refusal:
             found[name] = refusal

@@ -18,7 +18,7 @@ from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal, RobotState, Tolerance
-from spacerobot_ros.planning.methods.edge_path import edge_path
+from spacerobot_ros.planning.methods.area_loop import edge_path
 from spacerobot_ros.planning.methods.nominal_shape import NominalShape, best_nominal, given_nominal
 
 Array = npt.NDArray[np.float64]

@@ -125,11 +125,12 @@ def made(
     refusal: str = "",
     controls: frozenset[Any] = GaitMethod.controls,
 ) -> type[Made]:
-    def refuse(robot: SpaceRobot) -> str:
-        return objection
+    def refuse(robot: SpaceRobot) -> None:
+        if objection:
+            raise PlanningError(objection)
 
     members = {"name": name, "refusal": refusal, "controls": controls}
-    return type(name, (Made,), {**members, "objection": staticmethod(refuse)})
+    return type(name, (Made,), {**members, "require_suitable": staticmethod(refuse)})
 
 
 def choice_of(*methods: type[Made]) -> tuple[Planner, list[str]]:

@@ -13,18 +13,19 @@ from planning.sliding_robots import paper_robot, random_sliding_robot
 from support.oracles import PinocchioOracle
 from support.random_robots import random_robot_urdf
 
+from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import METHODS
+from spacerobot_ros.planning import METHODS, GaitMethod
 from spacerobot_ros.planning.core.controllability import (
     best_triple,
     brackets_anywhere,
     brackets_at,
     curvature_matrices,
     curvatures,
-    planar_chain,
     sample_shapes,
     sliding_masses,
 )
+from spacerobot_ros.planning.methods.geometric_phase import planar_chain
 
 Array = npt.NDArray[np.float64]
 
@@ -106,7 +107,7 @@ def test_the_papers_sliding_masses() -> None:
 def test_almost_all_offsets_are_controllable(seed: int) -> None:
     robot = random_sliding_robot(np.random.default_rng(seed), 3)
     found = sliding_masses(SpaceRobot.from_urdf(robot.urdf))
-    assert (found.rank, found.wanted, found.controllable) == (3, 3, True)
+    assert (found.rank, found.needed, found.controllable) == (3, 3, True)
 
 
 def test_sliders_in_a_plane_or_too_few_are_not() -> None:
@@ -122,7 +123,7 @@ def test_sliders_in_a_plane_or_too_few_are_not() -> None:
 
 def test_planar_robots_turn_about_one_axis() -> None:
     chain = planar_chain(robot_named("planar_chain"))
-    assert (chain.rank, chain.wanted, chain.controllable) == (1, 1, True)
+    assert (chain.rank, chain.needed, chain.controllable) == (1, 1, True)
     # At the paper's peak, the entries of its pair in the right order.
     assert chain.singular_values[0] == pytest.approx(0.5376, abs=5e-5)
     np.testing.assert_allclose(np.degrees(np.abs(chain.shape)), [153, 121], atol=0.6)
@@ -139,6 +140,14 @@ def test_a_robot_of_one_joint_encloses_no_area() -> None:
     assert "no loop encloses an area" in found.sentence
 
 
+def objection(method: type[GaitMethod], robot: SpaceRobot) -> str:
+    try:
+        method.require_suitable(robot)
+    except PlanningError as refusal:
+        return str(refusal)
+    return ""
+
+
 @pytest.mark.parametrize(
     ("name", "suits"),
     [
@@ -151,7 +160,7 @@ def test_a_robot_of_one_joint_encloses_no_area() -> None:
 def test_which_methods_suit_the_robots_of_the_papers(name: str, suits: set[str]) -> None:
     robot = robot_named(name)
     methods = ("lie_bracket", "square_path", "area_loop")
-    objections = {method: METHODS[method].objection(robot) for method in methods}
+    objections = {method: objection(METHODS[method], robot) for method in methods}
     assert {method for method in methods if not objections[method]} == suits
     for sentence in filter(None, objections.values()):
         assert name in sentence

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spacerobot_ros.planning.methods.edge_path import EdgePath, edge_path
+from spacerobot_ros.planning.methods.area_loop import EdgePath, edge_path
 
 Array = npt.NDArray[np.float64]
 

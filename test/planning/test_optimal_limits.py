@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, RobotState, plan
-from spacerobot_ros.planning.methods.optimal.constraints import PathConstraints
+from spacerobot_ros.planning.methods.optimal.multiple_shooting import Transcription
+from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
+from spacerobot_ros.planning.methods.optimal.problem import PathConstraints
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
-from spacerobot_ros.planning.methods.optimal.transcription import Transcription
 
 Array = npt.NDArray[np.float64]
 
@@ -239,7 +240,16 @@ def test_a_plan_is_found_again_only_where_all_is_the_same(
 
 def test_derivatives_of_the_program_are_those_of_its_functions(arm: SpaceRobot) -> None:
     """The Jacobian and the Hessian that are put together, against CasADi's own."""
-    constraints = PathConstraints.of(arm, 0.2, EAST, SUN, 0.2, [0.5, 0, 0, 1, 1, 1])
+    constraints = PathConstraints.of(
+        arm,
+        OptimalOptions(
+            max_base_rate=0.2,
+            keep_axis=tuple(EAST),
+            keep_direction=tuple(SUN),
+            keep_angle=0.2,
+            keep_out=(0.5, 0.0, 0.0, 1.0, 1.0, 1.0),
+        ),
+    )
     program = Transcription(arm, 3, np.eye(3), position=True, constraints=constraints).program()
     x, p, g = (program.problem[name] for name in ("x", "p", "g"))
     lam = ca.MX.sym("lam", g.numel())

@@ -29,8 +29,7 @@ from support.planners import planner_of
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Tolerance
-from spacerobot_ros.planning.core.planar import planar_axis
-from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase
+from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase, planar_axis
 
 
 @pytest.mark.parametrize("branched", [False, True])

@@ -28,8 +28,7 @@ from support.planning_refusals import refusal_in
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal, RobotState, Tolerance
-from spacerobot_ros.planning.core.planar import planar_axis
-from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase
+from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase, planar_axis
 
 Array = npt.NDArray[np.float64]
 

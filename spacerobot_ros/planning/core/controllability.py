@@ -18,20 +18,18 @@ import numpy as np
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
-from spacerobot_ros.planning.methods.curvature_peak import curvature_peaks
-from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase
 
 WORST_CONDITION = 1e6
 """Brackets that are worse conditioned do not span: rounding decides on their directions."""
 
-_NO_TURN = 1e-12
+NO_TURN = 1e-12
 """Singular values of brackets below this, rad per unit area, are rounding."""
 
 _SAMPLES = 24
-"""Shapes at which a robot is asked; brackets that span anywhere span at almost all of them."""
+"""Shapes at which a robot is examined; brackets that span anywhere span at almost all of them."""
 
 _UNLIMITED = {JointKind.PRISMATIC: 1.0}
-"""Half the range that is looked at of a joint without limits, m; pi for joints that turn."""
+"""Half the range that is examined of a joint without limits, m; pi for joints that turn."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,7 @@ class Controllability:
 
     Attributes
     ----------
-    rank, wanted
+    rank, needed
         Axes of rotation that the brackets span, and how many there are to span.
     singular_values
         (3,) of the best three brackets, rad per unit area (rad^2, rad m or m^2), descending.
@@ -53,7 +51,7 @@ class Controllability:
     """
 
     rank: int
-    wanted: int
+    needed: int
     singular_values: Array
     joints: tuple[str, ...]
     shape: Array
@@ -62,13 +60,24 @@ class Controllability:
     @property
     def controllable(self) -> bool:
         """Whether the brackets span what there is to span."""
-        return self.rank >= self.wanted
+        return self.rank >= self.needed
+
+    def require(self) -> None:
+        """Check that the robot is controllable.
+
+        Raises
+        ------
+        PlanningError
+            It is not; the sentence says why.
+        """
+        if not self.controllable:
+            raise PlanningError(self.sentence)
 
     @property
     def condition(self) -> float:
         """Condition number of the best three brackets; infinite where they do not span."""
         largest, _, smallest = self.singular_values
-        return float(largest / smallest) if smallest > _NO_TURN else np.inf
+        return float(largest / smallest) if smallest > NO_TURN else np.inf
 
 
 def shape_box(robot: SpaceRobot) -> tuple[Array, Array]:
@@ -113,7 +122,7 @@ def best_triple(K: Array, among: Sequence[int]) -> tuple[tuple[int, int, int], A
     triples = list(itertools.combinations(among, 3))
     matrices = np.array([curvature_matrices(K, triple) for triple in triples])
     values = np.linalg.svd(matrices, compute_uv=False)
-    best = int(np.argmax(values[:, 2] / np.maximum(values[:, 0], _NO_TURN)))
+    best = int(np.argmax(values[:, 2] / np.maximum(values[:, 0], NO_TURN)))
     return triples[best], matrices[best]
 
 
@@ -145,12 +154,18 @@ def slot_matrix(robot: SpaceRobot, shape: Array, sliders: Sequence[int]) -> Arra
     return np.column_stack(steps) if steps else np.zeros((3, 0))
 
 
-def slot_objection(robot: SpaceRobot, slots: Array) -> str:
-    """Return why slots (3, s) cannot move the base anywhere; "" if they can (paper 1, 4.1)."""
+def require_three_slots(robot: SpaceRobot, slots: Array) -> None:
+    """Check that sliders with slots (3, s) can move the base anywhere (paper 1, section 4.1).
+
+    Raises
+    ------
+    PlanningError
+        They cannot.
+    """
     rank = int(np.linalg.matrix_rank(slots, tol=1e-9 * np.abs(slots).max(initial=0.0)))
     if rank == 3:
-        return ""
-    return (
+        return
+    raise PlanningError(
         "lie_bracket needs three sliders with linearly independent slots (paper 1, section 4.1); "
         f"robot '{robot.description.name}' has {slots.shape[1]} slider(s) of rank {rank}."
     )
@@ -159,39 +174,12 @@ def slot_objection(robot: SpaceRobot, slots: Array) -> str:
 def sliding_masses(robot: SpaceRobot) -> Controllability:
     """Return the test of paper 1: three independent slots and spanning brackets of sliders."""
     sliders = sliders_of(robot)
-    objection = slot_objection(
-        robot, slot_matrix(robot, np.mean(shape_box(robot), axis=0), sliders)
-    )
-    if objection:
-        nothing = tuple(robot.joint_names[i] for i in sliders)
-        return Controllability(0, 3, np.zeros(3), nothing, np.zeros(robot.n), objection)
-    return brackets_anywhere(robot, sliders)
-
-
-def planar_chain(robot: SpaceRobot) -> Controllability:
-    """Return the test of paper 3: a planar robot of three or more links, with curvature."""
-    names, rest = robot.joint_names, np.zeros(robot.n)
     try:
-        phase = PlanarPhase(robot)
+        require_three_slots(robot, slot_matrix(robot, np.mean(shape_box(robot), axis=0), sliders))
     except PlanningError as refusal:
-        return Controllability(0, 1, np.zeros(3), names, rest, str(refusal))
-    box = np.stack(shape_box(robot))
-    middle = box.mean(axis=0)
-    tops = []
-    for i, j in itertools.combinations(range(robot.n), 2):
-        plane, shape = phase.plane(middle, i, j), middle.copy()
-        shape[[i, j]] = curvature_peaks(plane, middle[[i, j]], box[np.newaxis, :, [i, j]])[0]
-        tops.append((abs(float(plane.curvature(shape[[i, j]]))), (names[i], names[j]), shape))
-    largest, pair, shape = max(tops, key=lambda top: top[0])
-    sentence = (
-        f"{robot.n + 1} links in a plane: loops of joints '{pair[0]}' and '{pair[1]}' turn the "
-        f"base by up to {largest:.3g} rad a unit of area, round {np.round(shape, 3).tolist()} "
-        "(paper 3)."
-    )
-    if largest <= _NO_TURN:
-        sentence = f"Loops of the joints of robot '{robot.description.name}' do not turn its base."
-    values = np.array([largest, 0.0, 0.0])
-    return Controllability(int(largest > _NO_TURN), 1, values, pair, shape, sentence)
+        names = tuple(robot.joint_names[i] for i in sliders)
+        return Controllability(0, 3, np.zeros(3), names, np.zeros(robot.n), str(refusal))
+    return brackets_anywhere(robot, sliders)
 
 
 def _brackets(robot: SpaceRobot, shapes: Array, among: Sequence[int] | None) -> Controllability:
@@ -214,7 +202,7 @@ def _brackets(robot: SpaceRobot, shapes: Array, among: Sequence[int] | None) -> 
         )
     found = [best_triple(at, joints) for at in K]
     singular = np.linalg.svd(np.array([M for _, M in found]), compute_uv=False)
-    best = int(np.argmax(singular[:, 2] / np.maximum(singular[:, 0], _NO_TURN)))
+    best = int(np.argmax(singular[:, 2] / np.maximum(singular[:, 0], NO_TURN)))
     triple = tuple(names[i] for i in found[best][0])
     rank = min(rank, _rank(singular[best]))
     if len(shapes) == 1:
@@ -235,7 +223,7 @@ def _brackets(robot: SpaceRobot, shapes: Array, among: Sequence[int] | None) -> 
 
 def _rank(values: Array) -> int:
     """Return how many of descending singular values count."""
-    return int(np.sum(values > max(_NO_TURN, float(values[0]) / WORST_CONDITION)))
+    return int(np.sum(values > max(NO_TURN, float(values[0]) / WORST_CONDITION)))
 
 
 def _primes(count: int) -> Array:

@@ -105,11 +105,20 @@ class GaitMethod(ABC):
         self.control_period = control_period
         self.integration_step = integration_step
         self.options = self.Options() if options is None else options
+        self._setup()
 
-    @classmethod
-    def objection(cls, robot: SpaceRobot) -> str:
-        """Return why no goal of this robot can be planned, whatever the options; "" if some can."""
-        return ""
+    def _setup(self) -> None:  # noqa: B027 - methods that delegate have nothing to set up here
+        """Set up what follows from robot and options; called once, when they are there."""
+
+    @classmethod  # noqa: B027 - any robot is suitable by default
+    def require_suitable(cls, robot: SpaceRobot) -> None:
+        """Refuse a robot of which the method can plan no goal, whatever the options.
+
+        Raises
+        ------
+        PlanningError
+            It is such a robot; the sentence says why.
+        """
 
     @abstractmethod
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:

@@ -7,6 +7,10 @@ the first order misses is left for the next, which begins from the attitude that
 
 All edges are straight lines of the shape from rest to rest: what they turn the base by depends on
 the path alone, and held commands move along it.
+
+Loops go along joint axes and enclose given areas (figure 5) in the planes of the joints (1, 2),
+(2, 3) and (3, 1); an area is positive where the path goes round counter-clockwise. Six edges of a
+box enclose all three at once, rectangles one by one.
 """
 
 from __future__ import annotations
@@ -20,7 +24,6 @@ import numpy as np
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import attitude_error, quaternion_inverse, quaternion_multiply
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
@@ -29,9 +32,7 @@ from spacerobot_ros.planning.core.goal import Controlled, PoseError
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
-from spacerobot_ros.planning.methods.edge_path import EdgePath, edge_path
-from spacerobot_ros.planning.methods.nominal_choice import NominalChoice
-from spacerobot_ros.planning.methods.nominal_shape import NominalShape
+from spacerobot_ros.planning.methods.nominal_shape import PLANES, NominalChoice, NominalShape
 from spacerobot_ros.planning.methods.straight_legs import straight_motion
 
 _TRIALS = 6
@@ -39,6 +40,9 @@ _TRIALS = 6
 
 _ALL = 1.0 - 1e-9
 """A share k of the missing turn above this leaves nothing for the next cycle, but rounding."""
+
+_NEGLIGIBLE = 1e-3
+"""An area below this share of the largest counts as zero: a later cycle makes up for it."""
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -111,32 +115,28 @@ class AreaLoopGait(GaitMethod):
     Options: ClassVar[type[AreaLoopOptions]] = AreaLoopOptions
     options: AreaLoopOptions
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        control_period: float,
-        integration_step: float = DEFAULT_INTEGRATION_STEP,
-        options: AreaLoopOptions | None = None,
-    ) -> None:
-        super().__init__(robot, control_period, integration_step, options)
+    def _setup(self) -> None:
+        robot = self.robot
         chosen = self.options
-        # Planners exist before goals: an unsuitable robot is refused with the first one.
-        self._refusal = self.objection(robot)
         self._nominal = NominalChoice(robot, chosen.largest_edge, chosen.joints, chosen.nominal)
-        self._prediction = BasePrediction(robot, control_period, integration_step)
-        if not self._refusal:
+        self._prediction = BasePrediction(robot, self.control_period, self.integration_step)
+        # Planners exist before goals: an unsuitable robot is refused with the first one.
+        self._refusal: PlanningError | None = None
+        try:
+            self.require_suitable(robot)
             self._nominal.prepare()
+        except PlanningError as refusal:
+            self._refusal = refusal
 
     @classmethod
-    def objection(cls, robot: SpaceRobot) -> str:
-        """Return why loops of three joints cannot turn the robot about three axes."""
+    def require_suitable(cls, robot: SpaceRobot) -> None:
+        """Refuse robots that loops of three joints cannot turn about three axes."""
         if robot.n < 3:
-            return (
+            raise PlanningError(
                 f"area_loop needs three joints (paper 2); robot '{robot.description.name}' has "
                 f"{robot.n}."
             )
-        found = brackets_anywhere(robot)
-        return "" if found.controllable else found.sentence
+        brackets_anywhere(robot).require()
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan the way to the nominal shape and the next cycle; see :meth:`GaitMethod.plan`.
@@ -145,8 +145,8 @@ class AreaLoopGait(GaitMethod):
         ``longest`` bound what the goal takes, with the cycles before, which ``request.previous``
         counts.
         """
-        if self._refusal:
-            raise PlanningError(self._refusal)
+        if self._refusal is not None:
+            raise PlanningError(str(self._refusal))
         state, goal, tolerance = request.state, request.goal, request.tolerance
         self._require_rest(state)
         final = self._goal_shape(goal)
@@ -300,3 +300,82 @@ class _Gait:
 
     positions: Array
     attitudes: Array
+
+
+@dataclass(frozen=True)
+class EdgePath:
+    """Closed polygons, to be gone round one after the other.
+
+    Attributes
+    ----------
+    loops
+        Each (V, 3): the vertices in the order of travel, the first again at the end; the middle of
+        the box that holds them is the origin.
+    excess
+        By how much the longest edge is too long; 1: as long as it may be.
+    """
+
+    loops: tuple[Array, ...]
+    excess: float
+
+    @property
+    def kind(self) -> str:
+        """``cube``, ``rectangles`` or ``nothing``."""
+        if not self.loops:
+            return "nothing"
+        return "cube" if len(self.loops[0]) == 7 else "rectangles"
+
+
+def edge_path(areas: Array, longest: Array) -> EdgePath:
+    """Return the path that encloses ``areas`` (3,), its edges at most ``longest`` (3,) if possible.
+
+    The cube-like path is taken where its edges are short enough, or shorter than those of
+    rectangles. Areas that are too large give a path with ``excess`` over 1: edges go as the root
+    of the areas.
+    """
+    areas = np.where(np.abs(areas) > _NEGLIGIBLE * np.abs(areas).max(), areas, 0.0)
+    rectangles = _rectangles(areas, longest)
+    if np.all(areas != 0.0):
+        cube = _cube(areas, longest)
+        if cube.excess <= max(1.0, rectangles.excess):
+            return cube
+    return rectangles
+
+
+def cube_edges(areas: Array) -> tuple[Array, bool]:
+    """Return the edges ``d`` (3,) of the box, and whether its path is gone backwards.
+
+    Edges +d1, +d2, +d3, -d1, -d2, -d3 have the projected areas (d1 d2, d2 d3, -d1 d3); backwards
+    these change sign. No area may be zero.
+    """
+    S12, S23, S31 = areas
+    # The product of the projected areas is -(d1 d2 d3)^2.
+    backwards = bool(S12 * S23 * S31 > 0)
+    sense = -1.0 if backwards else 1.0
+    d1 = np.sqrt(abs(S12)) * np.sqrt(abs(S31 / S23))
+    d2 = sense * S12 / d1
+    return np.array([d1, d2, sense * S23 / d2]), backwards
+
+
+def _cube(areas: Array, longest: Array) -> EdgePath:
+    d, backwards = cube_edges(areas)
+    corners = np.vstack([np.zeros(3), np.cumsum(np.vstack([np.diag(d), -np.diag(d)]), axis=0)])
+    corners[-1] = 0.0
+    loop = corners - d / 2
+    excess = float(np.max(np.abs(d) / longest))
+    return EdgePath((loop[::-1] if backwards else loop,), excess)
+
+
+def _rectangles(areas: Array, longest: Array) -> EdgePath:
+    loops, excess = [], 0.0
+    for area, (i, j) in zip(areas, PLANES, strict=True):
+        if area == 0.0:
+            continue
+        # Both edges take the same share of what they may be.
+        share = np.sqrt(abs(area) / (longest[i] * longest[j]))
+        excess = max(excess, float(share))
+        loop = np.zeros((5, 3))
+        loop[:, i] = share * longest[i] * np.array([-0.5, 0.5, 0.5, -0.5, -0.5])
+        loop[:, j] = share * longest[j] * np.array([-0.5, -0.5, 0.5, 0.5, -0.5])
+        loops.append(loop if area > 0 else loop[::-1])
+    return EdgePath(tuple(loops), excess)

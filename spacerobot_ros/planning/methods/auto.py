@@ -48,9 +48,12 @@ class AutoGait(GaitMethod):
     ) -> None:
         super().__init__(robot, control_period, integration_step)
         self._candidates = candidates
-        self._objections = {
-            name: candidate.method.objection(robot) for name, candidate in candidates.items()
-        }
+        self._unsuitable: dict[str, str] = {}
+        for name, candidate in candidates.items():
+            try:
+                candidate.method.require_suitable(robot)
+            except PlanningError as refusal:
+                self._unsuitable[name] = str(refusal)
         self._built: dict[str, GaitMethod] = {}
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
@@ -63,10 +66,10 @@ class AutoGait(GaitMethod):
         PlanningError
             No method plans; the sentences of all of them say why.
         """
-        reasons = dict(self._objections)
+        reasons = dict(self._unsuitable)
         parts = frozenset[str]()
         for name in self._order(request):
-            if self._objections[name]:
+            if name in self._unsuitable:
                 continue
             method = self._method(name)
             pose = method.controls & POSE
@@ -86,7 +89,7 @@ class AutoGait(GaitMethod):
             return replace(schedule, notes=notes)
         raise PlanningError(
             f"No method plans this goal of robot '{self.robot.description.name}'. "
-            + " ".join(f"{name}: {reason}" for name, reason in reasons.items())
+            + " ".join(f"{name}: {reasons[name]}" for name in self._candidates)
         )
 
     def _order(self, request: PlanRequest) -> list[str]:
@@ -102,6 +105,6 @@ class AutoGait(GaitMethod):
     def _because(self, chosen: str, reasons: Mapping[str, str]) -> str:
         """Return the reasons against what comes before the chosen method, and that it suits."""
         names = list(self._candidates)
-        before = [reasons[name] for name in names[: names.index(chosen)] if reasons[name]]
+        before = [reasons[name] for name in names[: names.index(chosen)] if name in reasons]
         suits = f"{chosen} suits robot '{self.robot.description.name}'"
         return " ".join([f"{suits} and is the first that plans this goal.", *before])

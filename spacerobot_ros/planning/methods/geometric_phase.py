@@ -1,23 +1,36 @@
-"""How far a path of shapes turns the base of a planar robot: the geometric phase of paper 3.
+"""Planar robots, and how far a path of shapes turns their base: the geometric phase of paper 3.
 
-The attitude is one angle theta about the axis of the robot. At zero angular momentum
+A planar robot's joints all turn about parallel axes, and nothing tilts its base. The attitude is
+one angle theta about the axis of the robot. At zero angular momentum
 ``theta_dot = -s(psi)' psi_dot`` (eq. 3), where ``s_i = N_i / D`` is the component about the axis of
 the mechanical connection, ``D`` the inertia of the locked robot about the axis and ``N_i`` its
 coupling to joint i. The turn along a path of shapes is the line integral of ``-s`` (eq. 11): it
 depends on the path and not on the speed.
+
+Small loops turn the base most where the curvature is largest (remark 2). Boxes (2, 2) are lower
+over upper bounds of two joints, rad.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
 
+from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.planar import planar_axis
+from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.planning.core.controllability import NO_TURN, Controllability, shape_box
+
+_OUT_OF_PLANE = 1e-5
+"""Largest tilt of an axis, and turn about other axes a radian of a joint, that counts as planar:
+as much as angles written with six digits leave."""
+
+_SAMPLES = 8
+"""Shapes at which it is tested whether a robot stays in its plane."""
 
 _PANEL = 0.5
 """Longest piece of a leg that one Gauss rule integrates, rad."""
@@ -33,6 +46,100 @@ _SLOPE = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 _CORNERS = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 """Corners of the unit square, counter-clockwise."""
+
+_GRID_STEP = math.radians(15.0)
+_REFINEMENTS = 8
+_MOST_PEAKS = 4
+
+_EQUAL = 1e-4
+"""Peaks of the curvature that differ by less than this share are equally good, ..."""
+
+_EQUALLY_NEAR = 1e-2
+"""... and equally near where their distances differ by less than this, rad."""
+
+_AROUND = np.array([[x, y] for x in (0.0, -1.0, 1.0) for y in (0.0, -1.0, 1.0)])
+"""A point and its eight neighbours; the point itself comes first and wins a tie."""
+
+
+def planar_axis(robot: SpaceRobot) -> Array:
+    """Return the unit vector (3,), base components, that a planar robot of three links turns about.
+
+    Its largest component is positive, however the joints are oriented.
+
+    Raises
+    ------
+    PlanningError
+        The robot has fewer than three links or is not planar; the sentence names the joint.
+    """
+    name, bodies = robot.description.name, robot.description.bodies
+    if len(bodies) < 3:
+        raise PlanningError(
+            f"Robot '{name}' has {len(bodies)} link(s) that move against each other: with fewer "
+            "than three, motions of the joints cannot reorient a planar robot (paper 3, section "
+            "III)."
+        )
+    axes: list[Array] = []
+    rotations = [np.eye(3)]
+    for body, joint in zip(bodies[1:], robot.description.movable_joints, strict=True):
+        if joint.kind is JointKind.PRISMATIC:
+            raise PlanningError(
+                f"Robot '{name}' is not planar in the sense of paper 3: joint '{joint.name}' "
+                "slides, and all joints must turn about parallel axes."
+            )
+        # Joints about parallel axes leave all axes where they are: one shape tells.
+        rotations.append(rotations[body.parent] @ body.origin.R)
+        axes.append(rotations[-1] @ joint.axis)
+        if np.linalg.norm(np.cross(axes[0], axes[-1])) > _OUT_OF_PLANE:
+            raise PlanningError(
+                f"Robot '{name}' is not planar: the axis of joint '{joint.name}' is not parallel "
+                f"to that of joint '{robot.joint_names[0]}'."
+            )
+    axis = axes[0] * math.copysign(1.0, axes[0][np.argmax(np.abs(axes[0]))])
+    _require_turn_about(robot, axis)
+    return axis
+
+
+def _require_turn_about(robot: SpaceRobot, axis: Array) -> None:
+    """Refuse masses off the plane and products of inertia that tilt the base."""
+    # The tilt is a ratio of trigonometric polynomials of the shape: it is zero everywhere or
+    # almost nowhere, and a few shapes in general position tell which.
+    shapes = np.outer(np.arange(1, _SAMPLES + 1), np.sqrt(np.arange(2, robot.n + 2)))
+    A = robot.function("connection", compile=False)(shapes.T).full()[3:]
+    tilts = np.linalg.norm(A - np.outer(axis, axis @ A), axis=0).reshape(_SAMPLES, robot.n)
+    worst = np.unravel_index(np.argmax(tilts), tilts.shape)
+    if tilts[worst] > _OUT_OF_PLANE:
+        raise PlanningError(
+            f"Robot '{robot.description.name}' is not planar: joint "
+            f"'{robot.joint_names[worst[1]]}' also turns the base about other axes than its own, "
+            f"by up to {tilts[worst]:.2g} rad a rad; mass centres outside of one plane or products "
+            "of inertia do that."
+        )
+
+
+def planar_chain(robot: SpaceRobot) -> Controllability:
+    """Return the test of paper 3: a planar robot of three or more links, with curvature."""
+    names, rest = robot.joint_names, np.zeros(robot.n)
+    try:
+        phase = PlanarPhase(robot)
+    except PlanningError as refusal:
+        return Controllability(0, 1, np.zeros(3), names, rest, str(refusal))
+    box = np.stack(shape_box(robot))
+    middle = box.mean(axis=0)
+    tops = []
+    for i, j in itertools.combinations(range(robot.n), 2):
+        plane, shape = phase.plane(middle, i, j), middle.copy()
+        shape[[i, j]] = curvature_peaks(plane, middle[[i, j]], box[np.newaxis, :, [i, j]])[0]
+        tops.append((abs(float(plane.curvature(shape[[i, j]]))), (names[i], names[j]), shape))
+    largest, pair, shape = max(tops, key=lambda top: top[0])
+    sentence = (
+        f"{robot.n + 1} links in a plane: loops of joints '{pair[0]}' and '{pair[1]}' turn the "
+        f"base by up to {largest:.3g} rad a unit of area, round {np.round(shape, 3).tolist()} "
+        "(paper 3)."
+    )
+    if largest <= NO_TURN:
+        sentence = f"Loops of the joints of robot '{robot.description.name}' do not turn its base."
+    values = np.array([largest, 0.0, 0.0])
+    return Controllability(int(largest > NO_TURN), 1, values, pair, shape, sentence)
 
 
 class PlanarPhase:
@@ -144,3 +251,56 @@ def _along(s: Callable[[Array], Array], starts: Array, ends: Array) -> Array:
     weights = np.tile(_WEIGHTS, count) / count
     shapes = starts[:, np.newaxis] + along[:, np.newaxis] * moves[:, np.newaxis]
     return np.asarray(-np.einsum("p,lpn,ln->l", weights, s(shapes), moves))
+
+
+def centre_box(at: Array, lower: Array, upper: Array) -> Array:
+    """Return the box in which every point within the limits (2,) is found once.
+
+    Shapes repeat after a turn: a joint that goes further than once round has all its points within
+    half a turn of ``at`` (2,), or of the end of its range that is nearest to that.
+    """
+    width = np.minimum(upper - lower, 2 * math.pi)
+    start = np.clip(at - width / 2, lower, upper - width)
+    return np.stack([start, start + width])
+
+
+def curvature_peaks(plane: PhasePlane, at: Array, boxes: Array) -> Array:
+    """Return the points (R, 2) of the largest |curvature| in boxes (R, 2, 2).
+
+    Of equally good points it is the one that is nearest to ``at`` (2,).
+    """
+    # Joints without limits have the same box for squares of all sizes.
+    flat, row = np.unique(boxes.reshape(-1, 4), axis=0, return_inverse=True)
+    boxes = flat.reshape(-1, 2, 2)
+    tops = [_tops(plane, box) for box in boxes]
+    points = np.vstack(tops)
+    owner = np.repeat(np.arange(len(boxes)), [len(found) for found in tops])
+    lower, upper = boxes[owner, :1], boxes[owner, 1:]
+    step = _GRID_STEP
+    for _ in range(_REFINEMENTS):
+        step /= 2
+        near = np.clip(points[:, np.newaxis] + step * _AROUND, lower, upper)
+        around = np.abs(plane.curvature(near))
+        points = near[np.arange(len(points)), np.argmax(around, axis=1)]
+    heights = around.max(axis=1)
+    distances = np.linalg.norm(points - at, axis=1)
+    chosen = []
+    for k in range(len(boxes)):
+        mine = np.flatnonzero(owner == k)
+        good = mine[heights[mine] >= (1 - _EQUAL) * heights[mine].max()]
+        nearest = good[distances[good] <= distances[good].min() + _EQUALLY_NEAR]
+        # The last one in order, so that rounding does not choose between mirror images.
+        chosen.append(max(points[nearest].tolist()))
+    return np.array(chosen)[row.ravel()]
+
+
+def _tops(plane: PhasePlane, box: Array) -> Array:
+    """Return the highest local maxima (P, 2) of |curvature| on a grid over a box."""
+    from scipy.ndimage import maximum_filter  # Slow to import: only what plans squares needs it.
+
+    axes = [np.linspace(low, high, 1 + math.ceil((high - low) / _GRID_STEP)) for low, high in box.T]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    heights = np.abs(plane.curvature(grid))
+    tops = np.flatnonzero(heights == maximum_filter(heights, size=3, mode="nearest"))
+    order = np.argsort(-heights.ravel()[tops], kind="stable")
+    return grid.reshape(-1, 2)[tops[order[:_MOST_PEAKS]]]

@@ -15,12 +15,10 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import (
     attitude_error,
     matrix_from_quaternion,
@@ -33,10 +31,10 @@ from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import (
     WORST_CONDITION,
     best_triple,
+    require_three_slots,
     sliders_of,
     sliding_masses,
     slot_matrix,
-    slot_objection,
 )
 from spacerobot_ros.planning.core.goal import Goal, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
@@ -104,26 +102,19 @@ class LieBracketGait(GaitMethod):
     Options: ClassVar[type[LieBracketOptions]] = LieBracketOptions
     options: LieBracketOptions
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        control_period: float,
-        integration_step: float = DEFAULT_INTEGRATION_STEP,
-        options: LieBracketOptions | None = None,
-    ) -> None:
-        super().__init__(robot, control_period, integration_step, options)
+    def _setup(self) -> None:
+        robot = self.robot
         # Whole ticks a cycle: every cycle is then the same commands and the same rotation.
         self.ticks_a_cycle = max(
-            round(self.options.cycle_period / control_period), _FEWEST_TICKS_A_CYCLE
+            round(self.options.cycle_period / self.control_period), _FEWEST_TICKS_A_CYCLE
         )
         self.sliders = sliders_of(robot)
-        self._prediction = BasePrediction(robot, control_period, integration_step)
+        self._prediction = BasePrediction(robot, self.control_period, self.integration_step)
 
     @classmethod
-    def objection(cls, robot: SpaceRobot) -> str:
-        """Return which of the conditions of paper 1 the sliders do not meet."""
-        found = sliding_masses(robot)
-        return "" if found.controllable else found.sentence
+    def require_suitable(cls, robot: SpaceRobot) -> None:
+        """Refuse robots whose sliders do not fulfil the conditions of paper 1."""
+        sliding_masses(robot).require()
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan steps 1 to 3; see :meth:`GaitMethod.plan`."""
@@ -156,8 +147,7 @@ class LieBracketGait(GaitMethod):
         # The system's mass centre stays: r_f + R_f c(zf) = r_0 + R_0 c(z0).
         shift = Rf.T @ (state.position + R0 @ c0 - goal.position) - c0
         P = slot_matrix(robot, state.q, self.sliders)
-        if objection := slot_objection(robot, P):
-            raise PlanningError(objection)
+        require_three_slots(robot, P)
         z0, lower, upper = (x[self.sliders] for x in (state.q, robot.lower, robot.upper))
         dz: Array = np.linalg.lstsq(P, shift, rcond=None)[0].astype(float)
         if np.any(z0 + dz < lower) or np.any(z0 + dz > upper):
@@ -170,6 +160,8 @@ class LieBracketGait(GaitMethod):
         self, P: Array, shift: Array, z0: Array, dz: Array, lower: Array, upper: Array
     ) -> Array:
         """Spread the displacement over more than three sliders, or name the stroke too short."""
+        from scipy.optimize import lsq_linear  # Slow to import, and few goals need it.
+
         # Bounds must differ for the solver; a slider at its end gets a hair of room.
         room = 1e-12 * (1.0 + np.abs(upper - lower))
         bounded = lsq_linear(P, shift, (lower - z0 - room, upper - z0 + room), method="bvls")

@@ -1,4 +1,10 @@
-"""Which parts of a goal are to be met, and what that asks of the joints."""
+"""What a goal asks of the joints: which of its parts are to be reached, and whether they can be.
+
+At zero momentum ``omega_WB_B = F(q) qdot``. Where all columns of F are along one axis the base
+turns about that axis only, by an angle. Otherwise the brackets of the columns fill up the
+rotations, provided that the curvature of the connection is not zero everywhere (paper 1,
+section 4).
+"""
 
 from __future__ import annotations
 
@@ -9,25 +15,58 @@ import numpy as np
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_inverse,
     quaternion_multiply,
 )
-from spacerobot_ros.planning.core.goal import Controlled, Goal, RobotState, Tolerance
-from spacerobot_ros.planning.methods.optimal.limits import MotionLimits
-from spacerobot_ros.planning.methods.optimal.reach import Turning, shape_for_center, slides_anywhere
-from spacerobot_ros.planning.methods.optimal.trajectory import Task
+from spacerobot_ros.planning.core.controllability import (
+    curvatures,
+    require_three_slots,
+    sample_shapes,
+    shape_box,
+    sliders_of,
+    slot_matrix,
+)
+from spacerobot_ros.planning.core.goal import Controlled
+from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
+from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions, MotionLimits
 
 _NO_ROTATION = 1e-9
 
+_SAMPLES = 12
+"""Shapes in general position at which a robot is asked what it can do."""
+
+_NONE = 1e-7
+"""Singular values below this share of the largest count as zero."""
+
+_STILL = 1e-12
+"""Turn of the base a metre or radian of the joints that is none, rad."""
+
+_TRIES = 8
+"""Shapes from which one that puts the base somewhere is looked for."""
+
+_BEYOND = 1e-9
+"""Rounding that a joint may be beyond its limits by, m or rad."""
+
+_ON_THE_SPOT = 1e-10
+"""Distance from where the base is to be that counts as there, m."""
+
 
 @dataclass(frozen=True)
-class Wishes:
-    """The parts of a goal that one robot's manoeuvres meet.
+class GoalSpecification:
+    """The parts of a goal that one robot's manoeuvres reach.
 
-    ``same_shape`` says that goals without a shape of their own end in the one they start from.
+    Attributes
+    ----------
+    position, attitude
+        Whether these are parts of it.
+    same_shape
+        Whether goals without a shape of their own end in the one that they start from.
+    turning
+        How the joints turn the base.
     """
 
     position: bool
@@ -36,12 +75,14 @@ class Wishes:
     turning: Turning
 
     @classmethod
-    def of(
-        cls, robot: SpaceRobot, position: int = 0, attitude: int = 1, final_shape: int = 0
-    ) -> Wishes:
-        """Return the wishes of a method's options (see ``OptimalGait.options``)."""
-        wanted = slides_anywhere(robot) if position == 0 else position == 1
-        return cls(wanted, bool(attitude), bool(final_shape), Turning.of(robot))
+    def of(cls, robot: SpaceRobot, options: OptimalOptions) -> GoalSpecification:
+        """Return what the options make of the goals of a robot."""
+        position = options.base_position == 1
+        if options.base_position == 0:
+            position = slides_anywhere(robot)
+        return cls(
+            position, bool(options.base_attitude), bool(options.final_shape), Turning.of(robot)
+        )
 
     @property
     def controls(self) -> frozenset[Controlled]:
@@ -55,54 +96,67 @@ class Wishes:
 
     @property
     def axes(self) -> Array:
-        """Directions (m, 3) in the base along which the attitude is to be met."""
+        """Directions (m, 3) in the base along which the attitude is to be reached."""
         return self.turning.axes if self.attitude else np.zeros((0, 3))
 
-    def objection(self, robot: SpaceRobot) -> str:
-        """Return why none of these goals can be planned for the robot, "" if some can."""
+    def require_suitable(self, robot: SpaceRobot) -> None:
+        """Refuse a robot for which no such goal can be planned.
+
+        Raises
+        ------
+        PlanningError
+            There is none; the sentence says why.
+        """
         name = robot.description.name
         if robot.n == 0:
-            return f"Robot '{name}' has no joints that could move its base."
+            raise PlanningError(f"Robot '{name}' has no joints that could move its base.")
         if self.attitude and self.turning.moves and not len(self.turning.axes):
-            return (
+            raise PlanningError(
                 f"The attitude of robot '{name}' is uncontrollable: whatever its joints do, its "
                 "base only turns to and fro along one curve of attitudes; with "
                 "optimal.base_attitude 0 the attitude of the goal is ignored."
             )
-        return ""
 
-    def task(
+    def boundary_conditions(
         self,
         robot: SpaceRobot,
-        state: RobotState,
-        goal: Goal,
+        request: PlanRequest,
         shape: Array | None,
         limits: MotionLimits,
-        tolerance: Tolerance,
         direction_W: Array | None,
-    ) -> Task:
-        """Return what is asked; ``shape`` (n,) is the goal's, within the strokes.
+    ) -> BoundaryConditions:
+        """Return the boundary conditions of a request.
+
+        Parameters
+        ----------
+        robot, request, limits
+            For whom, what, and within which limits.
+        shape
+            (n,) of the goal, within the joint limits; None: any.
+        direction_W
+            (3,) kept direction of the path constraints, if there is one.
 
         Raises
         ------
         PlanningError
             A part of the goal is out of the robot's reach.
         """
-        if refusal := self.objection(robot):
-            raise PlanningError(refusal)
+        self.require_suitable(robot)
+        state, goal, tolerance = request.state, request.goal, request.tolerance
         turn = quaternion_multiply(quaternion_inverse(state.quaternion), goal.quaternion)
         if shape is None and self.same_shape:
             shape = state.q
         if self.attitude:
-            self._require_turn(robot, turn, shape, tolerance)
+            self._require_turn(robot, turn, shape, tolerance.attitude)
         R_WB = matrix_from_quaternion(state.quaternion)
         direction = np.zeros(3) if direction_W is None else R_WB.T @ direction_W
         if not self.position:
-            return Task(state.q, turn, state.q if shape is None else shape, shape, None, direction)
+            likely = state.q if shape is None else shape
+            return BoundaryConditions(state.q, turn, likely, shape, None, direction)
         if not self.attitude:
             raise PlanningError(
-                "The position of the base depends on its attitude: optimal meets it together with "
-                "the attitude (optimal.base_attitude 1)."
+                "The position of the base depends on its attitude: optimal reaches it together "
+                "with the attitude (optimal.base_attitude 1)."
             )
         # r + R c(q) is the centre of mass and stays: so c(q_f) is known.
         r_cm = state.position + R_WB @ robot.center_of_mass(state.q)
@@ -115,15 +169,15 @@ class Wishes:
                     "without thrust the centre of mass stays where it is. Leave the shape out, or "
                     "ignore the position with optimal.base_position 2."
                 )
-            return Task(state.q, turn, shape, shape, None, direction)
+            return BoundaryConditions(state.q, turn, shape, shape, None, direction)
         likely = shape_for_center(robot, limits, state.q, center)
         # Three coordinates have few shapes for one centre of mass, or one.
         if robot.n <= 3:
-            return Task(state.q, turn, likely, likely, None, direction)
-        return Task(state.q, turn, likely, None, center, direction)
+            return BoundaryConditions(state.q, turn, likely, likely, None, direction)
+        return BoundaryConditions(state.q, turn, likely, None, center, direction)
 
     def _require_turn(
-        self, robot: SpaceRobot, turn: Array, shape: Array | None, tolerance: Tolerance
+        self, robot: SpaceRobot, turn: Array, shape: Array | None, tolerance: float
     ) -> None:
         """Refuse attitudes that the joints cannot bring about."""
         axes, name = self.turning.axes, robot.description.name
@@ -131,7 +185,7 @@ class Wishes:
         about = axes @ vector
         across = float(np.linalg.norm(vector - axes.T @ about))
         tilt = 2 * math.atan2(across, math.hypot(float(np.linalg.norm(about)), scalar))
-        if tilt > max(tolerance.attitude, _NO_ROTATION):
+        if tilt > max(tolerance, _NO_ROTATION):
             if not len(axes):
                 raise PlanningError(
                     f"The attitude of robot '{name}' is uncontrollable: its joints do not turn its "
@@ -147,3 +201,148 @@ class Wishes:
                 f"The attitude of robot '{name}' is uncontrollable where the final shape is given: "
                 "loops of its joints do not turn its base."
             )
+
+
+@dataclass(frozen=True)
+class Turning:
+    """How motions of the joints turn the base.
+
+    Attributes
+    ----------
+    axes
+        (m, 3) in base components: one unit vector for a planar robot, the unit matrix where all
+        attitudes can be reached, none where the joints do not turn the base or only to and fro
+        along one curve of attitudes.
+    moves
+        Whether they turn it at all.
+    loops
+        Whether closed loops of the shape turn it.
+    """
+
+    axes: Array
+    moves: bool
+    loops: bool
+
+    @classmethod
+    def of(cls, robot: SpaceRobot) -> Turning:
+        """Find out from a few shapes in general position."""
+        none = np.zeros((0, 3))
+        if robot.n == 0:
+            return cls(none, moves=False, loops=False)
+        shapes = sample_shapes(robot, _SAMPLES)
+        A = robot.function("connection", compile=False)(shapes.T).full()[3:]
+        U, sizes, _ = np.linalg.svd(A, full_matrices=False)
+        if sizes[0] <= _STILL:
+            return cls(none, moves=False, loops=False)
+        loops = bool(np.abs(curvatures(robot, shapes)).max() > _NONE * sizes[0])
+        if np.sum(sizes > _NONE * sizes[0]) == 1:
+            axis = U[:, 0] * np.sign(U[np.argmax(np.abs(U[:, 0])), 0])
+            return cls(axis[np.newaxis], moves=True, loops=loops)
+        return cls(np.eye(3) if loops else none, moves=True, loops=loops)
+
+
+def slides_anywhere(robot: SpaceRobot) -> bool:
+    """Whether sliders can put the base anywhere: their slots are along three directions."""
+    try:
+        require_three_slots(
+            robot, slot_matrix(robot, np.mean(shape_box(robot), axis=0), sliders_of(robot))
+        )
+    except PlanningError:
+        return False
+    return True
+
+
+def center_rate(robot: SpaceRobot, q: Array) -> Array:
+    """Return ``dc/dq`` (3, n) of the centre of mass in base components: ``-A_v + c x A_omega``."""
+    A = robot.connection(q)
+    return np.asarray(A[:3] - np.cross(robot.center_of_mass(q), A[3:], axisb=0, axisc=0))
+
+
+def shape_for_center(robot: SpaceRobot, limits: MotionLimits, start: Array, wanted: Array) -> Array:
+    """Return the shape (n,), near ``start``, whose centre of mass is at ``wanted`` (3,), m, in B.
+
+    Raises
+    ------
+    PlanningError
+        None was found within the limits: the base cannot be where the goal wants it.
+    """
+    lower, upper = limits.lower, limits.upper
+    # The solver wants room between its bounds.
+    room = 1e-9 * (1 + np.abs(start))
+    middle, half = limits.span(start)
+    from scipy.optimize import least_squares  # Slow to import, and few goals need it.
+
+    rng = np.random.default_rng(0)
+    best, miss = start, np.inf
+    for attempt in range(_TRIES):
+        guess = start if attempt == 0 else middle + half * rng.uniform(-0.9, 0.9, robot.n)
+        found = least_squares(
+            lambda q: robot.center_of_mass(q) - wanted,
+            np.clip(guess, lower, upper),
+            lambda q: center_rate(robot, q),
+            bounds=(lower - room, upper + room),
+            xtol=1e-15,
+            ftol=1e-15,
+            gtol=1e-15,
+        )
+        q = np.clip(found.x, lower, upper)
+        distance = float(np.linalg.norm(robot.center_of_mass(q) - wanted))
+        if distance < miss:
+            best, miss = q, distance
+        if miss <= 1e-6:
+            break
+    found = nearest_for_center(robot, limits, best, wanted)
+    if found is not None:
+        return found
+    raise _out_of_reach(robot, limits, best, wanted)
+
+
+def nearest_for_center(
+    robot: SpaceRobot, limits: MotionLimits, near: Array, wanted: Array
+) -> Array | None:
+    """Return the shape (n,) next to ``near`` whose centre of mass is at ``wanted`` (3,) exactly."""
+    q = _free_shape(robot, near, wanted)
+    if np.maximum(limits.lower - q, q - limits.upper).max() > _BEYOND:
+        return near if _distance(robot, near, wanted) <= _ON_THE_SPOT else None
+    q = np.clip(q, limits.lower, limits.upper)
+    return q if _distance(robot, q, wanted) <= _ON_THE_SPOT else None
+
+
+def _free_shape(robot: SpaceRobot, near: Array, wanted: Array) -> Array:
+    """Return a shape by Newton's method, whatever the limits."""
+    q = near.copy()
+    for _ in range(20):
+        miss = wanted - robot.center_of_mass(q)
+        if np.linalg.norm(miss) <= 1e-14:
+            break
+        q = q + np.linalg.lstsq(center_rate(robot, q), miss, rcond=1e-9)[0]
+    return q
+
+
+def _distance(robot: SpaceRobot, q: Array, wanted: Array) -> float:
+    return float(np.linalg.norm(robot.center_of_mass(q) - wanted))
+
+
+def _out_of_reach(
+    robot: SpaceRobot, limits: MotionLimits, near: Array, wanted: Array
+) -> PlanningError:
+    """Return why no shape puts the base where it is wanted; ``near`` (n,) comes nearest."""
+    free = _free_shape(robot, near, wanted)
+    far = float(np.linalg.norm(free - near))
+    if _distance(robot, free, wanted) <= _ON_THE_SPOT and far < 10 * np.linalg.norm(
+        limits.span(near)[1]
+    ):
+        beyond = np.maximum(limits.lower - free, free - limits.upper)
+        worst = int(np.argmax(beyond))
+        joint = robot.description.movable_joints[worst]
+        unit = "m" if joint.kind is JointKind.PRISMATIC else "rad"
+        return PlanningError(
+            f"The goal is beyond the joint limits: it needs joint '{joint.name}' at "
+            f"{free[worst]:.4g} {unit}, and optimal keeps it in [{limits.lower[worst]:.4g}, "
+            f"{limits.upper[worst]:.4g}] {unit}."
+        )
+    return PlanningError(
+        "The goal position is out of reach: without thrust the centre of mass stays where it is, "
+        f"and the nearest that the joints of '{robot.description.name}' were found to put the base "
+        f"is {_distance(robot, near, wanted):.3g} m from it."
+    )

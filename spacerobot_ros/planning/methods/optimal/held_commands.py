@@ -1,7 +1,7 @@
 """From a smooth trajectory to commands that are held for a tick, and end on the goal exactly.
 
 The shapes at the ticks are points of the trajectory; between them the shape moves along chords,
-with velocities that are means over a tick. So strokes, velocities and accelerations keep their
+with velocities that are means over a tick. So joints, velocities and accelerations keep their
 limits, but the areas of the chords' loops are not quite those of the curves, nor is the solution's
 attitude that of the plant's integration. Newton's method bends the path by a few smooth waves until
 the plant's own prediction ends on the goal. The first variation of the final attitude is
@@ -23,13 +23,16 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import attitude_error, matrix_from_quaternion
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.methods.optimal.limits import MotionLimits
-from spacerobot_ros.planning.methods.optimal.trajectory import Task, Trajectory
+from spacerobot_ros.planning.methods.optimal.problem import (
+    BoundaryConditions,
+    MotionLimits,
+    Trajectory,
+)
 
 _WAVES = 6
 """Waves of a joint that a path is bent by."""
 
-_MET = 1e-11
+_REACHED = 1e-11
 """Attitude error that is as good as none, rad."""
 
 _MOST_STEPS = 25
@@ -41,7 +44,7 @@ _WITHIN = 1e-9
 """Rounding that a limit may be exceeded by, relative."""
 
 _SHYNESS = 0.02
-"""Share of the half stroke, off its ends, within which a path is bent less."""
+"""Share of half a joint's range, off its ends, within which a path is bent less."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class HeldCommands:
 class CommandHolder:
     """Turns trajectories of one robot into held commands.
 
-    ``axes`` (m, 3) are the directions in the base along which the attitude is met.
+    ``axes`` (m, 3) are the directions in the base along which the attitude is reached.
     """
 
     def __init__(
@@ -73,14 +76,14 @@ class CommandHolder:
     def hold(
         self,
         trajectory: Trajectory,
-        task: Task,
+        boundary: BoundaryConditions,
         final: Array,
         limits: MotionLimits,
         *,
         fewest_ticks: int = 1,
         fixed: bool = False,
     ) -> HeldCommands | None:
-        """Return the commands of a trajectory that end in ``final`` (n,) and the task's attitude.
+        """Return the commands of a trajectory that end in ``final`` (n,) and the goal attitude.
 
         They take the trajectory's time, rounded up to ticks, or as much longer as it takes to keep
         the limits (``fixed``: not longer); None where that is not found.
@@ -88,7 +91,7 @@ class CommandHolder:
         ticks = max(fewest_ticks, math.ceil(trajectory.duration / self._period - 1e-6))
         most = ticks if fixed else math.ceil(_LONGEST_STRETCH * ticks) + 4
         for _ in range(_MOST_STRETCHES):
-            held = self._bent(trajectory.at_ticks(ticks), task, final, limits)
+            held = self._bent(trajectory.at_ticks(ticks), boundary, final, limits)
             if held is None:
                 return None
             factor, overrun = limits.excess(held.positions, self._period)
@@ -102,22 +105,22 @@ class CommandHolder:
         return None
 
     def _bent(
-        self, positions: Array, task: Task, final: Array, limits: MotionLimits
+        self, positions: Array, boundary: BoundaryConditions, final: Array, limits: MotionLimits
     ) -> HeldCommands | None:
-        """Bend shapes (N + 1, n) until they end in the task's attitude; None if they do not."""
+        """Bend shapes (N + 1, n) until they end in the goal attitude; None if they do not."""
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         # The solver's last shape is the wanted one to its own precision.
         positions = positions + s**3 * (10 - 15 * s + 6 * s**2) * (final - positions[-1])
         positions = np.clip(positions, limits.lower, limits.upper)
-        positions[0], positions[-1] = task.start, final
+        positions[0], positions[-1] = boundary.start, final
         waves, best = self._waves(positions, limits), math.inf
         for _ in range(_MOST_STEPS):
             quaternions = self._prediction.attitudes(
                 positions, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
             )
-            error = self._axes @ attitude_error(quaternions[-1], task.turn)
+            error = self._axes @ attitude_error(quaternions[-1], boundary.turn)
             miss = float(np.linalg.norm(error))
-            if miss <= _MET or (miss <= 1e3 * _MET and miss > best / 2):
+            if miss <= _REACHED or (miss <= 1e3 * _REACHED and miss > best / 2):
                 return HeldCommands(positions, quaternions, miss)
             if miss > 2 * best:
                 return None

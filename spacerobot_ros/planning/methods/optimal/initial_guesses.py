@@ -22,21 +22,24 @@ from spacerobot_ros.model.rotations import (
     quaternion_from_rotvec,
     quaternion_multiply,
 )
-from spacerobot_ros.planning.methods.optimal.limits import MotionLimits
-from spacerobot_ros.planning.methods.optimal.trajectory import Task, Trajectory
+from spacerobot_ros.planning.methods.optimal.problem import (
+    BoundaryConditions,
+    MotionLimits,
+    Trajectory,
+)
 
 _CANDIDATES = 24
 """Loops of one kind from which the one that ends nearest to the goal is taken."""
 
 _WIDEST = 0.85
-"""Share of the half strokes that a guess uses at most."""
+"""Share of half the joints' ranges that a guess uses at most."""
 
 Loop = Callable[[np.random.Generator, Array, int], Array]
 """A closed path (N + 1, n) of order one at instants (N + 1,) from 0 to 1."""
 
 
 class InitialGuesses:
-    """Guesses for one task, endlessly many, the same ones every time.
+    """Guesses for boundary conditions, endlessly many, the same ones every time.
 
     Parameters
     ----------
@@ -50,21 +53,23 @@ class InitialGuesses:
         self._turn, self._curvature = turn, curvature
         self._instants = np.linspace(0.0, 1.0, intervals + 1)
 
-    def of(self, task: Task, limits: MotionLimits, final: Array) -> Iterator[Trajectory]:
+    def of(
+        self, boundary: BoundaryConditions, limits: MotionLimits, final: Array
+    ) -> Iterator[Trajectory]:
         """Yield guesses that end in the shape ``final`` (n,)."""
         rng = np.random.default_rng(1)
-        half = limits.span(task.start)[1]
-        direct = self._trajectory(self._direct(task.start, final), limits)
-        missing = attitude_error(direct.quaternions[-1], task.turn)
+        half = limits.span(boundary.start)[1]
+        direct = self._trajectory(self._direct(boundary.start, final), limits)
+        missing = attitude_error(direct.quaternions[-1], boundary.turn)
         size = min(1.0, self._size(final, half, float(np.linalg.norm(missing))))
         for number in itertools.count():
             loop = _LOOPS[number % len(_LOOPS)]
             found: list[tuple[float, Trajectory]] = []
             for _ in range(_CANDIDATES):
                 rounds = size * rng.uniform(0.3, 1.5) * loop(rng, self._instants, len(half))
-                shapes = self._path(rounds, task.start, final, limits)
+                shapes = self._path(rounds, boundary.start, final, limits)
                 trajectory = self._trajectory(shapes, limits)
-                left = attitude_error(trajectory.quaternions[-1], task.turn)
+                left = attitude_error(trajectory.quaternions[-1], boundary.turn)
                 found.append((float(np.linalg.norm(left)), trajectory))
             yield min(found, key=lambda entry: entry[0])[1]
 
@@ -73,16 +78,16 @@ class InitialGuesses:
         return start + np.outer(s**3 * (10 - 15 * s + 6 * s**2), final - start)
 
     def _path(self, rounds: Array, start: Array, final: Array, limits: MotionLimits) -> Array:
-        """Return shapes (N + 1, n) that go round, in half strokes, on the direct way."""
+        """Return shapes (N + 1, n) of loops, in half ranges, on the direct way."""
         direct = self._direct(start, final)
         middle, half = limits.span(start)
-        # Within most of the strokes, or as far out as the direct way is.
+        # Within most of the joint limits, or as far out as the direct way is.
         room = np.maximum(_WIDEST * half, np.abs(direct - middle))
         shapes = np.clip(direct + half * rounds, middle - room, middle + room)
         return np.clip(shapes, limits.lower, limits.upper)
 
     def _size(self, q: Array, half: Array, angle: float) -> float:
-        """Return how much of the half strokes a loop takes that turns the base by ``angle``."""
+        """Return how much of the half ranges a loop takes that turns the base by ``angle``."""
         n = len(q)
         K = np.abs(self._curvature(q).full()[3:]).sum(axis=0).reshape(n, n)
         largest = float((K * np.outer(half, half)).max())

@@ -1,33 +1,48 @@
 """Time-optimal manoeuvres within real limits, for any free-floating robot.
 
-The manoeuvre is the solution of an optimal control problem (:mod:`.optimal_control`) that begins at
-guesses with loops (:mod:`.initial_guesses`), made into held commands that end on the goal
+The manoeuvre is the solution of an optimal control problem (:mod:`.multiple_shooting`) that begins
+at guesses with loops (:mod:`.initial_guesses`), made into held commands that end on the goal
 (:mod:`.held_commands`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+import hashlib
+import json
+import logging
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import ClassVar
 
+import casadi as ca
 import numpy as np
 
+from spacerobot_ros import __version__
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
-from spacerobot_ros.parameters import parameter, values_of
+from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
-from spacerobot_ros.planning.methods.optimal.constraints import PathConstraints
-from spacerobot_ros.planning.methods.optimal.goal_specification import Wishes
-from spacerobot_ros.planning.methods.optimal.limits import MotionLimits, per_joint
-from spacerobot_ros.planning.methods.optimal.plan_cache import PlanCache, plan_key
-from spacerobot_ros.planning.methods.optimal.search import Effort, Found, ManoeuvreSearch
+from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
+from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
+from spacerobot_ros.planning.methods.optimal.problem import (
+    CandidateError,
+    MotionLimits,
+    PathConstraints,
+    per_joint,
+)
+from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch, SearchBudget
+
+_LOG = logging.getLogger(__name__)
 
 _CORRECTION_INTERVALS = 40
 
@@ -35,205 +50,110 @@ _NOTHING_LEFT = 1e-10
 """A goal this near, rad, m and joint coordinates, is where the robot is."""
 
 
-@dataclass(frozen=True)
-class OptimalOptions:
-    """The options of ``optimal``."""
-
-    duration: float = parameter(
-        0.0,
-        "0: as fast as possible; else least effort in this time",
-        unit="s",
-        minimum=0.0,
-        maximum=1000000000.0,
-    )
-    max_velocity: tuple[float, ...] = parameter(
-        (),
-        "of every joint, below the URDF's; []: those",
-        unit="m/s or rad/s",
-        minimum=0.0,
-        maximum=1000000000.0,
-        of_joints=True,
-    )
-    max_acceleration: tuple[float, ...] = parameter(
-        (),
-        "of every joint; []: by ramp_time",
-        unit="m/s^2 or rad/s^2",
-        minimum=0.0,
-        maximum=1000000000.0,
-        of_joints=True,
-    )
-    ramp_time: float = parameter(
-        0.5,
-        "from rest to full speed, without max_acceleration",
-        unit="s",
-        minimum=1e-06,
-        maximum=1000000000.0,
-    )
-    joint_margin: tuple[float, ...] = parameter(
-        (),
-        "of every joint to its stops; not in corrections",
-        unit="m or rad",
-        minimum=0.0,
-        maximum=1000000000.0,
-        of_joints=True,
-    )
-    base_position: int = parameter(
-        0, "0: met if sliders can, 1: met, 2: ignored", minimum=0, maximum=2
-    )
-    base_attitude: int = parameter(1, "1: met, 0: ignored", minimum=0, maximum=1)
-    final_shape: int = parameter(
-        0, "without one in the goal: 0: any, 1: the present one", minimum=0, maximum=1
-    )
-    max_base_rate: float = parameter(
-        0.0, "fastest turn of the base; 0: any", unit="rad/s", minimum=0.0, maximum=1000000000.0
-    )
-    keep_axis: tuple[float, ...] = parameter(
-        (),
-        "direction in the base that is kept away ...",
-        minimum=-1000000000.0,
-        maximum=1000000000.0,
-    )
-    keep_direction: tuple[float, ...] = parameter(
-        (), "... from this direction in the world ...", minimum=-1000000000.0, maximum=1000000000.0
-    )
-    keep_angle: float = parameter(
-        0.0, "... by this angle", unit="rad", minimum=0.0, maximum=3.141592653589793
-    )
-    keep_out: tuple[float, ...] = parameter(
-        (),
-        "boxes of shapes: lower, then upper corner",
-        unit="m or rad",
-        minimum=-1000000000.0,
-        maximum=1000000000.0,
-    )
-    intervals: int = parameter(
-        80, "steps of the optimal control problem", minimum=10, maximum=10000
-    )
-    starts: int = parameter(12, "guesses that are tried at most", minimum=1, maximum=10000)
-    answers: int = parameter(
-        3, "manoeuvres to find, of which the fastest is flown", minimum=1, maximum=10000
-    )
-    time_budget: float = parameter(
-        8.0,
-        "wall time to search; 5 times that if nothing is found",
-        unit="s",
-        minimum=0.1,
-        maximum=1000000000.0,
-    )
-    longest: float = parameter(
-        3600.0,
-        "longest manoeuvre that is still planned",
-        unit="s",
-        minimum=1.0,
-        maximum=1000000000.0,
-    )
-    cache: int = parameter(1, "1: manoeuvres are kept on disk", minimum=0, maximum=1)
-
-
 class OptimalGait(GaitMethod):
     """Minimum time, or least effort in a given time, from rest to rest.
 
-    It meets the attitude; the position where sliders can put the base anywhere, or where it is
-    asked to; and the final shape where the goal gives one.
+    It reaches the attitude; the position where sliders can put the base anywhere, or where the
+    options ask for it; and the final shape where the goal gives one. The search has a budget of
+    wall time: equal requests have equal schedules as long as it is not used up.
     """
 
     name: ClassVar[str] = "optimal"
     Options: ClassVar[type[OptimalOptions]] = OptimalOptions
     options: OptimalOptions
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        control_period: float,
-        integration_step: float = DEFAULT_INTEGRATION_STEP,
-        options: OptimalOptions | None = None,
-    ) -> None:
-        super().__init__(robot, control_period, integration_step, options)
-        chosen = self.options
-        self._wishes = Wishes.of(
-            robot, chosen.base_position, chosen.base_attitude, chosen.final_shape
-        )
-        self.controls = self._wishes.controls
-        self._limits = MotionLimits.of(
-            robot, chosen.max_velocity, chosen.max_acceleration, chosen.ramp_time
-        )
-        self._margin = _margin(robot, chosen.joint_margin)
-        self._constraints = PathConstraints.of(
-            robot,
-            chosen.max_base_rate,
-            chosen.keep_axis,
-            chosen.keep_direction,
-            chosen.keep_angle,
-            chosen.keep_out,
-        )
-        self._prediction = BasePrediction(robot, control_period, integration_step)
+    def _setup(self) -> None:
+        robot, chosen = self.robot, self.options
+        self._specification = GoalSpecification.of(robot, chosen)
+        self.controls = self._specification.controls
+        self._limits = MotionLimits.of(robot, chosen)
+        self._margin = np.zeros(robot.n)
+        if chosen.joint_margin:
+            self._margin = per_joint(robot, "joint_margin", chosen.joint_margin)
+        self._constraints = PathConstraints.of(robot, chosen)
+        self._prediction = BasePrediction(robot, self.control_period, self.integration_step)
         self._search = ManoeuvreSearch(
-            robot, self._prediction, control_period, self._wishes.axes, self._constraints
+            robot,
+            self._prediction,
+            self.control_period,
+            self._specification.axes,
+            self._constraints,
         )
         self._cache = PlanCache() if chosen.cache else None
 
     @classmethod
-    def objection(cls, robot: SpaceRobot) -> str:
-        """Return why no goal of this robot can be planned; see :meth:`GaitMethod.objection`."""
-        return Wishes.of(robot).objection(robot)
+    def require_suitable(cls, robot: SpaceRobot) -> None:
+        """Refuse robots that cannot turn their base; see :meth:`GaitMethod.require_suitable`."""
+        GoalSpecification.of(robot, OptimalOptions()).require_suitable(robot)
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan within the time budget; see :meth:`GaitMethod.plan`.
 
         A correction takes the smallest way instead of the fastest, and may use the margins.
         """
-        state, goal, correction = request.state, request.goal, request.correction
-        self._require_rest(state)
-        # Measured shapes may be a little beyond the stops.
-        state = replace(state, q=np.clip(state.q, self.robot.lower, self.robot.upper))
+        self._require_rest(request.state)
+        # Measured shapes may be a little beyond the joint limits.
+        q = np.clip(request.state.q, self.robot.lower, self.robot.upper)
+        state, goal, correction = replace(request.state, q=q), request.goal, request.correction
+        request = replace(request, state=state)
         margin = np.zeros(self.robot.n) if correction else self._margin
-        shape = self._goal_shape(goal)
-        direction = self._constraints.direction_W
-        task = self._wishes.task(
-            self.robot, state, goal, shape, self._limits, request.tolerance, direction
+        boundary = self._specification.boundary_conditions(
+            self.robot,
+            request,
+            self._goal_shape(goal),
+            self._limits,
+            self._constraints.direction_W,
         )
         # Where a goal needs the margin, the manoeuvre ends in it.
-        limits = self._limits.within(margin, state.q, task.likely)
-        if self._is_met(state, goal):
-            return self._schedule(state, goal, state.q[np.newaxis], {"starts": 0.0})
+        limits = self._limits.within(margin, q, boundary.likely)
+        if self._is_reached(state, goal):
+            return self._schedule(state, goal, q[np.newaxis], {"starts": 0.0})
         attitude = state.quaternion[np.newaxis]
-        broken = self._constraints.violation(state.q[np.newaxis], attitude, self.control_period)
-        if broken:
-            raise PlanningError(f"The robot is where it must not be: at the start, {broken}.")
+        try:
+            self._constraints.check(q[np.newaxis], attitude, self.control_period)
+        except CandidateError as reason:
+            raise PlanningError(
+                f"The robot is where it must not be: at the start, {reason}."
+            ) from None
         key = None
         if self._cache is not None and not correction:
-            key = self._key(state, goal, request.tolerance)
-        if self._cache is not None and key is not None and (kept := self._cache.load(key)):
-            return self._kept(goal, kept)
+            key = self._key(request)
+            if kept := self._cache.load(key):
+                return self._kept(goal, kept)
         found = self._search.search(
-            task,
+            boundary,
             limits,
             state.quaternion,
             self._intervals(correction),
-            self._effort(correction),
+            self._budget(correction),
             cancellation,
         )
-        schedule = self._schedule(state, goal, found.held.positions, _notes(found))
+        notes: Notes = {
+            "starts": float(found.starts),
+            "durations": list(found.solutions),
+            "solution_time": found.solution_time,
+        }
+        schedule = self._schedule(state, goal, found.held.positions, notes)
         if self._cache is not None and key is not None:
             self._cache.store(key, _arrays(schedule))
         return schedule
 
     def _intervals(self, correction: bool) -> int:
-        intervals = int(self.options.intervals)
+        intervals = self.options.intervals
         return min(intervals, _CORRECTION_INTERVALS) if correction else intervals
 
-    def _effort(self, correction: bool) -> Effort:
+    def _budget(self, correction: bool) -> SearchBudget:
         chosen = self.options
-        return Effort(
+        return SearchBudget(
             duration=0.0 if correction else chosen.duration,
             longest=chosen.longest,
             starts=chosen.starts,
-            answers=1 if correction else chosen.answers,
+            solutions=1 if correction else chosen.answers,
             time_budget=chosen.time_budget,
             gentle=correction,
         )
 
-    def _is_met(self, state: RobotState, goal: Goal) -> bool:
+    def _is_reached(self, state: RobotState, goal: Goal) -> bool:
         error = PoseError.between(state.position, state.quaternion, goal, state.q)
         nothing = Tolerance(_NOTHING_LEFT, _NOTHING_LEFT, _NOTHING_LEFT)
         return nothing.admits(error, self.controls)
@@ -252,7 +172,8 @@ class OptimalGait(GaitMethod):
         }
         return self._schedule_of(goal, positions, path, notes)
 
-    def _key(self, state: RobotState, goal: Goal, tolerance: Tolerance) -> str:
+    def _key(self, request: PlanRequest) -> str:
+        state, goal, tolerance = request.state, request.goal, request.tolerance
         shape = goal.joint_positions
         numbers = {
             "state": np.concatenate([state.position, state.quaternion, state.q]),
@@ -287,13 +208,51 @@ def _arrays(schedule: GaitSchedule) -> dict[str, Array]:
     }
 
 
-def _notes(found: Found) -> Notes:
-    return {
-        "starts": float(found.starts),
-        "durations": list(found.answers),
-        "solution_time": found.solution_time,
+class PlanCache:
+    """Arrays by a key; a file that cannot be read or written is as good as none."""
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self.folder = folder or cache_directory() / "plans"
+
+    def load(self, key: str) -> dict[str, Array] | None:
+        """Return what was stored under a key, or None."""
+        try:
+            # A file that is opened here is closed where it turns out to be broken, too.
+            with self._file(key).open("rb") as file, np.load(file) as content:
+                return {name: content[name] for name in content.files}
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+            _LOG.warning("The plan %s cannot be read and is made anew: %s", self._file(key), error)
+            return None
+
+    def store(self, key: str, arrays: Mapping[str, Array]) -> None:
+        """Keep arrays under a key."""
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=self.folder, delete=False) as file:
+                np.savez(file, allow_pickle=False, **arrays)
+            # Whole or not at all, whoever else writes it.
+            os.replace(file.name, self._file(key))
+        except OSError as error:
+            _LOG.warning("The plan cannot be kept in %s: %s", self.folder, error)
+
+    def _file(self, key: str) -> Path:
+        return self.folder / f"{key}.npz"
+
+
+def plan_key(robot: SpaceRobot, numbers: Mapping[str, Array], options: Mapping[str, object]) -> str:
+    """Return the name of a plan: a hash of the robot's equations and of all that was asked."""
+    digest = hashlib.sha256()
+    for name in ("locked_inertia", "center_of_mass"):
+        digest.update(robot.function(name, compile=False).serialize().encode())
+    facts = {
+        "versions": [__version__, ca.__version__, np.__version__],
+        "joints": robot.joint_names,
+        "options": options,
+        "numbers": {
+            name: [x.hex() for x in map(float, np.ravel(v))] for name, v in numbers.items()
+        },
     }
-
-
-def _margin(robot: SpaceRobot, values: Sequence[float]) -> Array:
-    return per_joint(robot, "joint_margin", values) if len(values) else np.zeros(robot.n)
+    digest.update(json.dumps(facts, sort_keys=True, default=repr).encode())
+    return digest.hexdigest()[:32]

@@ -12,16 +12,23 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
-from spacerobot_ros.planning.core.cancellation import Cancellation
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.methods.optimal.constraints import PathConstraints
+from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
 from spacerobot_ros.planning.methods.optimal.held_commands import CommandHolder, HeldCommands
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
-from spacerobot_ros.planning.methods.optimal.limits import MotionLimits
-from spacerobot_ros.planning.methods.optimal.optimal_control import ManoeuvreProblem
-from spacerobot_ros.planning.methods.optimal.reach import nearest_for_center
-from spacerobot_ros.planning.methods.optimal.trajectory import Task, Trajectory
-from spacerobot_ros.planning.methods.optimal.transcription import turn_function
+from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
+    MultipleShooting,
+    StopRule,
+    turn_function,
+)
+from spacerobot_ros.planning.methods.optimal.problem import (
+    BoundaryConditions,
+    CandidateError,
+    MotionLimits,
+    PathConstraints,
+    Trajectory,
+)
 
 _LOG = logging.getLogger(__name__)
 
@@ -40,33 +47,55 @@ _ROOM_IN_GIVEN_TIME = 0.99
 
 
 @dataclass(frozen=True)
-class Effort:
-    """How long and how hard to search; times in s.
+class SearchBudget:
+    """How long and how hard to search.
 
-    ``duration`` 0 is the least time; ``gentle`` prefers the path of least effort, whose turn of the
-    base depends least on masses that are not quite known.
+    Attributes
+    ----------
+    duration
+        What a manoeuvre is to take, s; 0: the least time.
+    longest
+        Longest manoeuvre, s.
+    starts, solutions
+        Guesses that are tried at most, and manoeuvres that are enough.
+    time_budget
+        Wall time, s.
+    gentle
+        Prefer the path of least effort, whose turn of the base depends least on masses that are
+        not quite known.
     """
 
     duration: float
     longest: float
     starts: int
-    answers: int
+    solutions: int
     time_budget: float
     gentle: bool = False
 
 
 @dataclass(frozen=True)
-class Found:
-    """A manoeuvre that takes ``duration`` seconds, how many ``starts`` were made for it, and the
-    durations of all ``answers``, s. ``solution_time`` is what it took before it was made into held
-    commands.
+class Manoeuvre:
+    """A manoeuvre that was found.
+
+    Attributes
+    ----------
+    held
+        Its commands.
+    duration
+        s.
+    solution_time
+        What it took before it was made into held commands, s.
+    starts
+        Guesses that were tried.
+    solutions
+        Durations of all manoeuvres that were found, s.
     """
 
     held: HeldCommands
     duration: float
     solution_time: float
     starts: int = 1
-    answers: list[float] = field(default_factory=list)
+    solutions: list[float] = field(default_factory=list)
 
 
 class ManoeuvreSearch:
@@ -77,7 +106,7 @@ class ManoeuvreSearch:
     robot, prediction, control_period
         The model, the base motion that commands cause, and how long each is held, s.
     axes
-        (m, 3) directions in the base along which the attitude is met.
+        (m, 3) directions in the base along which the attitude is reached.
     constraints
         What the path must keep.
     """
@@ -93,156 +122,138 @@ class ManoeuvreSearch:
         self._robot, self._period = robot, control_period
         self._axes, self._constraints = axes, constraints
         self._holder = CommandHolder(robot, prediction, control_period, axes)
-        self._problems: dict[tuple[int, bool], ManoeuvreProblem] = {}
+        self._solvers: dict[tuple[int, bool], MultipleShooting] = {}
 
     def search(
         self,
-        task: Task,
+        boundary: BoundaryConditions,
         limits: MotionLimits,
         quaternion: Array,
         intervals: int,
-        effort: Effort,
-        cancellation: Cancellation,
-    ) -> Found:
+        budget: SearchBudget,
+        cancellation: Cancellation = NEVER,
+    ) -> Manoeuvre:
         """Return the fastest manoeuvre found from attitude ``quaternion`` (4,) of R_WB.
 
         Raises
         ------
         PlanningError
-            None was found, or the search was cancelled.
+            None was found.
+        PlanningCancelled
+            The search was cancelled.
         """
         began = time.monotonic()
-        deadline = began + effort.time_budget
-        problem = self._problem(intervals, task.center is not None)
+        deadline, last_call = (began + x * budget.time_budget for x in (1.0, _LAST_CALL))
+        solver = self._solver(intervals, boundary.center is not None)
         curvature = self._robot.function("curvature", compile=False)
         guesses = InitialGuesses(turn_function(self._robot), curvature, intervals)
-        found: list[Found] = []
-        reasons: list[str] = []
-        for guess in guesses.of(task, limits, task.likely):
+        found: list[Manoeuvre] = []
+        starts, rejection = 0, ""
+        for guess in guesses.of(boundary, limits, boundary.likely):
             # Until something is found the search may go on beyond its time.
-            last_call = deadline if found else began + _LAST_CALL * effort.time_budget
-            trajectory = self._solved(
-                problem, task, limits, guess, deadline, last_call, effort, cancellation
-            )
-            cancellation.raise_if_requested()
-            answer = self._checked(trajectory, task, limits, quaternion, effort)
-            now = time.monotonic()
+            stop = StopRule(deadline, deadline if found else last_call, cancellation)
+            try:
+                solution = self._solution(solver, boundary, limits, guess, stop, budget)
+                cancellation.raise_if_requested()
+                manoeuvre = self._commanded(solution, boundary, limits, quaternion, budget)
+                result = f"{manoeuvre.duration:.6g} s"
+                found.append(manoeuvre)
+            except CandidateError as reason:
+                result = rejection = str(reason)
+            starts += 1
             _LOG.info(
                 "start %d: %s after %.2f s, %d steps of the solver",
-                len(found) + len(reasons) + 1,
-                answer if isinstance(answer, str) else f"{answer.duration:.6g} s",
-                now - began,
-                problem.iterations,
+                starts,
+                result,
+                time.monotonic() - began,
+                solver.iterations,
             )
-            if isinstance(answer, str):
-                reasons.append(answer)
-            else:
-                found.append(answer)
-            starts = len(found) + len(reasons)
-            if len(found) >= effort.answers or starts >= effort.starts:
-                break
-            if now >= (deadline if found else began + _LAST_CALL * effort.time_budget):
+            enough = len(found) >= budget.solutions or starts >= budget.starts
+            if enough or time.monotonic() >= (deadline if found else last_call):
                 break
         if not found:
             raise PlanningError(
-                f"No manoeuvre to the goal was found from {len(reasons)} start(s) in "
-                f"{time.monotonic() - began:.3g} s: {reasons[-1]}. A longer optimal.time_budget or "
+                f"No manoeuvre to the goal was found from {starts} start(s) in "
+                f"{time.monotonic() - began:.3g} s: {rejection}. A longer optimal.time_budget or "
                 "optimal.longest, more optimal.intervals, or a smaller goal may help."
             )
         best = min(found, key=lambda one: one.duration)
-        return replace(best, starts=starts, answers=[one.duration for one in found])
+        return replace(best, starts=starts, solutions=[one.duration for one in found])
 
-    def _checked(
-        self,
-        trajectory: Trajectory | None,
-        task: Task,
-        limits: MotionLimits,
-        quaternion: Array,
-        effort: Effort,
-    ) -> Found | str:
-        """Return a solution as held commands, or what is wrong with it."""
-        if trajectory is None:
-            return "the solver came to no way that keeps the limits"
-        held = self._held(trajectory, task, limits, effort)
-        if held is None:
-            return "held commands could not be brought to the goal within the limits"
-        attitudes = np.array([quaternion_multiply(quaternion, x) for x in held.quaternions])
-        broken = self._constraints.violation(held.positions, attitudes, self._period)
-        if broken:
-            return broken
-        duration = (len(held.positions) - 1) * self._period
-        return Found(held, duration, trajectory.duration)
-
-    def _problem(self, intervals: int, position: bool) -> ManoeuvreProblem:
+    def _solver(self, intervals: int, position: bool) -> MultipleShooting:
         key = intervals, position
-        if key not in self._problems:
-            self._problems[key] = ManoeuvreProblem(
+        if key not in self._solvers:
+            self._solvers[key] = MultipleShooting(
                 self._robot, intervals, self._axes, position, self._constraints
             )
-        return self._problems[key]
+        return self._solvers[key]
 
-    def _solved(
+    def _solution(
         self,
-        problem: ManoeuvreProblem,
-        task: Task,
+        solver: MultipleShooting,
+        boundary: BoundaryConditions,
         limits: MotionLimits,
         guess: Trajectory,
-        deadline: float,
-        last_call: float,
-        effort: Effort,
-        cancellation: Cancellation,
+        stop: StopRule,
+        budget: SearchBudget,
     ) -> Trajectory | None:
+        """Return what the solver makes of a guess, None if nothing."""
         shortest = _FEWEST_TICKS * self._period
         guess = self._constraints.slowed(guess)
-        if effort.duration > 0:
+        if budget.duration > 0:
             limits = replace(
                 limits,
                 velocity=_ROOM_IN_GIVEN_TIME * limits.velocity,
                 acceleration=_ROOM_IN_GIVEN_TIME * limits.acceleration,
             )
-            T = max(round(effort.duration / self._period), 1) * self._period
-        elif effort.gentle:
+            T = max(round(budget.duration / self._period), 1) * self._period
+        elif budget.gentle:
             T = max(_UNHURRIED * guess.duration, shortest)
         else:
-            solution = problem.solve(
-                task,
-                limits,
-                guess,
-                shortest=shortest,
-                longest=effort.longest,
-                deadline=deadline,
-                last_call=last_call,
-                cancellation=cancellation,
+            solution = solver.solve(
+                boundary, limits, guess, stop, shortest=shortest, longest=budget.longest
             )
-            if solution is None or problem.converged or self._constraints.base_rate > 0:
+            if solution is None or solver.converged or self._constraints.base_rate > 0:
                 return solution
             # What was cut short has time to spare.
             return solution.hurried(limits, shortest)
         guess = guess.retimed(T / guess.duration)
-        solution = problem.solve(
-            task,
-            limits,
-            guess,
-            shortest=T,
-            longest=T,
-            effort=True,
-            deadline=deadline,
-            last_call=last_call,
-            cancellation=cancellation,
+        solution = solver.solve(
+            boundary, limits, guess, stop, shortest=T, longest=T, least_effort=True
         )
-        if solution is None or not effort.gentle:
+        if solution is None or not budget.gentle:
             return solution
         return solution.hurried(limits, shortest)
 
-    def _held(
-        self, trajectory: Trajectory, task: Task, limits: MotionLimits, effort: Effort
-    ) -> HeldCommands | None:
-        final = task.final
+    def _commanded(
+        self,
+        trajectory: Trajectory | None,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        quaternion: Array,
+        budget: SearchBudget,
+    ) -> Manoeuvre:
+        """Return a solution as held commands.
+
+        Raises
+        ------
+        CandidateError
+            There is no solution, or none that commands reach within the constraints.
+        """
+        if trajectory is None:
+            raise CandidateError("the solver came to no way that keeps the limits")
+        final = boundary.final
         if final is None:
             final = np.clip(trajectory.shapes[-1], limits.lower, limits.upper)
-        if task.center is not None:
-            found = nearest_for_center(self._robot, limits, final, task.center)
-            if found is None:
-                return None
-            final = found
-        return self._holder.hold(trajectory, task, final, limits, fixed=effort.duration > 0)
+        if boundary.center is not None:
+            final = nearest_for_center(self._robot, limits, final, boundary.center)
+        fixed = budget.duration > 0
+        held = None
+        if final is not None:
+            held = self._holder.hold(trajectory, boundary, final, limits, fixed=fixed)
+        if held is None:
+            raise CandidateError("held commands could not be brought to the goal within the limits")
+        attitudes = np.array([quaternion_multiply(quaternion, x) for x in held.quaternions])
+        self._constraints.check(held.positions, attitudes, self._period)
+        duration = (len(held.positions) - 1) * self._period
+        return Manoeuvre(held, duration, trajectory.duration)

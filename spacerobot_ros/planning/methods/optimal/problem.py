@@ -1,0 +1,353 @@
+"""The optimal control problem: its boundary conditions, its constraints, and its solution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.model import SpaceRobot, symbolic_rotations
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
+
+_FREE_SPAN = np.pi
+"""Half of the range that a guess uses of a joint without limits, rad or m."""
+
+_SHARPNESS = 8
+"""Exponent of the smooth bodies that stand for boxes of shapes."""
+
+_FREE = 1e6
+"""Bounds of a box beyond this, m or rad, are none where a joint has no limits."""
+
+_ROOM = 0.02
+"""What a solution keeps off its path constraints, relative: they are imposed between steps."""
+
+
+class CandidateError(PlanningError):
+    """A solution or a state is not usable; the text is a clause that says why."""
+
+
+@dataclass(frozen=True)
+class BoundaryConditions:
+    """Both ends of a motion from rest to rest, seen from the attitude that it starts at.
+
+    Attributes
+    ----------
+    start
+        (n,) first shape, m or rad.
+    turn
+        (4,) quaternion of the goal attitude in the starting one.
+    likely
+        (n,) last shape for all that is known before the search.
+    final
+        (n,) last shape; None: any.
+    center
+        (3,) centre of mass of the system in the base at the end, m; None: anywhere.
+    direction
+        (3,) kept direction of the path constraints, in the starting base.
+    """
+
+    start: Array
+    turn: Array
+    likely: Array
+    final: Array | None = None
+    center: Array | None = None
+    direction: Array = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """Bounds (n,) of the joints: ``lower`` and ``upper`` in m or rad, ``velocity`` a second,
+    ``acceleration`` a second squared.
+    """
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    acceleration: Array
+
+    @classmethod
+    def of(cls, robot: SpaceRobot, options: OptimalOptions) -> MotionLimits:
+        """Return the robot's own limits, narrowed by what the options give for every joint.
+
+        Raises
+        ------
+        ParameterError
+            A list has not one number a joint, or a joint without speed limit has none for its
+            acceleration.
+        """
+        velocity = robot.velocity_limit.copy()
+        if options.max_velocity:
+            fastest = per_joint(robot, "max_velocity", options.max_velocity)
+            velocity = np.minimum(velocity, fastest)
+        if options.max_acceleration:
+            acceleration = per_joint(robot, "max_acceleration", options.max_acceleration)
+        else:
+            acceleration = velocity / options.ramp_time
+        for name, v, a in zip(robot.joint_names, velocity, acceleration, strict=True):
+            if not (v > 0 and np.isfinite(a) and a > 0):
+                raise ParameterError(
+                    f"Joint '{name}' is limited to {v:.4g} a second and {a:.4g} a second squared; "
+                    "optimal needs a speed above zero and a finite acceleration: see "
+                    "optimal.max_acceleration."
+                )
+        return cls(robot.lower.copy(), robot.upper.copy(), velocity, acceleration)
+
+    def within(self, margin: Array, *shapes: Array) -> MotionLimits:
+        """Return limits that keep ``margin`` (n,) from the ends of the joints' ranges.
+
+        Shapes (n,) that are given are admitted all the same.
+        """
+        # Where two margins overlap the joint keeps to the middle of its range.
+        with np.errstate(invalid="ignore"):
+            room = np.where(
+                np.isfinite(self.upper - self.lower), (self.upper - self.lower) / 2, np.inf
+            )
+        kept = np.minimum(margin, room)
+        lower = np.min([self.lower + kept, *shapes], axis=0)
+        upper = np.max([self.upper - kept, *shapes], axis=0)
+        return replace(
+            self, lower=np.maximum(lower, self.lower), upper=np.minimum(upper, self.upper)
+        )
+
+    def span(self, q: Array) -> tuple[Array, Array]:
+        """Return middle and half width (n,) of the range, finite round ``q`` (n,)."""
+        lower = np.maximum(self.lower, q - 2 * _FREE_SPAN)
+        upper = np.minimum(self.upper, q + 2 * _FREE_SPAN)
+        middle = np.where(np.isfinite(self.lower) & np.isfinite(self.upper), (lower + upper) / 2, q)
+        return middle, np.minimum((upper - lower) / 2, _FREE_SPAN)
+
+    def excess(self, positions: Array, period: float) -> tuple[float, float]:
+        """Return by what factor held commands would have to be slower, and what they overrun.
+
+        ``positions`` (N + 1, n) are the shapes at ticks of ``period`` seconds, at rest before and
+        after. The factor is at most 1 where velocities and accelerations keep their limits; the
+        overrun is the farthest that a joint is beyond its limits, m or rad.
+        """
+        rest = np.zeros((1, positions.shape[1]))
+        rates = np.vstack([rest, np.diff(positions, axis=0) / period, rest])
+        speed = np.abs(rates) / self.velocity
+        change = np.abs(np.diff(rates, axis=0)) / period / self.acceleration
+        beyond = np.maximum(self.lower - positions, positions - self.upper)
+        factor = max(float(speed.max(initial=0.0)), float(np.sqrt(change.max(initial=0.0))))
+        return factor, float(beyond.max(initial=0.0))
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """N steps of ``step`` seconds with constant accelerations.
+
+    ``shapes`` and ``velocities`` (N + 1, n) at the knots between them, and the attitude
+    ``quaternions`` (N + 1, 4) in the one at the start.
+    """
+
+    step: float
+    shapes: Array
+    velocities: Array
+    quaternions: Array
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return self.step * (len(self.shapes) - 1)
+
+    def at_ticks(self, ticks: int) -> Array:
+        """Return the shapes (ticks + 1, n) at equal intervals from the start to the end."""
+        steps = len(self.shapes) - 1
+        place = np.linspace(0.0, steps, ticks + 1)
+        k = np.minimum(place.astype(int), steps - 1)
+        tau = (place - k)[:, np.newaxis]
+        q, v0, v1 = self.shapes[k], self.velocities[k], self.velocities[k + 1]
+        return np.asarray(q + self.step * (v0 * tau + (v1 - v0) * tau**2 / 2))
+
+    def retimed(self, factor: float) -> Trajectory:
+        """Return the same path, travelled in ``factor`` times the time."""
+        return replace(self, step=self.step * factor, velocities=self.velocities / factor)
+
+    def hurried(self, limits: MotionLimits, shortest: float) -> Trajectory:
+        """Return the same path, as fast as the limits allow, in ``shortest`` seconds or more."""
+        speed = float((np.abs(self.velocities) / limits.velocity).max())
+        change = np.abs(np.diff(self.velocities, axis=0)) / self.step / limits.acceleration
+        factor = max(speed, float(np.sqrt(change.max())), shortest / self.duration)
+        return self.retimed(factor)
+
+
+@dataclass(frozen=True)
+class _Body:
+    """A smooth body of shapes round a box, through its corners.
+
+    ``middle`` and ``half`` are the box's, of the ``joints`` that it bounds.
+    """
+
+    joints: list[int]
+    middle: Array
+    half: Array
+
+    @classmethod
+    def of(cls, robot: SpaceRobot, lower: Array, upper: Array) -> _Body:
+        bounded = [
+            i
+            for i in range(robot.n)
+            if lower[i] > max(robot.lower[i], -_FREE) or upper[i] < min(robot.upper[i], _FREE)
+        ]
+        if not bounded:
+            raise ParameterError("A box of optimal.keep_out holds all shapes of the robot.")
+        # A side beyond the joint limits is as good at a finite distance: no joint gets there.
+        width = robot.upper - robot.lower
+        lower = np.maximum(lower, robot.lower - width)[bounded]
+        upper = np.minimum(upper, robot.upper + width)[bounded]
+        return cls(bounded, (upper + lower) / 2, (upper - lower) / 2 * (1 + _ROOM))
+
+
+@dataclass(frozen=True)
+class PathConstraints:
+    """Bounds on the path; each is absent by default.
+
+    Attributes
+    ----------
+    base_rate
+        Fastest turn of the base, rad/s; 0: any.
+    axis_B, direction_W, cone
+        The direction ``axis_B`` (3,), fixed in the base, stays out of the cone of half angle
+        ``cone`` (rad) round ``direction_W`` (3,), as an instrument that must not see the Sun.
+    boxes
+        (K, 2, n) lower and upper corners of boxes of shapes that the joints must not enter.
+    bodies
+        What stands for the boxes in the program.
+    """
+
+    base_rate: float = 0.0
+    axis_B: Array | None = None
+    direction_W: Array | None = None
+    cone: float = 0.0
+    boxes: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
+    bodies: tuple[_Body, ...] = ()
+
+    @classmethod
+    def of(cls, robot: SpaceRobot, options: OptimalOptions) -> PathConstraints:
+        """Return the constraints that the options ask for.
+
+        Raises
+        ------
+        ParameterError
+            A list has the wrong length, a direction is zero, or a box is empty.
+        """
+        axis = _direction("axis", options.keep_axis)
+        direction = _direction("direction", options.keep_direction)
+        if len({axis is None, direction is None, options.keep_angle == 0}) > 1:
+            raise ParameterError(
+                "An attitude that is kept takes all of optimal.keep_axis, optimal.keep_direction "
+                "and optimal.keep_angle."
+            )
+        joints, boxes = robot.n, options.keep_out
+        if len(boxes) % (2 * joints or 1):
+            raise ParameterError(
+                f"optimal.keep_out has {len(boxes)} numbers; a box of shapes has {joints} lower "
+                f"and {joints} upper ones."
+            )
+        corners = np.reshape(np.asarray(boxes, dtype=float), (-1, 2, max(joints, 1)))
+        if np.any(corners[:, 0] >= corners[:, 1]):
+            raise ParameterError(
+                "optimal.keep_out has a box whose lower bound is not below its upper."
+            )
+        bodies = tuple(_Body.of(robot, *box) for box in corners)
+        return cls(options.max_base_rate, axis, direction, options.keep_angle, corners, bodies)
+
+    @property
+    def on_knots(self) -> int:
+        """How many inequalities :meth:`symbolic` returns."""
+        return len(self.boxes) + (self.axis_B is not None)
+
+    def symbolic(self, q: ca.SX, quaternion: ca.SX, direction: ca.SX) -> ca.SX:
+        """Return the inequality constraints, not negative, at a shape and an attitude.
+
+        ``direction`` (3,) is the kept direction in the frame that the quaternion refers to.
+        """
+        rows = [ca.SX(0, 1)]
+        for body in self.bodies:
+            x = (q[body.joints] - body.middle) / body.half
+            rows.append(ca.log(ca.sum1(x**_SHARPNESS) / len(body.joints) + 1e-3))
+        if self.axis_B is not None:
+            R_WB = symbolic_rotations.matrix_from_quaternion(quaternion)
+            seen = ca.dot(R_WB @ ca.DM(self.axis_B), direction)
+            rows.append(np.cos(min(self.cone * (1 + _ROOM), np.pi)) - seen)
+        return ca.vertcat(*rows)
+
+    def check(self, positions: Array, quaternions: Array, period: float) -> None:
+        """Check a path: shapes (N + 1, n) and quaternions (N + 1, 4) of R_WB at the ticks.
+
+        Raises
+        ------
+        CandidateError
+            It violates a constraint.
+        """
+        for box in self.boxes:
+            inside = np.all((positions > box[0]) & (positions < box[1]), axis=1)
+            if inside.any():
+                raise CandidateError(
+                    f"the shape enters a box of keep_out at {np.argmax(inside) * period:.4g} s"
+                )
+        if self.axis_B is not None and self.direction_W is not None:
+            seen = [
+                float(matrix_from_quaternion(x) @ self.axis_B @ self.direction_W)
+                for x in quaternions
+            ]
+            angle = np.arccos(np.clip(np.max(seen), -1.0, 1.0))
+            if angle < self.cone - 1e-9:
+                raise CandidateError(f"the axis comes within {angle:.4g} rad of keep_direction")
+        if self.base_rate > 0:
+            rate = _fastest_turn(quaternions, period)
+            if rate > self.base_rate * (1 + 1e-6):
+                raise CandidateError(f"the base turns at {rate:.4g} rad/s")
+
+    @property
+    def imposed_base_rate(self) -> float:
+        """The bound on the base rate that a solution is held to at its steps, rad/s."""
+        return self.base_rate * (1 - _ROOM)
+
+    def slowed(self, guess: Trajectory) -> Trajectory:
+        """Return a guess that turns the base no faster than it may."""
+        if self.base_rate == 0:
+            return guess
+        fastest = _fastest_turn(guess.quaternions, guess.step)
+        return guess.retimed(max(1.0, fastest / self.imposed_base_rate))
+
+
+def _direction(name: str, values: Sequence[float]) -> Array | None:
+    if not values:
+        return None
+    vector = np.asarray(values, dtype=float)
+    length = float(np.linalg.norm(vector))
+    if vector.shape != (3,) or length == 0:
+        raise ParameterError(
+            f"optimal.keep_{name} is {values}; it must be three numbers, not all zero."
+        )
+    return np.asarray(vector / length)
+
+
+def _fastest_turn(quaternions: Array, period: float) -> float:
+    """Return the largest mean rate (rad/s) between attitudes (N + 1, 4) that are so far apart."""
+    # |a - b| is twice the sine of a quarter of the angle.
+    apart = np.linalg.norm(np.diff(quaternions, axis=0), axis=1)
+    angles = 4 * np.arcsin(np.minimum(apart / 2, 1.0))
+    return float(angles.max(initial=0.0)) / period
+
+
+def per_joint(robot: SpaceRobot, option: str, values: Sequence[float]) -> Array:
+    """Return an option's list as (n,) numbers.
+
+    Raises
+    ------
+    ParameterError
+        It has another length.
+    """
+    if len(values) != robot.n:
+        raise ParameterError(
+            f"optimal.{option} has {len(values)} number(s); robot '{robot.description.name}' has "
+            f"{robot.n} joints ({', '.join(robot.joint_names)})."
+        )
+    return np.asarray(values, dtype=float)
