@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 from sensor_msgs.msg import JointState
 from support.altered_bags import altered
-from support.ros_harness import assert_one_sentence
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.resources import share_directory

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
-from support.ros_harness import assert_one_sentence
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import BagWriter, RecordingError, read_bag
 from spacerobot_ros.errors import (

@@ -11,7 +11,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
 from support.plant_rig import TICK_NS, Rig
-from support.ros_harness import Harness, assert_one_sentence, construction
+from support.ros_harness import Harness, construction
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import PlantNode

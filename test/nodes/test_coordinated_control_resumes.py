@@ -15,15 +15,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from std_msgs.msg import String
-from support.control_loop import KP, SHAPE, STATUS, TIP, URDF, Loop, pose
-from support.ros_harness import (
-    LATCHED,
-    Harness,
-    Probe,
-    assert_one_sentence,
-    construction,
-    nanoseconds,
-)
+from support.control_loop import SHAPE, STATUS, TIP, URDF, Loop, pose
+from support.ros_harness import LATCHED, Harness, Probe, construction, nanoseconds
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.nodes import CoordinatedControlNode, FlightNode, PlannerNode, PlantNode
@@ -119,47 +113,6 @@ def test_the_goals_are_met_by_the_next_controller(
     np.testing.assert_allclose([tip.x, tip.y, tip.z], tip_goal, atol=1e-3)
 
 
-def test_it_is_flown_on_from_where_the_robot_is_and_what_was_held_is_still_held(
-    harness: Harness, file: Path
-) -> None:
-    loop = Loop(harness, resume_file=str(file))
-    loop.answer()
-    loop.aim(base=pose(AIM))
-    loop.answer()
-    replaced(loop, file)
-    # Meanwhile all of it has drifted: the base, that has a goal, and the tip, that had none.
-    loop.place = np.array([0.125, -0.25, 0.0])
-    wrench, _ = loop.answer()
-    np.testing.assert_allclose(wrench[:3], KP * ((AIM - loop.place) - loop.place), atol=1e-12)
-    assert loop.wait_for("tracking").level == DiagnosticStatus.OK
-
-
-def test_a_law_that_holds_the_shape_goes_on_to_the_shape(harness: Harness, file: Path) -> None:
-    outputs: dict[str, Any] = {"base_outputs": "x y rz", "joint_outputs": "shoulder elbow"}
-    loop = Loop(harness, resume_file=str(file), **outputs)
-    loop.aim(base=pose(AIM))
-    loop.answer()
-    assert json.loads(file.read_text())["base"]["joint_positions"] == SHAPE.tolist()
-    replaced(loop, file, **outputs)
-    loop.answer()
-    kept = json.loads(file.read_text())["base"]
-    assert (kept["position"], kept["joint_positions"]) == (AIM.tolist(), SHAPE.tolist())
-
-
-def test_a_goal_that_comes_at_once_replaces_the_kept_one(harness: Harness, file: Path) -> None:
-    loop = Loop(harness, resume_file=str(file))
-    far = TIP + np.array([0.0, 1.0, 0.0])
-    loop.aim(base=pose(AIM), end_effector=pose(far))
-    loop.answer()
-    replaced(loop, file)
-    loop.aim(base=pose([-0.5, 0.0, 0.0]))
-    wrench, _ = loop.answer()
-    np.testing.assert_allclose(wrench[:3], KP * np.array([-0.5, 1.0, 0.0]), atol=1e-12)
-    kept = json.loads(file.read_text())
-    assert kept["base"]["position"] == [-0.5, 0.0, 0.0]
-    assert kept["end_effector"]["position"] == far.tolist()
-
-
 def test_a_node_that_is_activated_again_goes_on(harness: Harness, file: Path) -> None:
     loop = Loop(harness, resume_file=str(file))
     loop.aim(base=pose(AIM))
@@ -182,43 +135,6 @@ def test_the_robot_may_be_told_later(harness: Harness, file: Path) -> None:
     harness.spin_until(lambda: loop.probe.count("joint_commands") > count, "the answer")
     harness.settle(loop.probe)
     np.testing.assert_allclose(loop.last_command[0], before, atol=1e-12)
-
-
-# -- nothing to go on to ----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("end", ["abort", "reached", "failed"])
-def test_a_goal_that_is_decided_is_not_kept(harness: Harness, file: Path, end: str) -> None:
-    loop = Loop(harness, resume_file=str(file), settle_time=0.02, time_limit=0.2)
-    loop.aim(base=pose(AIM))
-    loop.answer()
-    assert file.exists()
-    if end == "abort":
-        assert loop.abort().success
-        assert not file.exists()
-    # The tip is to stay where it was: at the goal of the base the robot would not be at rest.
-    if end == "reached":
-        loop.aim(base=pose(np.zeros(3)))
-    for _ in range(4 if end == "reached" else 25):
-        loop.answer()
-    loop.wait_for("aborted" if end == "abort" else end)
-    harness.settle(loop.probe)
-    assert not file.exists()
-    replaced(loop, file)
-    np.testing.assert_allclose(loop.answer()[0], 0.0, atol=1e-12)
-    loop.wait_for("holding")
-
-
-def test_a_goal_before_an_abort_is_dropped_and_one_after_it_is_flown(
-    harness: Harness, file: Path
-) -> None:
-    loop = Loop(harness, resume_file=str(file))
-    loop.answer()
-    loop.aim(base=pose(AIM))
-    assert loop.abort().success
-    loop.aim(base=pose([-0.5, 0.0, 0.0]))
-    np.testing.assert_allclose(loop.answer()[0][:3], [-0.5 * KP, 0.0, 0.0], atol=1e-12)
-    assert json.loads(file.read_text())["base"]["position"] == [-0.5, 0.0, 0.0]
 
 
 # -- files that are refused -------------------------------------------------------------------
@@ -288,13 +204,6 @@ def test_a_robot_that_comes_later_and_cannot_go_on_says_so_and_holds(
     description.publish(String(data=URDF.read_text("utf-8")))
     assert_one_sentence(loop.wait_for("refused").message, "computed_torque", "end-effector")
     np.testing.assert_allclose(loop.answer()[0], 0.0, atol=1e-12)
-
-
-def test_where_nothing_can_be_written_the_goal_is_flown(harness: Harness, file: Path) -> None:
-    loop = Loop(harness, resume_file=str(file.parent / "nowhere" / "goals.json"))
-    loop.aim(base=pose(AIM))
-    np.testing.assert_allclose(loop.answer()[0][:3], KP * AIM, atol=1e-12)
-    loop.wait_for("tracking")
 
 
 def test_a_process_with_a_broken_file_ends_with_one_sentence(file: Path, ros_domain: int) -> None:

@@ -13,7 +13,8 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 from support.control_loop import JOINTS, URDF
 from support.oracles import PinocchioOracle
-from support.ros_harness import Harness, assert_one_sentence
+from support.ros_harness import Harness
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.nodes import PlantNode
 

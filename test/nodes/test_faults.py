@@ -12,7 +12,8 @@ from rcl_interfaces.msg import Log
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from support.fault_flights import FaultFlight, values_of
-from support.ros_harness import Harness, assert_one_sentence, construction, nanoseconds
+from support.ros_harness import Harness, construction, nanoseconds
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import PlantNode

@@ -10,7 +10,8 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from std_srvs.srv import Trigger
 from support.fault_flights import FaultFlight, values_of
-from support.ros_harness import Harness, assert_one_sentence
+from support.ros_harness import Harness
+from support.sentences import assert_one_sentence
 
 SLIDERS: dict[str, Any] = {"robot": "sliding_masses", "diagnostics_period": 1.0}
 # Slides of 2 s in one swing, cycles of 1 s.

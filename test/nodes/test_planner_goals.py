@@ -10,7 +10,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from support.planner_flight import HERE, NEAR, TURNED, Flight, Place, goal_at, stamp_of, values_of
 from support.plant_rig import SLIDERS, TICK_NS
-from support.ros_harness import Harness, assert_one_sentence
+from support.ros_harness import Harness
+from support.sentences import assert_one_sentence
 
 pytestmark = pytest.mark.usefixtures("one_plant")
 

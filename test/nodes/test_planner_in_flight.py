@@ -14,7 +14,8 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 from support.planner_flight import NEAR, TURNED, Flight, stamp_of, values_of
 from support.plant_rig import TICK_NS
-from support.ros_harness import Harness, assert_one_sentence, nanoseconds
+from support.ros_harness import Harness, nanoseconds
+from support.sentences import assert_one_sentence
 
 pytestmark = pytest.mark.usefixtures("one_plant")
 

@@ -9,7 +9,8 @@ import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
 from support.planner_flight import HERE, NEAR, PLANNER, TURNED, Flight, values_of
-from support.ros_harness import Harness, assert_one_sentence, construction
+from support.ros_harness import Harness, construction
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import PlannerNode

@@ -10,7 +10,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from support.bad_commands import BAD_COMMANDS
 from support.odometry import pose_of, twist_of
 from support.plant_rig import SLIDERS, STATE, TICK, TICK_NS, Rig
-from support.ros_harness import Harness, assert_one_sentence, nanoseconds
+from support.ros_harness import Harness, nanoseconds
+from support.sentences import assert_one_sentence
 
 RATE_LIMIT, STROKE = 0.7, 2.5  # of each slider, as its <limit> says
 

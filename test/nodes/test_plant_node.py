@@ -18,7 +18,8 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from support.odometry import pose_of
 from support.plant_rig import STATE, TICK_NS, Rig
-from support.ros_harness import Harness, assert_one_sentence, construction, nanoseconds
+from support.ros_harness import Harness, construction, nanoseconds
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import PlantNode

@@ -11,7 +11,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import TransitionCallbackReturn
 from support.bad_commands import BAD_COMMANDS
 from support.plant_rig import TICK, TICK_NS, Rig
-from support.ros_harness import Harness, assert_one_sentence, nanoseconds
+from support.ros_harness import Harness, nanoseconds
+from support.sentences import assert_one_sentence
 
 REALTIME = {"time_mode": "realtime", "real_time_factor": 10.0, "command_timeout": 1.0}
 

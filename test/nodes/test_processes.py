@@ -26,7 +26,8 @@ from mcap.stream_reader import StreamReader
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
-from support.ros_harness import Harness, Probe, assert_one_sentence, nanoseconds
+from support.ros_harness import Harness, Probe, nanoseconds
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.nodes import NODE_TYPES
 

@@ -9,7 +9,8 @@ import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
 from support.recorded_stack import LATCHED_TOPICS, STREAMS, BagContent, Stack, message_class
-from support.ros_harness import Harness, Probe, assert_one_sentence, construction
+from support.ros_harness import Harness, Probe, construction
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import BagWriter, RecordingError
 from spacerobot_ros.errors import SpaceRobotError

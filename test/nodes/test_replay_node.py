@@ -21,7 +21,8 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
-from support.ros_harness import Harness, Probe, assert_one_sentence, construction, nanoseconds
+from support.ros_harness import Harness, Probe, construction, nanoseconds
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile
 from spacerobot_ros.errors import SpaceRobotError

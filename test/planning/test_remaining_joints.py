@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.effort_flights import robot_of
 from support.planners import Planner
-from support.ros_harness import assert_one_sentence
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.effort_flights import random_urdf, robot_of, thrusts, tumbling
 from support.oracles import Array, PinocchioOracle
-from support.ros_harness import assert_one_sentence
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,19 +13,15 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from support.executive_loop import KD, KP, SHAPE, TIP, URDF, Array
 from support.ros_harness import Harness
 
 from spacerobot_ros.nodes import CoordinatedControlNode
 
-Array = npt.NDArray[np.float64]
+__all__ = ["JOINTS", "KD", "KP", "SHAPE", "STATUS", "TICK_NS", "TIP", "URDF", "Loop", "pose"]
 
-URDF = Path(__file__).parents[2] / "urdf" / "planar_manipulator.urdf"
 JOINTS = ["shoulder", "elbow"]
 TICK_NS = 10_000_000
-SHAPE = np.array([-1.0, 1.0])
-# The links are a metre long and the shoulder is half a metre from the centre of the base.
-TIP = np.array([0.5 + math.cos(-1.0) + 1.0, math.sin(-1.0), 0.0])
-KP, KD = 30.0, 60.0
 STATUS = "controller/status"
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.ros_harness import assert_one_sentence
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import SpaceRobotError
 

@@ -208,12 +208,3 @@ def construction(context: rclpy.Context, parameters: Mapping[str, Any]) -> dict[
 def nanoseconds(stamp: Any) -> int:
     """Return a builtin_interfaces/Time (or Duration) in ns."""
     return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
-
-
-def assert_one_sentence(text: str, *mentions: str) -> None:
-    """Assert that a refusal is one sentence, for people, that mentions what it must."""
-    assert "\n" not in text.strip(), text
-    assert text.strip().endswith("."), text
-    assert "Traceback" not in text, text
-    for mention in mentions:
-        assert mention in text, f"'{mention}' is not mentioned in: {text}"

@@ -11,7 +11,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from support.altered_bags import altered
-from support.ros_harness import assert_one_sentence
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import SpaceRobotError

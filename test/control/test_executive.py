@@ -1,0 +1,515 @@
+"""What becomes of a controller's goals: every decision of its executive, without ROS."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.executive_loop import (
+    KD,
+    KP,
+    PERIOD,
+    SHAPE,
+    TIP,
+    UPRIGHT,
+    ExecutiveLoop,
+    goal_at,
+    planar_manipulator,
+)
+from support.sentences import assert_one_sentence
+
+from spacerobot_ros.control import Gains, JointReference, PoseReference, Reference
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.reference import HeldVelocityReference
+from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
+from spacerobot_ros.errors import ParameterError, PlanningError, SpaceRobotError
+from spacerobot_ros.parameters import configured
+
+AIM = np.array([0.5, 0.25, 0.0])
+SHAPE_IS_CONTROLLED: dict[str, Any] = {"base_outputs": "x y rz", "joint_outputs": "shoulder elbow"}
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "goals.json"
+
+
+# -- goals ------------------------------------------------------------------------------------
+
+
+def test_without_a_goal_the_pose_of_the_first_state_is_held() -> None:
+    loop = ExecutiveLoop()
+    np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
+    assert loop.state == "holding"
+    loop.place = np.array([0.1, -0.2, 0.0])
+    np.testing.assert_allclose(loop.answer()[0][:3], -2 * KP * loop.place, atol=1e-12)
+    assert loop.status.goal_id == ""
+
+
+def test_both_goals_are_pursued() -> None:
+    loop = ExecutiveLoop()
+    loop.answer()
+    up = np.array([0.0, 1.0, 0.0])
+    loop.aim(base=goal_at(AIM, "1.000000001"), end_effector=goal_at(TIP + up, "1.000000001"))
+    np.testing.assert_allclose(loop.answer()[0][:3], KP * (AIM + up), atol=1e-12)
+    assert loop.state == "tracking"
+    assert loop.status.command is not None
+    assert loop.status.command.errors["base.x"] == pytest.approx(0.5)
+    assert loop.status.command.errors["end_effector.y"] == pytest.approx(1.0)
+    assert loop.status.goal_id == "1.000000001"
+
+
+def test_the_other_goal_stays_when_one_is_replaced_and_the_status_is_about_the_latest() -> None:
+    loop = ExecutiveLoop()
+    loop.answer()
+    up = np.array([0.0, 1.0, 0.0])
+    loop.aim(base=goal_at(AIM, "a"), end_effector=goal_at(TIP + up, "b"))
+    loop.answer()
+    assert loop.status.goal_id == "b"
+    loop.aim(base=goal_at(-AIM, "c"))
+    np.testing.assert_allclose(loop.answer()[0][:3], KP * (up - AIM), atol=1e-12)
+    assert loop.status.goal_id == "c"
+
+
+def test_of_goals_between_two_states_the_latest_counts_whichever_it_is_for() -> None:
+    loop = ExecutiveLoop()
+    loop.aim(base=goal_at(AIM, "a"), end_effector=goal_at(TIP, "b"))
+    loop.aim(base=goal_at(-AIM, "c"))
+    np.testing.assert_allclose(loop.answer()[0][:3], -KP * AIM, atol=1e-12)
+    assert loop.status.goal_id == "c"
+
+
+def test_a_goal_is_reached_when_it_is_held_for_the_settling_time() -> None:
+    loop = ExecutiveLoop(settle_time=0.03, time_limit=1.0)
+    right = np.array([0.5, 0.0, 0.0])
+    loop.aim(base=goal_at(right, "7"), end_effector=goal_at(TIP + right, "7"))
+    loop.answer()
+    loop.place = right
+    for _ in range(3):
+        loop.answer()
+        assert loop.state == "tracking"
+    loop.place = right + np.array([0.002, 0.0, 0.0])
+    loop.answer()
+    loop.place = right
+    for _ in range(3):
+        loop.answer()
+        assert loop.state == "tracking", "the time begins anew"
+    loop.answer()
+    assert loop.state == "reached"
+    assert_one_sentence(loop.status.sentence, "met")
+    assert (loop.status.goal_id, loop.status.state.level) == ("7", 0)
+    loop.place = np.zeros(3)
+    loop.answer(5)
+    assert loop.state == "reached", "it was reached, wherever the robot is pushed to later"
+
+
+def test_a_goal_is_not_reached_before_the_reference_is() -> None:
+    settings: dict[str, Any] = {"profile": "quintic", "motion.acceleration": 0.5}
+    loop = ExecutiveLoop(settle_time=0.0, **settings)
+    loop.aim(base=goal_at([0.0005, 0.0, 0.0]))
+    loop.answer()
+    assert loop.state == "tracking", "already within the tolerance, but on its way"
+    loop.answer(40)
+    assert loop.state == "reached"
+
+
+def test_a_goal_that_is_not_met_in_time_has_failed() -> None:
+    loop = ExecutiveLoop(time_limit=0.05)
+    loop.aim(base=goal_at(AIM))
+    loop.answer(5)
+    assert loop.state == "tracking"
+    loop.answer()
+    assert (loop.state, loop.status.state.level) == ("failed", 2)
+    loop.aim(base=goal_at([0.0, 0.0, 0.0]))
+    loop.answer()
+    assert loop.state == "tracking", "the next goal has its own time"
+
+
+@pytest.mark.parametrize("key", ["base", "end_effector"])
+def test_tolerances_that_change_in_flight_take_effect(key: str) -> None:
+    loop = ExecutiveLoop(settle_time=0.0)
+    start = np.zeros(3) if key == "base" else TIP
+    loop.aim(**{key: goal_at(start + np.array([0.0, 0.2, 0.0]))})
+    loop.answer(3)
+    assert loop.state == "tracking"
+    loop.configure(position_tolerance=0.25)
+    loop.answer()
+    assert loop.state == "reached"
+
+
+def test_gains_that_change_in_flight_take_effect() -> None:
+    loop = ExecutiveLoop()
+    loop.aim(base=goal_at([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+    loop.configure(gains=Gains.uniform(70.0, KD))
+    loop.velocity = np.array([0.0, 0.5, 0.0])
+    np.testing.assert_allclose(loop.answer()[0][:3], [70.0, -2 * KD * 0.5, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("key", "settings"),
+    [
+        ("base", {"law": "computed_torque"}),
+        ("end_effector", {"law": "computed_torque"}),
+        ("end_effector", SHAPE_IS_CONTROLLED),
+    ],
+)
+def test_a_goal_for_what_is_not_controlled_is_refused(key: str, settings: dict[str, Any]) -> None:
+    loop = ExecutiveLoop(**settings)
+    law = settings.get("law", "transposed_jacobian")
+    with pytest.raises(PlanningError) as refusal:
+        loop.aim(**{key: goal_at(AIM)})
+    assert_one_sentence(str(refusal.value), law, key.replace("_", "-"), "joint.shoulder")
+    np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
+
+
+def test_a_refusal_is_reported_of_its_goal_and_the_earlier_one_goes_on() -> None:
+    loop = ExecutiveLoop()
+    loop.aim(base=goal_at(AIM, "flown"))
+    before = loop.answer()[0]
+    loop.executive.refuse("It is in frame 'moon'.", "refused")
+    assert loop.status == ControllerStatus(
+        ControllerState.REFUSED, "It is in frame 'moon'.", "refused", loop.statuses[-2].command
+    )
+    np.testing.assert_array_equal(loop.answer()[0], before)
+    assert (loop.state, loop.status.goal_id) == ("tracking", "flown")
+
+
+# -- abort ------------------------------------------------------------------------------------
+
+
+def test_abort_holds_the_robot_where_it_is() -> None:
+    loop = ExecutiveLoop(settle_time=0.0)
+    loop.aim(base=goal_at([1.0, 0.0, 0.0], "4"))
+    loop.answer()
+    loop.place = np.array([0.25, 0.0, 0.0])
+    loop.executive.abort()
+    np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
+    assert (loop.state, loop.status.state.level, loop.status.goal_id) == ("aborted", 1, "4")
+    loop.answer(3)
+    assert loop.state == "aborted"
+    assert_one_sentence(loop.status.sentence, "Aborted on request")
+    # A new goal is taken up from there.
+    loop.aim(base=goal_at([1.25, 0.0, 0.0], "5"))
+    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+    assert (loop.state, loop.status.goal_id) == ("tracking", "5")
+
+
+def test_an_abort_is_about_the_goal_that_still_waits() -> None:
+    loop = ExecutiveLoop()
+    loop.aim(base=goal_at(AIM, "flown"))
+    loop.answer()
+    loop.aim(base=goal_at(-AIM, "waiting"))
+    loop.executive.abort()
+    loop.answer()
+    assert (loop.state, loop.status.goal_id) == ("aborted", "waiting")
+
+
+def test_a_goal_before_an_abort_is_dropped_and_one_after_it_is_flown(file: Path) -> None:
+    loop = ExecutiveLoop(file)
+    loop.answer()
+    loop.aim(base=goal_at(AIM))
+    loop.executive.abort()
+    loop.aim(base=goal_at([-0.5, 0.0, 0.0]))
+    np.testing.assert_allclose(loop.answer()[0][:3], [-0.5 * KP, 0.0, 0.0], atol=1e-12)
+    assert json.loads(file.read_text())["base"]["position"] == [-0.5, 0.0, 0.0]
+    assert [status.state.value for status in loop.statuses[-2:]] == ["aborted", "tracking"]
+
+
+def test_a_reset_drops_goals_and_the_first_state_is_held_again() -> None:
+    loop = ExecutiveLoop()
+    loop.aim(base=goal_at(AIM, "1"))
+    loop.answer()
+    loop.aim(base=goal_at(-AIM, "2"))
+    loop.executive.reset()
+    loop.place = np.array([0.5, 0.0, 0.0])
+    np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
+    assert (loop.state, loop.status.goal_id) == ("holding", "")
+
+
+# -- without odom -----------------------------------------------------------------------------
+
+
+def test_the_base_is_estimated_for_a_while_and_then_the_thrusters_are_off() -> None:
+    loop = ExecutiveLoop(estimation_time=0.05)
+    loop.aim(base=goal_at([1.0, 0.0, 0.0], "3"))
+    measured = loop.answer()[0]
+    for _ in range(5):
+        wrench, _ = loop.answer(measured=False)
+        np.testing.assert_allclose(wrench, measured, atol=0.15 * np.abs(measured).max())
+        assert (loop.state, loop.status.state.level) == ("estimating", 1)
+        assert loop.status.goal_id == "3"
+    loop.rates = np.array([0.1, -0.2])
+    for _ in range(4):
+        wrench, effort = loop.answer(measured=False)
+        np.testing.assert_array_equal(wrench, np.zeros(6))
+    # The joints are slowed: their efforts take energy out of them.
+    assert effort @ loop.rates < 0.0
+    assert (loop.state, loop.status.state.level) == ("stopped", 2)
+    assert_one_sentence(loop.status.sentence, "thrusters off")
+    loop.rates = np.zeros(2)
+    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+    assert loop.state == "tracking"
+
+
+def test_without_odom_from_the_beginning_nothing_is_thrust_and_the_goal_waits() -> None:
+    loop = ExecutiveLoop()
+    loop.aim(base=goal_at([1.0, 0.0, 0.0]))
+    for _ in range(3):
+        np.testing.assert_array_equal(loop.answer(measured=False)[0], np.zeros(6))
+    assert loop.state == "stopped"
+    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+    assert loop.state == "tracking"
+
+
+def test_an_abort_without_odom_holds_where_the_robot_is_seen_again() -> None:
+    loop = ExecutiveLoop()
+    loop.aim(base=goal_at([1.0, 0.0, 0.0]))
+    loop.answer()
+    loop.executive.abort()
+    loop.answer(measured=False)
+    assert loop.state == "estimating"
+    loop.place = np.array([0.25, 0.0, 0.0])
+    np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
+    assert loop.state == "aborted"
+
+
+def test_a_robot_that_held_still_holds_after_a_gap() -> None:
+    loop = ExecutiveLoop()
+    loop.answer()
+    loop.answer(measured=False)
+    assert loop.state == "estimating"
+    loop.answer()
+    assert loop.state == "holding"
+
+
+def test_an_aborted_goal_is_not_reached_after_a_gap() -> None:
+    loop = ExecutiveLoop(settle_time=0.0)
+    loop.aim(base=goal_at([1.0, 0.0, 0.0]))
+    loop.answer()
+    loop.executive.abort()
+    loop.answer()
+    loop.answer(measured=False)
+    loop.answer(4)
+    assert loop.state == "aborted"
+
+
+def test_a_reached_goal_does_not_fail_after_a_gap() -> None:
+    loop = ExecutiveLoop(settle_time=0.01, time_limit=0.1)
+    loop.aim(base=goal_at([0.0, 0.0, 0.0]))
+    loop.answer(20)
+    assert loop.state == "reached"
+    loop.answer(measured=False)
+    assert loop.state == "estimating"
+    # It has drifted in the meantime.
+    loop.place = np.array([0.01, 0.0, 0.0])
+    loop.answer(4)
+    assert loop.state == "reached"
+    assert "failed" not in [status.state.value for status in loop.statuses]
+
+
+# -- the file ---------------------------------------------------------------------------------
+
+
+def resumed(file: Path, **settings: Any) -> ExecutiveLoop:
+    """Return another loop that resumes the goals of the file."""
+    loop = ExecutiveLoop(file, **settings)
+    loop.executive.resume(loop.file.load())
+    return loop
+
+
+def test_it_goes_on_from_where_the_robot_is_and_what_was_held_is_still_held(file: Path) -> None:
+    first = ExecutiveLoop(file)
+    first.answer()
+    first.aim(base=goal_at(AIM, "9.000000001"))
+    first.answer()
+    loop = resumed(file)
+    # Meanwhile all of it has drifted: the base, that has a goal, and the tip, that had none.
+    loop.place = np.array([0.125, -0.25, 0.0])
+    wrench, _ = loop.answer()
+    np.testing.assert_allclose(wrench[:3], KP * ((AIM - loop.place) - loop.place), atol=1e-12)
+    assert (loop.state, loop.status.goal_id) == ("tracking", "9.000000001")
+
+
+def test_a_law_that_holds_the_shape_goes_on_to_the_shape(file: Path) -> None:
+    first = ExecutiveLoop(file, **SHAPE_IS_CONTROLLED)
+    first.aim(base=goal_at(AIM))
+    first.answer()
+    assert json.loads(file.read_text())["base"]["joint_positions"] == SHAPE.tolist()
+    resumed(file, **SHAPE_IS_CONTROLLED).answer()
+    kept = json.loads(file.read_text())["base"]
+    assert (kept["position"], kept["joint_positions"]) == (AIM.tolist(), SHAPE.tolist())
+
+
+def test_a_goal_that_comes_at_once_replaces_the_saved_one(file: Path) -> None:
+    far = TIP + np.array([0.0, 1.0, 0.0])
+    first = ExecutiveLoop(file)
+    first.aim(base=goal_at(AIM), end_effector=goal_at(far))
+    first.answer()
+    loop = resumed(file)
+    loop.aim(base=goal_at([-0.5, 0.0, 0.0]))
+    np.testing.assert_allclose(loop.answer()[0][:3], KP * np.array([-0.5, 1.0, 0.0]), atol=1e-12)
+    kept = json.loads(file.read_text())
+    assert kept["base"]["position"] == [-0.5, 0.0, 0.0]
+    assert kept["end_effector"]["position"] == far.tolist()
+
+
+@pytest.mark.parametrize("end", ["aborted", "reached", "failed"])
+def test_a_goal_that_is_decided_is_not_kept(file: Path, end: str) -> None:
+    loop = ExecutiveLoop(file, settle_time=0.02, time_limit=0.2)
+    # The tip is to stay where it was: at another goal of the base the robot would not be at rest.
+    loop.aim(base=goal_at(np.zeros(3) if end == "reached" else AIM))
+    loop.answer()
+    assert file.exists()
+    if end == "aborted":
+        loop.executive.abort()
+        assert not file.exists()
+    loop.answer(25)
+    assert loop.state == end
+    assert not file.exists()
+    assert loop.file.load() == {}
+
+
+@pytest.mark.parametrize(
+    ("key", "shape", "settings", "mentions"),
+    [
+        ("end_effector", None, {"law": "computed_torque"}, ("computed_torque", "end-effector")),
+        ("base", np.zeros(3), {}, ("3 joints", "planar_manipulator", "2")),
+    ],
+)
+def test_goals_of_another_robot_or_law_are_refused(
+    key: str, shape: np.ndarray | None, settings: dict[str, Any], mentions: tuple[str, ...]
+) -> None:
+    loop = ExecutiveLoop(**settings)
+    with pytest.raises(ParameterError) as refusal:
+        loop.executive.resume({key: goal_at(AIM, shape=shape)})
+    assert_one_sentence(str(refusal.value), "resume_file", *mentions)
+    loop.answer()
+    assert loop.state == "holding"
+
+
+def test_where_nothing_can_be_written_the_goal_is_flown(tmp_path: Path) -> None:
+    loop = ExecutiveLoop(tmp_path / "nowhere" / "goals.json")
+    loop.aim(base=goal_at(AIM))
+    np.testing.assert_allclose(loop.answer()[0][:3], KP * AIM, atol=1e-12)
+    assert loop.state == "tracking"
+    (warning,) = loop.warnings
+    assert "would not be resumed" in warning
+
+
+# -- references from outside -----------------------------------------------------------------
+
+
+def test_a_reference_from_outside_is_followed_and_what_it_lacks_is_held() -> None:
+    loop = ExecutiveLoop(**SHAPE_IS_CONTROLLED)
+    loop.answer()
+    reference = Reference(base=PoseReference(AIM, UPRIGHT))
+    np.testing.assert_allclose(loop.answer(reference=reference)[0][:3], KP * AIM, atol=1e-12)
+    bent = Reference(joints=JointReference.at_rest(SHAPE + 0.1))
+    wrench, effort = loop.answer(reference=bent)
+    assert np.abs(wrench).max() < 1e-12
+    assert np.all(effort > 0.0)
+
+
+@given(st.lists(st.floats(-2.0, 2.0), min_size=2, max_size=6))
+def test_a_reference_of_held_velocities_leads_from_one_to_the_next(speeds: list[float]) -> None:
+    held = HeldVelocityReference(PERIOD)
+    position = np.zeros(1)
+    first = held.at_command(position, np.array(speeds[:1]))
+    assert (first.qdot[0], first.qddot[0]) == (speeds[0], 0.0)
+    for before, after in itertools.pairwise(speeds):
+        position = position + PERIOD * before
+        reference = held.at_command(position, np.array([after]))
+        assert reference.q == pytest.approx(position)
+        # Half a period on either side of the command is flown at its own velocity.
+        early, late = (reference.qdot + x * PERIOD / 2 * reference.qddot for x in (-1, 1))
+        assert early == pytest.approx(before, abs=1e-12)
+        assert late == pytest.approx(after, abs=1e-12)
+
+
+def test_a_body_twist_is_turned_into_the_world() -> None:
+    half = math.sqrt(0.5)
+    turned = PoseReference.with_body_twist(
+        AIM, np.array([0.0, 0.0, half, half]), np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0])
+    )
+    np.testing.assert_allclose(turned.velocity, [-2.0, 1.0, 3.0], atol=1e-15)
+    np.testing.assert_allclose(turned.angular_velocity, [-5.0, 4.0, 6.0], atol=1e-15)
+
+
+# -- statuses, construction -------------------------------------------------------------------
+
+
+def test_a_status_is_reported_on_changes_and_every_period() -> None:
+    loop = ExecutiveLoop(status_period=0.1, max_force=KP / 2)
+    loop.answer(25)
+    assert len(loop.statuses) == 3
+    loop.aim(base=goal_at([1.0, 0.0, 0.0]))
+    loop.answer()
+    assert loop.state == "tracking"
+    count = len(loop.statuses)
+    report = loop.status.command
+    assert report is not None
+    assert report.lost_force_N == pytest.approx(KP / 2)
+    # The base pulls by 0.7 of it, the tip the other way by 0.3: within the limit, reported at once.
+    loop.place = np.array([0.3, 0.0, 0.0])
+    loop.answer()
+    assert len(loop.statuses) == count + 1
+    report = loop.status.command
+    assert report is not None
+    assert report.lost_force_N == 0.0
+    loop.answer()
+    assert len(loop.statuses) == count + 1
+
+
+@given(
+    state=st.sampled_from(ControllerState),
+    goal_id=st.sampled_from(["", "12.000000345", "unstamped-2"]),
+    errors=st.none() | st.fixed_dictionaries({"base.x": st.floats(-9, 9), "joint.a": st.just(1.0)}),
+)
+def test_a_status_survives_its_values(
+    state: ControllerState, goal_id: str, errors: dict[str, float] | None
+) -> None:
+    report = None
+    if errors is not None:
+        report = CommandReport("model_based", True, 0.01, 0.5, 0.0, 1.5, 2.25, errors)
+    status = ControllerStatus(state, "A sentence.", goal_id, report)
+    values = status.to_values()
+    assert all(isinstance(value, str) for value in values.values())
+    again = ControllerStatus.from_values(values, "A sentence.")
+    assert again.to_values() == values
+    assert (again.state, again.goal_id, again.sentence) == (state, goal_id, "A sentence.")
+    assert state.decided == (state.value in ("reached", "failed", "refused", "aborted"))
+
+
+@pytest.mark.parametrize("values", [{}, {"state": "flying"}, {"state": "holding", "law": "a"}])
+def test_other_values_are_no_status_of_a_controller(values: dict[str, str]) -> None:
+    with pytest.raises(SpaceRobotError, match="no status of a controller"):
+        ControllerStatus.from_values(values)
+
+
+def test_a_controller_is_built_from_its_configuration() -> None:
+    robot = planar_manipulator()
+    chosen = {
+        "law": "model_based",
+        "base_outputs": "x y",
+        "joint_outputs": "elbow",
+        "model_based.null_space_damping": 3.0,
+        "gains.joints.kp": 7.0,
+        "max_torque": 2.0,
+    }
+    controller = build_controller(robot, configured(ControllerConfig, chosen))
+    assert controller.law.name == "model_based"
+    assert controller.law.outputs.labels == ("base.x", "base.y", "joint.elbow")
+    assert controller.law.options.null_space_damping == 3.0
+    default = build_controller(robot, ControllerConfig())
+    assert default.law.outputs.selection.end_effector_link == "end_effector"
+    with pytest.raises(ParameterError, match="tail"):
+        build_controller(robot, configured(ControllerConfig, {"joint_outputs": "tail"}))

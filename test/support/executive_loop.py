@@ -1,0 +1,96 @@
+"""The executive of a controller, with a test in the place of the plant; no ROS."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.control import ControlState, Reference
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
+from spacerobot_ros.control.status import ControllerStatus
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.parameters import configured
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
+
+Array = npt.NDArray[np.float64]
+
+URDF = Path(__file__).parents[2] / "urdf" / "planar_manipulator.urdf"
+SHAPE = np.array([-1.0, 1.0])
+# The links are a metre long and the shoulder is half a metre from the centre of the base.
+TIP = np.array([0.5 + math.cos(-1.0) + 1.0, math.sin(-1.0), 0.0])
+KP, KD = 30.0, 60.0
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+PERIOD = 0.01
+
+
+@cache
+def planar_manipulator() -> SpaceRobot:
+    return SpaceRobot.from_file(URDF)
+
+
+def goal_at(
+    position: npt.ArrayLike, goal_id: str = "", shape: Array | None = None
+) -> IdentifiedGoal:
+    return IdentifiedGoal(Goal(np.asarray(position, dtype=float), UPRIGHT, shape), goal_id)
+
+
+class ExecutiveLoop:
+    """A controller of the planar manipulator, and a robot that is where it is put.
+
+    Its axes are the world's. At rest the law (29) then commands the force ``Kp`` times the errors
+    of base and end-effector together, since the work of a force on the base moves both.
+    """
+
+    def __init__(self, goal_file: Path | None = None, **settings: Any) -> None:
+        defaults = {"tick_rate": 1 / PERIOD, "status_period": 0.01}
+        self.config = configured(ControllerConfig, {**defaults, **settings})
+        self.statuses: list[ControllerStatus] = []
+        self.warnings: list[str] = []
+        self.file = GoalFile(str(goal_file or ""), GOAL_KEYS)
+        self.executive = ControlExecutive(
+            build_controller(planar_manipulator(), self.config),
+            self.config,
+            self.statuses.append,
+            self.file,
+            self.warnings.append,
+        )
+        self.tick = 0
+        self.place, self.velocity, self.rates = np.zeros(3), np.zeros(3), np.zeros(2)
+
+    def aim(self, **goals: IdentifiedGoal) -> None:
+        for key, goal in goals.items():
+            self.executive.submit(key, goal)
+
+    def configure(self, **settings: Any) -> None:
+        self.config = replace(self.config, **settings)
+        self.executive.configure(self.config)
+
+    def answer(
+        self, ticks: int = 1, *, measured: bool = True, reference: Reference | None = None
+    ) -> tuple[Array, Array]:
+        """Show states; return the wrench and the efforts for the last one."""
+        for _ in range(ticks):
+            self.tick += 1
+            state = ControlState(self.place, UPRIGHT, self.velocity, np.zeros(3), SHAPE, self.rates)
+            result = self.executive.command(
+                self.tick * PERIOD, state if measured else None, SHAPE, self.rates, reference
+            )
+            self.executive.evaluate(self.tick * PERIOD, result)
+        return result.realised.wrench_B, result.realised.tau
+
+    @property
+    def status(self) -> ControllerStatus:
+        return self.statuses[-1]
+
+    @property
+    def state(self) -> str:
+        return self.status.state.value

@@ -1,0 +1,12 @@
+"""What sentences for people must be like."""
+
+from __future__ import annotations
+
+
+def assert_one_sentence(text: str, *mentions: str) -> None:
+    """Assert that a refusal is one sentence, for people, that mentions what it must."""
+    assert "\n" not in text.strip(), text
+    assert text.strip().endswith("."), text
+    assert "Traceback" not in text, text
+    for mention in mentions:
+        assert mention in text, f"'{mention}' is not mentioned in: {text}"
