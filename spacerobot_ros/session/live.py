@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rclpy.experimental import EventsExecutor
+from rosgraph_msgs.msg import Clock
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.planning import Goal
@@ -21,6 +22,7 @@ _LATCHED = 1.0
 """Wall s to wait for the status of earlier goals, so that it is not taken for an answer."""
 
 _LOOK_PERIOD = 0.1
+_SECOND = 10**9
 
 
 class _Sentences:
@@ -77,10 +79,23 @@ def send_goal(
     """
     with ros(private=False), stop_on_signals() as stopped:
         executor = EventsExecutor()
+        clock = 0
+
+        def on_clock(message: Clock) -> None:
+            nonlocal clock
+            clock = message.clock.sec * _SECOND + message.clock.nanosec
+
         clients = [
-            MissionClient(decider, "", namespace=namespace, name=f"goal_{decider}")
+            MissionClient(
+                decider,
+                "",
+                lambda: clock or time.time_ns(),
+                namespace=namespace,
+                name=f"goal_{decider}",
+            )
             for decider in ("planner", "coordinated_control")
         ]
+        clients[0].node.create_subscription(Clock, "/clock", on_clock, 10)
         try:
             for each in clients:
                 executor.add_node(each.node)
@@ -110,7 +125,7 @@ def _with_decider(clients: list[MissionClient], executor: EventsExecutor) -> Mis
         for client in clients:
             if client.is_connected() and client.has_decider():
                 patience = time.monotonic() + _LATCHED
-                while not client.status and time.monotonic() < patience:
+                while client.status is None and time.monotonic() < patience:
                     executor.spin_once(timeout_sec=0.05)
                 return client
     raise SpaceRobotError(

@@ -2,27 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 
 import rclpy
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 
+from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.goal_file import GoalIds
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 
-STATUS = {"planner": "planner/status", "coordinated_control": "controller/status"}
-"""By commander: where it reports what becomes of a goal."""
+Status = PlannerStatus | ControllerStatus
+"""What a commander reports."""
+
+_STATUS: Mapping[str, tuple[str, Callable[[Mapping[str, str], str], Status]]] = {
+    "planner": ("planner/status", PlannerStatus.from_values),
+    "coordinated_control": ("controller/status", ControllerStatus.from_values),
+}
+"""By commander: the topic of its status, and how it is read."""
 
 _LOOK_PERIOD = 0.2
 """Wall s from one look of a follower to the next."""
+
+_SECOND = 10**9
 
 
 class Outcome(str, Enum):
@@ -45,6 +58,8 @@ class MissionClient:
         The commander that decides: the planner where there is one.
     world_frame
         Frame of the goals.
+    now
+        Returns the time that goals are stamped with, ns: the simulated time where there is one.
     joint_names
         Returns the robot's joints, where goals have a shape; None: they have none.
     end_effector
@@ -59,6 +74,7 @@ class MissionClient:
         self,
         decider: str,
         world_frame: str,
+        now: Callable[[], int],
         *,
         joint_names: Callable[[], Sequence[str]] | None = None,
         end_effector: bool = False,
@@ -68,18 +84,15 @@ class MissionClient:
         context: rclpy.Context | None = None,
     ) -> None:
         self.node: Node = rclpy.create_node(name, namespace=namespace, context=context)
-        self.status: dict[str, str] = {}
-        """Values of the last status."""
-        self.sentence = ""
-        """Message of the last status."""
-        self.gait: dict[str, str] = {}
+        self.status: Status | None = None
+        """The last status of the commander that decides."""
+        self.gait: PlannerStatus | None = None
         """The planner's status when its first schedule for the goal began."""
         self._done = rclpy.task.Future(executor=None)
-        self._frame, self._joint_names, self._on_end = world_frame, joint_names, on_end
-        self._sent = ""
-        # A controller's status does not name the goal: what it reported before of another is over
-        # when it reports that it flies.
-        self._answered = decider == "planner"
+        self._frame, self._now = world_frame, now
+        self._joint_names, self._on_end = joint_names, on_end
+        self._sent = 0
+        self._goal_id: str | None = None
         self._goal_topic = self.node.create_publisher(PoseStamped, "goal_pose", STREAM)
         if joint_names is not None:
             self._shape_topic = self.node.create_publisher(JointState, "goal_joint_states", STREAM)
@@ -87,8 +100,9 @@ class MissionClient:
             self._end_effector_topic = self.node.create_publisher(
                 PoseStamped, "end_effector/goal_pose", STREAM
             )
+        topic, self._read = _STATUS[decider]
         self._status_topic = self.node.create_subscription(
-            DiagnosticStatus, STATUS[decider], self._on_status, LATCHED
+            DiagnosticStatus, topic, self._on_status, LATCHED
         )
 
     @property
@@ -98,9 +112,14 @@ class MissionClient:
         return outcome
 
     @property
+    def sentence(self) -> str:
+        """The sentence of the last status; empty before the first."""
+        return "" if self.status is None else self.status.sentence
+
+    @property
     def ends_at(self) -> float:
         """Simulated time at which the present schedule of the planner ends, s; else 0."""
-        return float(self.status.get("ends_at_s", 0.0))
+        return self.status.ends_at_s if isinstance(self.status, PlannerStatus) else 0.0
 
     def is_connected(self, readers: int = 1) -> bool:
         """Whether everything that this node publishes has that many readers."""
@@ -115,15 +134,21 @@ class MissionClient:
         return bool(self._status_topic.get_publisher_count())
 
     def send(self, goal: Goal, end_effector: Goal | None = None) -> None:
-        """Publish goal poses of the base and, where there is one, of the end-effector."""
-        self._sent = " ".join(f"{x:.9g}" for x in (*goal.position, *goal.quaternion))
+        """Publish goal poses of the base and, where there is one, of the end-effector.
+
+        Both have the same stamp, which is no other goal's: the status names them by it.
+        """
+        self._sent += 1
+        stamp = Time()
+        stamp.sec, stamp.nanosec = divmod(self._now() + self._sent, _SECOND)
+        self._goal_id = GoalIds().of(stamp.sec, stamp.nanosec)
         if goal.joint_positions is not None and self._joint_names is not None:
             self._shape_topic.publish(
                 JointState(name=list(self._joint_names()), position=goal.joint_positions.tolist())
             )
-        self._goal_topic.publish(self._pose(goal))
+        self._goal_topic.publish(self._pose(goal, stamp))
         if end_effector is not None:
-            self._end_effector_topic.publish(self._pose(end_effector))
+            self._end_effector_topic.publish(self._pose(end_effector, stamp))
 
     def follow(
         self, executor: EventsExecutor, look: Callable[[], bool], period: float = _LOOK_PERIOD
@@ -164,26 +189,23 @@ class MissionClient:
             self._on_end()
             self._done.set_result(outcome)
 
-    def _pose(self, goal: Goal) -> PoseStamped:
-        message = PoseStamped()
-        message.header.frame_id = self._frame
+    def _pose(self, goal: Goal, stamp: Time) -> PoseStamped:
+        message = PoseStamped(header=Header(stamp=stamp, frame_id=self._frame))
         p, o = message.pose.position, message.pose.orientation
         p.x, p.y, p.z = goal.position.tolist()
         o.x, o.y, o.z, o.w = goal.quaternion.tolist()
         return message
 
     def _on_status(self, message: DiagnosticStatus) -> None:
-        self.status = {pair.key: pair.value for pair in message.values}
-        self.sentence = message.message
-        state = self.status.get("state")
-        if not self._sent or self.status.get("goal", self._sent) != self._sent:
-            return  # Of an earlier goal.
-        if state == "executing" and not self.gait:
-            self.gait = dict(self.status)
-        decided = state in _ENDED
-        self._answered = self._answered or not decided or state == "refused"
-        if self._answered and decided:
-            self._end(Outcome(state))
-
-
-_ENDED = {outcome.value for outcome in Outcome} - {Outcome.INTERRUPTED.value}
+        values = {pair.key: pair.value for pair in message.values}
+        self.status = status = self._read(values, message.message)
+        if self._goal_id is None or status.goal_id != self._goal_id:
+            return  # Of an earlier goal, or of another client's.
+        if (
+            isinstance(status, PlannerStatus)
+            and status.state is PlannerState.EXECUTING
+            and self.gait is None
+        ):
+            self.gait = status
+        if status.state.decided:
+            self._end(Outcome(status.state.value))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -15,19 +14,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-import rclpy
 import yaml
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rclpy.client import Client
 from rclpy.experimental import EventsExecutor
-from rosgraph_msgs.msg import Clock as ClockMessage
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.robot_source import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.execution.executive import PLANNED
+from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.scenario import COMMANDERS, Kill, Scenario
 from spacerobot_ros.session.stack import Stack
@@ -46,8 +46,6 @@ _COMMANDS = ("joint_commands", "base_wrench", "joint_reference")
 
 _SETTLING = 1.0
 """Wall s for the recorder to take in what was published before time stood still."""
-
-_PLANNED = re.escape(PLANNED).replace(r"\{:\.6f\}", r"([\d.]+)")
 
 
 class MultiProcessStack(Stack):
@@ -84,12 +82,15 @@ class MultiProcessStack(Stack):
         self.client = MissionClient(
             scenario.commanders[0],
             scenario.config(scenario.commanders[0]).world_frame,
+            lambda: self._time_ns,
             joint_names=None if names is None else lambda: names,
             end_effector=scenario.end_effector_goal is not None,
         )
         node = self.client.node
-        node.create_subscription(ClockMessage, "/clock", self._on_clock, 10)
+        node.create_subscription(Clock, "/clock", self._on_clock, 10)
         self._change_state = node.create_client(ChangeState, "plant/change_state")
+        self._get_statistics = node.create_client(Trigger, "planner/statistics")
+        self._statistics = PlannerStatistics()
         self.executor = EventsExecutor()
         self.executor.add_node(node)
         try:
@@ -136,16 +137,14 @@ class MultiProcessStack(Stack):
         return Path(self._folder.name, f"{name}.txt").read_text("utf-8", errors="replace")
 
     @property
-    def plan_time(self) -> float:
-        """Wall time that planning took, as the planner has logged it, s."""
-        if "planner" not in self.processes:
-            return 0.0
-        return sum(float(text) for text in re.findall(_PLANNED, self.said("planner")))
-
-    @property
     def time_ns(self) -> int:
         """Simulated time that was last received, ns."""
         return self._time_ns
+
+    @property
+    def statistics(self) -> PlannerStatistics:
+        """What the planner has done, once the flight is finished."""
+        return self._statistics
 
     def start(self, goal: Goal | None) -> None:
         """Send the goal, if there is one, and let time run."""
@@ -184,6 +183,9 @@ class MultiProcessStack(Stack):
         end = time.monotonic() + _SETTLING
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.05)
+        if "planner" in self.names and "planner" not in self._timeline.away:
+            answer = self._call(self._get_statistics, Trigger.Request(), "planner")
+            self._statistics = PlannerStatistics.from_json(answer.message)
         for name in self.names:
             if name in self._timeline.away:
                 continue
@@ -249,7 +251,7 @@ class MultiProcessStack(Stack):
             os.killpg(process.pid, signal.SIGKILL)
             return process.wait()
 
-    def _on_clock(self, message: ClockMessage) -> None:
+    def _on_clock(self, message: Clock) -> None:
         self._time_ns = message.clock.sec * NANOSECONDS + message.clock.nanosec
         self._clock_seen = time.monotonic()
 
@@ -268,12 +270,16 @@ class MultiProcessStack(Stack):
         )
 
     def _transit(self, transition: int) -> None:
-        self._wait_for(self._change_state.service_is_ready, "the plant")
         request = ChangeState.Request(transition=Transition(id=transition))
-        answer: rclpy.task.Future = self._change_state.call_async(request)
-        self._wait_for(answer.done, "the plant's answer")
-        if not answer.result().success:
+        if not self._call(self._change_state, request, "plant").success:
             raise SpaceRobotError(f"The plant refuses: {_last_line(self.said('plant'))}")
+
+    def _call(self, service: Client, request: Any, name: str) -> Any:
+        """Return what a node answers to a request."""
+        self._wait_for(service.service_is_ready, f"the {name}")
+        answer = service.call_async(request)
+        self._wait_for(answer.done, f"the {name}'s answer")
+        return answer.result()
 
     def _wait_for(self, condition: Callable[[], bool], what: str) -> None:
         deadline = time.monotonic() + _START

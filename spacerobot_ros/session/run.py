@@ -16,21 +16,18 @@ from rclpy.signals import SignalHandlerOptions
 
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
 from spacerobot_ros.bag.recorded_robot import columns
+from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.nodes.common.process import use_loopback_discovery, use_private_discovery
 from spacerobot_ros.nodes.plant.diagnostics import PROPELLANT
 from spacerobot_ros.planning import Goal, PoseError
-from spacerobot_ros.session.mission_client import Outcome
+from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.session.mission_client import Outcome, Status
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.scenario import Scenario
 from spacerobot_ros.session.stack import InProcessStack, Stack
 
-_NO_GAIT = (
-    *("state", "goal", "goal_id", "corrections", "method"),
-    *("manoeuvre_time_s", "ends_at_s"),
-)
-"""Values of the planner's status that do not describe its gait."""
 
 Progress = Callable[[float, float], None]
 """Called with simulated time and the time the present schedule ends, s."""
@@ -189,31 +186,53 @@ class _Facts:
 
     outcome: Outcome
     sentence: str
+    status: Status | None
+    gait: PlannerStatus | None
     method: str
     plan_time: float
     wall_time: float
-    manoeuvre_time: float
-    corrections: int
-    gait: dict[str, str]
-    end_effector_turns: bool
 
     @classmethod
     def of(cls, stack: Stack, wall_time: float) -> _Facts:
         scenario, client = stack.scenario, stack.client
-        status = client.status
-        plans = "planner" in scenario.commanders
-        method = client.gait.get("method") or status.get("method" if plans else "law")
         outcome = client.outcome or Outcome.INTERRUPTED
+        method = client.gait.method if client.gait is not None else ""
+        if not method:
+            plans = "planner" in scenario.commanders
+            method = scenario.planner.method if plans else scenario.controller.law
         return cls(
             outcome=outcome,
             sentence="" if outcome is Outcome.INTERRUPTED else client.sentence,
-            method=method or (scenario.planner.method if plans else scenario.controller.law),
-            plan_time=stack.plan_time,
-            wall_time=wall_time,
-            manoeuvre_time=float(status.get("manoeuvre_time_s", 0.0)),
-            corrections=int(status.get("corrections", 0)),
+            status=client.status,
             gait=client.gait,
-            end_effector_turns=any(key.startswith("error.end_effector.r") for key in status),
+            method=method,
+            plan_time=stack.statistics.plan_time_s,
+            wall_time=wall_time,
+        )
+
+    @property
+    def corrections(self) -> int:
+        """New plans that the planner has made to come nearer."""
+        return self.status.corrections if isinstance(self.status, PlannerStatus) else 0
+
+    @property
+    def manoeuvre_time(self) -> float:
+        """Duration of all schedules, s; 0 without a planner."""
+        return self.status.manoeuvre_time_s if isinstance(self.status, PlannerStatus) else 0.0
+
+    @property
+    def gait_values(self) -> dict[str, Any]:
+        """The planner's results by name, for the schedule that it flew first."""
+        if self.gait is None:
+            return {}
+        return {"duration_s": self.gait.duration_s, **self.gait.notes}
+
+    @property
+    def end_effector_turns(self) -> bool:
+        """Whether the controller turns the end-effector to an attitude."""
+        command = self.status.command if isinstance(self.status, ControllerStatus) else None
+        return command is not None and any(
+            label.startswith("end_effector.r") for label in command.errors
         )
 
 
@@ -249,7 +268,7 @@ def _summarise(scenario: Scenario, path: Path, facts: _Facts) -> RunResult:
         "angular_momentum_drift": measured.angular_drift,
         "peak_joint_velocities": np.abs(measured.joint_rates).max(axis=0).tolist(),
         "corrections": facts.corrections,
-        "gait": {name: _numbers(text) for name, text in facts.gait.items() if name not in _NO_GAIT},
+        "gait": facts.gait_values,
         "state": facts.outcome.value,
         "message": sentence,
         "succeeded": facts.outcome is Outcome.REACHED,
@@ -279,15 +298,6 @@ def _last_diagnosis(bag: Bag, key: str) -> str | None:
         for status in array.status:
             value = next((pair.value for pair in status.values if pair.key == key), value)
     return value
-
-
-def _numbers(text: str) -> list[float] | float | str:
-    """Read a value of the planner's status: one number, several, or a text."""
-    try:
-        values = [float(word) for word in text.split()]
-    except ValueError:
-        return text
-    return values[0] if len(values) == 1 else values
 
 
 @contextmanager

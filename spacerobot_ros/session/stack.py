@@ -25,6 +25,7 @@ from spacerobot_ros.nodes import (
     RecorderNode,
 )
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.scenario import Scenario
 
@@ -72,8 +73,8 @@ class Stack(ABC):
 
     @property
     @abstractmethod
-    def plan_time(self) -> float:
-        """Wall time that planning took, s."""
+    def statistics(self) -> PlannerStatistics:
+        """What the planner has done, once the flight is finished."""
 
     @abstractmethod
     def start(self, goal: Goal | None) -> None:
@@ -144,6 +145,7 @@ class InProcessStack(Stack):
                 # The planner decides; a controller alone decides for itself.
                 scenario.commanders[0],
                 scenario.config(scenario.commanders[0]).world_frame,
+                lambda: self.plant.time_ns,
                 joint_names=(lambda: self.plant.plant.robot.joint_names) if shaped else None,
                 end_effector=scenario.end_effector_goal is not None,
                 on_end=self.plant.trigger_deactivate,
@@ -172,9 +174,9 @@ class InProcessStack(Stack):
         return self.plant.time_ns
 
     @property
-    def plan_time(self) -> float:
-        """Wall time that planning took, s."""
-        return self.planner.statistics.plan_time_s if self.planner is not None else 0.0
+    def statistics(self) -> PlannerStatistics:
+        """What the planner has done so far."""
+        return PlannerStatistics() if self.planner is None else self.planner.statistics
 
     def start(self, goal: Goal | None) -> None:
         """Activate everything and send the goal, if any; the plant's first state is planned from.

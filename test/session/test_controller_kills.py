@@ -24,6 +24,7 @@ from support.ros_harness import nanoseconds
 from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.session.mission_client import Outcome
 from spacerobot_ros.session.run import ros
 from spacerobot_ros.session.scenario import load_scenario
 
@@ -86,7 +87,7 @@ def test_a_controller_killed_at_random_moments_goes_on(flight: Flight, tmp_path:
         starts.append(flight.leave("coordinated_control", timeouts=4)[1])
         flight.spin(lambda: commanded[0] / 1e9 > starts[-1], "it commands again")
     flight.spin(lambda: flight.decided, "the goal is decided")
-    assert stack.client.status["state"] == "reached", stack.client.sentence
+    assert stack.client.outcome is Outcome.REACHED, stack.client.sentence
     assert not (tmp_path / "goals.json").exists()
     stack.finish()
     bag = read_bag(flight.bags[0])

@@ -17,6 +17,7 @@ from support.killed_flight import (
 )
 
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.session.mission_client import Outcome
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.run import ros
 from spacerobot_ros.session.scenario import Scenario, load_scenario
@@ -74,7 +75,7 @@ def test_a_node_killed_at_random_moments_joins_in_again(flight: Flight, name: st
         else:
             flight.spin(flight.bags[-1].exists, "the next bag")
     flight.spin(lambda: flight.decided, "the goal is decided")
-    assert stack.client.status["state"] == "reached", stack.client.sentence
+    assert stack.client.outcome is Outcome.REACHED, stack.client.sentence
     stack.finish()
     bags = [whole(bag) for bag in flight.bags]
     last = bags[-1]["/odom"]
