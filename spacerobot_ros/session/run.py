@@ -28,7 +28,6 @@ from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.scenario import Scenario
 from spacerobot_ros.session.stack import InProcessStack, Stack
 
-
 Progress = Callable[[float, float], None]
 """Called with simulated time and the time the present schedule ends, s."""
 
