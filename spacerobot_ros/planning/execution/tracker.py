@@ -280,10 +280,16 @@ class TrajectoryTracker:
         return self._check.error(state.position, state.quaternion)
 
     def track(self, stamp_ns: int, q: Array) -> list[int]:
-        """Write the setpoint for the shape ``q`` (n,) now; return which joints are found stuck."""
+        """Write the setpoint for the shape ``q`` (n,) now; return which joints are found stuck.
+
+        For a shape that is not finite the setpoint is to rest.
+        """
         assert self._follower is not None
         position, velocity = self.setpoint.position, self.setpoint.velocity
         self._follower.command(stamp_ns, q, position, velocity)
+        if not velocity.dot(velocity) < math.inf:
+            velocity[:] = 0.0
+            return []
         if self.stuck:
             velocity[self.stuck] = 0.0
         return self._watch.look(q, position, velocity)
@@ -291,7 +297,7 @@ class TrajectoryTracker:
     def hold(self, q: Array) -> None:
         """Write the setpoint that keeps the shape, where nothing is tracked."""
         # A reference must stay where it is; a plant makes rest of the shape that it has.
-        if self._commands_plant or not self._holding:
+        if (self._commands_plant or not self._holding) and q.dot(q) < math.inf:
             self.setpoint.position[:] = q
             self._holding = True
         self.setpoint.velocity[:] = 0.0

@@ -1,0 +1,556 @@
+"""The planner's state machine: every transition, no illegal one, and its page in the documents."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.planner_loop import HERE, NEAR, Loop, Place, StubMethod
+
+from spacerobot_ros.planning.execution.executive import (
+    TRANSITIONS,
+    Event,
+    IllegalTransitionError,
+    Phase,
+    PlanReason,
+    Transition,
+)
+from spacerobot_ros.planning.execution.status import PlannerState
+
+PAGE = Path(__file__).parents[2] / "docs" / "planner_state_machine.md"
+
+FAR: Place = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+OTHER: Place = ([-0.04, 0.0, 0.01], [0.0, 0.0, 0.0])
+
+
+# -- how to bring an executive into each phase ------------------------------------------------
+
+
+def resting(*, held: bool = False, ticks: int = 8, **parameters: Any) -> Loop:
+    return Loop(parameters, method=StubMethod(ticks), held=held)
+
+
+def stub_of(loop: Loop) -> StubMethod:
+    assert isinstance(loop.method, StubMethod)
+    return loop.method
+
+
+def measuring(**options: Any) -> Loop:
+    loop = resting(**options)
+    loop.propose(NEAR)
+    return loop
+
+
+def planning(place: Place = NEAR) -> Loop:
+    loop = resting(held=True)
+    loop.propose(place)
+    loop.tick()
+    return loop
+
+
+def executing(*, wrong_path: float = 0.0, overshoot: float = 0.0, **options: Any) -> Loop:
+    loop = resting(**options)
+    stub_of(loop).wrong_path, stub_of(loop).overshoot = wrong_path, overshoot
+    loop.propose(NEAR)
+    loop.tick()
+    if loop.held.busy:
+        loop.held.release()
+        loop.tick()
+    return loop
+
+
+def braking() -> Loop:
+    """Brake because the goal was given up."""
+    loop = executing(ticks=40)
+    loop.tick(5)
+    loop.abort()
+    return loop
+
+
+def braking_off_path(**options: Any) -> Loop:
+    """Brake to plan from rest, because the base is off its path."""
+    loop = executing(held=True, ticks=400, wrong_path=0.1, drift_position=1e-3, **options)
+    loop.tick(60)
+    return loop
+
+
+def evaluating(**options: Any) -> Loop:
+    """Wait for a second measured state after a schedule."""
+    return until(executing(averaging=2, **options), Phase.EVALUATING)
+
+
+def until(loop: Loop, phase: Phase, *, base: bool = True, ticks: int = 600) -> Loop:
+    for _ in range(ticks):
+        if loop.executive.phase is phase:
+            return loop
+        loop.tick(base=base)
+    raise AssertionError(f"{loop.executive.phase} instead of {phase}")
+
+
+def stuck(loop: Loop, *, base: bool = True) -> Loop:
+    """Hold the first joint until it is found stuck."""
+    loop.plant.hold(np.array([True, False, False]))
+    before = loop.executive.phase
+    for _ in range(600):
+        if loop.executive.phase is not before:
+            return loop
+        loop.tick(base=base)
+    raise AssertionError("no joint was found stuck")
+
+
+# -- every transition, by what happens --------------------------------------------------------
+
+P, E = Phase, Event
+
+Act = Callable[[Loop], object]
+
+
+def propose(place: Place) -> Act:
+    return lambda loop: loop.propose(place)
+
+
+def tick(loop: Loop) -> None:
+    loop.tick()
+
+
+def release(loop: Loop) -> None:
+    loop.held.release()
+    loop.tick()
+
+
+def abort(loop: Loop) -> None:
+    loop.abort()
+
+
+def stop(loop: Loop) -> None:
+    loop.stop()
+
+
+def to(phase: Phase, *, base: bool = True) -> Act:
+    return lambda loop: until(loop, phase, base=base)
+
+
+def long_flight() -> Loop:
+    return executing(ticks=400, stuck_ticks=5)
+
+
+def long_braking() -> Loop:
+    return braking_off_path(abort_time=100.0, stuck_ticks=5)
+
+
+def without_base(act: Callable[..., object]) -> Act:
+    return lambda loop: act(loop, base=False)
+
+
+HAPPENS: dict[tuple[Phase, Event, Phase], tuple[Callable[..., Any], ...]] = {
+    (P.IDLE, E.NEW_GOAL, P.MEASURING): (measuring,),
+    (P.MEASURING, E.NEW_GOAL, P.MEASURING): (measuring, propose(OTHER)),
+    (P.MEASURING, E.PLAN_REQUESTED, P.PLANNING): (planning,),
+    (P.MEASURING, E.ABORTED, P.IDLE): (measuring, abort),
+    (P.PLANNING, E.PLANNED, P.EXECUTING): (executing,),
+    (P.PLANNING, E.REFUSED, P.IDLE): (resting, propose(FAR), tick),
+    (P.PLANNING, E.REFUSED, P.MEASURING): (lambda: planning(FAR), propose(NEAR), release),
+    (P.PLANNING, E.REFUSED, P.EXECUTING): (executing, propose(FAR), tick),
+    (P.PLANNING, E.REFUSED, P.BRAKING): (braking, propose(FAR), tick),
+    (P.PLANNING, E.REFUSED, P.EVALUATING): (
+        *(lambda: executing(held=True), propose(FAR), to(P.PLANNING), release),
+    ),
+    (P.PLANNING, E.ABORTED, P.IDLE): (planning, abort),
+    (P.EXECUTING, E.NEW_GOAL, P.BRAKING): (lambda: executing(held=True), propose(OTHER), tick),
+    (P.EXECUTING, E.PLAN_REQUESTED, P.PLANNING): (executing, propose(OTHER), tick),
+    (P.EXECUTING, E.SCHEDULE_ENDED, P.EVALUATING): (executing, to(P.IDLE)),
+    (P.EXECUTING, E.SCHEDULE_ENDED, P.MEASURING): (
+        *(executing, propose(OTHER), to(P.MEASURING, base=False)),
+    ),
+    (P.EXECUTING, E.TRACKING_ERROR, P.BRAKING): (braking_off_path,),
+    (P.EXECUTING, E.JOINTS_STUCK, P.EVALUATING): (long_flight, stuck),
+    (P.EXECUTING, E.JOINTS_STUCK, P.MEASURING): (
+        *(long_flight, propose(OTHER), without_base(stuck)),
+    ),
+    (P.EXECUTING, E.ABORTED, P.BRAKING): (braking,),
+    (P.BRAKING, E.PLAN_REQUESTED, P.PLANNING): (braking, propose(OTHER), tick),
+    (P.BRAKING, E.AT_REST, P.IDLE): (braking, to(P.IDLE)),
+    (P.BRAKING, E.AT_REST, P.MEASURING): (*(braking, propose(OTHER), to(P.MEASURING, base=False)),),
+    (P.BRAKING, E.AT_REST, P.EVALUATING): (braking_off_path, to(P.PLANNING)),
+    (P.BRAKING, E.JOINTS_STUCK, P.EVALUATING): (long_braking, stuck),
+    (P.BRAKING, E.JOINTS_STUCK, P.MEASURING): (long_braking, propose(OTHER), stuck),
+    (P.BRAKING, E.ABORTED, P.BRAKING): (braking, abort),
+    (P.EVALUATING, E.NEW_GOAL, P.MEASURING): (evaluating, propose(OTHER)),
+    (P.EVALUATING, E.PLAN_REQUESTED, P.PLANNING): (lambda: evaluating(overshoot=0.5), tick),
+    (P.EVALUATING, E.REACHED, P.IDLE): (evaluating, tick),
+    (P.EVALUATING, E.FAILED, P.IDLE): (
+        *(lambda: evaluating(overshoot=0.5, max_corrections=0), tick),
+    ),
+    (P.EVALUATING, E.ABORTED, P.IDLE): (evaluating, abort),
+    (P.IDLE, E.DEACTIVATED, P.IDLE): (resting, stop),
+    (P.MEASURING, E.DEACTIVATED, P.IDLE): (measuring, stop),
+    (P.PLANNING, E.DEACTIVATED, P.IDLE): (planning, stop),
+    (P.EXECUTING, E.DEACTIVATED, P.IDLE): (executing, stop),
+    (P.BRAKING, E.DEACTIVATED, P.IDLE): (braking, stop),
+    (P.EVALUATING, E.DEACTIVATED, P.IDLE): (evaluating, stop),
+}
+"""How every transition comes about: a start, and what happens then."""
+
+
+def in_words(transition: Transition) -> str:
+    return f"{transition.source.value}, {transition.event.value}, {transition.target.value}"
+
+
+def check_chain(loop: Loop) -> None:
+    """Check that the transitions follow each other, and that each is in the table."""
+    phase = Phase.IDLE
+    for transition in loop.transitions:
+        assert transition.source is phase
+        assert transition in TRANSITIONS
+        phase = transition.target
+    assert loop.executive.phase is phase
+
+
+@pytest.mark.parametrize("wanted", [Transition(*key) for key in HAPPENS], ids=in_words)
+def test_every_transition_of_the_table_happens(wanted: Transition) -> None:
+    start, *story = HAPPENS[wanted.source, wanted.event, wanted.target]
+    loop = start()
+    for act in story:
+        act(loop)
+    assert wanted in loop.transitions
+    check_chain(loop)
+
+
+def test_only_transitions_of_the_table_are_tried() -> None:
+    assert {Transition(*key) for key in HAPPENS} == TRANSITIONS
+
+
+def test_every_other_transition_raises() -> None:
+    executive = resting().executive
+    for source, event, target in itertools.product(Phase, Event, Phase):
+        if Transition(source, event, target) in TRANSITIONS:
+            continue
+        executive._phase = source
+        with pytest.raises(IllegalTransitionError, match=source.name):
+            executive._go(event, target)
+        assert executive.phase is source
+    assert not executive.take_outputs()
+
+
+def test_every_phase_is_reached_and_left_and_every_event_used() -> None:
+    assert {t.target for t in TRANSITIONS} == set(Phase)
+    assert {t.source for t in TRANSITIONS} == set(Phase)
+    assert {t.event for t in TRANSITIONS} == set(Event)
+
+
+# -- why plans are requested ------------------------------------------------------------------
+
+
+def reasons(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> list[PlanReason]:
+    """Record why the executive of a loop requests plans from now on."""
+    requested: list[PlanReason] = []
+    request = loop.executive._request
+
+    def recorded(ticket: Any, state: Any) -> None:
+        requested.append(ticket.reason)
+        request(ticket, state)
+
+    monkeypatch.setattr(loop.executive, "_request", recorded)
+    return requested
+
+
+def test_a_goal_is_planned_from_rest_or_blended_into(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = resting(ticks=40)
+    requested = reasons(loop, monkeypatch)
+    loop.propose(NEAR)
+    loop.tick(10)
+    loop.propose(OTHER)
+    loop.tick()
+    assert requested == [PlanReason.NEW_GOAL, PlanReason.BLEND]
+    first, second = stub_of(loop).requests
+    assert first.previous is None
+    assert second.previous is None
+    assert not second.correction
+    # The second plan begins where the joints will be at rest, not where they are.
+    assert np.abs(second.state.q - loop.shapes[-2]).max() > 1e-3
+    assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
+
+
+def test_what_is_missed_is_corrected_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = resting()
+    requested = reasons(loop, monkeypatch)
+    stub_of(loop).overshoot = 0.1
+    status = loop.decide(NEAR)
+    # 0.062 m, a tenth of it is missed by every plan: 6.2 mm, 0.62 mm.
+    assert status.state is PlannerState.REACHED
+    assert status.corrections == 1
+    assert requested == [PlanReason.NEW_GOAL, PlanReason.CORRECTION]
+    first, second = stub_of(loop).requests
+    assert (first.correction, second.correction) == (False, True)
+    assert second.previous is loop.starts[0].schedule
+
+
+def test_partial_schedules_are_continued_and_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = resting(max_corrections=0)
+    requested = reasons(loop, monkeypatch)
+    stub_of(loop).partial = True
+    status = loop.decide(NEAR)
+    assert status.state is PlannerState.REACHED
+    assert status.corrections == 0
+    # Half of 0.062 m at a time until 1 mm is left.
+    assert requested == [PlanReason.NEW_GOAL, *[PlanReason.CONTINUATION] * 5]
+    assert all(request.correction for request in stub_of(loop).requests[1:])
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_a_tracking_error_is_planned_for_at_once_or_from_rest(
+    monkeypatch: pytest.MonkeyPatch, held: bool
+) -> None:
+    loop = executing(held=held, ticks=60, wrong_path=0.1, drift_position=0.02)
+    requested = reasons(loop, monkeypatch)
+    stub_of(loop).wrong_path = 0.0
+    for _ in range(400):
+        loop.tick()
+        loop.held.release()
+        if loop.statuses[-1].state.decided:
+            break
+    assert requested == [PlanReason.REPLAN if held else PlanReason.TRACKING_ERROR]
+    status = loop.statuses[-1]
+    assert (status.state, status.corrections) == (PlannerState.REACHED, 1)
+    assert any("Off the path by" in notice for notice in loop.notices)
+    assert not stub_of(loop).requests[-1].correction
+    # Either way the joints come to rest along the path: no step in velocity.
+    assert np.abs(np.diff(loop.speeds)).max() < 0.5 * max(loop.speeds)
+
+
+def test_a_tracking_error_that_cannot_be_planned_for_is_left_to_the_end() -> None:
+    loop = executing(ticks=60, wrong_path=0.1, drift_position=0.02)
+    stub_of(loop).refusing = True
+    loop.until(PlannerState.REACHED)
+    assert any("cannot be planned again: It is too far." in notice for notice in loop.notices)
+    assert loop.states == ["executing", "reached"]
+
+
+def test_tracking_errors_are_corrected_as_often_as_allowed() -> None:
+    loop = executing(ticks=200, wrong_path=0.5, drift_position=1e-3, max_corrections=2)
+    loop.tick(150)
+    assert len(stub_of(loop).requests) == 3
+    assert loop.statuses[-1].corrections == 2
+
+
+def test_a_goal_is_planned_for_without_the_joints_that_are_stuck(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    loop = executing(held=True, ticks=400, stuck_ticks=5)
+    quick_without_joints(loop)
+    requested = reasons(loop, monkeypatch)
+    stuck(loop)
+    q = loop.plant.q.copy()
+    until(loop, Phase.PLANNING)
+    assert requested == [PlanReason.STUCK_JOINTS]
+    task = loop.held.tasks[-1]
+    assert dict(task.stuck) == {"slider_1": q[0]}
+    assert task.required == {"position"}
+    assert not task.request.correction
+    assert any("Stuck: slider_1." in notice for notice in loop.notices)
+    # All joints are planned with for the next goal, and again without for this one if that is
+    # refused.
+    loop.propose(FAR)
+    loop.held.release()
+    loop.tick(2)
+    until(loop, Phase.PLANNING)
+    assert not loop.held.tasks[-1].stuck
+    loop.held.release()
+    until(loop, Phase.EVALUATING)
+    until(loop, Phase.PLANNING)
+    assert dict(loop.held.tasks[-1].stuck) == {"slider_1": q[0]}
+
+
+def test_the_next_goal_takes_the_result_of_a_refused_one_along() -> None:
+    """In the background: braked for a goal that is refused, the earlier one is planned again."""
+    loop = executing(held=True, ticks=40)
+    loop.tick(5)
+    loop.propose(FAR)
+    until(loop, Phase.PLANNING)
+    loop.held.release()
+    loop.tick()
+    refused = loop.statuses[-1]
+    assert (refused.state, refused.goal_id) == (PlannerState.REFUSED, "goal-2")
+    assert refused.sentence == "It is too far. The earlier goal is still pursued."
+    until(loop, Phase.PLANNING)
+    loop.held.release()
+    reached = loop.until(PlannerState.REACHED)
+    assert (reached.goal_id, reached.corrections) == ("goal-1", 0)
+
+
+# -- what the statuses say --------------------------------------------------------------------
+
+
+def test_statuses_speak_of_a_goal_by_its_id() -> None:
+    loop = resting(ticks=40)
+    loop.propose(NEAR)
+    loop.tick(5)
+    loop.propose(FAR)
+    loop.tick()
+    loop.until(PlannerState.REACHED)
+    loop.propose(OTHER)
+    loop.tick(3)
+    loop.abort()
+    assert [(s.state.value, s.goal_id) for s in loop.statuses] == [
+        ("executing", "goal-1"),
+        ("refused", "goal-2"),
+        ("reached", "goal-1"),
+        ("executing", "goal-3"),
+        ("aborted", "goal-3"),
+    ]
+
+
+def test_times_and_corrections_are_those_of_the_goal() -> None:
+    loop = resting()
+    stub_of(loop).overshoot = 0.1
+    status = loop.decide(NEAR)
+    assert status.manoeuvre_time_s == pytest.approx(2 * 8 * 0.05)
+    assert status.ends_at_s == pytest.approx(loop.starts[1].stamp_ns / 1e9 + 8 * 0.05)
+    assert loop.executive.statistics.plans == 2
+    assert loop.executive.statistics.plan_time_s > 0
+    assert loop.executive.statistics.commands_published == len(loop.commands)
+    # A goal that is refused in flight takes nothing from the one that is pursued.
+    stub_of(loop).overshoot = 0.0
+    loop.propose(OTHER)
+    loop.tick(2)
+    loop.propose(FAR)
+    status = loop.until(PlannerState.REACHED)
+    assert status.manoeuvre_time_s == pytest.approx(8 * 0.05)
+
+
+def test_a_state_that_is_not_finite_ends_no_goal_silently() -> None:
+    loop = measuring()
+    loop.measured.broken = True
+    loop.tick()
+    assert loop.statuses[-1].state is PlannerState.REFUSED
+    assert "not finite" in loop.statuses[-1].sentence
+    loop.measured.broken = False
+    assert loop.decide(NEAR).state is PlannerState.REACHED
+    # Measured in flight, the joints are commanded to rest as long as nothing is known of them.
+    loop.propose(HERE)
+    loop.tick(3)
+    loop.measured.broken = True
+    loop.tick()
+    assert not loop.commands[-1].any()
+    loop.measured.broken = False
+    assert loop.until(PlannerState.REACHED).goal_id == "goal-3"
+
+
+# -- whatever happens -------------------------------------------------------------------------
+
+ACTIONS: dict[str, Callable[[Loop], object]] = {
+    "near": lambda loop: loop.propose(NEAR),
+    "other": lambda loop: loop.propose(OTHER),
+    "here": lambda loop: loop.propose(HERE),
+    "far": lambda loop: loop.propose(FAR),
+    "abort": lambda loop: loop.abort(),
+    "stop": lambda loop: loop.stop(),
+    "tick": lambda loop: loop.tick(),
+    "ticks": lambda loop: loop.tick(7),
+    "many": lambda loop: loop.tick(50),
+    "blind": lambda loop: loop.tick(2, base=False),
+    "late": lambda loop: late(loop),
+    "broken": lambda loop: broken(loop),
+    "release": lambda loop: loop.held.release(),
+    "reset": lambda loop: loop.plant.reset(),
+    "jam": lambda loop: loop.plant.hold(np.array([True, False, False])),
+    "free": lambda loop: loop.plant.hold(np.zeros(3, dtype=np.bool_)),
+    "refuse": lambda loop: setattr(stub_of(loop), "refusing", True),
+    "plan": lambda loop: setattr(stub_of(loop), "refusing", False),
+    "partial": lambda loop: setattr(stub_of(loop), "partial", not stub_of(loop).partial),
+    "overshoot": lambda loop: setattr(stub_of(loop), "overshoot", 0.3),
+    "wrong path": lambda loop: setattr(stub_of(loop), "wrong_path", 0.1),
+    "strict": lambda loop: loop.set(position_tolerance=1e-9, max_corrections=1),
+}
+
+
+def quick_without_joints(loop: Loop) -> None:
+    """Have the stub plan without stuck joints too: models without them take seconds to build."""
+    loop.held._inner._method_for = lambda task: stub_of(loop)  # type: ignore[method-assign]
+
+
+def late(loop: Loop) -> None:
+    loop.tick(base=False)
+    loop.late()
+
+
+def broken(loop: Loop) -> None:
+    loop.measured.broken = True
+    loop.tick()
+    loop.measured.broken = False
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.booleans(),
+    st.integers(1, 3),
+    st.lists(st.sampled_from(sorted(ACTIONS)), min_size=1, max_size=25),
+)
+def test_no_sequence_of_events_leads_astray(held: bool, averaging: int, actions: list[str]) -> None:
+    loop = resting(
+        held=held, ticks=12, averaging=averaging, stuck_ticks=3, drift_position=0.05, abort_time=0.3
+    )
+    quick_without_joints(loop)
+    for action in actions:
+        ACTIONS[action](loop)  # A tick asserts that its command is finite.
+        moving = loop.executive._tracker.active
+        phase = loop.executive.phase
+        assert moving == (phase in (Phase.EXECUTING, Phase.BRAKING))
+        assert held or phase is not Phase.PLANNING
+    check_chain(loop)
+    # Whatever happened, it can be stopped, and the next goal is reached.
+    loop.stop()
+    loop.plant.hold(np.zeros(3, dtype=np.bool_))
+    loop.measured.broken = False
+    method = stub_of(loop)
+    method.refusing = method.partial = False
+    method.overshoot = method.wrong_path = 0.0
+    loop.set(position_tolerance=1e-3)
+    loop.propose(OTHER)
+    for _ in range(250):
+        loop.held.release()
+        loop.tick()
+        if loop.states[-1:] == ["reached"]:
+            break
+    assert loop.states[-1:] == ["reached"]
+    check_chain(loop)
+
+
+# -- the page in the documents ----------------------------------------------------------------
+
+
+def test_the_table_of_the_documentation_is_that_of_the_code() -> None:
+    rows = re.findall(r"^\| `(\w+)` \| `(\w+)` \| (`[^|]+) \|", PAGE.read_text("utf-8"), re.M)
+    shown = [
+        Transition(Phase[source], Event[event], Phase[target])
+        for source, event, targets in rows
+        for target in re.findall(r"`(\w+)`", targets)
+    ]
+    assert len(shown) == len(set(shown))
+    assert set(shown) == TRANSITIONS
+
+
+def test_the_diagram_of_the_documentation_is_that_of_the_code() -> None:
+    diagram = re.search(r"```mermaid\nstateDiagram-v2\n(.*?)```", PAGE.read_text("utf-8"), re.S)
+    assert diagram is not None
+    arrows = re.findall(r"^ *(\w+) --> (\w+): (.+)$", diagram[1], re.M)
+    shown = {
+        Transition(Phase[source], Event(event.strip()), Phase[target])
+        for source, target, events in arrows
+        for event in events.split(",")
+    }
+    # Every phase may be deactivated, which the page says in words.
+    assert shown == {t for t in TRANSITIONS if t.event is not Event.DEACTIVATED}
+
+
+def test_the_documentation_explains_every_phase_event_and_reason() -> None:
+    text = PAGE.read_text("utf-8")
+    for each in (*Phase, *Event, *PlanReason):
+        assert f"`{each.name}`" in text

@@ -1,0 +1,325 @@
+"""An executive and the plant that it moves, in one loop and without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.parameters import configured
+from spacerobot_ros.planning import GaitSchedule, Goal
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
+from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
+from spacerobot_ros.planning.core.schedule import BasePath
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.executive import (
+    BaseMeasurement,
+    Executive,
+    Notice,
+    Output,
+    ScheduleStart,
+    Transition,
+)
+from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.planning.execution.worker import (
+    Planned,
+    PlanningTask,
+    PlanningWorker,
+    Refused,
+    Worker,
+)
+from spacerobot_ros.resources import share_directory
+from spacerobot_ros.simulation import InitialState, VelocityPlant
+
+Array = npt.NDArray[np.float64]
+Place = tuple[Sequence[float], Sequence[float]]
+"""Position in m and rotation vector in rad."""
+
+TICK = 0.05
+TICK_NS = 50_000_000
+
+HERE: Place = ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+NEAR: Place = ([0.05, -0.03, 0.02], [0.0, 0.0, 0.0])
+TURNED: Place = ([0.02, -0.03, 0.01], [0.01, -0.005, 0.015])
+
+# A slide of 2 s in one swing and turns in cycles of 1 s: hundreds of ticks instead of 98,000.
+QUICK = {
+    "method": "lie_bracket",
+    "tick_rate": 1 / TICK,
+    "lie_bracket.t1": 2.0,
+    "lie_bracket.n1": 1,
+    "lie_bracket.cycle_period": 1.0,
+}
+
+
+@cache
+def robot_of(name: str = "sliding_masses") -> SpaceRobot:
+    """Return the model of a robot of the package, or of a URDF file."""
+    path = Path(name) if name.endswith(".urdf") else share_directory() / "urdf" / f"{name}.urdf"
+    return SpaceRobot.from_file(path)
+
+
+def goal_at(place: Place) -> Goal:
+    position, rotvec = place
+    return Goal.checked(position, Rotation.from_rotvec(rotvec).as_quat())
+
+
+class StubMethod(GaitMethod):
+    """Slides the base of the robot with three sliders in a straight line: one plan in 20 us.
+
+    Its base is at ``-q/8`` off the centre of mass. Goals beyond 1 m are refused; so are all while
+    ``refusing`` is set. Its gaits may be ``partial`` (half of the way), or too long by the share
+    ``overshoot``; the path it predicts may be wrong by ``wrong_path``, m. Only the position is
+    controlled.
+    """
+
+    name: ClassVar[str] = "stub"
+
+    def __init__(self, ticks: int = 8) -> None:
+        super().__init__(robot_of(), TICK)
+        self.requests: list[PlanRequest] = []
+        self.ticks, self.refusing, self.partial = ticks, False, False
+        self.overshoot, self.wrong_path = 0.0, 0.0
+
+    def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
+        self.requests.append(request)
+        state, way = request.state, request.goal.position - request.state.position
+        if self.refusing or np.linalg.norm(request.goal.position) > 1.0:
+            raise PlanningError("It is too far.")
+        swing = (1 - np.cos(np.linspace(0.0, np.pi, self.ticks + 1))) / 2
+        share = (1.0 + self.overshoot) * swing[:, np.newaxis]
+        if self.partial:
+            share /= 2
+        time: Array = TICK * np.arange(self.ticks + 1, dtype=float)
+        path = BasePath(
+            time,
+            state.position + share * (way + self.wrong_path),
+            np.tile(state.quaternion, (self.ticks + 1, 1)),
+        )
+        schedule = GaitSchedule(
+            method=self.name,
+            joint_names=self.robot.joint_names,
+            control_period=TICK,
+            positions=state.q - 8 * share * way,
+            path=path,
+            goal=request.goal,
+            partial=self.partial,
+        )
+        return replace(schedule, controls=frozenset({"position"}))
+
+
+class HeldWorker:
+    """A worker in the background whose plans are there when a test says so: no thread."""
+
+    background = True
+
+    def __init__(self, inner: PlanningWorker) -> None:
+        self._inner = inner
+        self.task: PlanningTask | None = None
+        self.cancelled = self.released = False
+        self.tasks: list[PlanningTask] = []
+
+    @property
+    def busy(self) -> bool:
+        return self.task is not None
+
+    def submit(self, task: PlanningTask) -> None:
+        assert self.task is None
+        self.task, self.cancelled, self.released = task, False, False
+        self.tasks.append(task)
+
+    def release(self) -> None:
+        """Let the plan be there at the next look."""
+        self.released = True
+
+    def poll(self) -> Planned | Refused | None:
+        if self.task is None or not self.released:
+            return None
+        task, self.task = self.task, None
+        if self.cancelled:
+            return None
+        try:
+            return Planned(self._inner.plan(task, Cancellation()), 0.25)
+        except PlanningError as refusal:
+            return Refused(str(refusal), 0.25)
+
+    def cancel(self) -> None:
+        self.cancelled = True
+
+    def close(self) -> None:
+        self.cancelled = self.released = True
+
+
+class PlantState:
+    """The measured state of a plant."""
+
+    def __init__(self, plant: VelocityPlant) -> None:
+        self._plant = plant
+        self.stamp_ns = 0
+        self.seen = True
+        """Whether the base is measured."""
+        self.broken = False
+        """Whether all that is measured is no number."""
+
+    @property
+    def q(self) -> Array:
+        return self._plant.q * np.nan if self.broken else self._plant.q
+
+    def base(self) -> BaseMeasurement | None:
+        if not self.seen:
+            return None
+        pose = self._plant.pose * np.nan if self.broken else self._plant.pose
+        return BaseMeasurement(pose, self._plant.twist, self._plant.qdot)
+
+
+class Loop:
+    """An executive and a plant that does what it is told, tick by tick.
+
+    Parameters
+    ----------
+    parameters
+        Of the planner, by name; beside a quick gait.
+    robot, initial
+        The plant's; the planner has the robot ``believed``, by default the same.
+    method
+        Plans instead of the one that the parameters name.
+    held
+        Plan in the background, where every plan is there when a test says so.
+    """
+
+    def __init__(
+        self,
+        parameters: dict[str, Any] | None = None,
+        *,
+        robot: str = "sliding_masses",
+        believed: str = "",
+        initial: InitialState | None = None,
+        method: GaitMethod | None = None,
+        held: bool = False,
+        goal_file: GoalFile | None = None,
+    ) -> None:
+        self.config = configured(PlannerConfig, {**QUICK, **(parameters or {})})
+        self.plant = VelocityPlant(robot_of(robot), TICK, initial)
+        model = robot_of(believed or robot)
+        inner = PlanningWorker(model, self.config, method)
+        self.method = method
+        self.held = HeldWorker(inner)
+        worker: Worker = self.held if held else inner
+        self.executive = Executive(model, self.config, worker, goal_file)
+        self.measured = PlantState(self.plant)
+        self.outputs: list[Output] = []
+        self.shapes: list[Array] = [self.plant.q.copy()]
+        """The shape (n,) at every tick."""
+        self.commands: list[Array] = []
+        """The velocities (n,) that were commanded at every tick."""
+        self.poses: list[Array] = [self.plant.pose.copy()]
+        """The pose (7,) of the base at every tick."""
+        self._goals = 0
+
+    # -- acting -------------------------------------------------------------------------------
+
+    def propose(self, place: Place | Goal) -> str:
+        """Propose a goal; return its id."""
+        self._goals += 1
+        goal = place if isinstance(place, Goal) else goal_at(place)
+        self.executive.propose(IdentifiedGoal(goal, f"goal-{self._goals}"))
+        self._take()
+        return f"goal-{self._goals}"
+
+    def abort(self) -> str | None:
+        sentence = self.executive.abort()
+        self._take()
+        return sentence
+
+    def stop(self) -> None:
+        self.executive.stop()
+        self._take()
+
+    def late(self) -> None:
+        """Show the base of the state that was answered last."""
+        self.measured.seen = True
+        self.executive.observe(self.measured)
+        self._take()
+
+    def set(self, **parameters: Any) -> None:
+        """Change live parameters."""
+        self.config = replace(self.config, **parameters)
+        self.executive.config = self.config
+
+    def tick(self, count: int = 1, *, base: bool = True) -> None:
+        """Answer this many states and step the plant; ``base``: whether it is measured."""
+        for _ in range(count):
+            self.measured.seen = base
+            setpoint = self.executive.update(self.measured)
+            self._take()
+            assert np.all(np.isfinite(setpoint.position))
+            assert np.all(np.isfinite(setpoint.velocity))
+            self.commands.append(setpoint.velocity.copy())
+            self.plant.step(setpoint.velocity)
+            self.measured.stamp_ns += TICK_NS
+            self.shapes.append(self.plant.q.copy())
+            self.poses.append(self.plant.pose.copy())
+
+    def until(self, *states: PlannerState, ticks: int = 4000) -> PlannerStatus:
+        """Tick until the latest status is one of these; return it."""
+        for _ in range(ticks):
+            if self.statuses and self.statuses[-1].state in states:
+                return self.statuses[-1]
+            self.tick()
+        raise AssertionError(f"not {states} within {ticks} ticks but {self.statuses}")
+
+    def decide(self, place: Place | Goal) -> PlannerStatus:
+        """Propose a goal and tick until it is decided; return the status that decides it."""
+        before = len(self.statuses)
+        self.propose(place)
+        for _ in range(4000):
+            self.tick()
+            decided = [s for s in self.statuses[before:] if s.state.decided]
+            if decided:
+                return decided[-1]
+        raise AssertionError(f"not decided: {self.statuses[before:]}")
+
+    def _take(self) -> None:
+        self.outputs += self.executive.take_outputs()
+
+    # -- looking ------------------------------------------------------------------------------
+
+    @property
+    def statuses(self) -> list[PlannerStatus]:
+        return [output for output in self.outputs if isinstance(output, PlannerStatus)]
+
+    @property
+    def states(self) -> list[str]:
+        return [status.state.value for status in self.statuses]
+
+    @property
+    def starts(self) -> list[ScheduleStart]:
+        return [output for output in self.outputs if isinstance(output, ScheduleStart)]
+
+    @property
+    def notices(self) -> list[str]:
+        return [output.sentence for output in self.outputs if isinstance(output, Notice)]
+
+    @property
+    def transitions(self) -> list[Transition]:
+        return [output for output in self.outputs if isinstance(output, Transition)]
+
+    @property
+    def speeds(self) -> list[float]:
+        """The largest commanded velocity at every tick."""
+        return [float(np.abs(velocity).max()) for velocity in self.commands]
+
+    def error_to(self, place: Place) -> tuple[float, float]:
+        """Return how far the base is from a goal: m, rad."""
+        pose = self.plant.pose
+        turn = Rotation.from_quat(pose[3:]).inv() * Rotation.from_rotvec(place[1])
+        return float(np.linalg.norm(pose[:3] - place[0])), float(turn.magnitude())
