@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from spacerobot_ros.cli.options import json_option
+from spacerobot_ros.cli.options import PATH, json_option
 
 
 @click.command("bench")
@@ -27,15 +27,35 @@ from spacerobot_ros.cli.options import json_option
     help="... with so many commands a second. May be repeated.  [default: 100]",
 )
 @json_option("Write the figures.")
+@click.option(
+    "--against",
+    type=PATH,
+    metavar="PATH",
+    help="Measure the checkout at PATH in turns with this one, and print the ratios.",
+)
 def command(
-    ticks: int, seconds: float | None, rates: tuple[float, ...], json_file: Path | None
+    ticks: int,
+    seconds: float | None,
+    rates: tuple[float, ...],
+    json_file: Path | None,
+    against: Path | None,
 ) -> None:
     """Measure the speed of the stack against a bare ping-pong in the same run."""
-    from spacerobot_ros.benchmarks import bench, real_time
+    if against is not None:
+        from spacerobot_ros.benchmarks.against import compare_checkouts
 
-    if seconds is None:
+        words = ["--ticks", str(ticks)]
+        if seconds is not None:
+            rate_words = [word for rate in rates for word in ("--rate", str(rate))]
+            words = ["--real-time", str(seconds), *rate_words]
+        lines = compare_checkouts(against, words, json_file)
+    elif seconds is None:
+        from spacerobot_ros.benchmarks import bench
+
         lines = bench.run_benchmark(ticks, json_file)
     else:
+        from spacerobot_ros.benchmarks import real_time
+
         lines = real_time.run_benchmark(seconds, rates or (100.0,), json_file)
     for line in lines:
         click.echo(line)
