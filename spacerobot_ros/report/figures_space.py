@@ -157,7 +157,7 @@ def path_plate(flight: Flight, beside: Sequence[Flight] = ()) -> Plate | str:
     if not len(flight.position):
         return NO_STATES
     goals = [flight.goal] if flight.goal is not None and flight.position_counts else []
-    goals += [goal for _, goal in flight.tool_goals[-1:]]
+    goals += [sent.goal for sent in flight.tool_goals[-1:]]
     # Beside the reach of an arm, the path of a base that nobody pushes would be a dot.
     shows_tool = len(flight.tool) > 0 and len(flight.tool_goals) > 0
     flown = [flight, *(other for other in beside if len(other.position))]

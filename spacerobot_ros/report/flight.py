@@ -12,39 +12,95 @@ import numpy as np
 
 from spacerobot_ros.bag import Bag, RecordedRobot, TopicSeries, read_bag
 from spacerobot_ros.bag.recorded_robot import columns
-from spacerobot_ros.errors import PlanningError, RobotDescriptionError
+from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
+from spacerobot_ros.errors import PlanningError, RobotDescriptionError, SpaceRobotError
 from spacerobot_ros.model import RobotDescription, parse_robot
 from spacerobot_ros.model.description import Array, Joint, Pose
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
 from spacerobot_ros.planning import METHODS, Goal, PoseError
+from spacerobot_ros.planning.execution.goal_file import GoalIds
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.signals import Cycles, Signal, find_cycles, nearest_rotvec, rotvecs
 from spacerobot_ros.report.solids import SolidRobot
 from spacerobot_ros.session.scenario import Published
 from spacerobot_ros.topics import TOPICS
 
-_FOLLOWED = ("executing", "reached", "failed", "aborted")
-"""States of the planner in which the goal it names is, or was, the one to fly to."""
+_FOLLOWED = frozenset(("executing", "reached", "failed", "aborted"))
+"""States in which the goal of a status is, or was, the one to fly to."""
 
 
 @dataclass(frozen=True)
 class Status:
-    """What the planner said at ``time`` (s): a sentence, and values by name."""
+    """What planner or controller reported.
+
+    Attributes
+    ----------
+    time
+        When, s.
+    sentence
+        For people.
+    report
+        The same for programs; None where it is no status of this package.
+    """
 
     time: float
-    message: str
-    values: dict[str, str]
+    sentence: str
+    report: PlannerStatus | ControllerStatus | None
 
     @property
     def state(self) -> str:
-        """State of the planner."""
-        return self.values.get("state", "")
+        """State of planner or controller; empty where it is not known."""
+        return self.report.state.value if self.report is not None else ""
 
-    def numbers(self, key: str) -> list[float]:
-        """Return a value as numbers; none if it is not there or is no list of numbers."""
-        try:
-            return [float(word) for word in self.values.get(key, "").split()]
-        except ValueError:
-            return []
+    @property
+    def executing(self) -> bool:
+        """Whether a schedule begins."""
+        return self.state == PlannerState.EXECUTING.value
+
+    @property
+    def goal_id(self) -> str:
+        """Id of the goal that the status is about; empty where it is not known."""
+        return self.report.goal_id if self.report is not None else ""
+
+    @property
+    def goal(self) -> tuple[float, ...]:
+        """Position and quaternion (7,) of that goal with 9 digits; empty where not reported."""
+        return self.report.goal if isinstance(self.report, PlannerStatus) else ()
+
+    @property
+    def method(self) -> str:
+        """Gait method of the schedule that begins, or control law."""
+        match self.report:
+            case PlannerStatus(method=method):
+                return method
+            case ControllerStatus(command=CommandReport(law=law)):
+                return law
+            case _:
+                return ""
+
+    @property
+    def outputs(self) -> frozenset[str]:
+        """Names of the outputs whose errors a controller reports."""
+        match self.report:
+            case ControllerStatus(command=CommandReport(errors=errors)):
+                return frozenset(errors)
+            case _:
+                return frozenset()
+
+    def note(self, name: str) -> list[float]:
+        """Return a result of the planning method as numbers; none if it is not there."""
+        notes = self.report.notes if isinstance(self.report, PlannerStatus) else {}
+        value = notes.get(name, "")
+        return [] if isinstance(value, str) else np.atleast_1d(value).tolist()
+
+
+@dataclass(frozen=True)
+class SentGoal:
+    """A goal pose that was sent at ``time`` (s), and the id under which statuses report on it."""
+
+    time: float
+    goal: Goal
+    goal_id: str
 
 
 @dataclass(frozen=True)
@@ -84,9 +140,8 @@ class Flight:
     wrench: Signal
     efforts: Signal
     statuses: list[Status]
-    sent: list[tuple[float, Goal]]
-    tool_goals: list[tuple[float, Goal]]
-    outputs: frozenset[str]
+    sent: list[SentGoal]
+    tool_goals: list[SentGoal]
     planned: list[Array]
 
     # -- what it is called --------------------------------------------------------------------
@@ -109,10 +164,8 @@ class Flight:
     @property
     def method(self) -> str:
         """Gait method: of the first schedule, or the planner's parameter; else the control law."""
-        named = [
-            s.values[key] for key in ("method", "law") for s in self.statuses if s.values.get(key)
-        ]
-        return named[0] if named else str(self.parameter("planner", "method") or "")
+        named = (status.method for status in self.statuses if status.method)
+        return next(named, str(self.parameter("planner", "method") or ""))
 
     @property
     def robot_name(self) -> str:
@@ -153,38 +206,44 @@ class Flight:
     @property
     def executing(self) -> list[Status]:
         """One status for each schedule that was flown."""
-        return [status for status in self.statuses if status.state == "executing"]
+        return [status for status in self.statuses if status.executing]
+
+    @cached_property
+    def outputs(self) -> frozenset[str]:
+        """Names of the controller's outputs; none where a planner has the goals."""
+        return frozenset[str]().union(*(status.outputs for status in self.statuses))
 
     @cached_property
     def targets(self) -> list[Target]:
         """Goals of the schedules; without any schedule, the goals that were sent."""
-        found = [(s.time, goal) for s in self.executing if (goal := self._named_goal(s))]
-        goals = found or self.sent
-        ends = [*(time for time, _ in goals), self.end][1:]
-        return [Target(t, end, goal) for (t, goal), end in zip(goals, ends, strict=True)]
+        found = [(s.time, goal) for s in self.executing if (goal := self._goal_of(s))]
+        return self._each_until_the_next(found or [(sent.time, sent.goal) for sent in self.sent])
 
     @property
     def goal(self) -> Goal | None:
-        """The goal that the end is judged by: the one flown to last, or else the one sent last."""
+        """The goal that counts at the end: the one flown to last, or else the one sent last."""
         for status in reversed(self.statuses):
-            goal = self._named_goal(status)
+            goal = self._goal_of(status)
             if status.state in _FOLLOWED and goal is not None:
                 return goal
-        return self.sent[-1][1] if self.sent else None
+        return self.sent[-1].goal if self.sent else None
 
     @property
     def tool_targets(self) -> list[Target]:
         """Goals of the end-effector, each until the next."""
-        ends = [*(time for time, _ in self.tool_goals), self.end][1:]
-        return [Target(t, end, goal) for (t, goal), end in zip(self.tool_goals, ends, strict=True)]
+        return self._each_until_the_next([(sent.time, sent.goal) for sent in self.tool_goals])
+
+    def _each_until_the_next(self, goals: list[tuple[float, Goal]]) -> list[Target]:
+        ends = [*(time for time, _ in goals), self.end][1:]
+        return [Target(t, end, goal) for (t, goal), end in zip(goals, ends, strict=True)]
 
     @property
     def tool_error(self) -> PoseError | None:
-        """What the last pose of the end-effector leaves to its last goal."""
+        """Remaining error of the last pose of the end-effector to its last goal."""
         if not self.tool_goals or not len(self.tool):
             return None
         last = self.tool.values[-1]
-        return PoseError.between(last[:3], last[3:], self.tool_goals[-1][1])
+        return PoseError.between(last[:3], last[3:], self.tool_goals[-1].goal)
 
     @property
     def position_counts(self) -> bool:
@@ -204,7 +263,7 @@ class Flight:
 
     @property
     def final_error(self) -> PoseError | None:
-        """What the last pose leaves to the goal."""
+        """Remaining error of the last pose to the goal."""
         if self.goal is None or not len(self.position):
             return None
         return PoseError.between(self.position.values[-1], self.quaternion[-1], self.goal)
@@ -221,13 +280,13 @@ class Flight:
         """
         schedules = self.executing
         if not schedules:
-            flying = [s.time for s in self.statuses if s.state == "tracking"]
+            tracking = ControllerState.TRACKING.value
+            flying = [s.time for s in self.statuses if s.state == tracking]
             ended = [s.time for s in self.statuses if s.state in _FOLLOWED]
             return ended[-1] - flying[0] if flying and ended else None
         index = last = self.statuses.index(schedules[-1])
-        goal = schedules[-1].values.get("goal")
-        while index and (before := self.statuses[index - 1]).state == "executing":
-            if before.values.get("goal") != goal:
+        while index and (before := self.statuses[index - 1]).executing:
+            if before.goal != schedules[-1].goal:
                 break
             index -= 1
         ended = [s.time for s in self.statuses[last + 1 :] if s.state in _FOLLOWED]
@@ -297,14 +356,18 @@ class Flight:
         joints = self.robot.movable_joints if self.robot is not None else ()
         return next((joint for joint in joints if joint.name == name), None)
 
-    def _named_goal(self, status: Status) -> Goal | None:
-        """The goal in a status, with all the digits of the goal pose that it was sent as."""
-        numbers = status.numbers("goal")
+    def _goal_of(self, status: Status) -> Goal | None:
+        """Return the goal of a status, as it was sent."""
+        for sent in reversed(self.sent):
+            if status.goal_id and status.goal_id == sent.goal_id:
+                return sent.goal
         try:
-            named = Goal.checked(numbers[:3], numbers[3:])
+            named = Goal.checked(status.goal[:3], status.goal[3:])
         except PlanningError:
             return None
-        for _, goal in reversed(self.sent):
+        # Bags of earlier versions have no ids: the goal that was sent has more digits.
+        for sent in reversed(self.sent):
+            goal = sent.goal
             same = np.allclose(goal.position, named.position, rtol=1e-7, atol=1e-8)
             if same and np.allclose(goal.quaternion, named.quaternion, rtol=0.0, atol=1e-7):
                 return goal
@@ -349,14 +412,9 @@ def read_flight(path: Path) -> Flight:
         tool=robot.signal("end_effector_pose", "pose"),
         wrench=robot.signal("base_wrench", "wrench"),
         efforts=_efforts(robot, names),
-        statuses=[
-            Status(time, message.message, {pair.key: pair.value for pair in message.values})
-            for time, message in robot.messages("planner/status")
-            or robot.messages("controller/status")
-        ],
+        statuses=_statuses(robot),
         sent=_goals(robot, "goal_pose"),
         tool_goals=_goals(robot, "end_effector/goal_pose"),
-        outputs=_outputs(robot),
         planned=[
             np.array([[getattr(p.pose.position, x) for x in "xyz"] for p in message.poses]).reshape(
                 -1, 3
@@ -439,29 +497,34 @@ def _efforts(robot: _Recorded, names: list[str]) -> Signal:
     return Signal(efforts.time, efforts.values[:, [given.index(name) for name in names]])
 
 
-def _outputs(robot: _Recorded) -> frozenset[str]:
-    """Return the names of the controller's outputs; none where a planner has the goals."""
-    if robot.get("planner/status") is not None:
-        return frozenset()
-    return frozenset(
-        pair.key.removeprefix("error.")
-        for _, message in robot.messages("controller/status")
-        for pair in message.values
-        if pair.key.startswith("error.")
-    )
+def _statuses(robot: _Recorded) -> list[Status]:
+    """Return the statuses of the planner, or else of the controller."""
+    planned = robot.messages("planner/status")
+    kind: type[PlannerStatus | ControllerStatus] = PlannerStatus if planned else ControllerStatus
+    statuses = []
+    for time, message in planned or robot.messages("controller/status"):
+        values = {pair.key: pair.value for pair in message.values}
+        try:
+            report = kind.from_values(values, message.message)
+        except SpaceRobotError:
+            report = None
+        statuses.append(Status(time, message.message, report))
+    return statuses
 
 
-def _goals(robot: _Recorded, topic: str) -> list[tuple[float, Goal]]:
+def _goals(robot: _Recorded, topic: str) -> list[SentGoal]:
     """Return the goal poses that are poses in the frame of the odometry."""
     odom = robot.get("odom")
     world = next(odom.messages())[1].header.frame_id if odom is not None else ""
-    goals = []
+    goals, ids = [], GoalIds()
     for time, message in robot.messages(topic):
+        stamp = message.header.stamp
+        goal_id = ids.of(stamp.sec, stamp.nanosec)
         p, o = message.pose.position, message.pose.orientation
         try:
             goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w])
         except PlanningError:
             continue
         if not world or message.header.frame_id in ("", world):
-            goals.append((time, goal))
+            goals.append(SentGoal(time, goal, goal_id))
     return goals

@@ -77,12 +77,12 @@ def _facts(flight: Flight) -> str:
 def _outcome(flight: Flight) -> str:
     if not flight.statuses:
         return (
-            '<p class="outcome">The bag holds no word of a planner or a controller '
+            '<p class="outcome">The bag holds no status of a planner or a controller '
             "(planner/status, controller/status).</p>"
         )
     last = flight.statuses[-1]
-    sentence = last.message
-    if last.state == "executing":
+    sentence = last.sentence
+    if last.executing:
         sentence += " The recording ends before that is decided."
     state = f"<b>{escape(last.state.capitalize())}</b>" if last.state else ""
     return f'<p class="outcome {escape(last.state)}">{state}{escape(sentence)}</p>'

@@ -95,7 +95,7 @@ def result_table(flight: Flight) -> Table:
 
 
 def _tool_rows(flight: Flight, error: PoseError) -> list[tuple[str, ...]]:
-    goal, last = flight.tool_goals[-1][1], flight.tool.values[-1]
+    goal, last = flight.tool_goals[-1].goal, flight.tool.values[-1]
     rows: list[tuple[str, ...]] = [
         ("End-effector goal", f"({_vector(goal.position)}) m"),
         ("End-effector, final", f"({_vector(last[:3])}) m"),
@@ -169,7 +169,7 @@ def _measured(flight: Flight, row: Published) -> tuple[list[float], str]:
         figures["manoeuvre_time_s"] = [time]
     if row.quantity in figures:
         return [float(x) for x in figures[row.quantity]], "flight"
-    numbers = flight.executing[0].numbers(row.quantity) if flight.executing else []
+    numbers = flight.executing[0].note(row.quantity) if flight.executing else []
     return numbers, "planner" if numbers else ""
 
 

@@ -227,7 +227,7 @@ def test_without_goal_and_planner_and_in_a_namespace(tmp_path: Path) -> None:
     page = report_of(tmp_path, Story(still(), prefix="/free_flyer"))
     assert list(page.figures) == FIGURES
     assert "The bag holds no goal pose." in page.text
-    assert "no word of a planner" in page.text
+    assert "no status of a planner" in page.text
     assert "Position error" not in dict(page.tables["numbers"])
 
 
