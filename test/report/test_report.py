@@ -269,6 +269,22 @@ def test_several_schedules(tmp_path: Path) -> None:
     assert numbers_in(page.number("Goal position")) == GOAL[0]
 
 
+@pytest.mark.usefixtures("blank")
+def test_the_goal_of_a_status_is_found_by_its_id(tmp_path: Path) -> None:
+    other = ([0.0, 0.0, 1.0], [0.0, 0.0, 0.1])
+    statuses = [
+        (0.0, "Flying.", EXECUTING | {"goal_id": "unstamped-1"}),
+        (10.0, "The goal is out of reach.", {"state": "refused", "goal_id": "10.000000000"}),
+        (30.0, "The goal is reached.", {"state": "reached", "goal_id": "unstamped-1"}),
+        (40.0, "This is no status.", {"state": "lost"}),
+    ]
+    goals = [(0.0, *GOAL), (10.0, *other)]
+    page = report_of(tmp_path, Story(still(), statuses, goals))
+    assert numbers_in(page.number("Goal position")) == GOAL[0]
+    assert numbers_in(page.number("Manoeuvre time")) == [30.0]
+    assert "This is no status." in page.text
+
+
 def test_cut_short_right_after_the_start(tmp_path: Path) -> None:
     statuses = [(0.0, "Flying a gait.", EXECUTING | goal_value())]
     page = report_of(tmp_path, Story(still(count=1), statuses, goals=[(0.0, *GOAL)]))
