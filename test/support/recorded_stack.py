@@ -118,7 +118,7 @@ class Stack:
             ),
             "the goal is decided",
         )
-        assert "met" in self.probe.last("/planner/status").message
+        assert "reached" in self.probe.last("/planner/status").message
 
     def stop(self) -> None:
         """Stop time, and let everything arrive that is on its way."""
