@@ -118,6 +118,7 @@ class LieBracketGait(GaitMethod):
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan steps 1 to 3; see :meth:`GaitMethod.plan`."""
+        cancellation.raise_if_requested()
         state, goal = request.state, request.goal
         self._require_rest(state)
         z_f = self.final_shape(state, goal)

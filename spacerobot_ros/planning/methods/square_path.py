@@ -150,6 +150,7 @@ class SquarePathGait(GaitMethod):
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan steps 1 to 4; see :meth:`GaitMethod.plan`."""
+        cancellation.raise_if_requested()
         state, goal, tolerance = request.state, request.goal, request.tolerance
         if self._refusal is not None:
             raise PlanningError(str(self._refusal))

@@ -1,0 +1,285 @@
+"""A plan follows from its request alone, says what it controls, and can be cancelled."""
+
+from __future__ import annotations
+
+import inspect
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import (
+    METHODS,
+    NEVER,
+    Cancellation,
+    GaitMethod,
+    GaitSchedule,
+    Goal,
+    PlanningCancelled,
+    PlanRequest,
+    RobotState,
+    Tolerance,
+    build_method,
+    method_options,
+)
+from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
+
+PERIOD, STEP = 0.1, 0.02
+SERVICER_SHAPE = (0.0, -1.2, 2.0, 0.0, 0.8, 0.0)
+FEW_STARTS = {
+    "cache": 0,
+    "starts": 1,
+    "answers": 1,
+    "intervals": 12,
+    "time_budget": 300.0,
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A method, a robot in a shape, and turns (rad) and a displacement (m) that it plans."""
+
+    method: str
+    robot: str
+    shape: tuple[float, ...]
+    turns: tuple[tuple[float, float, float], ...]
+    displacement: float
+    controls: frozenset[str]
+
+
+ATTITUDE, POSE = frozenset({"attitude", "shape"}), frozenset({"attitude", "position"})
+TURNS = ((0.03, -0.02, 0.04), (-0.05, 0.02, 0.01))
+SLIDERS, ARM, CHAIN = (0.1, 0.0, -0.1), (0.0, -0.8, 1.5), (1.0, 1.0)
+CASES = {
+    "lie_bracket": Case("lie_bracket", "sliding_masses", SLIDERS, TURNS, 0.05, POSE),
+    "square_path": Case(
+        "square_path", "planar_chain", CHAIN, ((0, 0, 0.5), (0, 0, -1.0)), 0.0, ATTITUDE
+    ),
+    "area_loop": Case("area_loop", "three_joint_arm", ARM, TURNS, 0.0, ATTITUDE),
+    "area_loop of six joints": Case("area_loop", "servicer", SERVICER_SHAPE, TURNS, 0.0, ATTITUDE),
+    "optimal": Case("optimal", "three_joint_arm", ARM, TURNS, 0.0, ATTITUDE),
+    "optimal with sliders": Case(
+        "optimal", "sliding_masses", SLIDERS, TURNS, 0.05, POSE | {"shape"}
+    ),
+    "auto": Case("auto", "three_joint_arm", ARM, TURNS, 0.0, ATTITUDE),
+    "remaining_joints": Case("remaining_joints", "servicer", SERVICER_SHAPE, TURNS, 0.0, ATTITUDE),
+}
+
+
+def robot_named(name: str) -> SpaceRobot:
+    return SpaceRobot.from_file(Path(__file__).parents[2] / "urdf" / f"{name}.urdf")
+
+
+def options_of(case: Case) -> dict[str, Any]:
+    """Return options that make planning quick."""
+    area_loop = {}
+    if case.robot == "servicer":
+        third = "elbow_pitch" if case.method == "area_loop" else "wrist_pitch"
+        area_loop["joints"] = f"shoulder_yaw shoulder_pitch {third}"
+    return {
+        "optimal": method_options("optimal", FEW_STARTS),
+        "area_loop": method_options("area_loop", area_loop),
+    }
+
+
+def built(case: Case, robot: SpaceRobot) -> GaitMethod:
+    if case.method != "remaining_joints":
+        return build_method(case.method, robot, PERIOD, STEP, options_of(case))
+    return RemainingJointsGait(
+        robot,
+        PERIOD,
+        STEP,
+        stuck={"elbow_pitch": 2.0},
+        method="area_loop",
+        options=options_of(case),
+    )
+
+
+def requests(case: Case) -> list[PlanRequest]:
+    """Return requests for two goals, and for the first one from elsewhere and within less."""
+    start = Rotation.from_rotvec([0.2, 0.1, -0.3])
+    state = RobotState(np.array([0.1, 0.2, 0.0]), start.as_quat(), np.array(case.shape))
+    there = state.position + case.displacement * np.array([1.0, -0.5, 0.3])
+    goals = [
+        Goal.checked(there, (start * Rotation.from_rotvec(turn)).as_quat()) for turn in case.turns
+    ]
+    near, wide = Tolerance(1e-3, 1e-3), Tolerance(2e-2, 2e-2)
+    moved = replace(state, q=state.q + 0.02 * (np.arange(len(state.q)) != 2))
+    return [
+        PlanRequest(state, goals[0], near),
+        PlanRequest(state, goals[1], near),
+        PlanRequest(moved, goals[0], wide, correction=True),
+    ]
+
+
+def content(schedule: GaitSchedule) -> dict[str, Any]:
+    """Return all of a schedule that can be compared with ==; notes without times of the clock."""
+    values = {field.name: getattr(schedule, field.name) for field in fields(schedule)}
+    for name in ("goal", "progress", "path"):
+        values.pop(name)
+    values["positions"] = schedule.positions.tobytes()
+    values |= {f"path {name}": array.tobytes() for name, array in vars(schedule.path).items()}
+    return values
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_equal_requests_have_equal_schedules_in_any_order(name: str) -> None:
+    case = CASES[name]
+    robot, asked = robot_named(case.robot), requests(case)
+    # The plan that goes on from the first one belongs to the first goal.
+    method = built(case, robot)
+    first = method.plan(asked[0])
+    asked.append(replace(asked[2], previous=first))
+    there = [content(method.plan(request)) for request in asked]
+    assert there[0] == content(first)
+    back = [content(method.plan(request)) for request in reversed(asked)]
+    assert back[::-1] == there
+    # Another instance, which has seen nothing.
+    for request, expected in zip(reversed(asked), there[::-1], strict=True):
+        assert content(built(case, robot).plan(request)) == expected
+    assert there[0] != there[1]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_schedule_says_what_it_controls_and_who_made_it(name: str) -> None:
+    case = CASES[name]
+    method = built(case, robot_named(case.robot))
+    before = method.controls
+    schedule = method.plan(requests(case)[0])
+    assert schedule.controls == case.controls
+    assert schedule.method in METHODS
+    assert schedule.method != "auto"
+    # What the method says of itself is the same as ever.
+    assert method.controls == before
+
+
+@pytest.mark.parametrize("kind", [*METHODS.values(), RemainingJointsGait])
+def test_every_method_and_every_wrapper_is_called_alike(kind: type[GaitMethod]) -> None:
+    assert issubclass(kind, GaitMethod)
+    of_all = inspect.signature(GaitMethod.plan)
+    assert inspect.signature(kind.plan) == of_all
+    built_with = list(inspect.signature(kind).parameters)[:3]
+    assert built_with == ["robot", "control_period", "integration_step"]
+
+
+# -- pieces of one goal -----------------------------------------------------------------------
+
+
+def test_cycles_are_counted_along_the_schedules_of_one_goal() -> None:
+    case = CASES["area_loop"]
+    method = built(case, robot_named(case.robot))
+    request = requests(case)[0]
+    first = method.plan(request)
+    again = method.plan(replace(request, correction=True, previous=first))
+    # A plant that does not turn at all: one more cycle is done, and as many are to come.
+    expected = [float(str(piece.notes["expected_cycles"])) for piece in (first, again)]
+    assert expected[1] == pytest.approx(expected[0] + 1.0)
+    alone = method.plan(replace(request, correction=True))
+    assert float(str(alone.notes["expected_cycles"])) == expected[0]
+
+
+def test_a_goal_keeps_its_nominal_shape_while_the_other_joints_rest() -> None:
+    case = CASES["area_loop of six joints"]
+    method = built(case, robot_named(case.robot))
+    request = requests(case)[0]
+    first = method.plan(request)
+    # As noise has it: the next plan begins a little elsewhere.
+    q = request.state.q + 5e-4
+    nearby = replace(request, state=replace(request.state, q=q))
+    kept = method.plan(replace(nearby, previous=first)).notes["nominal"]
+    assert kept == first.notes["nominal"]
+    anew = method.plan(nearby).notes["nominal"]
+    assert anew != kept
+
+
+def test_what_was_planned_with_all_joints_is_not_gone_on_with_without_some() -> None:
+    case = CASES["area_loop of six joints"]
+    robot = robot_named(case.robot)
+    request = requests(case)[0]
+    of_all = built(case, robot).plan(request)
+    without = built(CASES["remaining_joints"], robot)
+    alone = without.plan(request)
+    assert content(without.plan(replace(request, previous=of_all))) == content(alone)
+
+
+def test_auto_goes_on_with_the_method_of_the_schedule_before() -> None:
+    case = CASES["optimal"]
+    robot, request = robot_named(case.robot), requests(case)[0]
+    options = {"optimal": method_options("optimal", FEW_STARTS)}
+    by_optimal = build_method("optimal", robot, PERIOD, STEP, options).plan(request)
+    auto = build_method("auto", robot, PERIOD, STEP, options)
+    assert auto.plan(request).method == "area_loop"
+    assert auto.plan(replace(request, previous=by_optimal)).method == "optimal"
+    assert auto.plan(request).method == "area_loop"
+
+
+# -- cancellation -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_cancelled_plan_is_not_made(name: str) -> None:
+    case = CASES[name]
+    method = built(case, robot_named(case.robot))
+    cancellation = Cancellation()
+    cancellation.cancel()
+    with pytest.raises(PlanningCancelled, match=r"^Planning was cancelled\.$"):
+        method.plan(requests(case)[0], cancellation)
+    # The next one is.
+    assert method.plan(requests(case)[0], Cancellation()).ticks > 0
+
+
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        lambda robot, options: build_method("optimal", robot, PERIOD, STEP, options),
+        lambda robot, options: RemainingJointsGait(
+            robot,
+            PERIOD,
+            STEP,
+            stuck={"elbow_pitch": 2.0},
+            method="optimal",
+            options=options,
+        ),
+    ],
+    ids=["optimal", "optimal with remaining joints"],
+)
+def test_a_search_is_cancelled_from_another_thread(
+    wrapped: Callable[[SpaceRobot, dict[str, Any]], GaitMethod],
+) -> None:
+    robot = robot_named("servicer")
+    long = {"cache": 0, "intervals": 200, "starts": 1000, "answers": 1000, "time_budget": 1000.0}
+    method = wrapped(robot, {"optimal": method_options("optimal", long)})
+    case = replace(CASES["area_loop of six joints"], turns=((0.3, 0.2, -0.3),) * 2)
+    cancellation, ended = Cancellation(), list[BaseException]()
+
+    def search() -> None:
+        try:
+            method.plan(requests(case)[0], cancellation)
+        except PlanningError as reason:
+            ended.append(reason)
+
+    thread = threading.Thread(target=search, daemon=True)
+    thread.start()
+    time.sleep(1.5)
+    assert thread.is_alive()
+    cancellation.cancel()
+    # A step of the solver takes a fraction of a second.
+    thread.join(20.0)
+    assert not thread.is_alive()
+    assert [type(reason) for reason in ended] == [PlanningCancelled]
+
+
+def test_what_is_never_cancelled_cannot_be() -> None:
+    assert not NEVER.requested
+    NEVER.raise_if_requested()
+    with pytest.raises(RuntimeError, match="NEVER"):
+        NEVER.cancel()
+    assert not NEVER.requested
