@@ -48,7 +48,6 @@ class ReportedState:
         self._thrusters = thrusters_in(plant)
         self._sensors_used = self.sensors.used
         self.quantities = self._quantities()
-        self._place_end_effector()
 
     @property
     def topics(self) -> list[Topic]:
@@ -74,7 +73,8 @@ class ReportedState:
             Whether :attr:`quantities` are others than before.
         """
         self.sensors.measure()
-        self._place_end_effector()
+        if self._link is not None:
+            self._place_end_effector(self._link)
         if self.sensors.used == self._sensors_used:
             return False
         self._sensors_used = self.sensors.used
@@ -113,10 +113,8 @@ class ReportedState:
             }
         return quantities
 
-    def _place_end_effector(self) -> None:
-        if self._link is None:
-            return
-        plant, index, target = self._plant, self._link, self._end_effector_pose
+    def _place_end_effector(self, index: int) -> None:
+        plant, target = self._plant, self._end_effector_pose
         R_WB, r_WB = matrix_from_quaternion(plant.pose[3:]), plant.pose[:3]
         target[:3] = r_WB + R_WB @ plant.link_r[:, index]
         target[3:] = quaternion_from_matrix(R_WB @ plant.link_R[:, 3 * index : 3 * index + 3])

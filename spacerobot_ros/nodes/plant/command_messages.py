@@ -30,13 +30,15 @@ class CommandReader(ABC):
     """
 
     message_type: type[Any]
+    values: Array
+    """What the message read last commands, in the order of the robot's joints."""
 
     def __init__(self, source: CommandSource) -> None:
         self.source = source
 
     @abstractmethod
-    def read(self, raw: bytes) -> Array:
-        """Return the values of a message, in the order of the robot's joints.
+    def read(self, raw: bytes) -> int:
+        """Read a message into :attr:`values`; return its stamp, ns.
 
         Raises
         ------
@@ -53,14 +55,13 @@ class CommandReader(ABC):
 
     def offer(self, commands: CommandValidator, raw: bytes, now_ns: int) -> Refusal | None:
         """Offer a message to the validator; return why it is refused, if it is."""
-        values: Array | CommandError
         try:
-            values = self.read(raw)
+            stamp = self.read(raw)
         except UnreadableError as error:
             return commands.unreadable(self.source, error)
         except CommandError as error:
-            values = error
-        return commands.offer(self.source, self.stamp_ns, values, now_ns)
+            return commands.offer(self.source, self.stamp_ns, error, now_ns)
+        return commands.offer(self.source, stamp, self.values, now_ns)
 
 
 class _JointCommandReader(CommandReader):
@@ -72,12 +73,11 @@ class _JointCommandReader(CommandReader):
         super().__init__(source)
         assert source.quantity != "wrench"
         self._reader = JointReader(robot.joint_names, [source.quantity])
-        self._values = self._reader.values[source.quantity]
+        self.values = self._reader.values[source.quantity]
 
-    def read(self, raw: bytes) -> Array:
+    def read(self, raw: bytes) -> int:
         """Read the source's quantity."""
-        self._reader.accept(raw)
-        return self._values
+        return self._reader.accept(raw)
 
     @property
     def stamp_ns(self) -> int:
@@ -95,13 +95,14 @@ class _WrenchReader(CommandReader):
         self._base_link = robot.base_link
         self._reader = TemplateReader(WrenchStamped, lambda _: {"wrench.force.x": 6})
 
-    def read(self, raw: bytes) -> Array:
+    def read(self, raw: bytes) -> int:
         """Read force over torque."""
         self._reader.accept(raw)
         message = self._reader.prototype
         assert message is not None
         require_frame(message.header.frame_id, self._base_link)
-        return self._reader.floats("wrench.force.x")
+        self.values = self._reader.floats("wrench.force.x")
+        return self._reader.stamp_ns
 
     @property
     def stamp_ns(self) -> int:
