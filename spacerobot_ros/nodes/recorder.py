@@ -375,7 +375,7 @@ def _descriptions(path: str) -> list[tuple[str, dict[str, str]]]:
 
 def parameters_of(node: FlightNode) -> dict[str, str]:
     """Return a node's parameters as JSON texts by name, for a bag's metadata."""
-    return {name: json.dumps(value) for name, value in node.parameters.items()}
+    return {name: json.dumps(value) for name, value in node.parameter_values.items()}
 
 
 def main() -> None:

@@ -90,7 +90,7 @@ class Flight:
 
     def _on_state(self, state: JointState) -> None:
         stamp = state.header.stamp
-        tick = round((stamp.sec + stamp.nanosec * 1e-9) * float(self.plant.parameters["tick_rate"]))  # type: ignore[arg-type]
+        tick = round((stamp.sec + stamp.nanosec * 1e-9) * self.plant.config.tick_rate)
         for message in self._answer(tick):
             if not message.header.stamp.nanosec:
                 message.header.stamp = stamp

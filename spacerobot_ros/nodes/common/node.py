@@ -32,7 +32,7 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import robot_from_text, robot_of
 from spacerobot_ros.nodes.common.cdr import raw_publish
-from spacerobot_ros.parameters import Parameter, Value, configured, declared
+from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """State and commands: reliable, deep enough for a reader that is briefly busy."""
@@ -129,7 +129,6 @@ class FlightNode(LifecycleNode):
 
     def __init__(self, name: str, *, autostart: bool | None = None, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
-        self._declared = (AUTOSTART, *declared(self.Config))
         self.fault: SpaceRobotError | None = None
         self.on_end: Callable[[int], None] = lambda code: None
         """Called with an exit code by a node that has nothing left to do."""
@@ -137,11 +136,12 @@ class FlightNode(LifecycleNode):
         """What passes through the node as bytes, from its configuration to its cleanup."""
         self._raising = False
         try:
-            self.parameters: dict[str, Value] = declare(self, self._declared)
-            self._configured()
+            values = _declare(self, (AUTOSTART, *declared(self.Config)))
+            self._autostart = bool(values[AUTOSTART.name])
+            self.config = configured(self.Config, values)
             self.add_on_set_parameters_callback(self._on_set_parameters)
             self._permanent = set(self._entities())
-            if self.parameters["autostart"] if autostart is None else autostart:
+            if self._autostart if autostart is None else autostart:
                 self.start()
         except SpaceRobotError:
             self.destroy_node()
@@ -189,6 +189,11 @@ class FlightNode(LifecycleNode):
         self.raw_streams.append(stream)
 
     @property
+    def parameter_values(self) -> dict[str, Value]:
+        """The value of every parameter by its full name."""
+        return {AUTOSTART.name: self._autostart, **values_of(self.config)}
+
+    @property
     def is_active(self) -> bool:
         """Whether the node is in its active state."""
         machine = self._state_machine
@@ -217,7 +222,7 @@ class FlightNode(LifecycleNode):
         """Take in what is still on its way before the node ends."""
 
     def parameters_changed(self) -> None:
-        """React to a change of live parameters; ``self.parameters`` has the new values."""
+        """React to a change of live parameters; ``self.config`` has the new values."""
 
     # -- life cycle ---------------------------------------------------------------------------
 
@@ -261,9 +266,6 @@ class FlightNode(LifecycleNode):
         self.fault = None
         return TransitionCallbackReturn.SUCCESS
 
-    def _configured(self) -> None:
-        self.config = configured(self.Config, self.parameters)
-
     def _entities(self) -> list[Any]:
         return [*self.timers, *self.subscriptions, *self.services, *self.publishers]
 
@@ -280,13 +282,11 @@ class FlightNode(LifecycleNode):
                 next(act for kind, act in destroy.items() if isinstance(entity, kind))(entity)
 
     def _on_set_parameters(self, changes: list[RosParameter]) -> SetParametersResult:
-        reason = check_changes(self._declared, changes)
-        if reason:
-            return SetParametersResult(successful=False, reason=reason)
-        for change in changes:
-            if change.name in self.parameters:
-                self.parameters[change.name] = change.value
-        self._configured()
+        given = {change.name: change.value for change in changes}
+        try:
+            self.config = configured(self.Config, {**values_of(self.config), **given})
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         self.parameters_changed()
         return SetParametersResult(successful=True)
 
@@ -330,7 +330,7 @@ class RobotNode(FlightNode):
             self._on_part()
 
 
-def descriptor(parameter: Parameter) -> ParameterDescriptor:
+def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     """Return what ``ros2 param describe`` shows."""
     unit = f" [{parameter.unit}]" if parameter.unit else ""
     choices = ", ".join(parameter.choices)
@@ -354,7 +354,7 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
     return described
 
 
-def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
+def _declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
     """Declare parameters on a node and return their checked values.
 
     A whole number is accepted where a real one is wanted (``rate: 20``).
@@ -377,18 +377,6 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
             # rclpy cannot tell the type of an empty list: declare the type and leave it unset.
             kind = RosParameter.Type
             stored = kind.STRING_ARRAY if parameter.texts else kind.DOUBLE_ARRAY
-        node.declare_parameter(name, stored, descriptor(parameter), ignore_override=True)
+        node.declare_parameter(name, stored, _descriptor(parameter), ignore_override=True)
         values[name] = value
     return values
-
-
-def check_changes(parameters: Sequence[Parameter], changes: Sequence[RosParameter]) -> str:
-    """Return why a change while running is refused, or an empty text."""
-    by_name = {parameter.name: parameter for parameter in parameters}
-    for change in changes:
-        if change.name in by_name:
-            try:
-                by_name[change.name].checked(change.value)
-            except ParameterError as error:
-                return str(error)
-    return ""

@@ -1,0 +1,225 @@
+"""The rules for commands without ROS: each reason to refuse one, what is in force, what latches."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from spacerobot_ros.errors import CommandError, ParameterError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.commands import (
+    CommandSource,
+    CommandValidator,
+    Reason,
+    Refusal,
+    joint_order,
+    require_frame,
+    require_values,
+)
+from spacerobot_ros.simulation.config import PlantConfig
+
+SECOND = 10**9
+TICK = 50_000_000
+SLIDERS = SpaceRobot.from_file(robot_file("sliding_masses"))
+ARM = SpaceRobot.from_file(robot_file("three_joint_arm"))
+FAST = np.array([0.1, 0.2, -0.3])
+
+
+class Rig:
+    """A plant and its commands in one time mode."""
+
+    def __init__(self, robot: SpaceRobot = SLIDERS, **parameters: Any) -> None:
+        self.config = PlantConfig(**{"time_mode": "lockstep", **parameters})
+        self.plant = build_plant(robot, self.config)
+        self.commands = CommandValidator(self.plant, self.config)
+        self.joints: CommandSource = self.commands.sources[0]
+
+    def offer(
+        self, stamp_ns: int, now_ns: int, values: npt.NDArray[np.float64] | CommandError = FAST
+    ) -> Refusal | None:
+        return self.commands.offer(self.joints, stamp_ns, values, now_ns)
+
+    def reason(self, *args: Any) -> Reason:
+        refusal = self.offer(*args)
+        assert refusal is not None
+        assert self.commands.counts[refusal.reason] > 0
+        return refusal.reason
+
+    def in_force(self) -> list[float]:
+        return list(self.commands.begin_step()[0])
+
+
+def real_time(**parameters: Any) -> Rig:
+    return Rig(time_mode="realtime", command_timeout=0.5, **parameters)
+
+
+def test_a_tick_is_answered_once_and_by_its_own_stamp() -> None:
+    rig = Rig()
+    assert not rig.commands.complete
+    assert rig.offer(TICK, TICK) is None
+    assert rig.commands.complete
+    assert rig.reason(TICK, TICK, -FAST) is Reason.STALE, "it has been answered"
+    assert rig.in_force() == list(FAST)
+    assert not rig.commands.complete, "the next tick wants a command of its own"
+    assert rig.reason(TICK, 2 * TICK) is Reason.STALE
+    assert rig.reason(3 * TICK, 2 * TICK) is Reason.EARLY
+    assert rig.reason(2 * TICK + 1, 2 * TICK) is Reason.EARLY
+    assert not rig.commands.complete, "commands of other ticks answer nothing"
+    assert rig.commands.counts == {Reason.STALE: 2, Reason.EARLY: 2}
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        (CommandError("joint 'rudder' is unknown"), Reason.MALFORMED),
+        (np.array([0.1, np.nan, 0.0]), Reason.NOT_FINITE),
+        (np.array([np.inf, -np.inf, 0.0]), Reason.NOT_FINITE),
+        (np.array([0.0, 0.0, -9.0]), Reason.BEYOND_LIMITS),
+    ],
+)
+def test_a_bad_command_is_a_tick_at_rest(values: Any, reason: Reason) -> None:
+    rig = Rig(beyond_limits="refuse")
+    assert rig.offer(0, 0) is None
+    rig.commands.begin_step()
+    assert rig.reason(TICK, TICK, values) is reason
+    assert rig.commands.complete, "time goes on"
+    assert rig.in_force() == [0.0, 0.0, 0.0]
+    assert rig.offer(2 * TICK, 2 * TICK) is None
+    assert rig.in_force() == list(FAST)
+
+
+def test_beyond_the_limits_is_for_the_plant_to_clip_unless_it_is_refused() -> None:
+    assert Rig().offer(0, 0, np.array([0.0, 0.0, -9.0])) is None
+    limit = np.array(SLIDERS.velocity_limit)
+    assert Rig(beyond_limits="refuse").offer(0, 0, -limit) is None
+
+
+def test_real_time_refuses_what_is_old_early_or_out_of_order() -> None:
+    rig, now = real_time(), 10 * SECOND
+    assert rig.reason(now - SECOND, now) is Reason.STALE
+    assert rig.reason(now + SECOND, now) is Reason.EARLY
+    assert rig.offer(now, now) is None
+    assert rig.reason(now - TICK, now) is Reason.OUT_OF_ORDER
+    assert rig.offer(now, now, -FAST) is None, "one commander may correct itself"
+    rig.joints.commanders = 2
+    refusal = rig.offer(now, now)
+    assert refusal is not None
+    assert refusal.reason is Reason.SECOND_COMMANDER
+    assert refusal.latches, "by default"
+    assert rig.offer(now + TICK, now) == Refusal(Reason.LATCHED, rig.commands.fault)
+
+
+def test_two_commanders_may_be_accepted() -> None:
+    rig, now = real_time(second_commander="accept"), 10 * SECOND
+    rig.joints.commanders = 2
+    assert rig.offer(now, now) is None
+    assert rig.offer(now, now, -FAST) is None
+    assert rig.in_force() == list(-FAST)
+
+
+def test_an_unset_stamp_means_now() -> None:
+    rig, now = real_time(), 10 * SECOND
+    assert rig.offer(now - TICK, now) is None
+    assert rig.offer(0, now) is None
+    assert rig.joints.stamp_ns == now
+    # At the start it is the stamp of the first state.
+    early = real_time()
+    assert early.offer(0, TICK) is None
+    assert early.joints.stamp_ns == 0
+
+
+def test_commands_hold_until_they_are_older_than_the_timeout() -> None:
+    rig, now = real_time(), 10 * SECOND
+    assert rig.commands.drop_old(now) == [], "there has been none"
+    assert rig.offer(now, now) is None
+    assert rig.commands.drop_old(now + SECOND // 2) == []
+    assert rig.in_force() == list(FAST)
+    assert rig.commands.drop_old(now + SECOND // 2 + 1) == [rig.joints]
+    assert rig.in_force() == [0.0, 0.0, 0.0]
+    assert rig.commands.drop_old(now + SECOND) == [], "it is counted once"
+    for_ever = Rig(time_mode="realtime", command_timeout=0.0)
+    assert for_ever.offer(1, now) is None
+    assert for_ever.commands.drop_old(10**18) == []
+
+
+def test_a_latched_fault_refuses_everything_until_it_is_rearmed() -> None:
+    rig = Rig(latched_faults="not_finite stale")
+    bad = np.full(3, np.nan)
+    refusal = rig.offer(0, 0, bad)
+    assert refusal is not None
+    assert refusal.latches
+    assert "not finite" in rig.commands.fault
+    rig.commands.begin_step()
+    assert rig.reason(TICK, TICK) is Reason.LATCHED
+    assert rig.in_force() == [0.0, 0.0, 0.0]
+    again = rig.offer(2 * TICK, 2 * TICK, bad)
+    assert again is not None
+    assert again.reason is Reason.NOT_FINITE
+    assert not again.latches, "the first fault stays"
+    first = rig.commands.fault
+    assert rig.commands.rearm() == first
+    assert rig.commands.rearm() == ""
+    rig.commands.begin_step()
+    assert rig.offer(3 * TICK, 3 * TICK) is None
+
+
+def test_latching_takes_back_what_was_accepted_in_the_same_tick() -> None:
+    rig = Rig(ARM, actuation="effort", latched_faults="malformed")
+    wrench = rig.commands.sources[1]
+    assert rig.commands.offer(wrench, 0, np.ones(6), 0) is None
+    assert rig.reason(0, 0, CommandError("a joint is missing")) is Reason.MALFORMED
+    assert rig.commands.complete
+    assert not rig.commands.begin_step()[1].any()
+
+
+def test_an_unknown_reason_to_latch_is_refused() -> None:
+    with pytest.raises(ParameterError, match="'latched_faults' has 'bad_luck'"):
+        Rig(latched_faults="stale bad_luck")
+
+
+def test_a_wrench_is_waited_for_only_while_somebody_publishes_it() -> None:
+    rig = Rig(ARM, actuation="effort")
+    joints, wrench = rig.commands.sources
+    joints.commanders = wrench.commanders = 0
+    assert rig.commands.offer(wrench, 0, np.ones(6), 0) is None
+    rig.commands.require_commanded()
+    assert (joints.required, wrench.required) == (True, False)
+    assert not rig.commands.begin_step()[1].any(), "nobody is left who could end the thrust"
+    wrench.commanders = 1
+    rig.commands.require_commanded()
+    assert wrench.required
+
+
+def test_motors_brake_and_leave_the_momenta() -> None:
+    rig = Rig(ARM, actuation="effort", tick_rate=100.0, initial_joint_velocities=(0.2, -0.3, 0.25))
+    momenta = rig.plant.momentum[:6].copy()
+    assert not rig.commands.begin_step()[0].any(), "nobody has commanded it to rest yet"
+    rig.commands.rest()
+    for _ in range(200):
+        rig.plant.step(*rig.commands.begin_step())
+    assert np.abs(rig.plant.qdot).max() < 1e-9
+    np.testing.assert_allclose(rig.plant.momentum[:6], momenta, atol=1e-12)
+
+
+def test_names_and_lengths() -> None:
+    joints = ("a", "b", "c")
+    assert joint_order(joints, ["c", "a"]).tolist() == [2, 0]
+    for named, complete, words in (
+        (["c", "x"], False, "'x' is unknown"),
+        (["a", "b"], True, "'c' is missing"),
+        (["a", "a"], False, "named twice"),
+    ):
+        with pytest.raises(CommandError, match=words):
+            joint_order(joints, named, complete=complete)
+    require_values(["a", "b"], "effort", 2)
+    with pytest.raises(CommandError, match=r"2 joint\(s\) are named but 3 effort"):
+        require_values(["a", "b"], "effort", 3)
+    require_frame("", "base")
+    require_frame("base", "base")
+    with pytest.raises(CommandError, match="in frame 'world'"):
+        require_frame("world", "base")
