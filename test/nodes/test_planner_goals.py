@@ -51,26 +51,6 @@ def test_every_state_is_answered_with_one_command_of_its_stamp(harness: Harness)
         assert np.all(np.isfinite([*message.position, *message.velocity]))
 
 
-def test_goals_are_flown_one_after_the_other(harness: Harness) -> None:
-    flight = Flight(harness)
-    for place in (NEAR, TURNED, HERE):
-        assert values_of(flight.decide(place))["state"] == "reached"
-        distance, angle = flight.error_to(place)
-        assert distance <= 1e-3
-        assert angle <= 1e-3
-
-
-def test_the_pose_that_is_already_there_is_reached(harness: Harness) -> None:
-    flight = Flight(harness)
-    status = flight.decide(HERE)
-    assert flight.states[-1] == "reached"
-    assert_one_sentence(status.message, "reached")
-    (schedule,) = flight.probe.messages["gait_schedule"]
-    assert len(schedule.points) <= 2
-    flight.ticks(5)
-    assert not any(any(m.velocity) for m in flight.probe.messages["joint_states"])
-
-
 def test_a_goal_without_a_frame_is_taken_in_the_world(harness: Harness) -> None:
     flight = Flight(harness, {"world_frame": "map"}, {"world_frame": "map"})
     flight.send(goal_at(NEAR, frame=""))
@@ -143,24 +123,3 @@ def test_a_refused_goal_does_not_disturb_the_one_that_is_flown(harness: Harness,
     assert flight.states == ["idle", "executing", "refused", "reached"]
     assert max(flight.error_to(NEAR)) <= 1e-3
     assert len(flight.probe.messages["gait_schedule"]) == 1
-
-
-def test_a_drifting_robot_is_refused_with_the_true_reason(harness: Harness) -> None:
-    flight = Flight(harness, plant={"linear_momentum": [0.3, -0.4, 0.0]})
-    status = flight.decide(NEAR)
-    assert flight.states == ["idle", "refused"]
-    assert_one_sentence(status.message, "drifts", "momentum", "0.5 kg m/s")
-
-
-def test_a_turning_robot_is_refused_with_the_true_reason(harness: Harness) -> None:
-    flight = Flight(harness, plant={"angular_momentum": [0.0, 0.0, 0.25]})
-    status = flight.decide(NEAR)
-    assert flight.states == ["idle", "refused"]
-    assert_one_sentence(status.message, "momentum", "0.25 kg m^2/s")
-
-
-def test_a_robot_that_the_method_cannot_steer_is_refused(harness: Harness) -> None:
-    flight = Flight(harness, {"robot": "planar_chain"}, {"robot": "planar_chain"})
-    status = flight.decide(TURNED)
-    assert flight.states == ["idle", "refused"]
-    assert_one_sentence(status.message, "three sliders", "planar_chain")

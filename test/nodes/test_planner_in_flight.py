@@ -1,93 +1,28 @@
-"""A goal of the planner node that is replaced, aborted or corrected while it is flown."""
+"""Goals of the planner node while they are pursued: services, parameters, ids."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.srv import SetParameters
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
-from support.planner_flight import NEAR, TURNED, Flight, stamp_of, values_of
+from support.planner_flight import NEAR, TURNED, Flight, Place, goal_at, values_of
 from support.plant_rig import TICK_NS
-from support.ros_harness import Harness, nanoseconds
+from support.ros_harness import Harness
 from support.sentences import assert_one_sentence
+
+from spacerobot_ros.planning.execution.status import PlannerStatistics
 
 pytestmark = pytest.mark.usefixtures("one_plant")
 
-Array = npt.NDArray[np.float64]
 
-URDF = Path(__file__).parents[2] / "urdf"
-
-
-# -- preemption and abortion ------------------------------------------------------------------
-
-
-def test_a_new_goal_replaces_the_one_that_is_flown(harness: Harness) -> None:
-    flight = Flight(harness)
-    flight.send(([-0.1, 0.0, 0.05], [0.0, 0.0, 0.0]))
-    flight.start()
-    flight.wait("executing")
-    flight.ticks(15)
-    assert any(flight.probe.last("joint_states").velocity), "the first goal is being flown"
-    flight.decide(TURNED)
-    assert flight.states == ["idle", "executing", "executing", "reached"]
-    distance, angle = flight.error_to(TURNED)
-    assert max(distance, angle) <= 1e-3
-    first, second = flight.probe.messages["gait_schedule"]
-    ends = stamp_of(first) + nanoseconds(first.points[-1].time_from_start)
-    assert stamp_of(first) < stamp_of(second) < ends
-    # The second begins at the shape that the first had come to.
-    at_switch = next(
-        m for m in flight.probe.messages["joint_states"] if stamp_of(m) == stamp_of(second)
-    )
-    np.testing.assert_array_equal(second.points[0].positions, at_switch.position)
-    # No joint stops dead: what was flown comes to rest before the second gait begins.
-    after = next(
-        m
-        for m in flight.probe.messages["joint_states"]
-        if stamp_of(m) == stamp_of(second) + TICK_NS
-    )
-    before, now = np.array(at_switch.velocity), np.array(after.velocity)
-    assert np.abs(before).max() > 0.01
-    assert np.abs(now - before).max() < 0.2 * np.abs(before).max()
-
-
-def test_the_rest_is_planned_again_when_the_base_drifts_off_its_path(
-    harness: Harness, tmp_path: Path
-) -> None:
-    """The base is heavier than the planner believes, so that it does not go where it should."""
-    urdf = (URDF / "sliding_masses.urdf").read_text("utf-8")
-    heavier = tmp_path / "heavier.urdf"
-    heavier.write_text(urdf.replace('<mass value="10"/>', '<mass value="13"/>'), "utf-8")
-    flight = Flight(
-        harness, {"drift_position": 2e-3, "max_corrections": 10}, {"robot": str(heavier)}
-    )
-    flight.decide(NEAR)
-    first, second = flight.probe.messages["gait_schedule"][:2]
-    ends = stamp_of(first) + nanoseconds(first.points[-1].time_from_start)
-    assert stamp_of(first) < stamp_of(second) < ends
-    assert flight.states[-1] == "reached"
-    assert max(flight.error_to(NEAR)) <= 1e-3
-
-
-def test_small_drift_is_left_to_the_end(harness: Harness) -> None:
-    flight = Flight(harness, {"drift_position": 2e-3, "drift_attitude": 2e-3})
-    flight.decide(NEAR)
-    assert flight.states == ["idle", "executing", "reached"]
-
-
-def distance_from(path: Array, shape: Array) -> float:
-    """Return how far a shape is from the polygon through the shapes of a path."""
-    legs = np.diff(path, axis=0)
-    lengths = np.maximum((legs**2).sum(axis=1), 1e-30)
-    share = np.clip(((shape - path[:-1]) * legs).sum(axis=1) / lengths, 0.0, 1.0)
-    nearest = path[:-1] + share[:, np.newaxis] * legs
-    return float(np.linalg.norm(shape - nearest, axis=1).min())
+# -- services ---------------------------------------------------------------------------------
 
 
 def test_abortion_brings_the_joints_to_rest(harness: Harness) -> None:
@@ -100,19 +35,12 @@ def test_abortion_brings_the_joints_to_rest(harness: Harness) -> None:
     client = flight.probe.create_client(Trigger, "planner/abort")
     answer = harness.call(client, Trigger.Request())
     assert answer.success
+    assert_one_sentence(answer.message, "brake along the planned path")
     status = flight.wait("aborted")
     assert status.level == DiagnosticStatus.WARN
-    assert_one_sentence(status.message)
-    began = flight.probe.count("joint_states")
+    assert_one_sentence(status.message, answer.message)
     flight.ticks(10**9 // TICK_NS + 3)  # abort_time, and commands that were on their way.
-    braking = flight.probe.messages["joint_states"][began:]
-    place = list(braking[-1].position)
-    (schedule,) = flight.probe.messages["gait_schedule"]
-    path = np.array([point.positions for point in schedule.points])
-    for state in braking:
-        assert distance_from(path, np.array(state.position)) < 1e-9, "it rests on its path"
-    speeds = [np.abs(m.velocity).max() for m in braking]
-    assert max(np.abs(np.diff(speeds))) < 0.5 * max(speeds), "and does not stop dead"
+    place = list(flight.probe.last("joint_states").position)
     flight.ticks(60)
     assert list(flight.probe.last("joint_states").position) == place
     assert list(flight.probe.last("joint_states").velocity) == [0.0] * 3
@@ -125,14 +53,19 @@ def test_abortion_brings_the_joints_to_rest(harness: Harness) -> None:
     assert max(flight.error_to(NEAR)) <= 1e-3
 
 
-def test_a_goal_that_waits_for_a_state_can_be_aborted(harness: Harness) -> None:
+def test_statistics_are_those_of_the_flight(harness: Harness) -> None:
     flight = Flight(harness)
-    flight.send(NEAR)
+    client = flight.probe.create_client(Trigger, "planner/statistics")
+    flight.decide(NEAR)
+    flight.plant.trigger_deactivate()
     harness.settle(flight.probe)
-    harness.call(flight.probe.create_client(Trigger, "planner/abort"), Trigger.Request())
-    flight.start()
-    flight.ticks(10)
-    assert not flight.probe.messages["gait_schedule"]
+    answer = harness.call(client, Trigger.Request())
+    assert answer.success
+    statistics = PlannerStatistics.from_json(answer.message)
+    assert statistics == flight.planner.statistics
+    assert statistics.commands_published == flight.probe.count("joint_commands")
+    assert statistics.plans == 1
+    assert 0.0 < statistics.plan_time_s < 15.0
 
 
 def test_a_reset_of_the_plant_does_not_keep_the_goal_from_being_met(harness: Harness) -> None:
@@ -181,27 +114,6 @@ def test_a_tolerance_that_is_tightened_in_flight_makes_corrections_happen(harnes
     assert len(flight.probe.messages["gait_schedule"]) == 1 + corrections
 
 
-def test_a_goal_that_is_missed_fails_with_a_sentence(harness: Harness) -> None:
-    flight = Flight(
-        harness,
-        {
-            "position_tolerance": 0.1,
-            "attitude_tolerance": 0.1,
-            "lie_bracket.loop_area": 10.0,
-            "max_corrections": 0,
-        },
-    )
-    flight.send(TURNED)
-    flight.start()
-    flight.wait("executing")
-    flight.planner.set_parameters([Parameter("attitude_tolerance", value=1e-9)])
-    status = flight.wait("failed")
-    assert status.level == DiagnosticStatus.ERROR
-    assert_one_sentence(status.message, "not reached", "0 correction(s)")
-    flight.ticks(10)
-    assert list(flight.probe.last("joint_states").velocity) == [0.0] * 3
-
-
 def test_a_bad_change_in_flight_is_refused(harness: Harness) -> None:
     flight = Flight(harness)
     flight.send(NEAR)
@@ -223,3 +135,57 @@ def test_a_bad_change_in_flight_is_refused(harness: Harness) -> None:
         assert flight.planner.get_parameter(name).value == before
     flight.wait("reached")
     assert max(flight.error_to(NEAR)) <= 1e-3
+
+
+# -- ids --------------------------------------------------------------------------------------
+
+
+def stamped(place: Place, sec: int, nanosec: int) -> PoseStamped:
+    goal = goal_at(place)
+    goal.header.stamp.sec, goal.header.stamp.nanosec = sec, nanosec
+    return goal
+
+
+def ids_of(flight: Flight) -> list[tuple[str, str]]:
+    """States with the ids of the goals that they speak of."""
+    values = [values_of(status) for status in flight.probe.messages["planner/status"]]
+    return [(value["state"], value.get("goal_id", "")) for value in values]
+
+
+def test_statuses_name_the_goal_by_its_stamp(harness: Harness) -> None:
+    flight = Flight(harness)
+    flight.decide(stamped(NEAR, 3, 5))
+    flight.decide(NEAR)
+    refused = stamped(NEAR, 4, 123456789)
+    refused.header.frame_id = "moon"
+    flight.decide(refused)
+    assert ids_of(flight) == [
+        ("idle", ""),
+        ("executing", "3.000000005"),
+        ("reached", "3.000000005"),
+        ("executing", "unstamped-1"),
+        ("reached", "unstamped-1"),
+        ("refused", "4.123456789"),
+    ]
+
+
+def test_a_planner_that_starts_again_resumes_its_goal_by_its_id(
+    harness: Harness, tmp_path: Path
+) -> None:
+    flight = Flight(harness, {"resume_file": str(tmp_path / "goal.json")})
+    flight.send(stamped(TURNED, 7, 0))
+    flight.start()
+    flight.wait("executing")
+    flight.ticks(15)
+    for step in ("deactivate", "cleanup", "configure"):
+        assert getattr(flight.planner, f"trigger_{step}")() is TransitionCallbackReturn.SUCCESS
+    harness.connect()
+    flight.planner.trigger_activate()
+    flight.wait("reached")
+    assert max(flight.error_to(TURNED)) <= 1e-3
+    assert ids_of(flight)[2:] == [
+        ("planning", "7.000000000"),
+        ("executing", "7.000000000"),
+        ("reached", "7.000000000"),
+    ]
+    assert not (tmp_path / "goal.json").exists()

@@ -1,0 +1,376 @@
+"""Goals of an executive that plans with a real method, on the plant and without ROS."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from support.planner_loop import HERE, NEAR, TURNED, Loop, Place, StubMethod, goal_at
+from support.sentences import assert_one_sentence
+
+from spacerobot_ros.planning import GaitSchedule
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
+from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile
+from spacerobot_ros.planning.execution.status import PlannerState
+from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
+from spacerobot_ros.resources import share_directory
+from spacerobot_ros.simulation import InitialState
+
+Array = npt.NDArray[np.float64]
+
+BEYOND_STROKE: Place = ([-0.4, 0.0, 0.0], [0.0, 0.0, 0.0])
+# Wide tolerances and one large cycle: a first order that is some way off.
+COARSE = {
+    "position_tolerance": 0.1,
+    "attitude_tolerance": 0.1,
+    "lie_bracket.loop_area": 10.0,
+}
+
+
+# -- reached, or refused with the true reason -------------------------------------------------
+
+
+def test_goals_are_pursued_one_after_the_other() -> None:
+    loop = Loop()
+    for place in (NEAR, TURNED, HERE):
+        assert loop.decide(place).state is PlannerState.REACHED
+        assert max(loop.error_to(place)) <= 1e-3
+
+
+def test_the_pose_that_is_already_there_is_reached() -> None:
+    loop = Loop()
+    status = loop.decide(HERE)
+    assert status.state is PlannerState.REACHED
+    assert_one_sentence(status.sentence, "reached")
+    (start,) = loop.starts
+    assert start.schedule.ticks <= 1
+    loop.tick(5)
+    assert not any(loop.speeds)
+
+
+def test_the_measured_error_is_reported() -> None:
+    loop = Loop({"position_tolerance": 2e-3, "attitude_tolerance": 3e-4})
+    status = loop.decide(TURNED)
+    distance, angle = loop.error_to(TURNED)
+    assert distance <= 2e-3
+    assert angle <= 3e-4
+    assert status.position_error_m == pytest.approx(distance, rel=1e-3, abs=1e-9)
+    assert status.attitude_error_rad == pytest.approx(angle, rel=1e-3, abs=1e-9)
+    assert loop.states == ["executing", "reached"]
+
+
+def test_a_goal_that_is_refused_in_flight_does_not_disturb_the_earlier_one() -> None:
+    loop = Loop()
+    loop.propose(NEAR)
+    loop.tick(10)
+    loop.propose(BEYOND_STROKE)
+    loop.until(PlannerState.REACHED)
+    assert loop.states == ["executing", "refused", "reached"]
+    assert "beyond stroke" in loop.statuses[1].sentence
+    assert loop.statuses[1].sentence.endswith(" The earlier goal is still pursued.")
+    assert max(loop.error_to(NEAR)) <= 1e-3
+    assert len(loop.starts) == 1
+
+
+@pytest.mark.parametrize(
+    ("momenta", "mentions"),
+    [
+        ({"linear_momentum": np.array([0.3, -0.4, 0.0])}, ("drifts", "momentum", "0.5 kg m/s")),
+        ({"angular_momentum": np.array([0.0, 0.0, 0.25])}, ("momentum", "0.25 kg m^2/s")),
+    ],
+)
+def test_a_robot_with_momentum_is_refused_with_the_true_reason(
+    momenta: dict[str, Array], mentions: tuple[str, ...]
+) -> None:
+    loop = Loop(initial=InitialState(**momenta))
+    status = loop.decide(NEAR)
+    assert loop.states == ["refused"]
+    assert_one_sentence(status.sentence, *mentions)
+
+
+def test_a_robot_that_the_method_cannot_steer_is_refused() -> None:
+    loop = Loop(robot="planar_chain")
+    status = loop.decide(TURNED)
+    assert loop.states == ["refused"]
+    assert_one_sentence(status.sentence, "three sliders", "planar_chain")
+
+
+def test_a_goal_that_is_missed_fails_with_a_sentence() -> None:
+    loop = Loop({**COARSE, "max_corrections": 0})
+    loop.propose(TURNED)
+    loop.tick()
+    loop.set(attitude_tolerance=1e-9)
+    status = loop.until(PlannerState.FAILED)
+    assert_one_sentence(status.sentence, "not reached", "0 correction(s)")
+    loop.tick(10)
+    assert loop.speeds[-1] == 0.0
+
+
+def test_the_goal_is_on_file_as_long_as_it_is_pursued(tmp_path: Path) -> None:
+    file = GoalFile(str(tmp_path / "goal.json"))
+    loop = Loop(goal_file=file)
+    goal_id = loop.propose(NEAR)
+    loop.tick(5)
+    assert file.load()[BASE].goal_id == goal_id
+    loop.stop()
+    assert file.load()[BASE].goal_id == goal_id, "it is resumed after a restart"
+    loop.decide(NEAR)
+    assert file.load() == {}
+    loop.propose(HERE)
+    loop.tick(5)
+    loop.abort()
+    assert file.load() == {}
+
+
+def test_a_goal_that_cannot_be_saved_is_pursued(tmp_path: Path) -> None:
+    loop = Loop(goal_file=GoalFile(str(tmp_path / "none" / "goal.json")))
+    assert loop.decide(NEAR).state is PlannerState.REACHED
+    assert any("cannot be written" in notice for notice in loop.notices)
+
+
+# -- replaced, given up, off the path ---------------------------------------------------------
+
+
+def test_a_new_goal_replaces_the_one_that_is_pursued() -> None:
+    loop = Loop()
+    loop.propose(([-0.1, 0.0, 0.05], [0.0, 0.0, 0.0]))
+    loop.tick(15)
+    assert loop.speeds[-1] > 0.0
+    assert loop.decide(TURNED).state is PlannerState.REACHED
+    assert loop.states == ["executing", "executing", "reached"]
+    assert max(loop.error_to(TURNED)) <= 1e-3
+    first, second = loop.starts
+    assert second.stamp_ns < first.stamp_ns + first.schedule.duration * 1e9
+    # The second begins at the shape that the first had come to.
+    tick = second.stamp_ns // 50_000_000
+    np.testing.assert_array_equal(second.schedule.positions[0], loop.shapes[tick])
+    # No joint stops dead: the joints brake before the second gait begins.
+    before, now = loop.commands[tick - 1], loop.commands[tick]
+    assert np.abs(before).max() > 0.01
+    assert np.abs(now - before).max() < 0.2 * np.abs(before).max()
+    # And the path that is predicted for braking and gait together is what happens.
+    path = second.schedule.path
+    for k in range(0, len(path.time), 7):
+        at = tick + round(path.time[k] / 0.05)
+        np.testing.assert_allclose(path.position[k], loop.poses[at][:3], rtol=0, atol=1e-9)
+
+
+def test_a_base_off_its_path_is_planned_for_again(tmp_path: Path) -> None:
+    """The base is heavier than the planner believes, so that it does not go where it should."""
+    urdf = (share_directory() / "urdf" / "sliding_masses.urdf").read_text("utf-8")
+    heavier = tmp_path / "heavier.urdf"
+    heavier.write_text(urdf.replace('<mass value="10"/>', '<mass value="13"/>'), "utf-8")
+    loop = Loop(
+        {"drift_position": 2e-3, "max_corrections": 10},
+        robot=str(heavier),
+        believed="sliding_masses",
+    )
+    assert loop.decide(NEAR).state is PlannerState.REACHED
+    first, second = loop.starts[:2]
+    assert first.stamp_ns < second.stamp_ns < first.stamp_ns + first.schedule.duration * 1e9
+    assert max(loop.error_to(NEAR)) <= 1e-3
+
+
+def test_small_tracking_errors_are_left_to_the_end() -> None:
+    loop = Loop({"drift_position": 2e-3, "drift_attitude": 2e-3})
+    loop.decide(NEAR)
+    assert loop.states == ["executing", "reached"]
+
+
+def distance_from(path: Array, shape: Array) -> float:
+    """Return how far a shape is from the polygon through the shapes of a path."""
+    legs = np.diff(path, axis=0)
+    lengths = np.maximum((legs**2).sum(axis=1), 1e-30)
+    share = np.clip(((shape - path[:-1]) * legs).sum(axis=1) / lengths, 0.0, 1.0)
+    nearest = path[:-1] + share[:, np.newaxis] * legs
+    return float(np.linalg.norm(shape - nearest, axis=1).min())
+
+
+def test_abortion_brings_the_joints_to_rest_on_their_path() -> None:
+    loop = Loop()
+    loop.propose(NEAR)
+    loop.tick(15)
+    assert loop.abort() == "The joints brake along the planned path within 1 s."
+    assert_one_sentence(loop.statuses[-1].sentence, "Aborted on request.")
+    began = len(loop.commands)
+    loop.tick(83)
+    path = loop.starts[0].schedule.positions
+    for shape in loop.shapes[began:]:
+        assert distance_from(path, shape) < 1e-9, "it rests on its path"
+    braking = loop.speeds[began : began + 23]
+    assert max(np.abs(np.diff(braking))) < 0.5 * max(braking), "and does not stop dead"
+    assert not any(loop.speeds[began + 21 :])
+    assert loop.states == ["executing", "aborted"]
+    assert loop.abort() is None
+    assert loop.decide(NEAR).state is PlannerState.REACHED
+    assert max(loop.error_to(NEAR)) <= 1e-3
+
+
+def test_a_goal_that_waits_for_a_state_can_be_aborted() -> None:
+    loop = Loop()
+    loop.propose(NEAR)
+    loop.abort()
+    loop.tick(10)
+    assert not loop.starts
+
+
+# -- planned in the background ----------------------------------------------------------------
+
+
+def held(**parameters: Any) -> Loop:
+    return Loop({"abort_time": 0.5, **parameters}, held=True)
+
+
+def wait_for_plan(loop: Loop) -> None:
+    """Tick until a plan is being made."""
+    for _ in range(100):
+        if loop.held.busy:
+            return
+        loop.tick()
+    raise AssertionError("nothing is planned")
+
+
+def test_states_are_answered_at_rest_until_the_plan_is_there() -> None:
+    loop = held()
+    loop.propose(NEAR)
+    loop.tick(40)
+    assert not loop.statuses
+    assert not any(loop.speeds)
+    loop.held.release()
+    loop.until(PlannerState.REACHED)
+    assert loop.error_to(NEAR)[0] < 1e-3
+    assert any(loop.speeds)
+
+
+def test_a_new_goal_in_flight_is_planned_from_rest() -> None:
+    loop = held()
+    loop.propose(NEAR)
+    loop.tick()
+    loop.held.release()
+    loop.tick(15)
+    loop.propose(TURNED)
+    wait_for_plan(loop)
+    resting = len(loop.commands)
+    loop.tick(20)
+    assert not any(loop.speeds[resting:])
+    loop.held.release()
+    loop.tick()
+    loop.until(PlannerState.REACHED)
+    assert max(loop.error_to(TURNED)) < 1e-3
+    # Nothing jumps: from tick to tick no faster than the gait itself accelerates.
+    steps = np.abs(np.diff(loop.shapes, axis=0))
+    assert steps.max() <= 0.05 * max(loop.speeds) + 1e-12
+
+
+def test_an_abort_cancels_what_is_being_planned() -> None:
+    loop = held()
+    loop.propose(NEAR)
+    loop.tick(3)
+    assert loop.abort() == "The joints rest."
+    assert loop.held.cancelled
+    # Another goal waits until the cancelled plan has ended.
+    loop.propose(NEAR)
+    loop.tick(10)
+    assert len(loop.held.tasks) == 1
+    loop.held.release()
+    loop.tick(3)
+    assert len(loop.held.tasks) == 2
+    assert loop.states == ["aborted"]
+    loop.held.release()
+    loop.until(PlannerState.REACHED)
+
+
+class Searching(LieBracketGait):
+    """Looks whether its plan is cancelled, and waits for permission where it is given a gate."""
+
+    gate: threading.Event | None = None
+
+    def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
+        while self.gate is not None and not self.gate.wait(0.005):
+            cancellation.raise_if_requested()
+        cancellation.raise_if_requested()
+        return super().plan(request, cancellation)
+
+
+def threaded(method: LieBracketGait | StubMethod) -> Loop:
+    return Loop({"plan_in_background": True, "abort_time": 0.5}, method=method)
+
+
+def searching() -> Searching:
+    built = Loop().executive._worker._method  # type: ignore[attr-defined]
+    return Searching(built.robot, built.control_period, built.integration_step, built.options)
+
+
+def wait(loop: Loop, goal_id: str, state: PlannerState = PlannerState.REACHED) -> None:
+    """Tick until this is the state of the goal; a thread that plans is left time for it."""
+    end = time.monotonic() + 15.0
+    while not any((s.goal_id, s.state) == (goal_id, state) for s in loop.statuses[-1:]):
+        assert time.monotonic() < end, f"{goal_id} is not {state.value}: {loop.statuses}"
+        loop.tick()
+        time.sleep(0.0002)
+
+
+def test_a_thread_plans_while_states_are_answered() -> None:
+    loop = threaded(searching())
+    for place in (NEAR, HERE):
+        wait(loop, loop.propose(place))
+        assert loop.error_to(place)[0] < 1e-3
+
+
+def test_a_worker_that_is_closed_has_its_search_end_soon() -> None:
+    method = searching()
+    method.gate = threading.Event()
+    loop = threaded(method)
+    before = threading.active_count()
+    loop.propose(NEAR)
+    loop.tick(200)
+    assert threading.active_count() == before + 1
+    assert not loop.statuses, "it searches still"
+    loop.stop()
+    assert threading.active_count() == before
+    # It plans again when it is wanted again.
+    method.gate.set()
+    wait(loop, loop.propose(NEAR))
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_a_plan_after_an_abort_is_not_cancelled(background: bool) -> None:
+    loop = Loop({"plan_in_background": background, "abort_time": 0.5}, method=searching())
+    wait(loop, loop.propose(NEAR), PlannerState.EXECUTING)
+    assert loop.abort() is not None
+    wait(loop, loop.propose(NEAR))
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_a_defect_of_a_method_is_seen(background: bool) -> None:
+    class Broken(StubMethod):
+        def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
+            raise ZeroDivisionError("a defect")
+
+    loop = Loop({"plan_in_background": background}, method=Broken())
+    goal_id = loop.propose(NEAR)
+    with pytest.raises(ZeroDivisionError, match="a defect"):
+        wait(loop, goal_id)
+
+
+def test_the_search_of_the_optimal_method_is_cancelled() -> None:
+    loop = Loop({"method": "optimal", "optimal.cache": 0})
+    method = loop.executive._worker._method  # type: ignore[attr-defined]
+    cancellation = Cancellation()
+    cancellation.cancel()
+    state = loop.executive._average
+    base = loop.measured.base()
+    assert base is not None
+    state.add(base.pose, base.twist, loop.plant.q, base.qdot)
+    goal = goal_at(([0.0, 0.0, 0.0], [0.05, -0.03, 0.02]))
+    request = PlanRequest(state.state(), goal, loop.config.tolerance)
+    began = time.monotonic()
+    with pytest.raises(PlanningCancelled):
+        method.plan(request, cancellation)
+    assert time.monotonic() - began < 1.6
