@@ -1,0 +1,55 @@
+"""Files and tests that the documents name exist."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from docs_build.blocks import blocks
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [*sorted(ROOT.glob("docs/**/*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+_FENCED = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
+_CODE = re.compile(r"`([^`\n]+)`")
+_FILE = re.compile(r"(?:[\w.-]+/)*[\w.-]+\.(?:py|js|urdf|yaml|json|rviz)|(?:[\w-]+/)+")
+
+_OTHERS = {
+    *("examples/", "out/", "figures.json", "robot_description.urdf"),
+    *("my_robot.yaml", "my_robot.urdf"),
+}
+"""What the program makes, and a reader writes."""
+
+
+def named(page: Path) -> list[str]:
+    """Return what stands between single backticks."""
+    return _CODE.findall(_FENCED.sub("", page.read_text(encoding="utf-8")))
+
+
+def exists(name: str) -> bool:
+    """Whether a file or folder of the repository or the package is meant."""
+    if any((top / name).exists() for top in (ROOT, ROOT / "spacerobot_ros")):
+        return True
+    inside = (ROOT / "spacerobot_ros", ROOT / "test")
+    return "/" not in name.rstrip("/") and any(any(top.rglob(name.rstrip("/"))) for top in inside)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_that_a_page_names_exist(page: Path) -> None:
+    written = {block.file for block in blocks(page.read_text(encoding="utf-8"))}
+    own = written | _OTHERS
+    files = {name for name in named(page) if _FILE.fullmatch(name)}
+    missing = sorted(
+        name for name in files if not {name, name.rsplit("/", 1)[-1]} & own and not exists(name)
+    )
+    assert missing == []
+
+
+def test_tests_that_the_page_of_faults_names_exist() -> None:
+    text = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
+    source = (ROOT / "test" / "nodes" / "test_faults_flight.py").read_text(encoding="utf-8")
+    names = re.findall(r"(?:F |, )`(\w+)(?:\.\.\.)?`", text[text.index("## What the stack does") :])
+    flights = [name for name in names if not (ROOT / "config" / "faults" / f"{name}.yaml").exists()]
+    assert len(flights) > 10
+    assert [name for name in flights if f"def test_{name}" not in source] == []
