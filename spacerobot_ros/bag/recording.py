@@ -36,6 +36,12 @@ class RecordingState(Enum):
     """It is dropped: the bag is complete."""
 
 
+# Names of the module are found faster than members of an enum: they are needed for every message.
+_WAITING, _ON_CLOCK, _ON_WALL_TIME = (
+    RecordingState.WAITING,
+    RecordingState.ON_CLOCK,
+    RecordingState.ON_WALL_TIME,
+)
 _DROPPING = (RecordingState.PAUSED, RecordingState.FAILED, RecordingState.CLOSED)
 
 
@@ -100,7 +106,7 @@ class Recording:
     def start(self) -> None:
         """Record from now on."""
         if self.state is RecordingState.PAUSED:
-            self.state = self._decided or RecordingState.WAITING
+            self.state = self._decided or _WAITING
 
     def pause(self) -> None:
         """Record nothing until the next start."""
@@ -109,22 +115,22 @@ class Recording:
 
     def set_clock(self, time_ns: int) -> None:
         """Set the time that the clock shows; without effect once wall time was decided on."""
-        if self._decided is RecordingState.ON_WALL_TIME:
+        if self._decided is _ON_WALL_TIME:
             return
         self.now_ns = time_ns
-        if self.state is RecordingState.WAITING:
-            self._decide(RecordingState.ON_CLOCK)
+        if self.state is _WAITING:
+            self._decide(_ON_CLOCK)
 
     def record(self, channel: int, message: bytes, published_ns: int = 0) -> None:
         """Write a message, or keep it until the time of the bag is decided.
 
         ``published_ns`` is its stamp; 0: the time at which it is recorded.
         """
-        if self.state is not RecordingState.ON_CLOCK:
+        if self.state is not _ON_CLOCK:
             if not self.running:
                 return
             arrival_ns = self._wall_time()
-            if self.state is RecordingState.WAITING:
+            if self.state is _WAITING:
                 self._early.append(_Early(channel, message, published_ns, arrival_ns))
                 return
             self.now_ns = arrival_ns
@@ -140,7 +146,7 @@ class Recording:
         if self._early and not clock_is_published:
             waited_ns = self._wall_time() - self._early[0].arrival_ns
             if waited_ns > self._clock_wait_ns:
-                self._decide(RecordingState.ON_WALL_TIME)
+                self._decide(_ON_WALL_TIME)
         self._guarded(self.writer.flush)
 
     def describe(self, name: str, values: dict[str, str]) -> None:
@@ -162,7 +168,7 @@ class Recording:
         """
         if self.state is RecordingState.CLOSED:
             return
-        self._decide(RecordingState.ON_WALL_TIME)
+        self._decide(_ON_WALL_TIME)
         counts = {"messages": self.messages, "messages_lost": self.lost.total()}
         self.describe("recorder", {name: str(count) for name, count in counts.items()})
         self.state = RecordingState.CLOSED
@@ -173,9 +179,9 @@ class Recording:
         if self._decided is not None or self.failure is not None:
             return
         self._decided = state
-        if self.state is RecordingState.WAITING:
+        if self.state is _WAITING:
             self.state = state
-        on_clock = state is RecordingState.ON_CLOCK
+        on_clock = state is _ON_CLOCK
         early, self._early = self._early, []
 
         def write_all() -> None:

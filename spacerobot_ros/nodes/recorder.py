@@ -24,7 +24,7 @@ from spacerobot_ros import __version__
 from spacerobot_ros.bag import BagWriter, QosProfile, Recording, RecordingState
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns
+from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns, header_stamp
 from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode, RawInput, RawStream, Take
 from spacerobot_ros.nodes.common.process import run_node
@@ -58,6 +58,7 @@ class RecorderNode(FlightNode):
 
     def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
         self._taps = _StreamTaps()
+        self._stamps = _Stamps()
         super().__init__(name, **kwargs)
 
     # -- life ---------------------------------------------------------------------------------
@@ -204,7 +205,7 @@ class RecorderNode(FlightNode):
             self.get_logger().warning(f"Topic '{topic}' is not recorded: {error}")
             return
         self._recorded.add(topic)
-        take = _take(recording, topic, kind, channel)
+        take = _take(recording, self._stamps, topic, kind, channel)
         if self._taps.tap(topic, take, len(offered)):
             return
         events, qos = loss_events(recording, topic), _subscribed_qos(offered)
@@ -300,17 +301,32 @@ class _StreamTaps:
         return found if len(found) == publishers else []
 
 
-def _take(recording: Recording, topic: str, kind: Any, channel: int) -> Take:
+class _Stamps:
+    """Reads the times that messages begin with; those of one state begin with the same bytes."""
+
+    def __init__(self) -> None:
+        self._stamp = b""
+        self._time_ns = 0
+
+    def time_ns(self, raw: bytes) -> int:
+        """Return the time that a serialised message begins with, ns; 0 if it is before zero."""
+        stamp = header_stamp(raw)
+        if stamp != self._stamp:
+            self._stamp, self._time_ns = stamp, first_time_ns(raw)
+        return self._time_ns
+
+
+def _take(recording: Recording, stamps: _Stamps, topic: str, kind: Any, channel: int) -> Take:
     """Return what is done with a topic's messages: the clock sets the time of all others."""
-    record = recording.record
+    record, time_of = recording.record, stamps.time_ns
     urdf_name = f"{topic.strip('/').replace('/', '.')}.urdf"
 
     def on_clock(raw: bytes) -> None:
-        recording.set_clock(first_time_ns(raw))
+        recording.set_clock(time_of(raw))
         record(channel, raw)
 
     def on_stamped(raw: bytes) -> None:
-        record(channel, raw, first_time_ns(raw))
+        record(channel, raw, time_of(raw))
 
     def on_description(raw: bytes) -> None:
         if recording.running and urdf_name not in recording.attached:
