@@ -90,8 +90,8 @@ class CoordinatedController:
         self._known = False
         self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
 
-    def forget(self) -> None:
-        """Forget goals and what was measured; the next state is the first."""
+    def reset(self) -> None:
+        """Drop goals and what was measured; the next state is the first."""
         self._profile, self._given = None, Reference()
         self._sent = self._estimator = self._brake = None
         self._known, self.mode = False, Mode.MEASURED

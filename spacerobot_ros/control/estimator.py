@@ -31,7 +31,7 @@ class DeadReckoning:
     While the joints are still measured they need not be predicted. The predicted shape is then
     replaced by the measured one and the base moved as that difference moves it: the centre of mass
     and both momenta, which no joint effort changes, stay as predicted, and the attitude follows by
-    the connection ``A``. What is left to drift is what the thrusters do.
+    the connection ``A``. Only the effect of the thrusters is left to accumulate errors.
 
     Parameters
     ----------

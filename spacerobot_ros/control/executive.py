@@ -69,7 +69,7 @@ class ControlExecutive:
 
     def reset(self) -> None:
         """Drop goals and measurements: the next state is the first. The goal file stays."""
-        self.controller.forget()
+        self.controller.reset()
         self._pending: dict[str, IdentifiedGoal] = {}
         """Goals that are accepted and wait for the next measured state."""
         self._abort_requested = False

@@ -299,11 +299,11 @@ class OutputVector:
         )
         # The rate of J_B(q) z0dot at constant z0dot, then that of the axes it is given along.
         z0dot = ca.SX.sym("z0dot", self.N)
-        drift = ca.jtimes(J_B @ z0dot, self.q, self.qdot)
-        drift = ca.substitute(drift, z0dot, self.z0dot)
+        twist_rate = ca.jtimes(J_B @ z0dot, self.q, self.qdot)
+        twist_rate = ca.substitute(twist_rate, z0dot, self.z0dot)
         twist_B = J_B @ self.z0dot
         bias = [
-            R @ (drift[part] + ca.cross(self.omega, twist_B[part]))
+            R @ (twist_rate[part] + ca.cross(self.omega, twist_B[part]))
             for part in (slice(0, 3), slice(3, 6))
         ]
         J = ca.vertcat(R @ J_B[:3, :], R @ J_B[3:, :])

@@ -81,7 +81,7 @@ class QuinticReference(ReferenceProfile):
 
     All share one profile, ``s = 10 u^3 - 15 u^4 + 6 u^5`` of ``u = t / T``: rest to rest, without
     a jump in acceleration. T is the shortest time in which nothing exceeds its limits, so that the
-    one that needs longest sets the pace and all arrive together.
+    one that needs longest sets the pace and all reach their goals together.
     """
 
     name: ClassVar[str] = "quintic"

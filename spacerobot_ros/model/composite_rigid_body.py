@@ -261,7 +261,7 @@ def state_rate(kin: TreeKinematics, *, holding: bool = False) -> ca.Function:
     free = ca.SX.sym("free", kin.n) if holding else ca.DM.ones(kin.n)
     _, quaternion, qdot, p_W, _, _ = (x[part] for part in state_slices(kin.n))
     system, omega, external, Q = _equations(kin, x, command)
-    # A held joint takes no part in the others' equations, and its own says that qddot is zero.
+    # A held joint takes no part in the others' equations; its own makes its qddot zero.
     K = system.K * (free @ free.T)
     for j in range(kin.n):
         K[j, j] = system.K[j, j]

@@ -22,7 +22,7 @@ class RobotConfig:
     )
 
     def believed(self, robot: RobotDescription) -> RobotDescription:
-        """Return the robot as whoever has this configuration models it."""
+        """Return the robot as the owner of this configuration models it."""
         return robot
 
 

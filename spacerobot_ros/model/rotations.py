@@ -106,6 +106,18 @@ def attitude_error(quaternion: npt.ArrayLike, target: npt.ArrayLike) -> Array:
     return rotvec_from_quaternion(quaternion_multiply(quaternion_inverse(quaternion), target))
 
 
+def swing_angle(quaternion: npt.ArrayLike, axes: Array) -> float:
+    """Return by how much a rotation differs from all rotations about axes (k, 3), rad.
+
+    The axes are orthonormal; with one of them this is the swing that remains of a unit quaternion
+    (x, y, z, w) after its twist about the axis, with none the whole rotation.
+    """
+    q = np.asarray(quaternion, dtype=float)
+    about = axes @ q[:3]
+    across = float(np.linalg.norm(q[:3] - axes.T @ about))
+    return 2 * math.atan2(across, math.hypot(float(np.linalg.norm(about)), float(q[3])))
+
+
 def unit_quaternion(quaternion: npt.ArrayLike) -> Array:
     """Return the quaternion (x, y, z, w) scaled to length one.
 

@@ -1,7 +1,7 @@
 """The model of one robot: every equation the stack uses, compiled, behind plain methods.
 
 Frames: world W, base link B. Vectors with suffix ``_B`` are in base components. The shape ``q``
-(n,) is ordered as ``joint_names``. Convenience methods return new arrays; what runs every tick
+(n,) is ordered as ``joint_names``. Convenience methods return new arrays; what runs every period
 takes a :class:`BufferedFunction` from :meth:`SpaceRobot.buffered` and works in place.
 """
 

@@ -237,7 +237,7 @@ def _limits(joint: Any, kind: JointKind, where: str) -> JointLimits:
     if values["lower"] >= values["upper"]:
         raise RobotDescriptionError(
             f"The lower limit of {where} ({values['lower']}) is not below its upper limit "
-            f"({values['upper']}): it could not move; give a stroke, or make it fixed."
+            f"({values['upper']}): it could not move; give it a range, or make it fixed."
         )
     return JointLimits(**values)
 

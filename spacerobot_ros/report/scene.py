@@ -220,7 +220,7 @@ def _motion(flight: Flight, robot: RobotDescription, indices: Indices) -> Comman
         else:
             turns = np.column_stack([np.outer(np.sin(q / 2), joint.axis), np.cos(q / 2)])
             at_zero = quaternion_from_matrix(R)
-            moved = {"quaternion": np.array([quaternion_multiply(at_zero, p) for p in turns])}
+            moved = {"quaternion": quaternion_multiply(at_zero, turns)}
         clips.append(clip(paths[joint.child], time, moved))
     return set_animation(clips)
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 from control.flights import (
@@ -31,19 +32,23 @@ from support.random_robots import random_chain_urdf
 
 from spacerobot_ros.control import (
     LAWS,
+    Actuation,
     ControlLaw,
     ControlState,
     GainPair,
     Gains,
+    LawOptions,
     OutputSelection,
     PoseReference,
     Reference,
     TargetNotSetError,
 )
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.outputs import AXES
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot, compilation
-from spacerobot_ros.parameters import declared
+from spacerobot_ros.parameters import configured, declared, parameter
 
 
 @pytest.mark.parametrize("name", INVERTIBLE)
@@ -149,3 +154,52 @@ def test_a_random_chain_flies_both_poses() -> None:
         plant.step(law.command(plant.state, goal), 0.02)
     law.command(plant.state, goal)
     assert np.abs(law.error).max() < 1e-4
+
+
+@dataclass(frozen=True)
+class _DampingOptions(LawOptions):
+    strength: float = parameter(2.0, "how strongly joints are damped", minimum=0.0)
+
+
+class _Damping(ControlLaw):
+    """A law as somebody else may write it: it brakes the joints, and knows one option."""
+
+    name = "damping"
+    gain_units = ("N m/rad", "N m s/rad")
+    Options = _DampingOptions
+
+    def _inputs(self) -> dict[str, float]:
+        return {"strength": self.options.strength}
+
+    def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+        return {"tau": -symbols["strength"] * self.outputs.qdot}
+
+    def _actuation(self, reference: Reference) -> Actuation:
+        self._function.evaluate()
+        return Actuation(np.zeros(6), self._out["tau"].copy())
+
+
+def test_a_new_law_is_one_class_and_one_line_in_the_registry(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(LAWS, "damping", _Damping)
+    assert "damping.strength" in {each.name for each in declared(ControllerConfig)}
+    options = configured(ControllerConfig, {"damping.strength": 3.0}).options
+    config = ControllerConfig(law="damping", options=options)
+    controller = build_controller(load("planar_manipulator"), config)
+    state = replace(planar_start(), qdot=np.array([0.5, -0.25]))
+    result = controller.command(0.0, state, state.q, state.qdot)
+    np.testing.assert_allclose(result.realised.tau, [-1.5, 0.75])
+
+
+def test_the_units_of_gains_in_the_parameters_are_those_of_the_laws() -> None:
+    for name, law in LAWS.items():
+        for gain, unit in zip(("kp", "kd"), law.gain_units, strict=True):
+            (described,) = (
+                each.description
+                for each in declared(ControllerConfig)
+                if each.name == f"gains.base_position.{gain}"
+            )
+            stated = next(part for part in described.split(" with ")[1:] if name in part)
+            before = described.split(stated)[0]
+            assert before.endswith(f"{unit} with ")

@@ -26,6 +26,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     rotvec_from_quaternion,
     rotvecs_from_quaternions,
+    swing_angle,
     unit_quaternion,
 )
 
@@ -167,6 +168,19 @@ def test_many_attitudes_at_once_are_what_they_are_one_by_one(
     one = quaternion_multiply(a[0], b)
     assert_near(one, [quaternion_multiply(a[0], y) for y in b], 0.0)
     assert_near(rotvecs_from_quaternions(a), [rotvec_from_quaternion(x) for x in a])
+
+
+@repeatable
+@given(quaternions(), rotation_vectors().filter(lambda v: np.linalg.norm(v) > 1e-6))
+def test_the_swing_is_what_no_twist_takes_away(quaternion: Array, about: Array) -> None:
+    axis = about / np.linalg.norm(about)
+    turn = Rotation.from_quat(quaternion)
+    swing = swing_angle(quaternion, axis[np.newaxis])
+    # Swing and twist take the axis where the whole rotation takes it.
+    carried = float(np.clip(axis @ turn.apply(axis), -1.0, 1.0))
+    assert math.cos(swing) == pytest.approx(carried, abs=1e-12)
+    assert swing_angle(quaternion, np.empty((0, 3))) == pytest.approx(turn.magnitude(), abs=1e-7)
+    assert swing_angle(quaternion, np.eye(3)) == pytest.approx(0.0, abs=1e-12)
 
 
 # -- with symbols ------------------------------------------------------------------------------

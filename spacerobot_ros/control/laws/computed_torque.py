@@ -7,7 +7,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.control.laws.law import ControlLaw, Gains, LawOptions
+from spacerobot_ros.control.laws.law import ControlLaw
 from spacerobot_ros.control.outputs import OutputSelection
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.errors import ParameterError
@@ -24,32 +24,27 @@ class ComputedTorqueLaw(ControlLaw):
     ``Fs = C_q - D_q' D^-1 C_omega``. Written so it holds for any tree in space and any momentum;
     the paper's case is a planar chain without angular momentum. No wrench is commanded, so that
     both momenta stay what they are.
-
-    Raises
-    ------
-    ParameterError
-        The outputs are anything but all the joints: with free joints, or an aim for the base, the
-        shape is not this law's to command.
     """
 
     name: ClassVar[str] = "computed_torque"
     gain_units: ClassVar[tuple[str, str]] = ("1/s^2", "1/s")
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        outputs: OutputSelection,
-        gains: Gains,
-        options: LawOptions | None = None,
-    ) -> None:
+    @classmethod
+    def accepted_outputs(cls, robot: SpaceRobot, outputs: OutputSelection) -> OutputSelection:
+        """Return all the joints in the order of q, whatever order they were named in.
+
+        Raises
+        ------
+        ParameterError
+            The outputs are anything but all the joints: with free joints, or an aim for the base,
+            the shape is not this law's to command.
+        """
         if outputs.base or outputs.end_effector or set(outputs.joints) != set(robot.joint_names):
             raise ParameterError(
-                f"The law '{self.name}' drives all joints and nothing else; its outputs are the "
+                f"The law '{cls.name}' drives all joints and nothing else; its outputs are the "
                 f"joints {', '.join(robot.joint_names)}."
             )
-        # In the order of q, whatever order they were named in.
-        in_order = OutputSelection(joints=robot.joint_names)
-        super().__init__(robot, in_order, gains, options)
+        return OutputSelection(joints=robot.joint_names)
 
     @classmethod
     def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from spacerobot_ros.control.outputs import OutputSelection, OutputVector, default_selection
 from spacerobot_ros.control.state import Actuation, ControlState, Reference
@@ -35,14 +37,16 @@ class GainPair:
 
     kp: float = parameter(
         30.0,
-        "proportional gain; N/m (N m/rad) with transposed_jacobian, else 1/s^2",
+        "proportional gain; N/m or N m/rad with laws that command forces (transposed_jacobian), "
+        "1/s^2 with laws that command accelerations (model_based, computed_torque)",
         unit="by law",
         minimum=1e-9,
         read_only=False,
     )
     kd: float = parameter(
         60.0,
-        "derivative gain; N s/m (N m s/rad) with transposed_jacobian, else 1/s",
+        "derivative gain; N s/m or N m s/rad with laws that command forces (transposed_jacobian), "
+        "1/s with laws that command accelerations (model_based, computed_torque)",
         unit="by law",
         minimum=1e-9,
         read_only=False,
@@ -122,9 +126,10 @@ class ControlLaw(ABC):
     """A way to turn errors of the outputs into thruster forces and joint efforts.
 
     A law is constructed once for a robot and commands once every control period. A subclass gives
-    ``name``, ``gain_units``, and where it has options, ``Options``: a frozen dataclass derived from
-    :class:`LawOptions`, whose fields become the parameters ``<name>.<option>`` of the controller
-    node. A line in :mod:`spacerobot_ros.control.laws.registry` makes it available.
+    ``name``, ``gain_units``, :meth:`_results` and :meth:`_actuation`, and where it has options,
+    ``Options``: a frozen dataclass derived from :class:`LawOptions`, whose fields become the
+    parameters ``<name>.<option>`` of the controller node. A line in
+    :mod:`spacerobot_ros.control.laws.registry` makes it available.
 
     Parameters
     ----------
@@ -157,15 +162,16 @@ class ControlLaw(ABC):
         options: LawOptions | None = None,
     ) -> None:
         self.robot = robot
-        self.outputs = OutputVector(robot, outputs)
+        self.outputs = OutputVector(robot, self.accepted_outputs(robot, outputs))
         self.options: Any = configured(self.Options, values_of(options or self.Options()))
         self.singular_value_threshold: float = self.options.singular_value_threshold
+        inputs = self._inputs()
         symbols = {
             "state": self.outputs.state,
             "reference": self.outputs.reference,
             "kp": ca.SX.sym("kp", self.outputs.m),
             "kd": ca.SX.sym("kd", self.outputs.m),
-            **self._parameters(),
+            **{name: ca.SX.sym(name, np.size(value)) for name, value in inputs.items()},
         }
         results = {
             "error": self.outputs.error,
@@ -180,12 +186,25 @@ class ControlLaw(ABC):
         self._function = BufferedFunction(compiled(function))
         self._in = dict(zip(symbols, self._function.inputs, strict=True))
         self._out = dict(zip(results, self._function.outputs, strict=True))
+        for name, value in inputs.items():
+            self._in[name][:] = value
         self.set_gains(gains)
 
     @classmethod
     def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:
-        """Return what the law drives unless told otherwise; see :func:`default_selection`."""
+        """Return the outputs where none are chosen; see :func:`default_selection`."""
         return default_selection(robot.description, end_effector_link)
+
+    @classmethod
+    def accepted_outputs(cls, robot: SpaceRobot, outputs: OutputSelection) -> OutputSelection:
+        """Return the outputs as the law drives them.
+
+        Raises
+        ------
+        ParameterError
+            The law cannot drive these outputs of the robot.
+        """
+        return outputs
 
     def set_gains(self, gains: Gains) -> None:
         """Change the gains from the next command on."""
@@ -228,17 +247,24 @@ class ControlLaw(ABC):
         """Return the damping that the law adds to a singular value of J_z."""
         return 0.0
 
-    def _parameters(self) -> dict[str, ca.SX]:
-        """Return the symbols that the law's function takes beside state, reference and gains."""
+    def _inputs(self) -> Mapping[str, npt.ArrayLike]:
+        """Return what the law's function takes beside state, reference and gains, by name.
+
+        The values are those at first; :meth:`_actuation` may change them, in ``self._in``.
+        """
         return {}
 
     @abstractmethod
     def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        """Return what the law's function gives beside the errors and ``J_z``, by name."""
+        """Return what the law's function gives beside the errors and ``J_z``, by name.
+
+        ``symbols`` has ``kp`` and ``kd`` (m,) and one for each name of :meth:`_inputs`; all else is
+        in ``self.outputs``.
+        """
 
     @abstractmethod
     def _actuation(self, reference: Reference) -> Actuation:
-        """Evaluate the function at the packed inputs and return the command."""
+        """Return the command: call ``self._function.evaluate()`` and read ``self._out``."""
 
 
 def _pair(axis: str, position: GainPair, attitude: GainPair) -> GainPair:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
-from spacerobot_ros.control.laws.law import ControlLaw, Gains, LawOptions
-from spacerobot_ros.control.outputs import OutputSelection
+from spacerobot_ros.control.laws.law import ControlLaw, LawOptions
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
-from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
 
 
@@ -59,7 +59,7 @@ class ModelBasedLaw(ControlLaw):
     * What velocity along v no longer shows in the outputs, and so escapes their Kd, is damped
       directly, with the largest Kd.
 
-    Eq. (28) then holds for the other directions only, and :attr:`status` says so.
+    Eq. (28) then holds for the other directions only, and :attr:`status` reports it.
 
     Parameters
     ----------
@@ -72,27 +72,14 @@ class ModelBasedLaw(ControlLaw):
     gain_units: ClassVar[tuple[str, str]] = ("1/s^2", "1/s")
     Options: ClassVar[Any] = ModelBasedOptions
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        outputs: OutputSelection,
-        gains: Gains,
-        options: LawOptions | None = None,
-    ) -> None:
-        super().__init__(robot, outputs, gains, options)
-        self._in["null_space"][:] = (
-            self.options.posture_stiffness,
-            self.options.null_space_damping,
-        )
-
     def _damping(self, singular_value: float) -> float:
         return math.sqrt(max(0.0, self.singular_value_threshold**2 - singular_value**2))
 
-    def _parameters(self) -> dict[str, ca.SX]:
+    def _inputs(self) -> Mapping[str, npt.ArrayLike]:
         return {
-            "null_space": ca.SX.sym("null_space", 2),
-            "posture": ca.SX.sym("posture", self.robot.n),
-            "singular_damping": ca.SX.sym("singular_damping", self.outputs.N),
+            "null_space": (self.options.posture_stiffness, self.options.null_space_damping),
+            "posture": np.zeros(self.robot.n),
+            "singular_damping": np.zeros(self.outputs.N),
         }
 
     def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
+import numpy.typing as npt
 
-from spacerobot_ros.control.laws.law import ControlLaw, Gains, LawOptions
-from spacerobot_ros.control.outputs import OutputSelection
+from spacerobot_ros.control.laws.law import ControlLaw, LawOptions
 from spacerobot_ros.control.state import Actuation, Reference
-from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
 
 
@@ -48,18 +48,8 @@ class TransposedJacobianLaw(ControlLaw):
     gain_units: ClassVar[tuple[str, str]] = ("N/m or N m/rad", "N s/m or N m s/rad")
     Options: ClassVar[Any] = TransposedJacobianOptions
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        outputs: OutputSelection,
-        gains: Gains,
-        options: LawOptions | None = None,
-    ) -> None:
-        super().__init__(robot, outputs, gains, options)
-        self._in["joint_damping"][:] = self.options.joint_damping
-
-    def _parameters(self) -> dict[str, ca.SX]:
-        return {"joint_damping": ca.SX.sym("joint_damping")}
+    def _inputs(self) -> Mapping[str, npt.ArrayLike]:
+        return {"joint_damping": self.options.joint_damping}
 
     def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         z1 = self.outputs

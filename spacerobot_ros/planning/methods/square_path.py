@@ -25,7 +25,7 @@ import numpy as np
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import quaternion_inverse, quaternion_multiply
+from spacerobot_ros.model.rotations import quaternion_inverse, quaternion_multiply, swing_angle
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import Controlled, PoseError
@@ -194,19 +194,16 @@ class SquarePathGait(GaitMethod):
         """Return the angle in [-pi, pi] about the robot's axis from the present attitude."""
         start, wanted = request.state.quaternion, request.goal.quaternion
         axis = self._phase.axis
-        x, y, z, w = quaternion_multiply(quaternion_inverse(start), wanted)
-        vector = np.array([x, y, z])
-        # Swing after twist: what the twist about the axis leaves is a tilt out of the plane.
-        about = float(axis @ vector)
-        across = float(np.linalg.norm(vector - about * axis))
-        tilt = 2 * math.atan2(across, math.hypot(about, float(w)))
+        turn = quaternion_multiply(quaternion_inverse(start), wanted)
+        tilt = swing_angle(turn, axis[np.newaxis])
         if tilt > max(request.tolerance.attitude, _NO_ROTATION):
             raise PlanningError(
                 f"The goal attitude is {tilt:.4g} rad off any rotation about the axis "
                 f"{np.round(axis, 6).tolist()} of {self.robot.base_link}: planar robot "
                 f"'{self.robot.description.name}' turns about no other."
             )
-        return math.remainder(2 * math.atan2(about, float(w)), 2 * math.pi)
+        twist = 2 * math.atan2(float(axis @ turn[:3]), float(turn[3]))
+        return math.remainder(twist, 2 * math.pi)
 
     def _legs(self, psi_e: Array, loop: SquareLoop | None) -> list[tuple[Array, float]]:
         """Return the ends (n,) of the straight legs, and how long each is to take, s."""

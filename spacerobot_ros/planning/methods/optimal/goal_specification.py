@@ -8,7 +8,6 @@ section 4).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +19,7 @@ from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_inverse,
     quaternion_multiply,
+    swing_angle,
 )
 from spacerobot_ros.planning.core.controllability import (
     curvatures,
@@ -181,10 +181,7 @@ class GoalSpecification:
     ) -> None:
         """Refuse attitudes that the joints cannot bring about."""
         axes, name = self.turning.axes, robot.description.name
-        vector, scalar = turn[:3], float(turn[3])
-        about = axes @ vector
-        across = float(np.linalg.norm(vector - axes.T @ about))
-        tilt = 2 * math.atan2(across, math.hypot(float(np.linalg.norm(about)), scalar))
+        tilt = swing_angle(turn, axes)
         if tilt > max(tolerance, _NO_ROTATION):
             if not len(axes):
                 raise PlanningError(
