@@ -124,7 +124,7 @@ def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
 
 
 def _dynamics_lines(figures: dict[str, float | str]) -> Iterator[str]:
-    """Say how the dynamics of the six-joint robot compare with MuJoCo's."""
+    """Yield how the dynamics of the six-joint robot compare with MuJoCo's."""
     if "step_us" in figures:
         yield f"one RK4 step of the servicer's dynamics: {figures['step_us']:.1f} us"
     yield f"... in the virtual machine: {figures['step_without_compiler_us']:.1f} us"

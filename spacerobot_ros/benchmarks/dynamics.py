@@ -31,7 +31,7 @@ def dynamics_benchmark() -> dict[str, float | str]:
 
     Each engine takes a thousand steps in one call, which loops in compiled code: one tick of
     :class:`EffortPlant` and ``mujoco.mj_step(model, data, nstep=1000)``. All start from the same
-    drifting motion, without force and away from the strokes' ends. The plant integrates position,
+    drifting motion, without force and away from the joint limits. The plant integrates position,
     momenta and limits besides; MuJoCo is spared what this robot does not need (constraints,
     contacts, sensors, its own check of the state). They take turns, and medians are compared: what
     else the machine does then falls on all.
@@ -74,7 +74,7 @@ def dynamics_benchmark() -> dict[str, float | str]:
 
 
 def _rates(n: int) -> Array:
-    """Return joint rates (n,), rad/s: slow enough to stay within the strokes for all rounds."""
+    """Return joint rates (n,), rad/s: slow enough to stay within the limits in all rounds."""
     return 0.02 * np.cos(np.arange(n))
 
 

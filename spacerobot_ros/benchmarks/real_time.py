@@ -76,7 +76,7 @@ class RealTimeFigures:
         return late / (2 * self.ticks)
 
     def lines(self) -> Iterator[str]:
-        """Say it."""
+        """Yield the figures as lines for people."""
         worst = max(self.worst_tick_ms, self.worst_command_ms)
         yield (
             f"{self.rate:g} commands a second for {self.duration_s:.0f} s: "
@@ -234,7 +234,7 @@ def _prioritise(stack: MultiProcessStack) -> bool:
 
 
 class _IdleProcess:
-    """Waits for ticks and does nothing at them, to tell what the machine is to blame for.
+    """Waits for ticks and does nothing at them: its delays are those of the machine.
 
     Parameters
     ----------

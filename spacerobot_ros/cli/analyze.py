@@ -112,17 +112,17 @@ def _joint_rows(robot: SpaceRobot) -> list[str]:
 
     joints, bodies = robot.description.movable_joints, robot.description.bodies[1:]
     width = max([5, *(len(joint.name) for joint in joints[:_MOST_ROWS])])
-    head = f"{'joint':<{width}}  {'kind':<11}{'on':<16}{'stroke':>19}{'speed':>12}{'effort':>10}"
+    head = f"{'joint':<{width}}  {'kind':<11}{'on':<16}{'limits':>19}{'speed':>12}{'effort':>10}"
     rows = [f"{head}{'mass':>12}"]
     for joint, body in list(zip(joints, bodies, strict=True))[:_MOST_ROWS]:
         unit, of_effort = ("m", "N") if joint.kind is JointKind.PRISMATIC else ("rad", "N m")
         limits = joint.limits
-        stroke = f"{limits.lower:.4g} .. {limits.upper:.4g} {unit}"
+        room = f"{limits.lower:.4g} .. {limits.upper:.4g} {unit}"
         if math.isinf(limits.lower):
-            stroke = "free"
+            room = "free"
         speed, effort = f"{limits.velocity:.3g} {unit}/s", f"{limits.effort:.4g} {of_effort}"
         rows.append(
-            f"{joint.name:<{width}}  {joint.kind.value:<11}{joint.parent[:15]:<16}{stroke:>19}"
+            f"{joint.name:<{width}}  {joint.kind.value:<11}{joint.parent[:15]:<16}{room:>19}"
             f"{speed:>12}{effort:>10}{body.inertia.mass:>9.4g} kg"
         )
     if len(joints) > _MOST_ROWS:

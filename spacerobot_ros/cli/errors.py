@@ -30,7 +30,7 @@ _ROS = ("rclpy", "rosidl_parser", "ament_index_python")
 
 
 def fail(sentence: str = "") -> NoReturn:
-    """End a command that did what was asked, without success."""
+    """End a command that has done its work without success."""
     if sentence:
         click.echo(sentence, err=True)
     sys.exit(ExitCode.NOT_REACHED)

@@ -109,7 +109,7 @@ def command(
         write(picture, draw(problem, trial))
         click.echo(f"picture     {picture}")
     if not trial.reached:
-        fail(f"The goal is not met within the planner's tolerance: {left}.")
+        fail(f"The goal is not reached within the planner's tolerance: {left}.")
 
 
 def problem_of(

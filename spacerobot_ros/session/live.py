@@ -1,4 +1,4 @@
-"""Stacks that run until they are told to stop, and goals sent to them from outside."""
+"""Stacks that run until they are stopped, and goals sent to them from outside."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _DISCOVERY = 10.0
 """Wall s to wait for a commander that takes goals."""
 
 _LATCHED = 1.0
-"""Wall s to wait for the status of earlier goals, so that it is not taken for an answer."""
+"""Wall s to wait for the status of earlier goals, so that it does not pass for an answer."""
 
 _LOOK_PERIOD = 0.1
 _SECOND = 10**9
 
 
 class _Sentences:
-    """Shows what a client's status says, each sentence once."""
+    """Shows the sentences of the status that a client receives, each once."""
 
     def __init__(self, client: MissionClient, show: Callable[[str], None]) -> None:
         self._client, self._show, self._shown = client, show, ""
@@ -129,6 +129,6 @@ def _with_decider(clients: list[MissionClient], executor: EventsExecutor) -> Mis
                     executor.spin_once(timeout_sec=0.05)
                 return client
     raise SpaceRobotError(
-        f"Nobody has taken goals on 'goal_pose' for {_DISCOVERY:g} s: start a planner or a "
+        f"No commander takes goals on 'goal_pose' after {_DISCOVERY:g} s: start a planner or a "
         "controller, `spacerobot up SCENARIO`, in the same ROS domain and namespace."
     )

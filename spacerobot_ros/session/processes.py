@@ -61,7 +61,7 @@ class MultiProcessStack(Stack):
     Raises
     ------
     SpaceRobotError
-        A node ended at its start; the sentence is its own.
+        A node ended at its start; the sentence is the last that it wrote.
     """
 
     can_kill: ClassVar[bool] = True
@@ -118,8 +118,7 @@ class MultiProcessStack(Stack):
         overrides = {k: list(v) if isinstance(v, tuple) else v for k, v in overrides.items()}
         file = Path(self._folder.name, f"{name}.yaml")
         file.write_text(yaml.safe_dump({name: {"ros__parameters": overrides}}), "utf-8")
-        said = Path(self._folder.name, f"{name}.txt").open("wb")  # noqa: SIM115
-        with said:
+        with self._log_of(name).open("wb") as log:
             self.processes[name] = subprocess.Popen(
                 [
                     *(sys.executable, "-W", "ignore::RuntimeWarning:runpy"),
@@ -127,14 +126,20 @@ class MultiProcessStack(Stack):
                     *("--params-file", str(self.scenario.path), "--params-file", str(file)),
                 ],
                 env={**_WITHOUT_SHARED_MEMORY, **os.environ},
-                stdout=said,
-                stderr=said,
+                stdout=log,
+                stderr=log,
                 start_new_session=True,
             )
 
-    def said(self, name: str) -> str:
-        """Return what a node has written to its standard output and error."""
-        return Path(self._folder.name, f"{name}.txt").read_text("utf-8", errors="replace")
+    def _log_of(self, name: str) -> Path:
+        """Return the file of what a node writes to its standard output and error."""
+        return Path(self._folder.name, f"{name}.txt")
+
+    def _last_line(self, name: str) -> str:
+        # A crash ends with pages of loaded modules.
+        text = self._log_of(name).read_text("utf-8", errors="replace").strip()
+        lines = [line for line in text.splitlines() if not line.startswith("Extension mod")]
+        return lines[-1] if lines else "it wrote nothing."
 
     @property
     def time_ns(self) -> int:
@@ -192,7 +197,7 @@ class MultiProcessStack(Stack):
             code = self._end(name)
             if code != 0:
                 raise SpaceRobotError(
-                    f"Node '{name}' ended with code {code}: {_last_line(self.said(name))}"
+                    f"Node '{name}' ended with code {code}: {self._last_line(name)}"
                 )
 
     def close(self) -> None:
@@ -206,7 +211,7 @@ class MultiProcessStack(Stack):
         self._folder.cleanup()
 
     def require_alive(self) -> None:
-        """Raise the last words of a node that has ended.
+        """Raise the last line of a node that has ended.
 
         Raises
         ------
@@ -216,8 +221,7 @@ class MultiProcessStack(Stack):
         for name, process in self.processes.items():
             if process.poll() is not None and name not in self._timeline.away:
                 raise SpaceRobotError(
-                    f"Node '{name}' has ended (code {process.returncode}): "
-                    f"{_last_line(self.said(name))}"
+                    f"Node '{name}' has ended (code {process.returncode}): {self._last_line(name)}"
                 )
 
     def kill(self, name: str) -> None:
@@ -226,7 +230,7 @@ class MultiProcessStack(Stack):
         self.processes[name].wait()
 
     def _kill_and_restart(self) -> None:
-        """Do to the nodes what the scenario says for this time."""
+        """Kill and start the nodes that the scenario names for this time."""
         # A killed plant has no clock: the wall's goes on for it.
         factor = self.scenario.plant.real_time_factor
         since = factor * (time.monotonic() - self._clock_seen)
@@ -243,7 +247,7 @@ class MultiProcessStack(Stack):
         try:
             return process.wait(_END)
         except subprocess.TimeoutExpired:
-            # Its last words then say where it hangs.
+            # The traceback that it then writes shows where it hangs.
             process.send_signal(signal.SIGABRT)
         try:
             return process.wait(1.0)
@@ -272,7 +276,7 @@ class MultiProcessStack(Stack):
     def _transit(self, transition: int) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))
         if not self._call(self._change_state, request, "plant").success:
-            raise SpaceRobotError(f"The plant refuses: {_last_line(self.said('plant'))}")
+            raise SpaceRobotError(f"The plant refuses: {self._last_line('plant')}")
 
     def _call(self, service: Client, request: Any, name: str) -> Any:
         """Return what a node answers to a request."""
@@ -288,12 +292,6 @@ class MultiProcessStack(Stack):
             if time.monotonic() > deadline:
                 raise SpaceRobotError(f"Waited {_START:g} s for {what} in vain.")
             self.executor.spin_once(timeout_sec=0.05)
-
-
-def _last_line(text: str) -> str:
-    # A crash ends with pages of loaded modules.
-    lines = [line for line in text.strip().splitlines() if not line.startswith("Extension mod")]
-    return lines[-1] if lines else "it said nothing."
 
 
 class KillTimeline:

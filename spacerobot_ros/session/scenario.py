@@ -55,7 +55,7 @@ _KEYS = (
 )
 
 _LOCKSTEP: Mapping[str, Mapping[str, Any]] = {"plant": {"time_mode": "lockstep"}}
-"""The overrides of a scenario that nothing else is asked of, whatever its file says."""
+"""The overrides of a scenario as it is loaded: they go before what its file has."""
 
 _KILL = re.compile(r"(\S+) at (\S+)(?: until (\S+))?")
 

@@ -255,7 +255,7 @@ class InProcessStack(Stack):
         return node
 
     def _connect(self) -> None:
-        """Wait until every subscription in this process has met its publisher."""
+        """Wait until every subscription in this process is matched with its publisher."""
         deadline = time.monotonic() + _DISCOVERY_TIMEOUT
         while not self._connected():
             if time.monotonic() > deadline:
@@ -277,12 +277,12 @@ class InProcessStack(Stack):
         topics = {p.topic_name for p in ours} - {"/rosout", "/parameter_events"}
         if self.recorder is not None and not topics <= self.recorder.topics:
             return False
-        wanted: dict[str, int] = {}
+        expected: dict[str, int] = {}
         for node in self._nodes:
             for subscription in node.subscriptions:
-                wanted[subscription.topic_name] = wanted.get(subscription.topic_name, 0) + 1
+                expected[subscription.topic_name] = expected.get(subscription.topic_name, 0) + 1
         return all(
-            publisher.get_subscription_count() >= wanted.get(publisher.topic_name, 0)
+            publisher.get_subscription_count() >= expected.get(publisher.topic_name, 0)
             for publisher in ours
             if publisher.topic_name in topics
         )
