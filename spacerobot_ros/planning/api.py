@@ -1,4 +1,4 @@
-"""One call from a robot and a goal to a gait."""
+"""The Python API of planning: from a robot and a goal to a gait."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def plan(
         coordinates), and ``joint_positions`` (n,) to end in, in m or rad.
     start
         From where: a state, or the shape (n,) alone with the base at the origin of W; None is the
-        shape zero, or as near to it as the strokes are.
+        shape zero, or as near to it as the joint limits allow.
     method
         Name of a gait method; ``options`` are its own.
     control_period, tolerance, integration_step
-        How long a command is held (s), how near is there, and the longest step of the prediction
-        (s): the plant's, for a flight that ends where the plan does.
+        How long a command is held (s), how near to the goal is near enough, and the longest step of
+        the prediction (s): the plant's, for a flight that ends where the plan does.
 
     Raises
     ------

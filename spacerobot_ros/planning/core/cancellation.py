@@ -39,7 +39,7 @@ class Cancellation:
 
 
 class _Never(Cancellation):
-    """The cancellation of a plan that nobody can cancel."""
+    """The cancellation of a plan that cannot be cancelled."""
 
     def cancel(self) -> NoReturn:
         """Refuse: every plan without a cancellation of its own shares this one."""

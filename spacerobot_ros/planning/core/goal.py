@@ -1,4 +1,4 @@
-"""What a planner is asked for, and from where."""
+"""Goals, the states that plans begin in, and how far apart they are."""
 
 from __future__ import annotations
 
@@ -13,22 +13,28 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import attitude_error, unit_quaternion
 
 Controlled = Literal["position", "attitude", "shape"]
-"""A part of a goal: where the base is, how it is turned, how the joints stand."""
+"""A part of a goal: the position and the attitude of the base, and the joint positions."""
 
 POSE: frozenset[Controlled] = frozenset({"position", "attitude"})
 """The parts of a goal that are the pose of the base."""
 
 
 _FARTHEST = 1e12
-"""Beyond it a float64 does not tell a millimetre any more, m or rad."""
+"""Beyond it a float64 does not resolve a millimetre, m or rad."""
 
 
 @dataclass(frozen=True)
 class Goal:
-    """A pose of the base link in the world, and the shape to end in where it matters.
+    """A pose of the base link in the world, and the shape to end in.
 
-    ``position`` (3,) in m, ``quaternion`` (x, y, z, w); ``joint_positions`` (n,) in m or rad, in
-    the order of the robot's joints, None: the shape is the method's to choose.
+    Attributes
+    ----------
+    position
+        (3,) r_WB, m.
+    quaternion
+        (4,) of R_WB, (x, y, z, w).
+    joint_positions
+        (n,) in the order of the robot's joints, m or rad; None: the method chooses.
     """
 
     position: Array
@@ -47,7 +53,8 @@ class Goal:
         Raises
         ------
         GoalError
-            They are no lists of finite numbers, absurdly large, or the quaternion is zero.
+            A list has the wrong length, or numbers that are not finite or too large, or the
+            quaternion is zero.
         """
         r = _numbers(position, "position")
         q = _numbers(quaternion, "orientation")
@@ -85,7 +92,17 @@ def _numbers(given: npt.ArrayLike, what: str) -> Array:
 
 @dataclass(frozen=True)
 class RobotState:
-    """Where the robot is: base pose in W, shape, total momenta in W (about the centre of mass)."""
+    """The state of a robot.
+
+    Attributes
+    ----------
+    position, quaternion
+        (3,) r_WB in m, and (4,) of R_WB, (x, y, z, w).
+    q
+        (n,) joint positions, m or rad.
+    linear_momentum, angular_momentum
+        (3,) each in W, the second about the centre of mass of the system; kg m/s and kg m^2/s.
+    """
 
     position: Array
     quaternion: Array
@@ -96,10 +113,16 @@ class RobotState:
 
 @dataclass(frozen=True)
 class PoseError:
-    """What is left to a goal: ``position`` (3,) in W, m, and ``rotvec`` (3,) in B, rad.
+    """The remaining error to a goal.
 
-    ``shape`` (n,) in m or rad is what the joints still have to go; empty where no shape is asked
-    for.
+    Attributes
+    ----------
+    position
+        (3,) from the base to its goal, in W, m.
+    rotvec
+        (3,) rotation vector from the attitude to that of the goal, in B, rad.
+    shape
+        (n,) from the joint positions to those of the goal, m or rad; empty where the goal has none.
     """
 
     position: Array
@@ -110,7 +133,7 @@ class PoseError:
     def between(
         cls, position: Array, quaternion: Array, goal: Goal, q: Array | None = None
     ) -> PoseError:
-        """Return what is left from a pose, and from the shape ``q`` (n,) if given, to the goal."""
+        """Return the error from a pose, and from the shape ``q`` (n,) if given, to the goal."""
         shape = np.zeros(0)
         if q is not None and goal.joint_positions is not None:
             shape = goal.joint_positions - q
@@ -128,20 +151,20 @@ class PoseError:
 
     @property
     def farthest_joint(self) -> float:
-        """Largest joint error, m or rad; zero where no shape is asked for."""
+        """Largest joint error, m or rad; zero where the goal has none."""
         return float(np.abs(self.shape).max(initial=0.0))
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How near is there: ``position`` in m, ``attitude`` in rad, ``shape`` in m or rad a joint."""
+    """How near to a goal is near enough: ``position`` m, ``attitude`` rad, each joint m or rad."""
 
     position: float
     attitude: float
     shape: float = 1e-3
 
     def admits(self, error: PoseError, controls: frozenset[Controlled] = POSE) -> bool:
-        """Whether the goal is met, in the parts that are controlled."""
+        """Whether the goal is reached, in the parts that are controlled."""
         return (
             ("position" not in controls or error.distance <= self.position)
             and ("attitude" not in controls or error.angle <= self.attitude)

@@ -34,7 +34,7 @@ class PlanRequest:
     goal
         Where it is to end.
     tolerance
-        How near is there.
+        How near to the goal is near enough.
     correction
         Whether an earlier schedule for the same goal has just ended: the remaining error is small,
         and options that fix the size of the first manoeuvre do not apply.
@@ -79,7 +79,7 @@ class GaitMethod(ABC):
         Name in the registry, and of the group of parameters ``<name>.<option>``.
     controls
         The parts of a goal that the method's schedules control; the others come out as they must.
-        A method that chooses among others says it in each schedule alone.
+        A method that chooses among others states them in each schedule alone.
     Options
         A frozen dataclass, whose fields are declared by :mod:`spacerobot_ros.parameters`.
 
@@ -157,7 +157,7 @@ class GaitMethod(ABC):
         )
 
     def _goal_shape(self, goal: Goal) -> Array | None:
-        """Return the shape (n,) that the goal asks for, None where it asks for none.
+        """Return the shape (n,) of the goal within the joint limits, None where it has none.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""What a planner answers: the shape at every tick, and the base path that it predicts."""
+"""The result of planning: the shape at every tick, and the base path that it predicts."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ class GaitSchedule:
     path
         Predicted base path at instants of the method's choice, the first and the last included.
     goal
-        What it was planned for.
+        The goal that it was planned for.
     notes
         Named results of the method, for reports (a paper's symbols where it has them).
     partial
-        It ends short of the goal on purpose: the measured pose at its end decides on the next
-        piece.
+        It ends short of the goal on purpose: the next piece is planned from the pose that is
+        measured at its end.
     controls
         The parts of the goal that it controls, and by which its result is evaluated.
     progress

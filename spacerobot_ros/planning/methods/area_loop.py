@@ -55,24 +55,20 @@ class AreaLoopOptions:
     """The options of ``area_loop``."""
 
     k: float = parameter(
-        0.15, "share of the missing turn that one cycle makes up for", minimum=0.001, maximum=1.0
+        0.15, "share of the missing turn that one cycle makes up for", minimum=1e-3, maximum=1.0
     )
     edge_time: float = parameter(
-        4.0,
-        "duration of an edge; slow joints take longer",
-        unit="s",
-        minimum=0.001,
-        maximum=1000000000.0,
+        4.0, "duration of an edge; slow joints take longer", unit="s", minimum=1e-3, maximum=1e9
     )
     largest_edge: float = parameter(
-        1.0, "longest edge of a loop", unit="m or rad", minimum=0.001, maximum=10.0
+        1.0, "longest edge of a loop", unit="m or rad", minimum=1e-3, maximum=10.0
     )
     nominal: tuple[float, ...] = parameter(
         (),
         "nominal shape, all joints; []: the best",
         unit="m or rad",
-        minimum=-1000000.0,
-        maximum=1000000.0,
+        minimum=-1e6,
+        maximum=1e6,
         of_joints=True,
     )
     joints: str = parameter(
@@ -83,11 +79,7 @@ class AreaLoopOptions:
     )
     most_cycles: int = parameter(1000, "cycles that a goal may take", minimum=1, maximum=1000000)
     longest: float = parameter(
-        100000.0,
-        "longest manoeuvre that is still planned",
-        unit="s",
-        minimum=1.0,
-        maximum=1000000000.0,
+        100000.0, "longest manoeuvre that is still planned", unit="s", minimum=1.0, maximum=1e9
     )
 
 
@@ -116,8 +108,7 @@ class AreaLoopGait(GaitMethod):
     options: AreaLoopOptions
 
     def _setup(self) -> None:
-        robot = self.robot
-        chosen = self.options
+        robot, chosen = self.robot, self.options
         self._nominal = NominalChoice(robot, chosen.largest_edge, chosen.joints, chosen.nominal)
         self._prediction = BasePrediction(robot, self.control_period, self.integration_step)
         # Planners exist before goals: an unsuitable robot is refused with the first one.

@@ -1,4 +1,4 @@
-"""The method that robot and goal allow, chosen goal by goal."""
+"""``auto``: the method that robot and goal allow, chosen goal by goal."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class AutoGait(GaitMethod):
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan by the first method that can; see :meth:`GaitMethod.plan`.
 
-        ``notes`` say which (``chosen``) and why (``because``).
+        ``notes`` name it (``chosen``) and why (``because``).
 
         Raises
         ------
@@ -93,7 +93,7 @@ class AutoGait(GaitMethod):
         )
 
     def _order(self, request: PlanRequest) -> list[str]:
-        """Return the names in the order of trial: first the method that flies this goal already."""
+        """Return the names in the order of trial: first that of the schedule before."""
         flying = "" if request.previous is None else request.previous.method
         return sorted(self._candidates, key=lambda name: name != flying)
 

@@ -58,40 +58,29 @@ class LieBracketOptions:
         100.0,
         "duration of step 2, the slide to the final shape",
         unit="s",
-        minimum=0.001,
-        maximum=1000000000.0,
+        minimum=1e-3,
+        maximum=1e9,
     )
     n1: int = parameter(
         10, "periods of the sin^2 velocity profile in step 2", minimum=1, maximum=10000
     )
     cycle_period: float = parameter(
-        3.0,
-        "duration of one cycle of step 3, (tf - t1) / n",
-        unit="s",
-        minimum=0.001,
-        maximum=1000000000.0,
+        3.0, "duration of one cycle of step 3, (tf - t1) / n", unit="s", minimum=1e-3, maximum=1e9
     )
     cycles: int = parameter(
-        0, "n, the number of cycles of step 3; 0: by loop_area", minimum=0, maximum=100000000.0
+        0, "n, the number of cycles of step 3; 0: by loop_area", minimum=0, maximum=1e8
     )
     loop_area: float = parameter(
-        0.04, "|alpha| / n when cycles is 0", unit="m^2", minimum=1e-09, maximum=1000000000.0
+        0.04, "|alpha| / n when cycles is 0", unit="m^2", minimum=1e-9, maximum=1e9
     )
     a22_ratio: float = parameter(
-        1.0,
-        "free amplitude a22 over sqrt(|a22 b12|); 1: balanced",
-        minimum=0.001,
-        maximum=1000000000.0,
+        1.0, "free amplitude a22 over sqrt(|a22 b12|); 1: balanced", minimum=1e-3, maximum=1e9
     )
     a31_ratio: float = parameter(
-        1.0, "a31 over sqrt(|a31 (b21, b11)|); 1: balanced", minimum=0.001, maximum=1000000000.0
+        1.0, "a31 over sqrt(|a31 (b21, b11)|); 1: balanced", minimum=1e-3, maximum=1e9
     )
     longest: float = parameter(
-        100000.0,
-        "longest manoeuvre that is still planned",
-        unit="s",
-        minimum=1.0,
-        maximum=1000000000.0,
+        100000.0, "longest manoeuvre that is still planned", unit="s", minimum=1.0, maximum=1e9
     )
 
 

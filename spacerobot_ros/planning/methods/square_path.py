@@ -63,28 +63,20 @@ class SquarePathOptions:
     """The options of ``square_path``."""
 
     t1: float = parameter(
-        8.0,
-        "end of step 1, the motion to the final shape",
-        unit="s",
-        minimum=0.001,
-        maximum=1000000000.0,
+        8.0, "end of step 1, the motion to the final shape", unit="s", minimum=1e-3, maximum=1e9
     )
     t2: float = parameter(
-        12.0,
-        "end of step 2, the motion to the square",
-        unit="s",
-        minimum=0.001,
-        maximum=1000000000.0,
+        12.0, "end of step 2, the motion to the square", unit="s", minimum=1e-3, maximum=1e9
     )
     t3: float = parameter(
         20.0,
         "end of step 3, one loop; more loops take as long each",
         unit="s",
-        minimum=0.001,
-        maximum=1000000000.0,
+        minimum=1e-3,
+        maximum=1e9,
     )
     t4: float = parameter(
-        24.0, "end of step 4, the motion back", unit="s", minimum=0.001, maximum=1000000000.0
+        24.0, "end of step 4, the motion back", unit="s", minimum=1e-3, maximum=1e9
     )
     most_loops: int = parameter(20, "loops that a turn may take", minimum=1, maximum=1000000)
     given_centre: int = parameter(
@@ -100,11 +92,7 @@ class SquarePathOptions:
         0, "1: refuse goals that are not where the base ends", minimum=0, maximum=1
     )
     longest: float = parameter(
-        3600.0,
-        "longest manoeuvre that is still planned",
-        unit="s",
-        minimum=1.0,
-        maximum=1000000000.0,
+        3600.0, "longest manoeuvre that is still planned", unit="s", minimum=1.0, maximum=1e9
     )
 
 
@@ -120,8 +108,7 @@ class SquarePathGait(GaitMethod):
     options: SquarePathOptions
 
     def _setup(self) -> None:
-        robot = self.robot
-        chosen = self.options
+        robot, chosen = self.robot, self.options
         t1, t2, t3, t4 = chosen.t1, chosen.t2, chosen.t3, chosen.t4
         instants = (0.0, t1, t2, t3, t4)
         if not np.all(np.diff(instants) > 0):

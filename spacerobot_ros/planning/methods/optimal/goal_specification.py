@@ -1,4 +1,4 @@
-"""What a goal asks of the joints: which of its parts are to be reached, and whether they can be.
+"""Goal specification: which parts of a goal are to be reached, and whether the joints can.
 
 At zero momentum ``omega_WB_B = F(q) qdot``. Where all columns of F are along one axis the base
 turns about that axis only, by an angle. Otherwise the brackets of the columns fill up the
@@ -37,7 +37,7 @@ from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions, 
 _NO_ROTATION = 1e-9
 
 _SAMPLES = 12
-"""Shapes in general position at which a robot is asked what it can do."""
+"""Shapes in general position at which it is tested what a robot can do."""
 
 _NONE = 1e-7
 """Singular values below this share of the largest count as zero."""

@@ -119,7 +119,7 @@ class OptimalGait(GaitMethod):
         if self._cache is not None and not correction:
             key = self._key(request)
             if kept := self._cache.load(key):
-                return self._kept(goal, kept)
+                return self._loaded(goal, kept)
         found = self._search.search(
             boundary,
             limits,
@@ -185,7 +185,7 @@ class OptimalGait(GaitMethod):
         }
         return plan_key(self.robot, numbers, values_of(self.options))
 
-    def _kept(self, goal: Goal, kept: Mapping[str, Array]) -> GaitSchedule:
+    def _loaded(self, goal: Goal, kept: Mapping[str, Array]) -> GaitSchedule:
         path = BasePath(*(kept[f"path_{part}"] for part in _PATH))
         notes: Notes = {
             name.removeprefix(_NOTE): value.tolist()
@@ -232,17 +232,17 @@ class PlanCache:
             self.folder.mkdir(parents=True, exist_ok=True)
             with tempfile.NamedTemporaryFile(dir=self.folder, delete=False) as file:
                 np.savez(file, allow_pickle=False, **arrays)
-            # Whole or not at all, whoever else writes it.
+            # Whole or not at all, even if two processes write it.
             os.replace(file.name, self._file(key))
         except OSError as error:
-            _LOG.warning("The plan cannot be kept in %s: %s", self.folder, error)
+            _LOG.warning("The plan cannot be saved in %s: %s", self.folder, error)
 
     def _file(self, key: str) -> Path:
         return self.folder / f"{key}.npz"
 
 
 def plan_key(robot: SpaceRobot, numbers: Mapping[str, Array], options: Mapping[str, object]) -> str:
-    """Return the name of a plan: a hash of the robot's equations and of all that was asked."""
+    """Return the name of a plan: a hash of the robot's equations and of the request."""
     digest = hashlib.sha256()
     for name in ("locked_inertia", "center_of_mass"):
         digest.update(robot.function(name, compile=False).serialize().encode())

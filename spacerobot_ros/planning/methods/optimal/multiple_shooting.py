@@ -348,7 +348,7 @@ class MultipleShooting:
         Parameters
         ----------
         boundary, limits, guess
-            What is asked, and where the solver begins.
+            The problem, and where the solver begins.
         stop
             When the solver stops early.
         shortest, longest

@@ -1,4 +1,4 @@
-"""The options of ``optimal``, and what they make of the joints and the path."""
+"""The options of ``optimal``."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class OptimalOptions:
 
     duration: float = parameter(
         0.0,
-        "0: as fast as possible; else least effort in this time",
+        "duration of a manoeuvre of least effort; 0: as fast as possible",
         unit="s",
         minimum=0.0,
         maximum=1e9,
     )
     max_velocity: tuple[float, ...] = parameter(
         (),
-        "of every joint, below the URDF's; []: those",
+        "speed limit of every joint, below the URDF's; []: the URDF's",
         unit="m/s or rad/s",
         minimum=0.0,
         maximum=1e9,
@@ -29,7 +29,7 @@ class OptimalOptions:
     )
     max_acceleration: tuple[float, ...] = parameter(
         (),
-        "of every joint; []: by ramp_time",
+        "acceleration limit of every joint; []: by ramp_time",
         unit="m/s^2 or rad/s^2",
         minimum=0.0,
         maximum=1e9,
@@ -37,47 +37,51 @@ class OptimalOptions:
     )
     ramp_time: float = parameter(
         0.5,
-        "from rest to full speed, without max_acceleration",
+        "time from rest to full speed, without max_acceleration",
         unit="s",
         minimum=1e-6,
         maximum=1e9,
     )
     joint_margin: tuple[float, ...] = parameter(
         (),
-        "of every joint to its stops; not in corrections",
+        "distance of every joint to its limits, not in corrections; []: none",
         unit="m or rad",
         minimum=0.0,
         maximum=1e9,
         of_joints=True,
     )
     base_position: int = parameter(
-        0, "0: met if sliders can, 1: met, 2: ignored", minimum=0, maximum=2
+        0, "0: reached if sliders can, 1: reached, 2: ignored", minimum=0, maximum=2
     )
-    base_attitude: int = parameter(1, "1: met, 0: ignored", minimum=0, maximum=1)
+    base_attitude: int = parameter(1, "1: reached, 0: ignored", minimum=0, maximum=1)
     final_shape: int = parameter(
-        0, "without one in the goal: 0: any, 1: the present one", minimum=0, maximum=1
+        0, "of goals without a shape: 0: any, 1: the present one", minimum=0, maximum=1
     )
     max_base_rate: float = parameter(
         0.0, "fastest turn of the base; 0: any", unit="rad/s", minimum=0.0, maximum=1e9
     )
     keep_axis: tuple[float, ...] = parameter(
-        (), "direction in the base that is kept away ...", minimum=-1e9, maximum=1e9
+        (), "direction in the base, away from keep_direction; []: none", minimum=-1e9, maximum=1e9
     )
     keep_direction: tuple[float, ...] = parameter(
-        (), "... from this direction in the world ...", minimum=-1e9, maximum=1e9
+        (), "direction in the world that keep_axis stays away from", minimum=-1e9, maximum=1e9
     )
     keep_angle: float = parameter(
-        0.0, "... by this angle", unit="rad", minimum=0.0, maximum=math.pi
+        0.0, "angle that keep_axis stays away by", unit="rad", minimum=0.0, maximum=math.pi
     )
     keep_out: tuple[float, ...] = parameter(
-        (), "boxes of shapes: lower, then upper corner", unit="m or rad", minimum=-1e9, maximum=1e9
+        (),
+        "boxes that the shape avoids: lower, then upper corner",
+        unit="m or rad",
+        minimum=-1e9,
+        maximum=1e9,
     )
     intervals: int = parameter(
         80, "steps of the optimal control problem", minimum=10, maximum=10000
     )
     starts: int = parameter(12, "guesses that are tried at most", minimum=1, maximum=10000)
     answers: int = parameter(
-        3, "manoeuvres to find, of which the fastest is flown", minimum=1, maximum=10000
+        3, "manoeuvres to find, of which the fastest is taken", minimum=1, maximum=10000
     )
     time_budget: float = parameter(
         8.0,

@@ -240,8 +240,8 @@ class PathConstraints:
         direction = _direction("direction", options.keep_direction)
         if len({axis is None, direction is None, options.keep_angle == 0}) > 1:
             raise ParameterError(
-                "An attitude that is kept takes all of optimal.keep_axis, optimal.keep_direction "
-                "and optimal.keep_angle."
+                "A direction that is kept away takes all of optimal.keep_axis, "
+                "optimal.keep_direction and optimal.keep_angle."
             )
         joints, boxes = robot.n, options.keep_out
         if len(boxes) % (2 * joints or 1):
