@@ -82,6 +82,10 @@ docs: $(STAMP)/docs ## build the documentation site; see out/docs/index.html
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python3 -m mkdocs build --strict --quiet
 	@echo "out/docs/index.html"
 
+.PHONY: figures
+figures: $(STAMP)/docs ## compute the numbers of the documents again: docs/figures.json
+	$(BIN)/python3 -m docs_build.figures
+
 .PHONY: clean
 clean: ## remove .venv, caches, the site, and the demo's bag and report
 	rm -rf $(VENV) build/lib build/bdist.* spacerobot_ros.egg-info

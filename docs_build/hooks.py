@@ -13,9 +13,6 @@ from mkdocs.exceptions import PluginError
 from docs_build import diagrams, equations, reference
 from docs_build.blocks import Block, replace_blocks
 
-FIGURES = reference.DOCS / "figures.json"
-"""The numbers of the documents; `make figures` writes them."""
-
 _characters: set[str] = set()
 """Of all equations of the site."""
 
@@ -50,7 +47,8 @@ def prepared(markdown: str) -> str:
 
     ``{{ value KEY }}``
         A number of ``docs/figures.json``, with the digits that it has there.
-    ``{{ parameters NODE }}``, ``{{ cli }}``, ``{{ api PACKAGE }}``
+    ``{{ parameters NODE }}``, ``{{ topics }}``, ``{{ state_fields }}``, ``{{ cli }}``,
+    ``{{ api PACKAGE }}``
         Generated references.
 
     Raises
@@ -64,7 +62,7 @@ def prepared(markdown: str) -> str:
 @cache
 def figures() -> dict[str, str]:
     """Return the numbers of the documents by key."""
-    return dict(json.loads(FIGURES.read_text(encoding="utf-8")))
+    return dict(json.loads((reference.DOCS / "figures.json").read_text(encoding="utf-8")))
 
 
 def _drawn(block: Block) -> str | None:
@@ -78,6 +76,10 @@ def _replacement(found: re.Match[str]) -> str:
             return figures()[argument]
         case "parameters":
             return reference.parameters(argument)
+        case "topics":
+            return reference.topics()
+        case "state_fields":
+            return reference.state_fields()
         case "cli":
             return reference.command_line()
         case "api":

@@ -15,6 +15,7 @@ from spacerobot_ros.cli.main import main
 from spacerobot_ros.nodes import NODE_TYPES, ReplayNode
 from spacerobot_ros.nodes.common.node import AUTOSTART
 from spacerobot_ros.parameters import Parameter, declared
+from spacerobot_ros.topics import TOPICS, state_topics
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 """The texts."""
@@ -49,6 +50,36 @@ def default_text(value: Any) -> str:
     if isinstance(value, tuple):
         return "[" + ", ".join(default_text(each) for each in value) + "]"
     return str(value) or "''"
+
+
+def topics() -> str:
+    """Return the table of the stack's topics."""
+    rows = []
+    for topic in TOPICS.values():
+        names = [node if node != "user" else "you" for node in topic.publishers]
+        latched = ", latched" if topic.latched else ""
+        condition = f" Where {topic.when}." if topic.when else ""
+        rows.append(
+            (
+                f"`{topic.name}`",
+                f"{topic.short_type}{latched}",
+                ", ".join(names),
+                f"{topic.meaning}.{condition}",
+            )
+        )
+    return table(("topic", "type", "from", "meaning"), rows)
+
+
+def state_fields() -> str:
+    """Return the table of the numbers that the plant's state topics carry."""
+    rows = []
+    for topic in state_topics():
+        for field in topic.state:
+            numbers = ", ".join(f"`{each}`" for each in field.members or field.entries)
+            rows.append(
+                (f"`{topic.name}`", f"`{field.path}`", numbers or f"one for each of the {topic.of}")
+            )
+    return table(("topic", "field", "numbers"), rows)
 
 
 def _row(declaration: Parameter) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ from spacerobot_ros.nodes import (
 )
 from spacerobot_ros.nodes.common.node import AUTOSTART
 from spacerobot_ros.parameters import declared
+from spacerobot_ros.topics import TOPICS
 
 
 def rows_of(markdown: str) -> list[list[str]]:
@@ -68,3 +69,27 @@ def test_every_command_and_option_is_documented() -> None:
         for parameter in command.params:
             for option in (*parameter.opts, *parameter.secondary_opts):
                 assert option in section or parameter.human_readable_name in section
+
+
+def test_every_topic_is_documented() -> None:
+    rows = {row[0]: row for row in rows_of(reference.topics())}
+    assert list(rows) == list(TOPICS)
+    for name, topic in TOPICS.items():
+        assert rows[name][1].startswith(topic.short_type)
+        assert ("latched" in rows[name][1]) == topic.latched
+
+
+def test_every_service_is_documented_with_its_type() -> None:
+    page = (reference.DOCS / "reference" / "topics.md").read_text(encoding="utf-8")
+    documented = {(row[0], row[1]) for row in rows_of(page.split("## Services")[1])}
+    found = set()
+    nodes = reference.DOCS.parent / "spacerobot_ros" / "nodes"
+    for path in nodes.rglob("*.py"):
+        relative = path.relative_to(nodes)
+        folder = relative.parts[0] if len(relative.parts) > 1 else path.stem
+        node = {"controller": "coordinated_control"}.get(folder, folder)
+        source = path.read_text(encoding="utf-8")
+        for kind, name in re.findall(r'create_service\((\w+), "~/(\w+)"', source):
+            found.add((f"{node}/{name}", f"std_srvs/{kind}"))
+    assert len(found) >= 9
+    assert documented == found

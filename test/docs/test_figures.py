@@ -1,0 +1,46 @@
+"""The numbers of the documents are those that the program computes, and every one is used."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from docs_build.figures import FIGURES, figures
+
+WRITTEN: dict[str, str] = json.loads(FIGURES.read_text(encoding="utf-8"))
+
+
+def numbers(text: str) -> list[float]:
+    return [float(x) for x in re.findall(r"-?\d+(?:\.\d+)?(?:e-?\d+)?", text)]
+
+
+def test_the_file_is_what_make_figures_writes() -> None:
+    found = figures()
+    assert found.keys() == WRITTEN.keys()
+    for key, text in found.items():
+        # The last digit may round another way on another processor.
+        digits = max((len(part) for part in re.findall(r"\.(\d+)", text)), default=0)
+        unit = 1.01 * 10.0**-digits
+        np.testing.assert_allclose(numbers(text), numbers(WRITTEN[key]), rtol=0, atol=unit)
+
+
+@pytest.mark.parametrize(
+    ("key", "recomputed", "tolerance"),
+    [
+        # Computed independently of this program, from the equations of the papers.
+        ("lie_bracket.zf", [-2.378408, 1.687252, -1.377082], 1e-4),
+        ("lie_bracket.c", [-0.047568, 0.033745, -0.027542], 1e-4),
+        ("square_path.turn_of_step_1", [0.999503], 1e-6),
+        ("square_path.wanted_phase", [0.571293], 1e-6),
+        ("square_path.z_star", [1.130702], 1e-6),
+        ("coordinated_control.transposed_jacobian.force_at_start", [5.5116, 59.3298], 1e-3),
+        ("coordinated_control.model_based.force_at_start", [864.58, 642.76], 1e-2),
+    ],
+)
+def test_numbers_are_those_of_an_independent_computation(
+    key: str, recomputed: list[float], tolerance: float
+) -> None:
+    np.testing.assert_allclose(numbers(WRITTEN[key]), recomputed, rtol=0, atol=tolerance)

@@ -1,0 +1,162 @@
+"""Imports point down, and only the upper layers know ROS."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = "spacerobot_ros"
+
+LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
+    # Of each folder its parts from the top down; parts of one line do not import each other. The
+    # first one that a module's path begins with is the module's.
+    PACKAGE: (
+        ("__main__",),
+        ("cli",),
+        ("benchmarks",),
+        ("report",),
+        ("session",),
+        ("nodes",),
+        ("verification",),
+        ("bag", "simulation"),
+        ("planning", "control"),
+        ("model",),
+        ("parameters", "resources", "topics"),
+        ("errors",),
+        ("__init__",),
+    ),
+    f"{PACKAGE}.nodes": (
+        ("__init__",),
+        ("plant", "planner", "controller", "recorder", "replay"),
+        ("common",),
+    ),
+    f"{PACKAGE}.planning": (
+        ("__init__",),
+        ("api", "analysis"),
+        ("execution",),
+        ("methods",),
+        ("core",),
+    ),
+}
+
+ROS = {
+    "builtin_interfaces",
+    "diagnostic_msgs",
+    "geometry_msgs",
+    "launch",
+    "launch_ros",
+    "lifecycle_msgs",
+    "nav_msgs",
+    "rcl_interfaces",
+    "rclpy",
+    "rosgraph_msgs",
+    "rosidl_runtime_py",
+    "sensor_msgs",
+    "std_msgs",
+    "std_srvs",
+    "tf2_msgs",
+    "trajectory_msgs",
+    "visualization_msgs",
+}
+KNOW_ROS = ("nodes", "session", "cli", "benchmarks")
+
+
+@cache
+def sources() -> dict[str, Path]:
+    """Return the package's modules by name; a folder's own module is ``<folder>.__init__``."""
+    return {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts): path
+        for path in sorted((ROOT / PACKAGE).rglob("*.py"))
+    }
+
+
+@cache
+def imports(module: str) -> tuple[str, ...]:
+    """Return the modules that a module imports anywhere in its text."""
+    tree = ast.parse(sources()[module].read_text(encoding="utf-8"))
+    return tuple(each for node in ast.walk(tree) for each in _named(node))
+
+
+def _named(node: ast.AST) -> Iterator[str]:
+    if isinstance(node, ast.Import):
+        yield from (_module(alias.name) for alias in node.names)
+    elif isinstance(node, ast.ImportFrom):
+        assert node.level == 0
+        assert node.module is not None
+        for alias in node.names:
+            whole = _module(f"{node.module}.{alias.name}")
+            yield whole if whole in sources() else _module(node.module)
+
+
+def _module(name: str) -> str:
+    return f"{name}.__init__" if f"{name}.__init__" in sources() else name
+
+
+def layer(folder: str, module: str) -> int | None:
+    """Return the layer of a module within a folder, 0 at the top; None where it is elsewhere."""
+    if not module.startswith(f"{folder}."):
+        return None
+    part = module.removeprefix(f"{folder}.").split(".")[0]
+    for number, parts in enumerate(LAYERS[folder]):
+        if part in parts:
+            return number
+    raise AssertionError(f"{module} is in no layer of {folder}")
+
+
+@pytest.mark.parametrize("folder", LAYERS)
+def test_imports_point_down(folder: str) -> None:
+    wrong = []
+    # The package's own module offers what is above it, to those who ask.
+    for module in sources().keys() - {f"{PACKAGE}.__init__"}:
+        own = layer(folder, module)
+        part = module.removeprefix(f"{folder}.").split(".")[0]
+        for other in imports(module):
+            below = layer(folder, other)
+            same = other.removeprefix(f"{folder}.").split(".")[0] == part
+            if own is not None and below is not None and not same and below <= own:
+                wrong.append(f"{module} -> {other}")
+    assert sorted(wrong) == []
+
+
+def test_only_the_upper_layers_know_ros() -> None:
+    wrong = [
+        f"{module} -> {other}"
+        for module in sources()
+        if not module.startswith(tuple(f"{PACKAGE}.{part}." for part in KNOW_ROS))
+        for other in imports(module)
+        if other.split(".")[0] in ROS
+    ]
+    assert wrong == []
+
+
+def test_everything_that_is_imported_is_known_to_these_tests() -> None:
+    known = {*sys.stdlib_module_names, *ROS, PACKAGE}
+    needed = {
+        *("ament_index_python", "casadi", "click", "lz4", "matplotlib", "mcap", "meshcat"),
+        *("mujoco", "numpy", "rosbags", "rosidl_parser", "rpyutils", "scipy"),
+        *("urdf_parser_py", "yaml", "zstandard"),
+    }
+    others = {name.split(".")[0] for module in sources() for name in imports(module)} - known
+    assert others <= needed
+
+
+def test_modules_do_not_import_each_other_in_a_circle() -> None:
+    finished: set[str] = set()
+
+    def visit(module: str, path: tuple[str, ...]) -> None:
+        assert module not in path, " -> ".join((*path, module))
+        if module in finished or module not in sources():
+            return
+        for other in imports(module):
+            if not other.endswith("__init__"):
+                visit(other, (*path, module))
+        finished.add(module)
+
+    for module in sources():
+        visit(module, ())

@@ -1,0 +1,67 @@
+"""The files about the project name one version, existing files, existing targets."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+import spacerobot_ros
+
+ROOT = Path(__file__).resolve().parents[2]
+TARGETS = set(re.findall(r"^([a-z-]+):.*## ", (ROOT / "Makefile").read_text(), re.MULTILINE))
+CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+
+
+def recipes() -> dict[str, list[str]]:
+    """Return the files of every row of "To add X, touch these files"."""
+    section = CONTRIBUTING.split("## To add something")[1].split("\n## ")[0]
+    rows = [line.strip("|").split("|") for line in section.splitlines() if line.startswith("| **")]
+    return {row[0].strip(" *"): re.findall(r"`([^`]+)`", row[1]) for row in rows}
+
+
+def test_one_version_everywhere() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == spacerobot_ros.__version__
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## (?:\[)?(\d+\.\d+\.\d+)", changes, re.MULTILINE)[0] == (
+        spacerobot_ros.__version__
+    )
+
+
+@pytest.mark.parametrize("recipe", recipes())
+def test_the_files_to_touch_exist(recipe: str) -> None:
+    files = recipes()[recipe]
+    assert files
+    for file in files:
+        # A new file stands as the folder that it goes into, and a name in capitals.
+        existing = file.split("NEW")[0].rstrip("/")
+        assert (ROOT / existing).exists(), file
+
+
+def test_a_parameter_takes_two_files_and_a_topic_three() -> None:
+    assert len(recipes()["parameter"]) <= 2
+    assert len(recipes()["plant topic"]) <= 3
+
+
+@pytest.mark.parametrize("document", ["README.md", "CONTRIBUTING.md", ".github/workflows/test.yml"])
+def test_make_targets_that_are_named_exist(document: str) -> None:
+    text = (ROOT / document).read_text(encoding="utf-8")
+    named = set(re.findall(r"^(?:.*run: |\s*|.*`)make ([a-z][a-z-]*)", text, re.MULTILINE))
+    assert named
+    assert named <= TARGETS
+
+
+def test_workflow_and_hooks_are_yaml_that_names_what_setup_allows() -> None:
+    workflow = yaml.safe_load((ROOT / ".github/workflows/test.yml").read_text())
+    versions = workflow["jobs"]["test"]["strategy"]["matrix"]["python"]
+    assert versions == ["3.10", "3.11", "3.12", "3.13"]
+    assert f'python_requires=">={versions[0]}"' in (ROOT / "setup.py").read_text()
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
+    assert [hook["id"] for hook in hooks] == ["ruff-check", "ruff-format", "mypy"]
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 170
