@@ -25,7 +25,8 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("nodes",),
         ("verification",),
         ("bag", "simulation"),
-        ("planning", "control"),
+        ("control",),  # above planning, whose goals it takes
+        ("planning",),
         ("model",),
         ("parameters", "resources", "topics"),
         ("errors",),
