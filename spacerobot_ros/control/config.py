@@ -20,37 +20,68 @@ class ControllerConfig(BelievedRobotConfig):
 
     law: str = parameter("transposed_jacobian", "control law", choices=tuple(LAWS))
     tick_rate: float = parameter(
-        100.0, "commands a second; the plant's", unit="Hz", minimum=0.001, maximum=100000.0
+        100.0, "commands per second; that of the plant", unit="Hz", minimum=0.001, maximum=100000.0
     )
     world_frame: str = parameter("world", "frame that goals must be given in")
-    end_effector_frame: str = parameter("", "link that is controlled; '': 'end_effector', if any")
-    base_outputs: str = parameter("", "axes of the base: x y z rx ry rz; '': by the robot")
-    end_effector_outputs: str = parameter("", "axes of the end-effector; '': by the robot")
-    joint_outputs: str = parameter("", "joints that are outputs; '': by the robot")
+    end_effector_frame: str = parameter(
+        "", "link of the end-effector; '': 'end_effector', if there is one"
+    )
+    base_outputs: str = parameter(
+        "", "axes of the base that are outputs: x y z rx ry rz; all three '': by the robot"
+    )
+    end_effector_outputs: str = parameter("", "axes of the end-effector that are outputs")
+    joint_outputs: str = parameter("", "joints that are outputs")
     profile: str = parameter("step", "how references move to goals", choices=tuple(PROFILES))
     motion: MotionLimits = group(MotionLimits())
-    max_force: float = parameter(0.0, "of the thrusters; 0: no limit", unit="N", minimum=0.0)
-    max_torque: float = parameter(0.0, "of the thrusters; 0: no limit", unit="N m", minimum=0.0)
+    max_force: float = parameter(
+        0.0, "largest force of the thrusters; 0: no limit", unit="N", minimum=0.0
+    )
+    max_torque: float = parameter(
+        0.0, "largest torque of the thrusters; 0: no limit", unit="N m", minimum=0.0
+    )
     estimation_time: float = parameter(
-        1.0, "without odom the base is estimated this long", unit="s", minimum=0.0
+        1.0, "time for which the base is estimated while odom is missing", unit="s", minimum=0.0
     )
     position_tolerance: float = parameter(
-        0.001, "a goal is met within", unit="m", minimum=0.0, read_only=False
+        0.001,
+        "largest position error at a goal that is reached",
+        unit="m",
+        minimum=0.0,
+        read_only=False,
     )
     attitude_tolerance: float = parameter(
-        0.001, "a goal is met within", unit="rad", minimum=0.0, read_only=False
+        0.001,
+        "largest attitude error at a goal that is reached",
+        unit="rad",
+        minimum=0.0,
+        read_only=False,
     )
     joint_tolerance: float = parameter(
-        0.001, "a goal is met within", unit="m or rad", minimum=0.0, read_only=False
+        0.001,
+        "largest error of a joint at a goal that is reached",
+        unit="m or rad",
+        minimum=0.0,
+        read_only=False,
     )
-    settle_time: float = parameter(1.0, "... for this long", unit="s", minimum=0.0, read_only=False)
+    settle_time: float = parameter(
+        1.0,
+        "time for which all errors must stay within the tolerances",
+        unit="s",
+        minimum=0.0,
+        read_only=False,
+    )
     time_limit: float = parameter(
-        0.0, "a goal not met after this long has failed; 0: never", unit="s", minimum=0.0
+        0.0,
+        "time after which a goal that is not reached has failed; 0: never",
+        unit="s",
+        minimum=0.0,
     )
     status_period: float = parameter(
         1.0, "simulated time between status messages", unit="s", minimum=0.01
     )
-    resume_file: str = parameter("", "keeps the present goals for one that starts again; '': none")
+    resume_file: str = parameter(
+        "", "file that keeps the present goals for a controller that is restarted; '': none"
+    )
     gains: Gains = group(Gains())
     options: Mapping[str, Any] = registered(LAWS)
 

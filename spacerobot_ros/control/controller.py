@@ -41,7 +41,7 @@ class Mode(str, Enum):
 
 @dataclass(frozen=True)
 class Errors:
-    """What the outputs are off their goals: worst position (m), attitude (rad) and joint error."""
+    """Largest errors of the outputs: of positions (m), attitudes (rad) and joints (m or rad)."""
 
     position: float
     attitude: float
@@ -84,17 +84,18 @@ class CoordinatedController:
         self.mode = Mode.MEASURED
         self._profile: ReferenceProfile | None = None
         self._began = 0.0
-        self._given = Reference()
+        self._followed = Reference()
         self._sent: Actuation | None = None
+        self._last: ControlState | None = None
+        """The state that was measured last."""
         self._estimator: DeadReckoning | None = None
-        self._known = False
         self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
 
     def reset(self) -> None:
         """Drop goals and what was measured; the next state is the first."""
-        self._profile, self._given = None, Reference()
-        self._sent = self._estimator = self._brake = None
-        self._known, self.mode = False, Mode.MEASURED
+        self._profile, self._followed = None, Reference()
+        self._sent = self._last = self._estimator = self._brake = None
+        self.mode = Mode.MEASURED
 
     def set_gains(self, gains: Gains) -> None:
         """Change the gains from the next command on."""
@@ -123,8 +124,8 @@ class CoordinatedController:
         self._began = time
 
     def follow(self, reference: Reference) -> None:
-        """Take this instant's reference from outside; what it lacks is held by the profile."""
-        self._given = reference
+        """Track a reference from outside at the next command; the profile gives what it lacks."""
+        self._followed = reference
 
     def command(
         self, time: float, measured: ControlState | None, q: Array, qdot: Array
@@ -155,7 +156,7 @@ class CoordinatedController:
 
     @property
     def goal(self) -> Reference:
-        """Where references come to rest, of all that was given or is held; empty at first."""
+        """Where the references of all that is controlled come to rest; empty at first."""
         return Reference() if self._profile is None else self._profile.goal
 
     @property
@@ -191,7 +192,7 @@ class CoordinatedController:
 
     def _reference(self, time: float) -> Reference:
         assert self._profile is not None
-        own, given = self._profile.at(time - self._began), self._given
+        own, given = self._profile.at(time - self._began), self._followed
         if given.base is None and given.joints is None and given.end_effector is None:
             return own
         return Reference(
@@ -206,10 +207,9 @@ class CoordinatedController:
             if self._estimator is not None:
                 self._estimator.reset(measured)
             self._last = measured
-            self._known = True
             self.mode, self._brake = Mode.MEASURED, None
             return measured
-        if not self._known or self._sent is None or self.mode is Mode.STOPPED:
+        if self._last is None or self._sent is None or self.mode is Mode.STOPPED:
             self.mode = Mode.STOPPED
             return None
         if self._estimator is None:

@@ -32,7 +32,6 @@ from support.random_robots import random_chain_urdf
 
 from spacerobot_ros.control import (
     LAWS,
-    Actuation,
     ControlLaw,
     ControlState,
     GainPair,
@@ -172,11 +171,8 @@ class _Damping(ControlLaw):
         return {"strength": self.options.strength}
 
     def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        return {"tau": -symbols["strength"] * self.outputs.qdot}
-
-    def _actuation(self, reference: Reference) -> Actuation:
-        self._function.evaluate()
-        return Actuation(np.zeros(6), self._out["tau"].copy())
+        tau = -symbols["strength"] * self.outputs.qdot
+        return {"actuation": ca.vertcat(ca.SX(6, 1), tau)}
 
 
 def test_a_new_law_is_one_class_and_one_line_in_the_registry(

@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import ClassVar
 
 import casadi as ca
-import numpy as np
 
 from spacerobot_ros.control.laws.law import ControlLaw
 from spacerobot_ros.control.outputs import OutputSelection
-from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.space_robot import SpaceRobot
@@ -58,8 +56,5 @@ class ComputedTorqueLaw(ControlLaw):
         u = z1.acceleration + symbols["kd"] * z1.error_rate + symbols["kp"] * z1.error
         D, D_q, D_qq = H[3:6, 3:6], H[3:6, 6:], H[6:, 6:]
         omega_dot = -solve_positive_definite(D, D_q @ u + C[3:6])
-        return {"tau": D_qq @ u + D_q.T @ omega_dot + C[6:]}
-
-    def _actuation(self, reference: Reference) -> Actuation:
-        self._function.evaluate()
-        return Actuation(np.zeros(6), self._out["tau"].copy())
+        tau = D_qq @ u + D_q.T @ omega_dot + C[6:]
+        return {"actuation": ca.vertcat(ca.SX(6, 1), tau)}

@@ -126,9 +126,9 @@ class ControlLaw(ABC):
     """A way to turn errors of the outputs into thruster forces and joint efforts.
 
     A law is constructed once for a robot and commands once every control period. A subclass gives
-    ``name``, ``gain_units``, :meth:`_results` and :meth:`_actuation`, and where it has options,
-    ``Options``: a frozen dataclass derived from :class:`LawOptions`, whose fields become the
-    parameters ``<name>.<option>`` of the controller node. A line in
+    ``name``, ``gain_units`` and :meth:`_results`, and where it has options, ``Options``: a frozen
+    dataclass derived from :class:`LawOptions`, whose fields become the parameters
+    ``<name>.<option>`` of the controller node. A line in
     :mod:`spacerobot_ros.control.laws.registry` makes it available.
 
     Parameters
@@ -258,13 +258,17 @@ class ControlLaw(ABC):
     def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         """Return what the law's function gives beside the errors and ``J_z``, by name.
 
+        ``actuation`` (6 + n,) is the command: force (N) and torque (N m) at the origin of the base
+        link in base components, then the joint efforts; other results are the law's own.
         ``symbols`` has ``kp`` and ``kd`` (m,) and one for each name of :meth:`_inputs`; all else is
         in ``self.outputs``.
         """
 
-    @abstractmethod
     def _actuation(self, reference: Reference) -> Actuation:
-        """Return the command: call ``self._function.evaluate()`` and read ``self._out``."""
+        """Evaluate the function and return the command; its inputs are in ``self._in``."""
+        self._function.evaluate()
+        actuation = self._out["actuation"]
+        return Actuation(actuation[:6].copy(), actuation[6:].copy())
 
 
 def _pair(axis: str, position: GainPair, attitude: GainPair) -> GainPair:

@@ -10,7 +10,6 @@ import casadi as ca
 import numpy.typing as npt
 
 from spacerobot_ros.control.laws.law import ControlLaw, LawOptions
-from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.parameters import parameter
 
 
@@ -56,8 +55,3 @@ class TransposedJacobianLaw(ControlLaw):
         effort = symbols["kp"] * z1.error + symbols["kd"] * z1.error_rate
         friction = ca.vertcat(ca.SX(6, 1), symbols["joint_damping"] * z1.qdot)
         return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ effort - friction}
-
-    def _actuation(self, reference: Reference) -> Actuation:
-        self._function.evaluate()
-        actuation = self._out["actuation"]
-        return Actuation(actuation[:6].copy(), actuation[6:].copy())
