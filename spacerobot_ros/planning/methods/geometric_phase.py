@@ -296,11 +296,10 @@ def curvature_peaks(plane: PhasePlane, at: Array, boxes: Array) -> Array:
 
 def _tops(plane: PhasePlane, box: Array) -> Array:
     """Return the highest local maxima (P, 2) of |curvature| on a grid over a box."""
-    from scipy.ndimage import maximum_filter  # Slow to import: only what plans squares needs it.
-
     axes = [np.linspace(low, high, 1 + math.ceil((high - low) / _GRID_STEP)) for low, high in box.T]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     heights = np.abs(plane.curvature(grid))
-    tops = np.flatnonzero(heights == maximum_filter(heights, size=3, mode="nearest"))
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(heights, 1, mode="edge"), (3, 3))
+    tops = np.flatnonzero(heights == around.max(axis=(2, 3)))
     order = np.argsort(-heights.ravel()[tops], kind="stable")
     return grid.reshape(-1, 2)[tops[order[:_MOST_PEAKS]]]

@@ -282,6 +282,10 @@ class SquareSearch:
         self._phase = phase
         self._most_loops = most_loops
         self._centre = centre
+        # scipy.optimize loads slowly: with the method that needs it, before the first plan.
+        from scipy.optimize import brentq
+
+        self._root = brentq
         self._movable: list[int] = np.flatnonzero(robot.velocity_limit > 0).tolist()
 
     def loop(self, psi_e: Array, wanted: float) -> SquareLoop:
@@ -303,7 +307,7 @@ class SquareSearch:
         loops = math.ceil(abs(wanted) / largest.largest)
         target = abs(wanted) / loops
         solved = [
-            (candidates, *_solve(candidates, target))
+            (candidates, *self._solve(candidates, target))
             for candidates in found
             if candidates is largest or candidates.largest >= target
         ]
@@ -367,24 +371,21 @@ class SquareSearch:
             centres = curvature_peaks(plane, at, np.array(boxes))
         return _Candidates(pair, plane, centres, sides, plane.squares(centres, sides))
 
+    def _solve(self, candidates: _Candidates, wanted: float) -> tuple[int, float]:
+        """Return the row of the smallest candidate that turns far enough, and its ``z*``.
 
-def _solve(candidates: _Candidates, wanted: float) -> tuple[int, float]:
-    """Return the row of the smallest candidate that turns far enough, and ``z*`` round its centre.
+        ``wanted`` is the turn of one loop in either sense, rad, at most the largest there is.
+        """
+        # Rounding must not leave the largest out.
+        enough = np.abs(candidates.phases) >= min(wanted, candidates.largest)
+        row = int(np.argmax(enough))
+        centre, side = candidates.centres[[row]], float(candidates.sides[row])
+        sign = math.copysign(1.0, candidates.phases[row])
 
-    ``wanted`` is the turn of one loop in either sense, rad, at most the largest there is.
-    """
-    # Rounding must not leave the largest out.
-    enough = np.abs(candidates.phases) >= min(wanted, candidates.largest)
-    row = int(np.argmax(enough))
-    centre, side = candidates.centres[[row]], float(candidates.sides[row])
-    sign = math.copysign(1.0, candidates.phases[row])
+        def excess(z: float) -> float:
+            return sign * float(candidates.plane.squares(centre, np.array([z]))[0]) - wanted
 
-    def excess(z: float) -> float:
-        return sign * float(candidates.plane.squares(centre, np.array([z]))[0]) - wanted
-
-    # The last digit of a phase depends on how many legs are integrated together.
-    if excess(side) <= 0:
-        return row, side
-    from scipy.optimize import brentq  # Slow to import: only what plans squares needs it.
-
-    return row, float(brentq(excess, 0.0, side, xtol=1e-13, rtol=1e-14))
+        # The last digit of a phase depends on how many legs are integrated together.
+        if excess(side) <= 0:
+            return row, side
+        return row, float(self._root(excess, 0.0, side, xtol=1e-13, rtol=1e-14))
