@@ -64,18 +64,9 @@ class McapFile:
     """An MCAP file that grows by whole records.
 
     Every append goes to the operating system at once, and one that fails is undone, so that the
-    file of a process that dies is whole but for the record that it was appending.
-
-    Parameters
-    ----------
-    path
-        The file; its folders are made.
-    compression
-        Of the chunks: ``zstd``, ``lz4`` or ``none``.
-    overwrite
-        Whether a file that is there is replaced.
-    profile
-        What the messages are; ``ros2`` unless they are of something else.
+    file of a process that dies is whole but for the record that it was appending. ``compression``
+    and ``overwrite`` are as of :class:`~spacerobot_ros.bag.BagWriter`; ``profile`` says what the
+    messages are.
 
     Raises
     ------
@@ -122,15 +113,10 @@ class McapFile:
         return self._size
 
     def append_chunk(self, records: bytearray, entries: dict[int, list[int]]) -> None:
-        """Append one chunk and the indexes of its messages.
+        """Append a chunk of encoded records and the indexes of its messages.
 
-        Parameters
-        ----------
-        records
-            The encoded records of the chunk.
-        entries
-            Of each channel, for each of its messages, log time in nanoseconds and offset
-            in ``records``, one after the other.
+        ``entries`` are, of each channel, for each of its messages, log time in nanoseconds and
+        offset in ``records``, one after the other.
 
         Raises
         ------
@@ -251,7 +237,7 @@ class McapFile:
         self._append(data_end + bytes(summary) + footer + MCAP0_MAGIC)
 
     def close(self) -> None:
-        """Let go of the file; does not raise."""
+        """Close the file; does not raise."""
         with suppress(OSError):
             self._raw.close()
 

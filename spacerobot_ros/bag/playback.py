@@ -248,7 +248,7 @@ class Playback:
         return self._take()
 
     def close(self) -> None:
-        """Let go of the bag; nothing is left to play."""
+        """Close the bag; nothing is left to play."""
         self._turn.close()
         self._next = None
 

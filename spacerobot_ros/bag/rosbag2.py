@@ -290,16 +290,8 @@ def metadata_record(
 ) -> Metadata:
     """Return rosbag2's metadata record, its YAML laid out as rosbag2 dumps it.
 
-    Parameters
-    ----------
-    file_name
-        Name of the bag file, without folders.
-    topics
-        The topics in the bag.
-    start_ns
-        Log time of the earliest message in nanoseconds; None without messages.
-    end_ns
-        Log time of the latest one.
+    ``file_name`` has no folders; ``start_ns`` and ``end_ns`` are the log times of the earliest and
+    the latest message in nanoseconds, None without messages.
     """
     start, duration = INFINITE_NS, 0
     if start_ns is not None and end_ns is not None:

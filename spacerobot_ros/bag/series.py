@@ -47,22 +47,14 @@ _LITTLE_ENDIAN_CDR = b"\x00\x01"
 
 
 class TopicSeries:
-    """The messages of one topic, by log time.
+    """The messages of one topic, by log time; ``bag[topic]`` makes it.
 
-    Parameters
+    Attributes
     ----------
-    topic
-        Its name.
-    type_name
-        The type of its messages.
+    topic, type_name
+        Name of the topic and of the type of its messages.
     time_ns
         Log times in nanoseconds, not decreasing, shape (N,).
-    data
-        The N serialised messages.
-    fields
-        Definitions of the type and of those it uses.
-    decode
-        Makes a message of its serialised form.
     """
 
     def __init__(
@@ -273,20 +265,9 @@ class Columns:
 
 
 def columns(messages: Sequence[bytes], type_name: str, fields: Fields) -> Columns | None:
-    """Find the fields that lie at the same place in every message.
+    """Return the fields that lie at the same place in every message of one type.
 
-    Parameters
-    ----------
-    messages
-        Serialised messages of one type (CDR with its header).
-    type_name
-        Such as ``nav_msgs/msg/Odometry``.
-    fields
-        Definitions of that type and of those it uses.
-
-    Returns
-    -------
-    All fields outside of lists of messages and of strings; None if the layouts differ.
+    They are those outside of lists of messages and of strings; None if the layouts differ.
     """
     if not messages or len(set(map(len, messages))) != 1:
         return None

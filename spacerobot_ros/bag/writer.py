@@ -259,7 +259,7 @@ class BagWriter:
         self._finish_chunk()
 
     def close(self) -> None:
-        """Write what is left and the summary, and let go of the file; a second call does nothing.
+        """Write what is left and the summary, and close the file; a second call does nothing.
 
         Raises
         ------

@@ -389,11 +389,6 @@ def _descriptions(path: str) -> list[tuple[str, dict[str, str]]]:
         ) from error
 
 
-def parameters_of(node: FlightNode) -> dict[str, str]:
-    """Return a node's parameters as JSON texts by name, for a bag's metadata."""
-    return {name: json.dumps(value) for name, value in node.parameter_values.items()}
-
-
 def main() -> None:
     """Record until SIGINT or SIGTERM."""
     sys.exit(run_node(RecorderNode))

@@ -106,7 +106,7 @@ class ReplayNode(FlightNode):
         self._timers = []
 
     def cleanup(self) -> None:
-        """Let go of the bag."""
+        """Close the bag."""
         self._close_bag()
 
     # -- publishers ---------------------------------------------------------------------------

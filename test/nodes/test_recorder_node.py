@@ -14,12 +14,11 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
 from support.planner_flight import PLANNER
-from support.recorded_stack import LATCHED_TOPICS, PLANT, STREAMS, BagContent, Stack
+from support.recorded_stack import LATCHED_TOPICS, PLANT, STREAMS, BagContent, Stack, parameters_of
 from support.ros_harness import LATCHED, Harness, nanoseconds
 
 from spacerobot_ros import __version__
 from spacerobot_ros.nodes import PlantNode, RecorderNode
-from spacerobot_ros.nodes.recorder import parameters_of
 
 URDF = Path(__file__).parents[2] / "urdf" / "sliding_masses.urdf"
 

@@ -13,11 +13,11 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from support.altered_bags import altered
+from support.recorded_stack import parameters_of
 from support.ros_harness import Harness
 
 from spacerobot_ros.bag import RecordingError
 from spacerobot_ros.nodes import PlantNode, RecorderNode
-from spacerobot_ros.nodes.recorder import parameters_of
 from spacerobot_ros.verification.comparison import verify_bag
 
 SLIDERS = ["slider_1", "slider_2", "slider_3"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from support.planner_flight import PLANNER
 from support.ros_harness import Harness, Probe
 
 from spacerobot_ros.nodes import PlannerNode, PlantNode, RecorderNode
+from spacerobot_ros.nodes.common.node import FlightNode
 
 PLANT = {
     "robot": "sliding_masses",
@@ -29,6 +31,11 @@ STREAMS = (
     "/clock", "/odom", "/base_pose", "/joint_states", "/joint_commands", "/momentum", "/markers",
     "/diagnostics", "/goal_pose",
 )  # fmt: skip
+
+
+def parameters_of(node: FlightNode) -> dict[str, str]:
+    """Return a node's parameters as JSON texts by name, for a bag's metadata."""
+    return {name: json.dumps(value) for name, value in node.parameter_values.items()}
 
 
 def message_class(type_name: str) -> Any:
