@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from spacerobot_ros.model.description import Array, JointKind
-from spacerobot_ros.model.rotations import rotvec_from_quaternion
+from spacerobot_ros.model.rotations import rotvec_from_quaternion, rotvecs_from_quaternions
 from spacerobot_ros.report.style import (
     FAINT,
     colour,
@@ -36,7 +36,7 @@ def _figure(problem: Problem, trial: Trial) -> Figure:
     ticks = problem.control_period * np.arange(len(positions), dtype=np.float64)
     rates = np.diff(positions, axis=0) / problem.control_period
     path = trial.path
-    turned = np.array([rotvec_from_quaternion(x) for x in path.quaternion])
+    turned = rotvecs_from_quaternions(path.quaternion)
     names = robot.joint_names
     figure, rows = sheet([[1], [1], [1, 1]], [1.9, 1.9, 1.9], right=room_for(names) + 0.35)
     joints, speeds, (place, attitude) = rows[0][0], rows[1][0], rows[2]
