@@ -63,8 +63,12 @@ def new_environment(prefix: Path) -> Path:
 
 def module_of(node: str) -> str:
     """Return the module that an executable runs."""
-    folder = {"coordinated_control": "controller"}.get(node, node)
-    return f"spacerobot_ros.nodes.{folder}.node"
+    modules = {
+        "coordinated_control": "controller.node",
+        "recorder": "recorder",
+        "replay": "replay",
+    }
+    return f"spacerobot_ros.nodes.{modules.get(node, f'{node}.node')}"
 
 
 @pytest.fixture
@@ -91,7 +95,7 @@ def project(tmp_path: Path) -> Path:
         source.write_text(STUB)
     for node in NODES:
         source = project / f"{module_of(node).replace('.', '/')}.py"
-        source.parent.mkdir()
+        source.parent.mkdir(exist_ok=True)
         (source.parent / "__init__.py").touch()
         source.write_text(STUB)
     return project
