@@ -30,7 +30,7 @@ class PlantKind:
     Attributes
     ----------
     plant
-        The class, called with robot, tick period (s), initial state and integration step (s).
+        The class, called with robot, control period (s), initial state and integration step (s).
     integration_step
         The longest Runge-Kutta step unless the configuration gives one, s.
     wrench
@@ -68,7 +68,8 @@ def build_plant(
     ParameterError
         The integration step is too short, or the initial state, a thruster or a fault is refused.
     """
-    kind, step, tick_period = PLANTS[config.actuation], config.integration_step, config.tick_period
+    kind, step = PLANTS[config.actuation], config.integration_step
+    control_period = config.control_period
     if 0.0 < step < _SHORTEST_STEP:
         raise ParameterError(
             f"Parameter 'integration_step' is {step}; it must be 0 (by the actuation) or at least "
@@ -80,14 +81,14 @@ def build_plant(
             f"'{config.actuation}' nothing pushes the base: set actuation to effort, or thrusters "
             "to ''."
         )
-    if step and tick_period / step > _MOST_STEPS:
+    if step and control_period / step > _MOST_STEPS:
         raise ParameterError(
             f"Parameter 'integration_step' is {step:g} s, which is more than {_MOST_STEPS:.0e} "
-            f"steps in a tick of {tick_period:g} s; choose longer steps or shorter ticks."
+            f"steps in a tick of {control_period:g} s; choose longer steps or shorter ticks."
         )
     start = InitialState.of(config) if initial is None else initial
-    plant = kind.plant(robot, tick_period, start, step or kind.integration_step)
-    plant = with_thrusters(plant, tick_period, config.thrusters, config.thrusters_excluded)
+    plant = kind.plant(robot, control_period, start, step or kind.integration_step)
+    plant = with_thrusters(plant, control_period, config.thrusters, config.thrusters_excluded)
     return FaultyPlant(
-        plant, config.faults, tick_period, wrench=kind.wrench, seed=config.sensors.seed
+        plant, config.faults, control_period, wrench=kind.wrench, seed=config.sensors.seed
     )

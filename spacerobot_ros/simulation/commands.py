@@ -218,7 +218,7 @@ class CommandValidator:
                 CommandSource("base_wrench", "wrench", np.full(6, np.inf)),
             ]
             # Velocity servos stop at once; motors have to brake.
-            self._brakes = _JointBrakes(plant, config.tick_period)
+            self._brakes = _JointBrakes(plant, config.control_period)
         self._commands = [source.command for source in self.sources]
         self._lockstep = config.time_mode == "lockstep"
         self._timeout = config.command_timeout
@@ -311,7 +311,7 @@ class CommandValidator:
         return fault
 
     def require_commanded(self) -> None:
-        """Wait for wrenches only while somebody publishes them; joints are always waited for."""
+        """Wait for wrenches only while a node publishes them; joints are always waited for."""
         for source in self.sources[1:]:
             source.required = source.commanders > 0
             if not source.required:
@@ -320,7 +320,7 @@ class CommandValidator:
                 source.arrived = False
 
     def drop_old(self, now_ns: int) -> list[CommandSource]:
-        """Bring to rest what nobody has commanded for the timeout; return those sources."""
+        """Bring to rest the sources without a command for the timeout, and return them."""
         silent = []
         for source in self.sources:
             age = now_ns - source.stamp_ns
@@ -383,9 +383,9 @@ def _latching(words: str) -> frozenset[Reason]:
 class _JointBrakes:
     """Motor efforts against the joint rates of a plant: inner forces, which leave its momenta."""
 
-    def __init__(self, plant: Plant, tick_period: float) -> None:
+    def __init__(self, plant: Plant, control_period: float) -> None:
         robot: SpaceRobot = plant.robot
-        rate = min(_BRAKING_RATE, _LARGEST_RATE_PER_TICK / tick_period)
+        rate = min(_BRAKING_RATE, _LARGEST_RATE_PER_TICK / control_period)
         outputs = ComputedTorqueLaw.default_outputs(robot, "")
         # Only the damping acts: the reference is always where the joints are.
         self._law = ComputedTorqueLaw(robot, outputs, Gains.uniform(1.0, rate))

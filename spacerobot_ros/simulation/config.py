@@ -130,6 +130,6 @@ class PlantConfig(RobotConfig):
         return period_ns(self.tick_rate)
 
     @property
-    def tick_period(self) -> float:
+    def control_period(self) -> float:
         """Duration of a tick, s."""
         return self.period_ns / _SECOND

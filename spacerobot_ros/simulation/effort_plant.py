@@ -2,7 +2,7 @@
 
 One tick is one compiled function: limits, integration, and every quantity that is published. The
 total momenta are integrated as such (:mod:`spacerobot_ros.model.composite_rigid_body`): without
-thrust they do not change by a single bit. Ticks in which a joint touches the end of its stroke are
+thrust they do not change by a single bit. Ticks in which a joint touches one of its limits are
 taken again with its stop (:mod:`spacerobot_ros.simulation.joint_stops`).
 """
 
@@ -48,7 +48,7 @@ class EffortPlant:
     ----------
     robot
         The model; its efforts are clipped to the limits of its description.
-    tick_period
+    control_period
         Duration of a tick, s.
     initial
         Where to start.
@@ -58,22 +58,22 @@ class EffortPlant:
     Raises
     ------
     ParameterError
-        The initial shape has the wrong length or lies outside the strokes, or a number is bad.
+        The initial shape has the wrong length or lies outside the joint limits, or a number is bad.
     """
 
     def __init__(
         self,
         robot: SpaceRobot,
-        tick_period: float,
+        control_period: float,
         initial: InitialState | None = None,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
     ) -> None:
-        substeps = steps_in(tick_period, integration_step)
+        substeps = steps_in(control_period, integration_step)
         self.robot = robot
-        self.tick_period = tick_period
+        self.control_period = control_period
         self.initial = initial or InitialState()
         n = robot.n
-        self._stops = JointStops(robot, tick_period / substeps)
+        self._stops = JointStops(robot, control_period / substeps)
         self._advance = BufferedFunction(compiled(_tick_function(robot, substeps)))
         self._state, self._command, self._h = self._advance.inputs
         self._next_state, self.pose, self.twist, self._realised = self._advance.outputs[:4]
@@ -125,8 +125,8 @@ class EffortPlant:
         """Advance one tick under joint efforts (n,), clipped to their limits, and a base wrench.
 
         ``wrench`` (6,) is force (N) over torque (N m) at the origin of the base link, in base
-        components; it turns with the base during the tick. A joint that reaches the end of its
-        stroke stops there without rebound and is held while something pushes it outwards. Returns
+        components; it turns with the base during the tick. A joint that reaches its limit
+        stops there without rebound and is held while something pushes it outwards. Returns
         whether any joint was limited; ``effort_limited`` and ``stroke_limited`` count the ticks by
         joint.
 
@@ -156,7 +156,7 @@ class EffortPlant:
                 raise CommandError(f"A command is not finite: {self._command.tolist()}.")
             if touched or self._holding:
                 self._state[:], stopped = self._stops.advance(
-                    self._state, self._realised, self.tick_period, self._held
+                    self._state, self._realised, self.control_period, self._held
                 )
                 self._report()
         except SpaceRobotError:
@@ -172,7 +172,7 @@ class EffortPlant:
         """Fill every output at ``_state``: a tick of zero duration."""
         self._h[:] = 0.0
         self._advance.evaluate()
-        self._h[:] = self.tick_period
+        self._h[:] = self.control_period
 
 
 def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
@@ -191,7 +191,7 @@ def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
     v, omega = robot.function("base_twist", compile=False)(quaternion, q, qdot, p_W, L_W)
     center = robot.function("center_of_mass", compile=False)(q)
     r_WB_W = r_WC_W - robot.function("rotate", compile=False)(quaternion, center)
-    ledger = robot.function("momentum", compile=False)(quaternion, q, v, omega, qdot)
+    momentum = robot.function("momentum", compile=False)(quaternion, q, v, omega, qdot)
     link_R, link_r = robot.function("link_poses", compile=False)(q)
     clipped = command[:n] != effort
     # Comparisons with what is not a number are false.
@@ -205,7 +205,7 @@ def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
             ca.vertcat(r_WB_W, quaternion),
             ca.vertcat(v, omega),
             realised,
-            ca.vertcat(*ledger),
+            ca.vertcat(*momentum),
             link_R,
             link_r,
             ca.densify(ca.vertcat(ca.sum1(clipped) + touched, clipped, touched)),
@@ -216,7 +216,7 @@ def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
 def _watched_step(robot: SpaceRobot) -> ca.Function:
     """Return the step that also counts, in one more entry of the state, joints on or beyond stops.
 
-    It looks at the end of each step: a joint cannot swing out of its stroke and back within one.
+    It looks at the end of each step: a joint cannot swing beyond its limit and back within one.
     """
     step = robot.function("flight_step", compile=False)
     watched = ca.MX.sym("x", step.size1_in(0) + 1)
@@ -227,6 +227,6 @@ def _watched_step(robot: SpaceRobot) -> ca.Function:
 
 
 def _touching(robot: SpaceRobot, state: ca.MX) -> ca.MX:
-    """Return how many joints are not strictly inside their strokes."""
+    """Return how many joints are not strictly inside their limits."""
     q = state[: robot.n]
     return robot.n - ca.sum1(ca.logic_and(q > ca.DM(robot.lower), q < ca.DM(robot.upper)))

@@ -238,7 +238,7 @@ class FaultyPlant(WrappedPlant):
         The plant within.
     faults
         What goes wrong and when, a fault a line (:func:`parse_fault`).
-    tick_period
+    control_period
         Duration of a tick, s.
     wrench
         Whether steps take a wrench.
@@ -255,7 +255,7 @@ class FaultyPlant(WrappedPlant):
         self,
         plant: Plant,
         faults: Iterable[str],
-        tick_period: float,
+        control_period: float,
         *,
         wrench: bool,
         seed: int = 0,
@@ -269,7 +269,7 @@ class FaultyPlant(WrappedPlant):
         self.tick = 0
         """Ticks since the beginning."""
         self.step: Callable[..., bool] = self._step
-        self._tick_period = tick_period
+        self._control_period = control_period
         self._rng = np.random.default_rng(seed)
         self._index = {name: i for i, name in enumerate(self.robot.joint_names)}
         n = self.robot.n
@@ -282,7 +282,7 @@ class FaultyPlant(WrappedPlant):
     @property
     def time(self) -> float:
         """Simulated time, s."""
-        return self.tick * self._tick_period
+        return self.tick * self._control_period
 
     @property
     def active(self) -> tuple[Fault, ...]:
@@ -305,8 +305,8 @@ class FaultyPlant(WrappedPlant):
 
     def look(self) -> None:
         """Take up the faults of this moment."""
-        active = self.timeline.at(self.time + _ROUNDING * self._tick_period)
-        self._next_tick = self.timeline.next_change / self._tick_period - _ROUNDING
+        active = self.timeline.at(self.time + _ROUNDING * self._control_period)
+        self._next_tick = self.timeline.next_change / self._control_period - _ROUNDING
         if active is self._seen:
             return
         self._seen = active

@@ -17,7 +17,7 @@ from spacerobot_ros.simulation.config import PlantConfig
 class InitialState:
     """Where a run starts: base pose in W (m; quaternion x, y, z, w), shape, and total momenta in W.
 
-    ``joint_positions`` None means zero, or the nearest end of a stroke that excludes zero.
+    ``joint_positions`` None means zero, or the nearest limit of a joint that cannot be there.
     ``angular_momentum`` (kg m^2/s) is about the system's centre of mass. ``joint_velocities`` None
     means zero; the base's twist follows from them and the momenta. ``center_of_mass`` (m, in W)
     puts the system's centre of mass there instead of the base link at ``position``.
@@ -94,7 +94,7 @@ class InitialState:
         Raises
         ------
         ParameterError
-            Their number is wrong, or one lies outside its stroke.
+            Their number is wrong, or one lies outside its limits.
         """
         if self.joint_positions is None:
             return np.clip(np.zeros(robot.n), robot.lower, robot.upper)
@@ -104,7 +104,7 @@ class InitialState:
         ):
             if not (lower <= value <= upper):
                 raise ParameterError(
-                    f"The initial position of joint '{name}', {value}, is outside its stroke "
+                    f"The initial position of joint '{name}', {value}, is outside its limits "
                     f"[{lower}, {upper}]."
                 )
         return q

@@ -1,14 +1,14 @@
-"""Joints that run into the ends of their strokes: inelastic stops.
+"""Joints that run into their limits: inelastic stops.
 
 A stop acts between the two links of its joint, along the joint's coordinate: an internal force,
 which changes neither total momentum; the other joints and the base take their share. With ``K`` the
 inertia matrix of the shape (:mod:`spacerobot_ros.model.composite_rigid_body`), stops do two things:
 
-* Arrival: of all rates that lead out of no stroke, ``qdot+`` is the nearest to ``qdot-`` in the
+* Arrival: of all rates that lead beyond no limit, ``qdot+`` is the nearest to ``qdot-`` in the
   metric of K. The joint does not rebound; ``(qdot+ - qdot-)' K (qdot+ - qdot-) / 2`` of energy is
   lost (Carnot). The time of arrival is found to rounding.
 * Holding: a joint on its stop stays there through an integration step if it is pushed outwards,
-  that is, if the nearest to ``qdot + h K^-1 Q`` that leads out of no stroke has it at rest (Gauss's
+  that is, if the nearest to ``qdot + h K^-1 Q`` that leads beyond no limit has it at rest (Gauss's
   principle of least constraint over a step, Moreau's time stepping). So it leaves with a delay of
   at most one step, and the endless shorter and shorter hops of joints that knock each
   other off their stops end.

@@ -1,4 +1,4 @@
-"""What every plant offers to whoever steps and publishes it, and plants round other plants."""
+"""The interface of every plant, and plants round other plants."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class ReportedState:
 
     def __init__(self, plant: FaultyPlant, config: PlantConfig) -> None:
         self._plant = plant
-        self.sensors = Sensors(plant, config.sensors, config.tick_period)
+        self.sensors = Sensors(plant, config.sensors, config.control_period)
         self._link = _end_effector(plant.robot, config.end_effector_frame)
         self._end_effector_pose = np.zeros(7)
         self._thrusters = thrusters_in(plant)

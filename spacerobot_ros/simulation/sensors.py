@@ -36,7 +36,7 @@ class Sensors:
         Whose state is measured, and whose faults the sensors share.
     config
         How they err without faults.
-    tick_period
+    control_period
         s.
 
     Raises
@@ -45,14 +45,14 @@ class Sensors:
         The bias of the joints has the wrong length.
     """
 
-    def __init__(self, plant: FaultyPlant, config: SensorConfig, tick_period: float) -> None:
+    def __init__(self, plant: FaultyPlant, config: SensorConfig, control_period: float) -> None:
         n = plant.robot.n
         if len(config.joint_bias) not in (0, n):
             raise ParameterError(
                 f"Parameter 'sensors.joint_bias' has {len(config.joint_bias)} number(s); the robot "
                 f"has {n} joints."
             )
-        self._plant, self._config, self._tick_period = plant, config, tick_period
+        self._plant, self._config, self._control_period = plant, config, control_period
         self._rng = np.random.default_rng(config.seed)
         self._joint_index = {name: i for i, name in enumerate(plant.robot.joint_names)}
         self.pose, self.twist = plant.pose.copy(), plant.twist.copy()
@@ -122,5 +122,5 @@ class Sensors:
             elif fault.kind == "sensor_delay":
                 delay = max(delay, fault.value)
         self._noise = {group: variance**0.5 for group, variance in variances.items()}
-        self._delay = round(delay / self._tick_period)
+        self._delay = round(delay / self._control_period)
         self._past = deque(self._past, maxlen=self._delay + 1)

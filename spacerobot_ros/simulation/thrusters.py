@@ -15,8 +15,8 @@ from spacerobot_ros.simulation.plant import Plant, WrappedPlant
 class ThrusterPlant(WrappedPlant):
     """A plant under efforts, its wanted base wrench realised by pulses of thrusters.
 
-    Everything of the plant within is as it was; its ledger stays exact because what the thrusters
-    put in is the wrench that it is stepped with. A thruster that is on for part of a tick gives its
+    Everything of the plant within is as it was; its momentum balance stays exact because what the
+    thrusters put in is the wrench that it is stepped with. A thruster that is on for part of a tick gives its
     impulse evenly over the tick. Besides, there are
 
     ``wrench``
@@ -33,14 +33,15 @@ class ThrusterPlant(WrappedPlant):
         (6,) what the last tick's wanted wrench lost to the thrusters' limits, and in how many ticks
         it lost anything.
     ``thruster_health``, ``stuck_on``
-        (m,) thrust over what the table says, 1 unless set, and whether a thruster is on whatever it
-        is told, false unless set. The allocation does not know of either; :meth:`exclude` tells it.
+        (m,) thrust over what the table says, 1 unless set, and whether a thruster is on whatever is
+        commanded, false unless set. The allocation takes neither into account; see
+        :meth:`exclude`.
 
     Parameters
     ----------
     plant
         The plant within; its steps take efforts and a wrench.
-    tick_period
+    control_period
         Duration of a tick, s.
     table
         The thrusters.
@@ -54,12 +55,12 @@ class ThrusterPlant(WrappedPlant):
     """
 
     def __init__(
-        self, plant: Plant, tick_period: float, table: ThrusterTable, excluded: Sequence[str] = ()
+        self, plant: Plant, control_period: float, table: ThrusterTable, excluded: Sequence[str] = ()
     ) -> None:
         super().__init__(plant)
         self.table = table
-        self._tick_period = tick_period
-        self._modulator = ThrusterModulator(table, tick_period, excluded)
+        self._control_period = control_period
+        self._modulator = ThrusterModulator(table, control_period, excluded)
         self._wrenches, self._mass_flow = table.wrenches, table.mass_flow
         count = len(table.names)
         self.wrench = np.zeros(6)
@@ -111,7 +112,7 @@ class ThrusterPlant(WrappedPlant):
         for command in (effort, wanted):
             if not np.all(np.isfinite(command)):
                 raise CommandError(f"A command is not finite: {np.asarray(command).tolist()}.")
-        tick = self._tick_period
+        tick = self._control_period
         on_time = self._modulator.fire(wanted)
         on_time[self.stuck_on] = tick
         self.duty[:] = on_time / tick
@@ -124,14 +125,14 @@ class ThrusterPlant(WrappedPlant):
         return limited
 
 
-def with_thrusters(plant: Plant, tick_period: float, source: str, excluded: str = "") -> Plant:
+def with_thrusters(plant: Plant, control_period: float, source: str, excluded: str = "") -> Plant:
     """Give a plant under efforts the thrusters of its URDF, of a YAML file, or none.
 
     Parameters
     ----------
     plant
         The plant, which takes any wrench.
-    tick_period
+    control_period
         Duration of a tick, s.
     source
         ``urdf``, the path of a file, or empty: then the plant is returned as it is.
@@ -148,7 +149,7 @@ def with_thrusters(plant: Plant, tick_period: float, source: str, excluded: str 
     if not source:
         return plant
     robot = plant.robot.description
-    return ThrusterPlant(plant, tick_period, find_thrusters(source, robot), excluded.split())
+    return ThrusterPlant(plant, control_period, find_thrusters(source, robot), excluded.split())
 
 
 def thrusters_in(plant: Plant) -> ThrusterPlant | None:

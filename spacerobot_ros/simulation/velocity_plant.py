@@ -30,7 +30,7 @@ class VelocityPlant:
     ----------
     robot
         The model.
-    tick_period
+    control_period
         Duration of a tick, s.
     initial
         Where to start.
@@ -40,20 +40,20 @@ class VelocityPlant:
     Raises
     ------
     ParameterError
-        The initial shape has the wrong length or lies outside the strokes, its joints move, or a
+        The initial shape has the wrong length or lies outside the joint limits, its joints move, or a
         number is bad.
     """
 
     def __init__(
         self,
         robot: SpaceRobot,
-        tick_period: float,
+        control_period: float,
         initial: InitialState | None = None,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
     ) -> None:
-        substeps = steps_in(tick_period, integration_step)
+        substeps = steps_in(control_period, integration_step)
         self.robot = robot
-        self.tick_period = tick_period
+        self.control_period = control_period
         self.initial = initial or InitialState()
         self._advance = BufferedFunction(compiled(_tick_function(robot, substeps)))
         inputs, outputs = self._advance.inputs, self._advance.outputs
@@ -93,16 +93,16 @@ class VelocityPlant:
         self._command[:] = 0.0
         self._h[:] = 0.0
         self._advance.evaluate()
-        self._h[:] = self.tick_period
+        self._h[:] = self.control_period
 
     def hold(self, joints: Flags) -> None:
         """Hold these joints (n,) where they are from now on, whatever is commanded."""
         self._held = joints.copy() if joints.any() else None
 
     def step(self, command: Array) -> bool:
-        """Advance one tick under the joint velocities ``command`` (n,), clipped to rate and stroke.
+        """Advance one tick under the joint velocities ``command`` (n,), clipped to its limits.
 
-        A joint that would leave its stroke within the tick moves at the rate that ends on it.
+        A joint that would pass its limit within the tick moves at the rate that ends on it.
         Returns whether any joint was limited; ``velocity_limited`` and ``stroke_limited`` count
         the ticks by joint.
         """
@@ -128,7 +128,7 @@ def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
 
     rate = ca.fmin(ca.fmax(command, -robot.velocity_limit), robot.velocity_limit)
     q = state[:n]
-    # A tick of no duration only reports the state: its strokes must not divide by zero.
+    # A tick of no duration only reports the state: its limits must not divide by zero.
     duration = ca.fmax(h, 1e-12)
     to_lower, to_upper = (ca.DM(robot.lower) - q) / duration, (ca.DM(robot.upper) - q) / duration
     qdot = ca.fmin(ca.fmax(rate, to_lower), to_upper)
@@ -142,7 +142,7 @@ def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
     r_cm_next = r_cm + p_W * (h / robot.total_mass)
     center = robot.function("center_of_mass", compile=False)(q_next)
     r_WB = r_cm_next - robot.function("rotate", compile=False)(quaternion, center)
-    ledger = robot.function("momentum", compile=False)(quaternion, q_next, v, omega, qdot)
+    momentum = robot.function("momentum", compile=False)(quaternion, q_next, v, omega, qdot)
     link_R, link_r = robot.function("link_poses", compile=False)(q_next)
     return ca.Function(
         f"velocity_tick_{substeps}",
@@ -152,7 +152,7 @@ def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
             ca.vertcat(r_WB, quaternion),
             ca.vertcat(v, omega),
             qdot,
-            ca.vertcat(*ledger),
+            ca.vertcat(*momentum),
             link_R,
             link_r,
             ca.densify(limited),

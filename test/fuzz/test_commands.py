@@ -12,7 +12,7 @@ from sensor_msgs.msg import JointState
 from support.fuzzing import NUMBERS, TEXTS, damaged, fuzz
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.nodes.plant.command_messages import CommandReader, command_reader
+from spacerobot_ros.nodes.plant.command_messages import CommandReader
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.building import build_plant
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Reason
@@ -71,7 +71,7 @@ class Commanded:
         config = PlantConfig(actuation=actuation, command_timeout=0.0)
         self.commands = CommandValidator(build_plant(robot(), config), config)
         self.source: CommandSource = self.commands.sources[number]
-        self.reader: CommandReader = command_reader(self.source, robot())
+        self.reader: CommandReader = CommandReader(self.source, robot())
 
     def accepts(self, raw: bytes) -> bool:
         """Return whether the source accepts some bytes; what it accepts is finite."""
@@ -180,7 +180,7 @@ def assert_judged_alike(message: object, kind: type, number: int, beyond_limits:
     decoded = deserialize_message(raw, kind)
     stamp = decoded.header.stamp.sec * 10**9 + decoded.header.stamp.nanosec
     source, again = by_node.sources[number], by_bag.sources[number]
-    refusal = command_reader(source, robot()).offer(by_node, raw, stamp)
+    refusal = CommandReader(source, robot()).offer(by_node, raw, stamp)
     assert by_bag.offer(again, stamp, read_command(decoded, again, robot()), stamp) == refusal
     assert by_bag.counts == by_node.counts
     assert by_bag.fault == by_node.fault

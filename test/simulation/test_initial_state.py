@@ -57,7 +57,7 @@ def test_joints_under_velocity_commands_start_at_rest() -> None:
     ("given", "sentence"),
     [
         ({"joint_positions": np.zeros(2)}, r"joint positions are 2 numbers; robot 'random' has 3"),
-        ({"joint_positions": np.array([0.0, 3.5, 3.5])}, "outside its stroke"),
+        ({"joint_positions": np.array([0.0, 3.5, 3.5])}, "outside its limits"),
         ({"joint_positions": np.array([0.0, math.nan, 0.0])}, "positions must be finite"),
         ({"joint_positions": np.array([math.inf] * 3)}, "positions must be finite"),
         ({"joint_velocities": np.zeros(4)}, "joint velocities are 4 numbers"),

@@ -59,7 +59,7 @@ Take = Callable[[bytes], None]
 class RawStream:
     """The messages of one topic that pass through a node.
 
-    A subscription of its own is dear for somebody who is in the same process and wants every
+    A subscription of its own is dear for a component of the same process that wants every
     message: the middleware copies each one, queues it, and wakes the executor for it.
 
     Parameters
@@ -100,7 +100,7 @@ class RawOutput(RawStream):
 
 
 class RawInput(RawStream):
-    """What a node takes of a topic, whoever publishes it: ``take`` is the node's callback."""
+    """What a node receives on a topic, from any publisher: ``take`` is the node's callback."""
 
 
 class FlightNode(LifecycleNode):
@@ -182,7 +182,7 @@ class FlightNode(LifecycleNode):
         return stream
 
     def take_raw(self, kind: type[Any], topic: str, callback: Take) -> None:
-        """Subscribe to serialised messages, for whoever listens to the stream as well."""
+        """Subscribe to serialised messages; a listener of the stream is shown them as well."""
         stream = RawInput(self.resolve_topic_name(topic), callback)
         # Looked up for every message: a listener may come and go.
         self.create_subscription(kind, topic, lambda raw: stream.take(raw), STREAM, raw=True)

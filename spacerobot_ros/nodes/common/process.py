@@ -32,7 +32,7 @@ def use_loopback_discovery() -> None:
 def use_private_discovery() -> None:
     """Keep discovery in this process unless the user chose a range or a domain.
 
-    Two lockstep stacks that hear each other would refuse each other's commands.
+    Two lockstep stacks that receive each other's messages would refuse each other's commands.
     """
     if not any(os.environ.get(name) for name in (*_DISCOVERY_CHOICES, "ROS_DOMAIN_ID")):
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "OFF"

@@ -169,7 +169,7 @@ class PlantReport:
         return diagnostic_status(
             self._name("strokes"),
             _OK,
-            "how far each joint is from the nearer end of its stroke, m or rad",
+            "how far each joint is from the nearer of its limits, m or rad",
             {
                 joint: f"{margin:.6g}"
                 for joint, margin in zip(robot.joint_names, margins, strict=True)

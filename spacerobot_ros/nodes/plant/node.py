@@ -17,7 +17,7 @@ from spacerobot_ros.model.robot_source import robot_of
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.plant.command_messages import CommandReader, command_reader
+from spacerobot_ros.nodes.plant.command_messages import CommandReader
 from spacerobot_ros.nodes.plant.diagnostics import PlantReport
 from spacerobot_ros.nodes.plant.publisher import LinkMarkers, StatePublisher
 from spacerobot_ros.simulation import InitialState
@@ -94,7 +94,7 @@ class PlantNode(FlightNode):
         self._marker_ticks = self._ticks(config.marker_period)
         self._report_ticks = self._ticks(config.diagnostics_period)
         for source in self._commands.sources:
-            reader = command_reader(source, robot)
+            reader = CommandReader(source, robot)
             self.take_raw(reader.message_type, source.topic, partial(self._on_command, reader))
         self.create_subscription(String, "fault_injection", self._on_fault, STREAM)
         self.create_service(Trigger, "~/reset", self._on_reset)
