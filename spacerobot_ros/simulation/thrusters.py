@@ -16,8 +16,8 @@ class ThrusterPlant(WrappedPlant):
     """A plant under efforts, its wanted base wrench realised by pulses of thrusters.
 
     Everything of the plant within is as it was; its momentum balance stays exact because what the
-    thrusters put in is the wrench that it is stepped with. A thruster that is on for part of a tick gives its
-    impulse evenly over the tick. Besides, there are
+    thrusters put in is the wrench that it is stepped with. A thruster that is on for part of a tick
+    gives its impulse evenly over the tick. Besides, there are
 
     ``wrench``
         (6,) force (N) over torque (N m) at the origin of the base link, base components, that the
@@ -55,7 +55,11 @@ class ThrusterPlant(WrappedPlant):
     """
 
     def __init__(
-        self, plant: Plant, control_period: float, table: ThrusterTable, excluded: Sequence[str] = ()
+        self,
+        plant: Plant,
+        control_period: float,
+        table: ThrusterTable,
+        excluded: Sequence[str] = (),
     ) -> None:
         super().__init__(plant)
         self.table = table

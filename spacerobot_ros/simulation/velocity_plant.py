@@ -40,8 +40,8 @@ class VelocityPlant:
     Raises
     ------
     ParameterError
-        The initial shape has the wrong length or lies outside the joint limits, its joints move, or a
-        number is bad.
+        The initial shape has the wrong length or lies outside the joint limits, its joints move,
+        or a number is bad.
     """
 
     def __init__(

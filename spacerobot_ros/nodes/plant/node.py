@@ -30,6 +30,9 @@ from spacerobot_ros.simulation.time_modes import Lockstep, PlantState, RealTime
 _LOOK_PERIOD = 0.1
 """How often a plant looks for new subscribers and commanders, wall s."""
 
+# Looked up for every command: an enum takes its time to find a member.
+_INACTIVE, _RUNNING = PlantState.INACTIVE, PlantState.RUNNING
+
 
 class PlantNode(FlightNode):
     """Integrates the momentum-conserving model and publishes what a real robot would.
@@ -221,7 +224,7 @@ class PlantNode(FlightNode):
     # -- commands -----------------------------------------------------------------------------
 
     def _on_command(self, reader: CommandReader, raw: bytes) -> None:
-        if self._active is PlantState.INACTIVE:
+        if self._active is _INACTIVE:
             return
         refusal = reader.offer(self._commands, raw, self._tick * self._period_ns)
         if refusal is not None:
@@ -233,7 +236,7 @@ class PlantNode(FlightNode):
             self._real_time.count_command(now, reader.source.stamp_ns)
 
     def _step_if_complete(self) -> None:
-        if self._active is PlantState.RUNNING and self._commands.complete:
+        if self._active is _RUNNING and self._commands.complete:
             self._step()
 
     def _on_fault(self, message: String) -> None:
