@@ -100,7 +100,7 @@ def _coordinated_control() -> dict[str, str]:
         controller = build_controller(robot, scenario.controller)
         base, end_effector = scenario.goal, scenario.end_effector_goal
         assert end_effector is not None
-        period, key = scenario.plant.tick_period, f"coordinated_control.{law}"
+        period, key = scenario.plant.control_period, f"coordinated_control.{law}"
         for tick in range(round(12.0 / period) + 1):
             state = ControlState(
                 plant.pose[:3].copy(),
