@@ -303,7 +303,7 @@ def threaded(method: LieBracketGait | StubMethod) -> Loop:
 
 
 def searching() -> Searching:
-    built = Loop().executive._worker._method  # type: ignore[attr-defined]
+    built = Loop().executive._worker._method
     return Searching(built.robot, built.control_period, built.integration_step, built.options)
 
 
@@ -361,7 +361,7 @@ def test_a_defect_of_a_method_is_seen(background: bool) -> None:
 
 def test_the_search_of_the_optimal_method_is_cancelled() -> None:
     loop = Loop({"method": "optimal", "optimal.cache": 0})
-    method = loop.executive._worker._method  # type: ignore[attr-defined]
+    method = loop.executive._worker._method
     cancellation = Cancellation()
     cancellation.cancel()
     state = loop.executive._average

@@ -26,16 +26,15 @@ from spacerobot_ros.planning.execution.executive import (
     Notice,
     Output,
     ScheduleStart,
-    Transition,
 )
 from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.state_machine import Transition
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.planning.execution.worker import (
     Planned,
     PlanningTask,
     PlanningWorker,
     Refused,
-    Worker,
 )
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
@@ -117,13 +116,15 @@ class StubMethod(GaitMethod):
         return replace(schedule, controls=frozenset({"position"}))
 
 
-class HeldWorker:
+class HeldWorker(PlanningWorker):
     """A worker in the background whose plans are there when a test says so: no thread."""
 
     background = True
 
-    def __init__(self, inner: PlanningWorker) -> None:
-        self._inner = inner
+    def __init__(
+        self, robot: SpaceRobot, config: PlannerConfig, method: GaitMethod | None = None
+    ) -> None:
+        super().__init__(robot, config, method)
         self.task: PlanningTask | None = None
         self.cancelled = self.released = False
         self.tasks: list[PlanningTask] = []
@@ -148,7 +149,7 @@ class HeldWorker:
         if self.cancelled:
             return None
         try:
-            return Planned(self._inner.plan(task, Cancellation()), 0.25)
+            return Planned(self.plan(task, Cancellation()), 0.25)
         except PlanningError as refusal:
             return Refused(str(refusal), 0.25)
 
@@ -210,10 +211,9 @@ class Loop:
         self.config = configured(PlannerConfig, {**QUICK, **(parameters or {})})
         self.plant = VelocityPlant(robot_of(robot), TICK, initial)
         model = robot_of(believed or robot)
-        inner = PlanningWorker(model, self.config, method)
         self.method = method
-        self.held = HeldWorker(inner)
-        worker: Worker = self.held if held else inner
+        self.held = HeldWorker(model, self.config, method)
+        worker = self.held if held else PlanningWorker(model, self.config, method)
         self.executive = Executive(model, self.config, worker, goal_file)
         self.measured = PlantState(self.plant)
         self.outputs: list[Output] = []
@@ -289,7 +289,8 @@ class Loop:
         raise AssertionError(f"not decided: {self.statuses[before:]}")
 
     def _take(self) -> None:
-        self.outputs += self.executive.take_outputs()
+        self.outputs += self.executive.outputs
+        self.executive.outputs.clear()
 
     # -- looking ------------------------------------------------------------------------------
 

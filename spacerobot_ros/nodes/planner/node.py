@@ -36,9 +36,9 @@ from spacerobot_ros.planning.execution.executive import (
     Notice,
     ScheduleStart,
     Severity,
-    Transition,
 )
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
+from spacerobot_ros.planning.execution.state_machine import Transition
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatistics,
@@ -46,9 +46,6 @@ from spacerobot_ros.planning.execution.status import (
     goal_values,
 )
 from spacerobot_ros.planning.execution.worker import LONGEST_END
-
-ANSWERED = "{:d} commands were published."
-"""What a planner logs when it is deactivated."""
 
 
 class PlannerNode(RobotNode):
@@ -118,7 +115,8 @@ class PlannerNode(RobotNode):
     def deactivate(self) -> None:
         """Give up the present goal and command nothing any more; the goal file stays."""
         if self._running and self._executive is not None:
-            self.get_logger().info(ANSWERED.format(self.statistics.commands_published))
+            commands = self.statistics.commands_published
+            self.get_logger().info(f"{commands} commands were published.")
             self._executive.stop()
             self._publish_outputs(self._executive)
             if self._announcement is not None:
@@ -189,7 +187,9 @@ class PlannerNode(RobotNode):
 
     def _on_odom(self, raw: bytes) -> None:
         self._states.put_odom(raw)
-        self._on_part()
+        # With a goal to plan for or to evaluate, even a pose that comes after its joints counts.
+        if self._executive is not None and self._executive.measuring:
+            self._on_part()
 
     def _on_joints(self, raw: bytes) -> None:
         self._states.put_joint_states(raw)
@@ -202,20 +202,21 @@ class PlannerNode(RobotNode):
             return
         states, measured = self._states, self._measured
         pairing = states.ready()
-        # A state that was answered without its pose is planned from when the next joints come.
-        if pairing is None or (pairing is Pairing.LATE_POSE and not executive.measuring):
+        if pairing is None:
             return
-        odom = None if pairing is Pairing.WITHOUT_POSE else states.odom
+        odom = states.odom if pairing is not Pairing.WITHOUT_POSE else None
         try:
             measured.accept(states.joint_states, odom)
         except CommandError as error:
             self.get_logger().error(f"joint_states: {error}.", throttle_duration_sec=5.0)
             return
         if pairing is Pairing.LATE_POSE:
+            # The state was answered without it, and is planned from when the next joints come.
             executive.observe(measured)
         else:
             executive.update(measured)
-            self._publish_outputs(executive)
+            if executive.outputs:
+                self._publish_outputs(executive)
             self._commands.take(self._setpoint.serialised(stamp_bytes(measured.stamp_ns)))
         if measured.base_error is not None:
             self.get_logger().error(f"odom: {measured.base_error}.", throttle_duration_sec=5.0)
@@ -225,8 +226,8 @@ class PlannerNode(RobotNode):
 
     def _publish_outputs(self, executive: Executive) -> None:
         """Publish and log what the executive hands out."""
-        logger = self.get_logger()
-        for output in executive.take_outputs():
+        while executive.outputs:
+            output, logger = executive.outputs.popleft(), self.get_logger()
             match output:
                 case PlannerStatus():
                     self._publish_status(output)

@@ -1,11 +1,12 @@
 """What becomes of the goals of a planner: an explicit state machine, free of ROS.
 
 A node gives it goals (:meth:`Executive.propose`) and measured states (:meth:`Executive.update`),
-and gets a setpoint for every state and outputs to publish (:meth:`Executive.take_outputs`).
+and gets a setpoint for every state and outputs to publish (:attr:`Executive.outputs`).
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -20,6 +21,13 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
 from spacerobot_ros.planning.execution.state_average import StateAverage
+from spacerobot_ros.planning.execution.state_machine import (
+    Event,
+    Phase,
+    PlanReason,
+    StateMachine,
+    Transition,
+)
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatistics,
@@ -34,143 +42,7 @@ from spacerobot_ros.planning.execution.worker import (
     PlanningTask,
     PlanningWorker,
     Refused,
-    Worker,
 )
-
-
-class Phase(Enum):
-    """What an executive is doing."""
-
-    IDLE = "idle"
-    """There is no goal; the joints rest."""
-
-    MEASURING = "measuring"
-    """A new goal waits for measured states to plan from; the joints rest."""
-
-    PLANNING = "planning"
-    """A plan is being made."""
-
-    EXECUTING = "executing"
-    """A schedule is tracked."""
-
-    BRAKING = "braking"
-    """The joints brake along the planned path."""
-
-    EVALUATING = "evaluating"
-    """A schedule has ended; measured states are compared with the goal. The joints rest."""
-
-
-class Event(Enum):
-    """Why the phase of an executive changes."""
-
-    NEW_GOAL = "new goal"
-    """There is a new goal to plan for."""
-
-    PLAN_REQUESTED = "plan requested"
-    """The measured state is known, and a plan from it is requested (:class:`PlanReason`)."""
-
-    PLANNED = "planned"
-    """The plan is there."""
-
-    REFUSED = "refused"
-    """There is no plan, for a reason."""
-
-    SCHEDULE_ENDED = "schedule ended"
-    """The schedule that was tracked is over."""
-
-    AT_REST = "at rest"
-    """The braking is over."""
-
-    TRACKING_ERROR = "tracking error"
-    """The base is off its predicted path, and plans are made from rest."""
-
-    JOINTS_STUCK = "joints stuck"
-    """Joints do not follow."""
-
-    REACHED = "reached"
-    """The goal is reached within tolerance."""
-
-    FAILED = "failed"
-    """The goal is not reached, and no correction is left or the measured state is not finite."""
-
-    ABORTED = "aborted"
-    """The goal is given up on request."""
-
-    DEACTIVATED = "deactivated"
-    """Everything is given up at once."""
-
-
-class Transition(NamedTuple):
-    """A change of phase, and why."""
-
-    source: Phase
-    event: Event
-    target: Phase
-
-
-_TABLE: dict[tuple[Phase, Event], tuple[Phase, ...]] = {
-    (Phase.IDLE, Event.NEW_GOAL): (Phase.MEASURING,),
-    (Phase.MEASURING, Event.NEW_GOAL): (Phase.MEASURING,),
-    (Phase.MEASURING, Event.PLAN_REQUESTED): (Phase.PLANNING,),
-    (Phase.MEASURING, Event.ABORTED): (Phase.IDLE,),
-    (Phase.PLANNING, Event.PLANNED): (Phase.EXECUTING,),
-    (Phase.PLANNING, Event.REFUSED): (
-        *(Phase.IDLE, Phase.MEASURING, Phase.EXECUTING, Phase.BRAKING, Phase.EVALUATING),
-    ),
-    (Phase.PLANNING, Event.ABORTED): (Phase.IDLE,),
-    (Phase.EXECUTING, Event.NEW_GOAL): (Phase.BRAKING,),
-    (Phase.EXECUTING, Event.PLAN_REQUESTED): (Phase.PLANNING,),
-    (Phase.EXECUTING, Event.SCHEDULE_ENDED): (Phase.EVALUATING, Phase.MEASURING),
-    (Phase.EXECUTING, Event.TRACKING_ERROR): (Phase.BRAKING,),
-    (Phase.EXECUTING, Event.JOINTS_STUCK): (Phase.EVALUATING, Phase.MEASURING),
-    (Phase.EXECUTING, Event.ABORTED): (Phase.BRAKING,),
-    (Phase.BRAKING, Event.PLAN_REQUESTED): (Phase.PLANNING,),
-    (Phase.BRAKING, Event.AT_REST): (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING),
-    (Phase.BRAKING, Event.JOINTS_STUCK): (Phase.EVALUATING, Phase.MEASURING),
-    (Phase.BRAKING, Event.ABORTED): (Phase.BRAKING,),
-    (Phase.EVALUATING, Event.NEW_GOAL): (Phase.MEASURING,),
-    (Phase.EVALUATING, Event.PLAN_REQUESTED): (Phase.PLANNING,),
-    (Phase.EVALUATING, Event.REACHED): (Phase.IDLE,),
-    (Phase.EVALUATING, Event.FAILED): (Phase.IDLE,),
-    (Phase.EVALUATING, Event.ABORTED): (Phase.IDLE,),
-    **{(phase, Event.DEACTIVATED): (Phase.IDLE,) for phase in Phase},
-}
-
-TRANSITIONS: frozenset[Transition] = frozenset(
-    Transition(source, event, target)
-    for (source, event), targets in _TABLE.items()
-    for target in targets
-)
-"""Every transition that is allowed; ``docs/planner_state_machine.md`` shows them."""
-
-
-class IllegalTransitionError(RuntimeError):
-    """A defect: a transition that the table does not allow."""
-
-
-class PlanReason(Enum):
-    """Why a plan was requested."""
-
-    NEW_GOAL = "new goal"
-    """A goal, from rest."""
-
-    BLEND = "blend"
-    """A goal while the joints move: they brake along the planned path first."""
-
-    CORRECTION = "correction"
-    """The schedule has ended, and the goal is not reached."""
-
-    CONTINUATION = "continuation"
-    """The schedule was partial on purpose: this is its next piece."""
-
-    TRACKING_ERROR = "tracking error"
-    """The base is off its predicted path; the joints brake along that path first."""
-
-    REPLAN = "replan"
-    """The schedule was braked: off its path, or for a new goal that was refused then."""
-
-    STUCK_JOINTS = "stuck joints"
-    """Joints do not follow; the plan is made with the others."""
 
 
 class Severity(Enum):
@@ -283,7 +155,7 @@ class Executive:
         self,
         robot: SpaceRobot,
         config: PlannerConfig,
-        worker: Worker | None = None,
+        worker: PlanningWorker | None = None,
         goal_file: GoalFile | None = None,
     ) -> None:
         self._robot, self.config = robot, config
@@ -292,21 +164,22 @@ class Executive:
         self._file = goal_file or GoalFile("")
         self._average = StateAverage(robot, config.averaging, config.rest_tolerance)
         self._tracker = TrajectoryTracker(robot, config)
-        self._phase = Phase.IDLE
+        self._machine = StateMachine()
         self._proposed: IdentifiedGoal | None = None
         """A goal that is to be planned for."""
         self._ticket: _Ticket | None = None
         """The plan that is being made."""
         self._pursuit: _Pursuit | None = None
         """The goal that is executed or evaluated."""
-        self._outputs: list[Output] = []
+        self.outputs: deque[Output] = deque()
+        """What is to be published and logged, in order; the node takes it out."""
         self._plan_time, self._plans, self._commands = 0.0, 0, 0
         self._stamp_ns = 0
 
     @property
     def phase(self) -> Phase:
         """What is being done."""
-        return self._phase
+        return self._machine.phase
 
     @property
     def setpoint(self) -> Setpoint:
@@ -316,19 +189,12 @@ class Executive:
     @property
     def measuring(self) -> bool:
         """Whether a base that is measured now will be planned from, or evaluated."""
-        return self._proposed is not None or self._phase is Phase.EVALUATING
+        return self._proposed is not None or self.phase is Phase.EVALUATING
 
     @property
     def statistics(self) -> PlannerStatistics:
         """What was done so far."""
         return PlannerStatistics(self._plan_time, self._plans, self._commands)
-
-    def take_outputs(self) -> Sequence[Output]:
-        """Return what is to be published since the last call, in order."""
-        if not self._outputs:
-            return ()
-        outputs, self._outputs = self._outputs, []
-        return outputs
 
     # -- what comes from outside --------------------------------------------------------------
 
@@ -336,7 +202,7 @@ class Executive:
         """Plan for a goal from the states that are measured next; it replaces any other."""
         self._proposed = identified
         self._average.restart()
-        if self._phase in (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING):
+        if self.phase in (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING):
             self._go(Event.NEW_GOAL, Phase.MEASURING)
 
     def abort(self) -> str | None:
@@ -346,7 +212,7 @@ class Executive:
         """
         goal_id, sentence = self._goal_id(), "The joints rest."
         self._file.delete()
-        match self._phase:
+        match self.phase:
             case Phase.IDLE:
                 return None
             case Phase.EXECUTING | Phase.BRAKING:
@@ -355,14 +221,14 @@ class Executive:
                 sentence = f"The joints brake along the planned path within {duration:g} s."
                 self._go(Event.ABORTED, Phase.BRAKING)
             case Phase.MEASURING | Phase.PLANNING | Phase.EVALUATING:
-                waits_only = self._phase is Phase.MEASURING and self._pursuit is None
+                waits_only = self.phase is Phase.MEASURING and self._pursuit is None
                 self._go(Event.ABORTED, Phase.IDLE)
                 if waits_only:
                     self._proposed = None
                     return None
                 self._worker.cancel()
         self._proposed = self._ticket = self._pursuit = None
-        self._outputs.append(
+        self.outputs.append(
             PlannerStatus(PlannerState.ABORTED, f"Aborted on request. {sentence}", goal_id=goal_id)
         )
         return sentence
@@ -388,15 +254,16 @@ class Executive:
         self._stamp_ns = stamp
         if tracker.ended(stamp, q):
             self._on_end()
-        match self._phase:
-            case Phase.PLANNING:
-                self._take_result()
-            case Phase.MEASURING | Phase.EVALUATING:
-                self._measure_at_rest(measured)
+        match self._machine.phase:
             case Phase.EXECUTING | Phase.BRAKING if self._proposed is not None:
                 self._measure_in_motion(measured)
-            case Phase.EXECUTING if tracker.check_due(stamp):
-                self._check_tracking(measured)
+            case Phase.EXECUTING:
+                if tracker.check_due(stamp):
+                    self._check_tracking(measured)
+            case Phase.MEASURING | Phase.EVALUATING:
+                self._measure_at_rest(measured)
+            case Phase.PLANNING:
+                self._take_result()
         if tracker.active:
             stuck = tracker.track(stamp, q)
             if stuck and self._pursuit is not None:
@@ -425,17 +292,17 @@ class Executive:
         self._add(measured)
         if not self._average.complete:
             return
-        if self._phase is Phase.MEASURING:
+        if self.phase is Phase.MEASURING:
             self._plan_for_new_goal()
         # Where that was refused the state is still known, unless it took time.
-        if self._phase is Phase.EVALUATING:
+        if self.phase is Phase.EVALUATING:
             self._evaluate()
         self._average.restart()
 
     def _measure_in_motion(self, measured: MeasuredState) -> None:
         """Plan for a new goal from the state now, or from rest if the plan will take time."""
         if self._worker.background:
-            if self._phase is Phase.EXECUTING:
+            if self.phase is Phase.EXECUTING:
                 self._brake_for_replan(Event.NEW_GOAL)
             return
         base = measured.base()
@@ -532,7 +399,7 @@ class Executive:
         assert ticket is not None
         self._plan_time += result.wall_time
         self._plans += 1
-        self._notice(Severity.INFO, PLANNED.format(result.wall_time))
+        self._notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
         self._conclude_plan(ticket, result)
 
     def _conclude_plan(self, ticket: _Ticket, result: Planned | Refused) -> None:
@@ -605,7 +472,7 @@ class Executive:
             remaining,
             schedule,
         )
-        self._outputs.append(ScheduleStart(schedule, self._stamp_ns))
+        self.outputs.append(ScheduleStart(schedule, self._stamp_ns))
 
     def _brake_for_replan(self, event: Event) -> None:
         """Come to rest along the planned path: in the background plans are made from rest."""
@@ -617,7 +484,7 @@ class Executive:
 
     def _on_end(self) -> None:
         """End what was tracked; its result is evaluated unless its goal was given up."""
-        at_rest = self._phase is Phase.BRAKING
+        at_rest = self.phase is Phase.BRAKING
         self._tracker.stop(at_last_shape=not at_rest)
         self._average.restart()
         self._go(Event.AT_REST if at_rest else Event.SCHEDULE_ENDED, self._phase_at_rest())
@@ -681,16 +548,10 @@ class Executive:
 
     def _go(self, event: Event, target: Phase) -> None:
         """Change the phase; every change comes through here."""
-        transition = Transition(self._phase, event, target)
-        if transition not in TRANSITIONS:
-            raise IllegalTransitionError(
-                f"{self._phase.name} may not become {target.name} by {event.name}."
-            )
-        self._phase = target
-        self._outputs.append(transition)
+        self.outputs.append(self._machine.go(event, target))
 
     def _notice(self, severity: Severity, sentence: str) -> None:
-        self._outputs.append(Notice(severity, sentence))
+        self.outputs.append(Notice(severity, sentence))
 
     def _report(
         self,
@@ -702,7 +563,7 @@ class Executive:
         schedule: GaitSchedule | None = None,
     ) -> None:
         """Report on a goal: with what its pursuit has taken, its error, and its schedule."""
-        self._outputs.append(
+        self.outputs.append(
             PlannerStatus(
                 state,
                 sentence,
@@ -725,7 +586,3 @@ class Executive:
             return self._proposed.goal_id
         current = self._ticket or self._pursuit
         return "" if current is None else current.identified.goal_id
-
-
-PLANNED = "Planned in {:.6f} s."
-"""What is logged of every plan."""

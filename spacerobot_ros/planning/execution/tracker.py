@@ -287,7 +287,7 @@ class TrajectoryTracker:
         assert self._follower is not None
         position, velocity = self.setpoint.position, self.setpoint.velocity
         self._follower.command(stamp_ns, q, position, velocity)
-        if not velocity.dot(velocity) < math.inf:
+        if not math.isfinite(velocity.dot(velocity)):
             velocity[:] = 0.0
             return []
         if self.stuck:
@@ -297,7 +297,8 @@ class TrajectoryTracker:
     def hold(self, q: Array) -> None:
         """Write the setpoint that keeps the shape, where nothing is tracked."""
         # A reference must stay where it is; a plant makes rest of the shape that it has.
-        if (self._commands_plant or not self._holding) and q.dot(q) < math.inf:
-            self.setpoint.position[:] = q
+        if self._commands_plant or not self._holding:
+            if math.isfinite(q.dot(q)):
+                self.setpoint.position[:] = q
+            self.setpoint.velocity[:] = 0.0
             self._holding = True
-        self.setpoint.velocity[:] = 0.0

@@ -6,7 +6,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from threading import Thread
-from typing import Protocol
 
 import numpy as np
 
@@ -71,30 +70,6 @@ class Refused:
 
     reason: str
     wall_time: float = 0.0
-
-
-class Worker(Protocol):
-    """What an executive has its plans made by; see :class:`PlanningWorker`."""
-
-    @property
-    def background(self) -> bool:
-        """Whether plans take time in which states are answered."""
-
-    @property
-    def busy(self) -> bool:
-        """Whether a plan is being made, or its result waits, or it has yet to end."""
-
-    def submit(self, task: PlanningTask) -> None:
-        """Make a plan; one at a time."""
-
-    def poll(self) -> Planned | Refused | None:
-        """Return the result once it is there, None before and for a plan that was cancelled."""
-
-    def cancel(self) -> None:
-        """Have the plan that is being made end without a result."""
-
-    def close(self) -> None:
-        """Cancel, and wait until nothing goes on any more."""
 
 
 class PlanningWorker:
