@@ -20,6 +20,10 @@ class Pairing(str, Enum):
     """``odom`` of a state that was handed over without it before."""
 
 
+# Python looks up the member of an enum as slowly as it calls a function; these are for every state.
+_WHOLE, _WITHOUT_POSE, _LATE_POSE = Pairing.WHOLE, Pairing.WITHOUT_POSE, Pairing.LATE_POSE
+
+
 class StateSynchroniser:
     """Holds the latest odom and joint_states and hands every state over once.
 
@@ -85,15 +89,15 @@ class StateSynchroniser:
             self._odom_fresh = self._odom_fresh and not together
             if self._joints_fresh:
                 self._joints_fresh = False
-                return Pairing.WHOLE if posed else Pairing.WITHOUT_POSE
-            return Pairing.LATE_POSE if posed else None
+                return _WHOLE if posed else _WITHOUT_POSE
+            return _LATE_POSE if posed else None
         if (
             self._joints_fresh
             and (self._without_pose or (self._odom_fresh and together))
             and all(header_stamp(raw) == self._joints_stamp for raw in self._required.values())
         ):
             self._odom_fresh = self._joints_fresh = False
-            return Pairing.WITHOUT_POSE if self._without_pose else Pairing.WHOLE
+            return _WITHOUT_POSE if self._without_pose else _WHOLE
         return None
 
     def overdue(self) -> Pairing | None:
@@ -106,4 +110,4 @@ class StateSynchroniser:
             return None
         self._joints_fresh = False
         self._without_pose = self._joints_stamp != self._odom_stamp
-        return Pairing.WITHOUT_POSE if self._without_pose else Pairing.WHOLE
+        return _WITHOUT_POSE if self._without_pose else _WHOLE

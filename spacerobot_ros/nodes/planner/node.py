@@ -47,6 +47,9 @@ from spacerobot_ros.planning.execution.status import (
 )
 from spacerobot_ros.planning.execution.worker import LONGEST_END
 
+# Python looks up the member of an enum as slowly as it calls a function; these are for every state.
+_WITHOUT_POSE, _LATE_POSE = Pairing.WITHOUT_POSE, Pairing.LATE_POSE
+
 
 class PlannerNode(RobotNode):
     """Turns goal poses into gaits and publishes their velocities, one command for every state.
@@ -204,13 +207,13 @@ class PlannerNode(RobotNode):
         pairing = states.ready()
         if pairing is None:
             return
-        odom = states.odom if pairing is not Pairing.WITHOUT_POSE else None
+        odom = states.odom if pairing is not _WITHOUT_POSE else None
         try:
             measured.accept(states.joint_states, odom)
         except CommandError as error:
             self.get_logger().error(f"joint_states: {error}.", throttle_duration_sec=5.0)
             return
-        if pairing is Pairing.LATE_POSE:
+        if pairing is _LATE_POSE:
             # The state was answered without it, and is planned from when the next joints come.
             executive.observe(measured)
         else:

@@ -44,6 +44,9 @@ from spacerobot_ros.planning.execution.worker import (
     Refused,
 )
 
+# Python looks up the member of an enum as slowly as it calls a function; these are for every state.
+_EXECUTING, _EVALUATING = Phase.EXECUTING, Phase.EVALUATING
+
 
 class Severity(Enum):
     """How grave a notice is."""
@@ -189,7 +192,7 @@ class Executive:
     @property
     def measuring(self) -> bool:
         """Whether a base that is measured now will be planned from, or evaluated."""
-        return self._proposed is not None or self.phase is Phase.EVALUATING
+        return self._proposed is not None or self._machine.phase is _EVALUATING
 
     @property
     def statistics(self) -> PlannerStatistics:
@@ -254,16 +257,10 @@ class Executive:
         self._stamp_ns = stamp
         if tracker.ended(stamp, q):
             self._on_end()
-        match self._machine.phase:
-            case Phase.EXECUTING | Phase.BRAKING if self._proposed is not None:
-                self._measure_in_motion(measured)
-            case Phase.EXECUTING:
-                if tracker.check_due(stamp):
-                    self._check_tracking(measured)
-            case Phase.MEASURING | Phase.EVALUATING:
-                self._measure_at_rest(measured)
-            case Phase.PLANNING:
-                self._take_result()
+        phase = self._machine.phase
+        # In most states a schedule is tracked, and nothing else is to be done.
+        if phase is not _EXECUTING or self._proposed is not None or tracker.check_due(stamp):
+            self._act(phase, measured)
         if tracker.active:
             stuck = tracker.track(stamp, q)
             if stuck and self._pursuit is not None:
@@ -272,6 +269,18 @@ class Executive:
             tracker.hold(q)
         self._commands += 1
         return tracker.setpoint
+
+    def _act(self, phase: Phase, measured: MeasuredState) -> None:
+        """Do what the phase demands beside tracking."""
+        match phase:
+            case Phase.MEASURING | Phase.EVALUATING:
+                self._measure_at_rest(measured)
+            case Phase.PLANNING:
+                self._take_result()
+            case Phase.EXECUTING | Phase.BRAKING if self._proposed is not None:
+                self._measure_in_motion(measured)
+            case Phase.EXECUTING:
+                self._check_tracking(measured)
 
     # -- measuring ----------------------------------------------------------------------------
 
