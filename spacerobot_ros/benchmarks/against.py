@@ -9,7 +9,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,9 +90,9 @@ class Checkout:
 
 
 def compare_checkouts(
-    other: Path, words: Sequence[str], json_file: Path | None, rounds: int = _ROUNDS
-) -> Iterator[str]:
-    """Measure this checkout and another one alternately, yielding lines to show.
+    other: Path, words: Sequence[str], show: Callable[[str], None], rounds: int = _ROUNDS
+) -> dict[str, Figures]:
+    """Measure this checkout and another one alternately.
 
     Both are run by this interpreter; medians of the rounds are compared, figure by figure, where
     both have it.
@@ -103,10 +103,14 @@ def compare_checkouts(
         Folder of the other checkout.
     words
         Options of ``spacerobot bench`` that both understand.
-    json_file
-        File for the medians ``here`` and ``there`` and their ``ratio``; None writes none.
+    show
+        Called with lines for people.
     rounds
         How often each is measured.
+
+    Returns
+    -------
+    The medians ``here`` and ``there`` by name, and the ``ratio`` of what both have.
 
     Raises
     ------
@@ -119,21 +123,16 @@ def compare_checkouts(
         # Each goes first in turn: what warms up falls on both.
         for checkout in (here, there) if number % 2 == 0 else (there, here):
             found[checkout].append(checkout.measure(words))
-        yield f"round {number + 1} of {rounds} measured"
-    medians = [_medians(found[checkout]) for checkout in (here, there)]
+        show(f"round {number + 1} of {rounds} measured")
+    ours, others = (_medians(found[checkout]) for checkout in (here, there))
     ratios = {
-        name: value / medians[1][name]
-        for name, value in medians[0].items()
-        if medians[1].get(name, 0.0) != 0.0
+        name: value / others[name] for name, value in ours.items() if others.get(name, 0.0) != 0.0
     }
     width = max(map(len, ratios), default=0)
-    yield f"{'':<{width}}{'here':>14}{'there':>14}{'here/there':>12}"
+    show(f"{'':<{width}}{'here':>14}{'there':>14}{'here/there':>12}")
     for name, ratio in ratios.items():
-        yield f"{name:<{width}}{medians[0][name]:>14.6g}{medians[1][name]:>14.6g}{ratio:>12.3f}"
-    if json_file is not None:
-        content = {"here": medians[0], "there": medians[1], "ratio": ratios}
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        show(f"{name:<{width}}{ours[name]:>14.6g}{others[name]:>14.6g}{ratio:>12.3f}")
+    return {"here": ours, "there": others, "ratio": ratios}
 
 
 def _medians(rounds: Sequence[Figures]) -> dict[str, float]:

@@ -7,7 +7,6 @@ plant's topics, one answers with a command, and raw subscriptions write it all i
 
 from __future__ import annotations
 
-import json
 import statistics
 import tempfile
 import time
@@ -71,8 +70,8 @@ _PATIENCE = 2.0
 _REPLAYED = "/bench/joint_states"
 
 
-def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
-    """Measure, yielding lines to show; ``json_file`` receives the figures.
+def run_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float | str]:
+    """Measure, show lines for people and return the figures by name.
 
     The stack and its peer take turns, and medians are compared: what else the machine does then
     falls on both.
@@ -84,7 +83,7 @@ def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
             peer_rates.append(_peer_rate(ticks, bag))
             stack_rates.append(_stack_rate(ticks, bag))
             bare_stack_rates.append(_stack_rate(ticks, None))
-            yield (
+            show(
                 f"round: {stack_rates[-1]:8.0f} ticks/s with plant, planner and recorder, "
                 f"{peer_rates[-1]:8.0f} bare"
             )
@@ -102,25 +101,24 @@ def run_benchmark(ticks: int, json_file: Path | None) -> Iterator[str]:
         "plant_tick_us": 1e6 * tick,
         "compiler": c_compiler() or "none (virtual machine)",
     }
-    yield f"lockstep, recorded: {stack_rate:.0f} ticks/s (median of {_ROUNDS})"
-    yield f"bare ping-pong with as many topics and a raw recorder: {peer_rate:.0f} ticks/s"
-    yield f"ratio: {100 * stack_rate / peer_rate:.0f} %"
+    show(f"lockstep, recorded: {stack_rate:.0f} ticks/s (median of {_ROUNDS})")
+    show(f"bare ping-pong with as many topics and a raw recorder: {peer_rate:.0f} ticks/s")
+    show(f"ratio: {100 * stack_rate / peer_rate:.0f} %")
     cost = 100 * (1 - stack_rate / unrecorded)
-    yield f"without the recorder: {unrecorded:.0f} ticks/s; recording costs {cost:.0f} % of them"
-    yield (
+    show(f"without the recorder: {unrecorded:.0f} ticks/s; recording costs {cost:.0f} % of them")
+    show(
         f"replay at rate 1, 100 messages a second: spacing off by {1e3 * spacing:.2f} ms (median), "
         f"{1e3 * worst_spacing:.1f} ms at most"
     )
-    yield f"one plant tick alone: {1e6 * tick:.1f} us (compiler: {figures['compiler']})"
+    show(f"one plant tick alone: {1e6 * tick:.1f} us (compiler: {figures['compiler']})")
     for name, first, later in _planning_times():
         figures |= {f"plan_{name}_first_s": first, f"plan_{name}_s": later}
-        yield f"planning by {name}: {1e3 * later:.0f} ms, the first time {1e3 * first:.0f} ms"
+        show(f"planning by {name}: {1e3 * later:.0f} ms, the first time {1e3 * first:.0f} ms")
     dynamics = dynamics_benchmark()
     figures |= dynamics
-    yield from _dynamics_lines(dynamics)
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    for line in _dynamics_lines(dynamics):
+        show(line)
+    return figures
 
 
 def _dynamics_lines(figures: dict[str, float | str]) -> Iterator[str]:

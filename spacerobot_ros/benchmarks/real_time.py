@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 import multiprocessing
 import os
 import statistics
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -105,19 +104,17 @@ class RealTimeFigures:
         }
 
 
-def run_benchmark(duration: float, rates: Sequence[float], json_file: Path | None) -> Iterator[str]:
-    """Fly for ``duration`` s at each rate, yielding lines to show.
-
-    ``json_file`` receives the figures.
-    """
+def run_benchmark(
+    duration: float, rates: Sequence[float], show: Callable[[str], None]
+) -> dict[str, float]:
+    """Fly for ``duration`` s at each rate, show lines and return the figures by name."""
     figures: dict[str, float] = {}
     for rate in rates:
         measured = real_time_flight(rate, duration)
         figures |= measured.figures()
-        yield from measured.lines()
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+        for line in measured.lines():
+            show(line)
+    return figures
 
 
 def real_time_flight(rate: float, duration: float) -> RealTimeFigures:

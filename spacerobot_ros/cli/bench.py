@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import click
 
-from spacerobot_ros.cli.options import PATH, json_option
+from spacerobot_ros.cli.options import PATH, json_option, write_json
 
 
 @click.command("bench")
@@ -41,6 +43,7 @@ def command(
     against: Path | None,
 ) -> None:
     """Measure the speed of the stack against a bare ping-pong in the same run."""
+    figures: Mapping[str, Any]
     if against is not None:
         from spacerobot_ros.benchmarks.against import compare_checkouts
 
@@ -48,14 +51,14 @@ def command(
         if seconds is not None:
             rate_words = [word for rate in rates for word in ("--rate", str(rate))]
             words = ["--real-time", str(seconds), *rate_words]
-        lines = compare_checkouts(against, words, json_file)
+        figures = compare_checkouts(against, words, click.echo)
     elif seconds is None:
         from spacerobot_ros.benchmarks import bench
 
-        lines = bench.run_benchmark(ticks, json_file)
+        figures = bench.run_benchmark(ticks, click.echo)
     else:
         from spacerobot_ros.benchmarks import real_time
 
-        lines = real_time.run_benchmark(seconds, rates or (100.0,), json_file)
-    for line in lines:
-        click.echo(line)
+        figures = real_time.run_benchmark(seconds, rates or (100.0,), click.echo)
+    if json_file is not None:
+        write_json(json_file, figures)

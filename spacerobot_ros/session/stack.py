@@ -18,7 +18,6 @@ from rclpy.parameter import Parameter
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.nodes import (
     NODE_TYPES,
-    CoordinatedControlNode,
     FlightNode,
     PlannerNode,
     PlantNode,
@@ -133,11 +132,10 @@ class InProcessStack(Stack):
         try:
             nodes = {name: self._make(name, context) for name in self.names}
             self.plant: PlantNode = nodes["plant"]
-            self.commanders: list[FlightNode] = [nodes[name] for name in scenario.commanders]
-            self.planner: PlannerNode | None = nodes.get("planner")
-            self.controller: CoordinatedControlNode | None = nodes.get("coordinated_control")
-            self.recorder: RecorderNode | None = nodes.get("recorder")
-            for node in self.commanders:
+            self._commanders: list[FlightNode] = [nodes[name] for name in scenario.commanders]
+            self._planner: PlannerNode | None = nodes.get("planner")
+            self._recorder: RecorderNode | None = nodes.get("recorder")
+            for node in self._commanders:
                 # Their warnings are in their status, which is shown anyway.
                 node.get_logger().set_level(LoggingSeverity.ERROR)
             shaped = scenario.goal.joint_positions is not None
@@ -155,12 +153,12 @@ class InProcessStack(Stack):
             running = {name: node for name, node in nodes.items() if name != "recorder"}
             for node in running.values():
                 node.require(node.trigger_configure)
-            if self.recorder is not None:
+            if self._recorder is not None:
                 # Last, when every topic has its publisher.
-                self.recorder.watch(running.values())
-                self.recorder.require(self.recorder.trigger_configure)
+                self._recorder.watch(running.values())
+                self._recorder.require(self._recorder.trigger_configure)
                 for title, values in scenario.records(list(running)).items():
-                    self.recorder.describe(title, values)
+                    self._recorder.describe(title, values)
             for node in self._nodes:
                 self.executor.add_node(node)
             self._connect()
@@ -176,7 +174,7 @@ class InProcessStack(Stack):
     @property
     def statistics(self) -> PlannerStatistics:
         """What the planner has done so far."""
-        return PlannerStatistics() if self.planner is None else self.planner.statistics
+        return PlannerStatistics() if self._planner is None else self._planner.statistics
 
     def start(self, goal: Goal | None) -> None:
         """Activate everything and send the goal, if any; the plant's first state is planned from.
@@ -194,9 +192,9 @@ class InProcessStack(Stack):
 
         def launch() -> None:
             self.client.node.destroy_timer(timer)
-            if self.recorder is not None:
-                self.recorder.trigger_activate()
-            for node in reversed(self.commanders):
+            if self._recorder is not None:
+                self._recorder.trigger_activate()
+            for node in reversed(self._commanders):
                 node.trigger_activate()
             if goal is not None:
                 self.client.send(goal, self.scenario.end_effector_goal)
@@ -213,16 +211,16 @@ class InProcessStack(Stack):
         """Stop the plant, record what is still on its way, and complete the bag."""
         if self.plant.is_active:
             self.plant.trigger_deactivate()
-        for node in self.commanders:
+        for node in self._commanders:
             node.trigger_deactivate()
-        if self.recorder is None:
+        if self._recorder is None:
             return
         # In one process what is published is there.
-        self.recorder.drain(self.executor, quiet=0.02)
-        self.recorder.trigger_deactivate()
-        self.recorder.trigger_cleanup()
-        if self.recorder.failure or self.recorder.fault:
-            raise self.recorder.failure or self.recorder.fault  # type: ignore[misc]
+        self._recorder.drain(self.executor, quiet=0.02)
+        self._recorder.trigger_deactivate()
+        self._recorder.trigger_cleanup()
+        if self._recorder.failure or self._recorder.fault:
+            raise self._recorder.failure or self._recorder.fault  # type: ignore[misc]
 
     def close(self) -> None:
         """Destroy the nodes."""
@@ -264,8 +262,8 @@ class InProcessStack(Stack):
                     "is the loopback interface up, and ROS_DOMAIN_ID between 0 and 101?"
                 )
             self.executor.spin_once(timeout_sec=0.01)
-            if self.recorder is not None:
-                self.recorder.scan()
+            if self._recorder is not None:
+                self._recorder.scan()
         if self.client.node.count_publishers("odom") > 1:
             raise SpaceRobotError(
                 "Another plant already publishes 'odom' in this ROS domain; "
@@ -273,9 +271,9 @@ class InProcessStack(Stack):
             )
 
     def _connected(self) -> bool:
-        ours = [p for node in self._nodes for p in node.publishers if node is not self.recorder]
+        ours = [p for node in self._nodes for p in node.publishers if node is not self._recorder]
         topics = {p.topic_name for p in ours} - {"/rosout", "/parameter_events"}
-        if self.recorder is not None and not topics <= self.recorder.topics:
+        if self._recorder is not None and not topics <= self._recorder.topics:
             return False
         expected: dict[str, int] = {}
         for node in self._nodes:
