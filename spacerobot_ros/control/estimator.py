@@ -127,7 +127,7 @@ def _center_rate(robot: SpaceRobot) -> ca.Function:
         qdot,
         z0ddot[6:],
     )
-    return dense_function("center_rate", [y, wrench, tau], [rate], (["y", "w", "tau"], ["rate"]))
+    return dense_function("center_rate", {"y": y, "w": wrench, "tau": tau}, {"rate": rate})
 
 
 def _center_from_origin(robot: SpaceRobot) -> ca.Function:
@@ -137,7 +137,7 @@ def _center_from_origin(robot: SpaceRobot) -> ca.Function:
     r_cm = r_WB + matrix_from_quaternion(quaternion) @ _center_of_mass(robot, q)
     v_cm = v - _base_jacobian(robot, q)[:, 3:] @ ca.vertcat(omega, qdot)
     y = ca.vertcat(r_cm, quaternion, v_cm, omega, q, qdot)
-    return dense_function("center_from_origin", [x], [y], (["x"], ["y"]))
+    return dense_function("center_from_origin", {"x": x}, {"y": y})
 
 
 def _origin_from_center(robot: SpaceRobot) -> ca.Function:
@@ -147,7 +147,7 @@ def _origin_from_center(robot: SpaceRobot) -> ca.Function:
     r_WB = r_cm - matrix_from_quaternion(quaternion) @ _center_of_mass(robot, q)
     v = v_cm + _base_jacobian(robot, q)[:, 3:] @ ca.vertcat(omega, qdot)
     x = ca.vertcat(r_WB, quaternion, v, omega, q, qdot)
-    return dense_function("origin_from_center", [y], [x], (["y"], ["x"]))
+    return dense_function("origin_from_center", {"y": y}, {"x": x})
 
 
 def _center_of_mass(robot: SpaceRobot, q: ca.SX) -> ca.SX:
@@ -175,5 +175,5 @@ def _joint_correction(robot: SpaceRobot) -> ca.Function:
     )
     r_next = r_cm - matrix_from_quaternion(turned) @ _center_of_mass(robot, measured)
     corrected = ca.vertcat(r_next, turned, v_next, omega_next, measured, measured_rate)
-    names = ["x", "q", "qdot"], ["x_next"]
-    return dense_function("joint_correction", [x, measured, measured_rate], [corrected], names)
+    inputs = {"x": x, "q": measured, "qdot": measured_rate}
+    return dense_function("joint_correction", inputs, {"x_next": corrected})

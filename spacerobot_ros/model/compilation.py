@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sysconfig
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import casadi as ca
@@ -79,11 +79,14 @@ class BufferedFunction:
 
 
 def dense_function(
-    name: str, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX], names: tuple[list[str], list[str]]
+    name: str, inputs: Mapping[str, ca.SX], outputs: Mapping[str, ca.SX]
 ) -> ca.Function:
-    """Return a CasADi function with dense results and shared common subexpressions."""
-    dense = ca.cse([ca.densify(output) for output in outputs])
-    return ca.Function(name, list(inputs), dense, *names)
+    """Return a CasADi function with dense results and shared common subexpressions.
+
+    ``inputs`` and ``outputs`` are symbols and expressions by the names of arguments and results.
+    """
+    dense = ca.cse([ca.densify(output) for output in outputs.values()])
+    return ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs))
 
 
 def compiled(function: ca.Function) -> ca.Function:

@@ -247,8 +247,8 @@ def shape_equations(kin: TreeKinematics) -> ca.Function:
     """Return the function ``(x, command) -> (K, Q)`` of ``K qddot = Q``."""
     x, command = _symbols(kin)
     system, _, _, Q = _equations(kin, x, command)
-    names = (["x", "command"], ["K", "Q"])
-    return dense_function("shape_equations", [x, command], [system.K, Q], names)
+    inputs = {"x": x, "command": command}
+    return dense_function("shape_equations", inputs, {"K": system.K, "Q": Q})
 
 
 def state_rate(kin: TreeKinematics, *, holding: bool = False) -> ca.Function:
@@ -274,10 +274,10 @@ def state_rate(kin: TreeKinematics, *, holding: bool = False) -> ca.Function:
         R_WB @ external[:3],
         p_W / kin.robot.total_mass,
     )
+    inputs = {"x": x, "command": command}
     if holding:
-        names = ["x", "command", "free"]
-        return dense_function("holding_rate", [x, command, free], [x_dot], (names, ["x_dot"]))
-    return dense_function("flight_rate", [x, command], [x_dot], (["x", "command"], ["x_dot"]))
+        return dense_function("holding_rate", {**inputs, "free": free}, {"x_dot": x_dot})
+    return dense_function("flight_rate", inputs, {"x_dot": x_dot})
 
 
 def _symbols(kin: TreeKinematics) -> tuple[ca.SX, ca.SX]:

@@ -244,7 +244,7 @@ class SpaceRobot:
 
     def _shape_function(self, name: str, *outputs: ca.SX) -> ca.Function:
         names = ["result"] if len(outputs) == 1 else [f"result_{i}" for i in range(len(outputs))]
-        return dense_function(name, [self._kin.q], outputs, (["q"], names))
+        return dense_function(name, {"q": self._kin.q}, dict(zip(names, outputs, strict=True)))
 
     def _locked_inertia(self) -> ca.Function:
         return self._shape_function("locked_inertia", self._inertia.D, self._inertia.D_q)
@@ -253,42 +253,40 @@ class SpaceRobot:
         frames = [self._kin.frame(link) for link in self.link_names]
         R = ca.horzcat(*(frame[0] for frame in frames))
         r = ca.horzcat(*(frame[1] for frame in frames))
-        return dense_function("link_poses", [self._kin.q], [R, r], (["q"], ["R_BL", "r_BL_B"]))
+        return dense_function("link_poses", {"q": self._kin.q}, {"R_BL": R, "r_BL_B": r})
 
-    def _velocities(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        return ca.SX.sym("v", 3), ca.SX.sym("omega", 3), ca.SX.sym("qdot", self.n)
+    def _state(self, v: str, *, quaternion: bool = False) -> dict[str, ca.SX]:
+        """Return symbols of the shape and the velocities, by name; ``v`` names the first."""
+        attitude = {"quaternion_WB": ca.SX.sym("quaternion", 4)} if quaternion else {}
+        return {
+            **attitude,
+            "q": self._kin.q,
+            v: ca.SX.sym("v", 3),
+            "omega_WB_B": ca.SX.sym("omega", 3),
+            "qdot": ca.SX.sym("qdot", self.n),
+        }
 
     def _bias(self) -> ca.Function:
-        v, omega, qdot = self._velocities()
-        C_plus = bias(self._kin, v, omega, qdot)
-        names = ["q", "v_cm_B", "omega_WB_B", "qdot"]
-        return dense_function("bias", [self._kin.q, v, omega, qdot], [C_plus], (names, ["C_plus"]))
+        state = self._state("v_cm_B")
+        _, *velocities = state.values()
+        return dense_function("bias", state, {"C_plus": bias(self._kin, *velocities)})
 
     def _forward_dynamics(self) -> ca.Function:
-        v, omega, qdot = self._velocities()
+        state = self._state("v_cm_B")
+        _, *velocities = state.values()
         wrench, tau = ca.SX.sym("wrench_B", 6), ca.SX.sym("tau", self.n)
-        acceleration = forward_dynamics(
-            self._inertia,
-            bias(self._kin, v, omega, qdot),
-            generalised_forces(self._kin, wrench, tau),
-        )
-        return dense_function(
-            "forward_dynamics",
-            [self._kin.q, v, omega, qdot, wrench, tau],
-            [acceleration],
-            (["q", "v_cm_B", "omega_WB_B", "qdot", "wrench_B", "tau"], ["z0ddot"]),
-        )
+        forces = generalised_forces(self._kin, wrench, tau)
+        acceleration = forward_dynamics(self._inertia, bias(self._kin, *velocities), forces)
+        inputs = {**state, "wrench_B": wrench, "tau": tau}
+        return dense_function("forward_dynamics", inputs, {"z0ddot": acceleration})
 
     def _dynamics(self) -> ca.Function:
         """The same function as ``forward_dynamics``, by fewer operations."""
-        v, omega, qdot = self._velocities()
-        wrench, tau = ca.SX.sym("wrench_B", 6), ca.SX.sym("tau", self.n)
-        return dense_function(
-            "dynamics",
-            [self._kin.q, v, omega, qdot, wrench, tau],
-            [composite_dynamics(self._kin, v, omega, qdot, wrench, tau)],
-            (["q", "v_cm_B", "omega_WB_B", "qdot", "wrench_B", "tau"], ["z0ddot"]),
-        )
+        state = self._state("v_cm_B")
+        _, *velocities = state.values()
+        forces = {"wrench_B": ca.SX.sym("wrench_B", 6), "tau": ca.SX.sym("tau", self.n)}
+        acceleration = composite_dynamics(self._kin, *velocities, *forces.values())
+        return dense_function("dynamics", {**state, **forces}, {"z0ddot": acceleration})
 
     def _flight_step(self, *, holding: bool = False) -> ca.Function:
         rate = state_rate(self._kin, holding=holding)
@@ -305,34 +303,27 @@ class SpaceRobot:
         return self._shape_function("curvature", stacked)
 
     def _momentum(self) -> ca.Function:
-        v, omega, qdot = self._velocities()
-        quaternion = ca.SX.sym("quaternion", 4)
+        state = self._state("v_WB_B", quaternion=True)
+        quaternion, _, *velocities = state.values()
         R_WB = matrix_from_quaternion(quaternion)
-        p_B, L_B, energy = momentum_of_bodies(self._kin, v, omega, qdot)
-        return dense_function(
-            "momentum",
-            [quaternion, self._kin.q, v, omega, qdot],
-            [R_WB @ p_B, R_WB @ L_B, energy],
-            (["quaternion_WB", "q", "v_WB_B", "omega_WB_B", "qdot"], ["p_W", "L_W", "energy"]),
-        )
+        p_B, L_B, energy = momentum_of_bodies(self._kin, *velocities)
+        outputs = {"p_W": R_WB @ p_B, "L_W": R_WB @ L_B, "energy": energy}
+        return dense_function("momentum", state, outputs)
 
     def _base_twist(self) -> ca.Function:
         qdot = ca.SX.sym("qdot", self.n)
         quaternion, p_W, L_W = ca.SX.sym("quaternion", 4), ca.SX.sym("p", 3), ca.SX.sym("L", 3)
         R_BW = matrix_from_quaternion(quaternion).T
         v, omega = base_twist(self._kin, self._inertia, qdot, R_BW @ p_W, R_BW @ L_W)
-        return dense_function(
-            "base_twist",
-            [quaternion, self._kin.q, qdot, p_W, L_W],
-            [v, omega],
-            (["quaternion_WB", "q", "qdot", "p_W", "L_W"], ["v_WB_B", "omega_WB_B"]),
-        )
+        inputs = {"quaternion_WB": quaternion, "q": self._kin.q, "qdot": qdot}
+        inputs |= {"p_W": p_W, "L_W": L_W}
+        return dense_function("base_twist", inputs, {"v_WB_B": v, "omega_WB_B": omega})
 
     def _rotate(self) -> ca.Function:
         quaternion, vector = ca.SX.sym("quaternion", 4), ca.SX.sym("vector", 3)
         rotated = matrix_from_quaternion(quaternion) @ vector
-        names = ["quaternion_WB", "vector_B"]
-        return dense_function("rotate", [quaternion, vector], [rotated], (names, ["vector_W"]))
+        inputs = {"quaternion_WB": quaternion, "vector_B": vector}
+        return dense_function("rotate", inputs, {"vector_W": rotated})
 
     def _velocity_step(self, substeps: str) -> ca.Function:
         count = int(substeps)

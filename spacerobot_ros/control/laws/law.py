@@ -179,11 +179,9 @@ class ControlLaw(ABC):
             "J_z": self.outputs.J_z,
             **self._results(symbols),
         }
-        names = list(symbols), list(results)
-        function = dense_function(
-            f"law_{self.name}", list(symbols.values()), list(results.values()), names
+        self._function = BufferedFunction(
+            compiled(dense_function(f"law_{self.name}", symbols, results))
         )
-        self._function = BufferedFunction(compiled(function))
         self._in = dict(zip(symbols, self._function.inputs, strict=True))
         self._out = dict(zip(results, self._function.outputs, strict=True))
         for name, value in inputs.items():
