@@ -107,6 +107,11 @@ class Joint:
     axis: Array
     limits: JointLimits
 
+    @property
+    def unit(self) -> str:
+        """Unit of its position: m or rad."""
+        return "m" if self.kind is JointKind.PRISMATIC else "rad"
+
     def locked(self, position: float) -> Joint:
         """Return the fixed joint that holds the child where this one has it at ``position``."""
         moved = Pose(r=position * self.axis)

@@ -171,6 +171,15 @@ def require_three_slots(robot: SpaceRobot, slots: Array) -> None:
     )
 
 
+def tilted_goal(robot: SpaceRobot, axis: Array, tilt: float) -> PlanningError:
+    """Return the refusal of an attitude ``tilt`` (rad) off the turns about an ``axis`` (3,)."""
+    return PlanningError(
+        f"The goal attitude is {tilt:.4g} rad off any rotation about the axis "
+        f"{(np.round(axis, 6) + 0.0).tolist()} of {robot.base_link}: planar robot "
+        f"'{robot.description.name}' turns about no other."
+    )
+
+
 def sliding_masses(robot: SpaceRobot) -> Controllability:
     """Return the test of paper 1: three independent slots and spanning brackets of sliders."""
     sliders = sliders_of(robot)

@@ -10,7 +10,7 @@ import numpy as np
 
 from spacerobot_ros.errors import GoalError, PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, RobotState, Tolerance
@@ -178,11 +178,10 @@ class GaitMethod(ABC):
         worst = int(np.argmax(beyond))
         if beyond[worst] > _BEYOND:
             joint = robot.description.movable_joints[worst]
-            unit = "m" if joint.kind is JointKind.PRISMATIC else "rad"
             raise PlanningError(
                 f"The goal shape is beyond limits: joint '{joint.name}' at "
-                f"{wanted[worst]:.4g} {unit}, and its limits are "
-                f"[{robot.lower[worst]:.4g}, {robot.upper[worst]:.4g}] {unit}."
+                f"{wanted[worst]:.4g} {joint.unit}, and its limits are "
+                f"[{robot.lower[worst]:.4g}, {robot.upper[worst]:.4g}] {joint.unit}."
             )
         return np.clip(wanted, robot.lower, robot.upper)
 

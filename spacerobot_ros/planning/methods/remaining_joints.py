@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.parameters import declared
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.goal import Controlled, RobotState
@@ -154,8 +154,7 @@ class RemainingJointsGait(GaitMethod):
         places = []
         for joint in self.robot.description.movable_joints:
             if joint.name in self._stuck:
-                unit = "m" if joint.kind is JointKind.PRISMATIC else "rad"
-                place = f"{self._stuck[joint.name]:.4g} {unit}"
+                place = f"{self._stuck[joint.name]:.4g} {joint.unit}"
                 places.append(f"joint '{joint.name}' is stuck at {place}")
         return " and ".join(places)
 

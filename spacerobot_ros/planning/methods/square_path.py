@@ -28,6 +28,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_inverse, quaternion_multiply, swing_angle
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
+from spacerobot_ros.planning.core.controllability import tilted_goal
 from spacerobot_ros.planning.core.goal import Controlled, PoseError
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
@@ -184,11 +185,7 @@ class SquarePathGait(GaitMethod):
         turn = quaternion_multiply(quaternion_inverse(start), wanted)
         tilt = swing_angle(turn, axis[np.newaxis])
         if tilt > max(request.tolerance.attitude, _NO_ROTATION):
-            raise PlanningError(
-                f"The goal attitude is {tilt:.4g} rad off any rotation about the axis "
-                f"{np.round(axis, 6).tolist()} of {self.robot.base_link}: planar robot "
-                f"'{self.robot.description.name}' turns about no other."
-            )
+            raise tilted_goal(self.robot, axis, tilt)
         twist = 2 * math.atan2(float(axis @ turn[:3]), float(turn[3]))
         return math.remainder(twist, 2 * math.pi)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.model.description import Array
 
 _NO_MOTION = 1e-9
 """A joint that is to move less than this, m or rad, rests."""
@@ -45,11 +45,10 @@ def straight_motion(
     if total > longest:
         slowest = int(np.argmin(robot.velocity_limit))
         joint = robot.description.movable_joints[slowest]
-        unit = "m/s" if joint.kind is JointKind.PRISMATIC else "rad/s"
         raise PlanningError(
             f"A motion of {len(legs)} straight legs would take {total:.4g} s, more than longest = "
             f"{longest:.6g} s; the slowest joint is '{joint.name}', which does "
-            f"{robot.velocity_limit[slowest]:.3g} {unit}."
+            f"{robot.velocity_limit[slowest]:.3g} {joint.unit}/s."
         )
     pieces = [start[np.newaxis]]
     for before, end, duration in legs:

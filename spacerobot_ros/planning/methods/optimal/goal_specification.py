@@ -14,7 +14,7 @@ import numpy as np
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_inverse,
@@ -28,6 +28,7 @@ from spacerobot_ros.planning.core.controllability import (
     shape_box,
     sliders_of,
     slot_matrix,
+    tilted_goal,
 )
 from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.planning.core.method import PlanRequest
@@ -188,11 +189,7 @@ class GoalSpecification:
                     f"The attitude of robot '{name}' is uncontrollable: its joints do not turn its "
                     f"base, and the goal is turned by {tilt:.4g} rad."
                 )
-            raise PlanningError(
-                f"The goal attitude is {tilt:.4g} rad off any rotation about the axis "
-                f"{(np.round(axes[0], 6) + 0.0).tolist()} of {robot.base_link}: planar robot "
-                f"'{name}' turns about no other."
-            )
+            raise tilted_goal(robot, axes[0], tilt)
         if shape is not None and len(axes) and not self.turning.loops:
             raise PlanningError(
                 f"The attitude of robot '{name}' is uncontrollable where the final shape is given: "
@@ -332,11 +329,10 @@ def _out_of_reach(
         beyond = np.maximum(limits.lower - free, free - limits.upper)
         worst = int(np.argmax(beyond))
         joint = robot.description.movable_joints[worst]
-        unit = "m" if joint.kind is JointKind.PRISMATIC else "rad"
         return PlanningError(
             f"The goal is beyond the joint limits: it needs joint '{joint.name}' at "
-            f"{free[worst]:.4g} {unit}, and optimal keeps it in [{limits.lower[worst]:.4g}, "
-            f"{limits.upper[worst]:.4g}] {unit}."
+            f"{free[worst]:.4g} {joint.unit}, and optimal keeps it in [{limits.lower[worst]:.4g}, "
+            f"{limits.upper[worst]:.4g}] {joint.unit}."
         )
     return PlanningError(
         "The goal position is out of reach: without thrust the centre of mass stays where it is, "
