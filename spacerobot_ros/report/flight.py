@@ -114,14 +114,30 @@ class Target:
 
 @dataclass(frozen=True)
 class Flight:
-    """What a bag holds of a flight. Signals that it does not hold are empty.
+    """What a bag holds of a flight, times in s since the first state; missing signals are empty.
 
-    ``position``, ``attitude`` (exponential coordinates), ``twist`` (velocity and angular velocity
-    of the base link, in its frame), ``shape``, ``rates`` and ``momentum`` (as on the topic) are in
-    SI units, times in s since the first state; ``sent`` are the goal poses that are poses,
-    ``planned`` the planned positions of the base (K, 3), one array a schedule. ``tool`` is the pose
-    of the end-effector (N, 7) and ``tool_goals`` the goals it was sent; ``wrench`` (N, 6) what the
-    thrusters were commanded, force and torque in the base link; ``efforts`` what the joints were.
+    Attributes
+    ----------
+    file_name, message_count, metadata, robot, joint_names
+        About the bag, and the robot in it.
+    position, quaternion, attitude
+        Pose of the base link in the world: (N, 3) m, (N, 4) and exponential coordinates (N, 3).
+    twist
+        Velocity and angular velocity of the base link in its frame (N, 6), m/s and rad/s.
+    shape, rates, efforts
+        Positions, velocities and commanded efforts of the joints (N, n), SI units.
+    momentum
+        Momenta and kinetic energy (N, 7), without the momenta that thrusters have put in.
+    tool
+        Pose of the end-effector in the world (N, 7).
+    wrench
+        Force and torque that were commanded of the thrusters, in the base link (N, 6), N and N m.
+    statuses
+        What the planner reported, or else the controller.
+    sent, tool_goals
+        The goals of base and end-effector.
+    planned
+        Planned positions of the base (K, 3), one array a schedule.
     """
 
     file_name: str
