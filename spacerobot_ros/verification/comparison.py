@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
@@ -16,7 +15,7 @@ from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.building import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator, Refusal
 from spacerobot_ros.simulation.reported_state import ReportedState
-from spacerobot_ros.topics import TOPICS, Topic, state_topics
+from spacerobot_ros.topics import Topic, state_topics
 from spacerobot_ros.verification.recorded_flight import RecordedFlight, read_flight
 
 TOLERANCE = 1e-9
@@ -151,14 +150,18 @@ class _Published:
 
 def _published(flight: RecordedFlight) -> list[_Published]:
     """Read the state topics; the plant stamps those without a header like its odometry."""
-    bag, period, names = flight.bag, flight.config.period_ns, flight.robot.joint_names
+    recorded, period, names = flight.recorded, flight.config.period_ns, flight.robot.joint_names
+    if recorded.joint_names != list(names):
+        raise RecordingError(
+            f"The joint states in the bag {flight.path} are of "
+            f"{', '.join(recorded.joint_names)}; its robot has {', '.join(names)}."
+        )
     published: list[_Published] = []
-    clock = bag[f"{flight.namespace}/odom"].stamp_ns
+    clock = recorded["odom"].stamp_ns
     for topic in sorted(state_topics(), key=_rank):
-        name = f"{flight.namespace}/{topic.name}"
-        if not topic.verified or bag.topics.get(name) != topic.type or not bag.message_count(name):
+        series = recorded.get(topic.name) if topic.verified else None
+        if series is None:
             continue
-        series = bag[name]
         stamps = series.stamp_ns
         if not series.stamped and len(series) == len(clock):
             stamps = clock
@@ -166,11 +169,9 @@ def _published(flight: RecordedFlight) -> list[_Published]:
         between = np.flatnonzero(ticks * period != stamps)
         if between.size:
             raise RecordingError(
-                f"A message on {name} of the bag {bag.path} is stamped "
+                f"A message on {series.topic} of the bag {flight.path} is stamped "
                 f"{stamps[between[0]] / _SECOND:.9g} s, between the ticks of the plant in it."
             )
-        if topic.name == "joint_states":
-            _require_joints(flight, next(series.messages())[1].name)
         labels = [each.labels(names) for each in topic.state]
         table = np.hstack(
             [
@@ -181,20 +182,12 @@ def _published(flight: RecordedFlight) -> list[_Published]:
         # A message with another number of values than it should have.
         table[np.isnan(table).any(axis=1)] = np.nan
         flat = [label for words in labels for label in words]
-        published.append(_Published(topic, name, ticks, table, flat))
+        published.append(_Published(topic, series.topic, ticks, table, flat))
     return published
 
 
 def _rank(topic: Topic) -> int:
     return _EXPLAINING.index(topic.name) if topic.name in _EXPLAINING else len(_EXPLAINING)
-
-
-def _require_joints(flight: RecordedFlight, names: Sequence[str]) -> None:
-    if list(names) != list(flight.robot.joint_names):
-        raise RecordingError(
-            f"The joint states in the bag {flight.bag.path} are of {', '.join(names)}; its robot "
-            f"has {', '.join(flight.robot.joint_names)}."
-        )
 
 
 def _initial(
@@ -207,7 +200,7 @@ def _initial(
     needed = ("odom", "joint_states", "momentum")
     if not all(len(parts.get(name, ())) for name in needed):
         raise RecordingError(
-            f"The bag {flight.bag.path} begins in mid-flight, and its first state lacks odom, "
+            f"The bag {flight.path} begins in mid-flight, and its first state lacks odom, "
             "joint_states or momentum."
         )
     n, joints = flight.robot.n, parts["joint_states"][0]
@@ -261,7 +254,7 @@ def _resimulate(
     commands = CommandValidator(plant, flight.config)
     if first and state.sensors.used:
         raise RecordingError(
-            f"The bag {flight.bag.path} begins in mid-flight, where the noise of its sensors is "
+            f"The bag {flight.path} begins in mid-flight, where the noise of its sensors is "
             "not known."
         )
     plant.tick = first
@@ -314,7 +307,7 @@ def _require_no_reset(
         if repeated.size:
             time = p.ticks[repeated[0] + 1] * flight.config.period_ns / _SECOND
             raise RecordingError(
-                f"In the bag {flight.bag.path} the plant was reset at {time:.9g} s; only flights "
+                f"In the bag {flight.path} the plant was reset at {time:.9g} s; only flights "
                 "without a reset can be verified."
             )
 
@@ -403,10 +396,10 @@ class _Comparison:
             return f" (a fault latched at {time}; rearming is not in a bag)"
         if before in done.refusals:
             topic, refusal = done.refusals[before]
-            name = f"{self._flight.namespace}/{topic}"
+            name = f"{self._flight.recorded.namespace}/{topic}"
             return f" (that on {name} stamped {self._time(before)} is refused: {refusal.clause})"
         if tick > done.first and before not in done.given:
-            name = f"{self._flight.namespace}/{TOPICS['joint_commands'].name}"
+            name = f"{self._flight.recorded.namespace}/joint_commands"
             return f" (no message on {name} is stamped {self._time(before)})"
         return ""
 

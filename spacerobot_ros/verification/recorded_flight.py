@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,6 @@ from spacerobot_ros.simulation.commands import (
     require_values,
 )
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.topics import TOPICS
 
 _SECOND = 10**9
 
@@ -36,8 +36,8 @@ class RecordedFlight:
 
     Attributes
     ----------
-    bag, namespace
-        Where it is recorded, and the namespace of its topics.
+    recorded
+        The topics of the robot.
     config
         The parameters of its plant; those that an earlier version did not have are at their
         defaults.
@@ -47,8 +47,7 @@ class RecordedFlight:
         The faults that were injected in each tick.
     """
 
-    bag: Bag
-    namespace: str
+    recorded: RecordedRobot
     config: PlantConfig
     robot: SpaceRobot
     injections: dict[int, list[str]]
@@ -62,15 +61,18 @@ class RecordedFlight:
             A message is damaged.
         """
         commands: dict[int, RecordedCommand] = {}
-        for _, message in self._messages(source.topic):
+        series = self.recorded.get(source.topic)
+        for _, message in series.messages() if series is not None else ():
             stamp = message.header.stamp
             tick, rest = divmod(stamp.sec * _SECOND + stamp.nanosec, self.config.period_ns)
             if not rest and tick not in commands:
                 commands[tick] = read_command(message, source, self.robot)
         return commands
 
-    def _messages(self, topic: str) -> Any:
-        return _messages(self.bag, self.namespace, topic)
+    @property
+    def path(self) -> Path:
+        """The bag."""
+        return self.recorded.bag.path
 
 
 def read_command(message: Any, source: CommandSource, robot: SpaceRobot) -> RecordedCommand:
@@ -103,42 +105,36 @@ def read_flight(bag: Bag) -> RecordedFlight:
     RobotDescriptionError
         Its URDF is refused.
     """
-    namespace = _namespace(bag)
-    config = _config(bag, namespace)
-    urdf = RecordedRobot(bag, namespace).urdf
+    recorded = _recorded(bag)
+    config = _config(bag, recorded.namespace)
+    urdf = recorded.urdf
     if urdf is None:
         raise RecordingError(f"The bag {bag.path} holds no description of its robot.")
     injections: dict[int, list[str]] = {}
     # Faults have no stamp: they came in the tick of their log time.
-    for time_ns, message in _messages(bag, namespace, "fault_injection"):
+    series = recorded.get("fault_injection")
+    for time_ns, message in series.messages() if series is not None else ():
         injections.setdefault(time_ns // config.period_ns, []).append(message.data)
     robot = robot_from_text(urdf.decode(errors="replace"), config)
-    return RecordedFlight(bag, namespace, config, robot, injections)
+    return RecordedFlight(recorded, config, robot, injections)
 
 
-def _messages(bag: Bag, namespace: str, topic: str) -> Any:
-    """Return the messages of a topic with their log times; none where it has another type."""
-    name = f"{namespace}/{topic}"
-    return bag.messages(name) if bag.topics.get(name) == TOPICS[topic].type else ()
-
-
-def _namespace(bag: Bag) -> str:
-    namespaces = [
-        topic.removesuffix("/odom")
-        for topic, kind in bag.topics.items()
+def _recorded(bag: Bag) -> RecordedRobot:
+    """Return the one robot of which the bag holds odom and joint_states."""
+    candidates = [
+        RecordedRobot(bag, topic.removesuffix("/odom"))
+        for topic in bag.topics
         if topic.endswith("/odom")
-        and kind == TOPICS["odom"].type
-        and bag.message_count(topic)
-        and bag.topics.get(f"{topic.removesuffix('/odom')}/joint_states")
-        == TOPICS["joint_states"].type
     ]
-    if len(namespaces) != 1:
-        found = f"{len(namespaces)} plants ({', '.join(namespaces)})" if namespaces else "no plant"
+    found = [each for each in candidates if each.get("odom") and each.get("joint_states")]
+    if len(found) != 1:
+        names = ", ".join(each.namespace for each in found)
+        plants = f"{len(found)} plants ({names})" if found else "no plant"
         raise RecordingError(
-            f"The bag {bag.path} holds the states of {found}: to verify it takes one that "
+            f"The bag {bag.path} holds the states of {plants}: to verify it takes one that "
             "published odom and joint_states."
         )
-    return namespaces[0]
+    return found[0]
 
 
 def _config(bag: Bag, namespace: str) -> PlantConfig:
