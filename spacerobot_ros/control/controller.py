@@ -86,15 +86,13 @@ class CoordinatedController:
         self._began = 0.0
         self._followed = Reference()
         self._sent: Actuation | None = None
-        self._last: ControlState | None = None
-        """The state that was measured last."""
         self._estimator: DeadReckoning | None = None
         self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
 
     def reset(self) -> None:
         """Drop goals and what was measured; the next state is the first."""
         self._profile, self._followed = None, Reference()
-        self._sent = self._last = self._estimator = self._brake = None
+        self._sent = self._estimator = self._brake = None
         self.mode = Mode.MEASURED
 
     def set_gains(self, gains: Gains) -> None:
@@ -206,15 +204,15 @@ class CoordinatedController:
         if measured is not None:
             if self._estimator is not None:
                 self._estimator.reset(measured)
-            self._last = measured
             self.mode, self._brake = Mode.MEASURED, None
             return measured
-        if self._last is None or self._sent is None or self.mode is Mode.STOPPED:
+        if self._sent is None or self.mode is Mode.STOPPED:
             self.mode = Mode.STOPPED
             return None
         if self._estimator is None:
             self._estimator = DeadReckoning(self.law.robot, self._control_period)
-            self._estimator.reset(self._last)
+            # A copy of the last measured state: the arrays of a state may be used again.
+            self._estimator.reset(self.law.state)
         if self._estimator.elapsed + self._control_period > self._estimation_time + 1e-9:
             self.mode = Mode.STOPPED
             return None

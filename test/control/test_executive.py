@@ -25,7 +25,13 @@ from support.executive_loop import (
 )
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.control import Gains, JointReference, PoseReference, Reference
+from spacerobot_ros.control import (
+    ControlState,
+    Gains,
+    JointReference,
+    PoseReference,
+    Reference,
+)
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.reference import HeldVelocityReference
@@ -513,3 +519,22 @@ def test_a_controller_is_built_from_its_configuration() -> None:
     assert default.law.outputs.selection.end_effector_link == "end_effector"
     with pytest.raises(ParameterError, match="tail"):
         build_controller(robot, configured(ControllerConfig, {"joint_outputs": "tail"}))
+
+
+def test_the_estimate_begins_at_the_last_measured_state_whatever_becomes_of_its_memory() -> None:
+    """A node reads every state into the same arrays: what is kept of one must be a copy."""
+    commands = []
+    for reused in (False, True):
+        controller = build_controller(planar_manipulator(), ControllerConfig())
+        q, qdot = np.zeros(2), np.array([0.4, -0.3])
+        for tick in range(4):
+            joints = SHAPE + PERIOD * tick * qdot
+            if reused:
+                q[:] = joints
+            else:
+                q = joints
+            base = np.array([0.1, 0.0, 0.0])
+            state = ControlState(base, UPRIGHT, np.zeros(3), np.zeros(3), q, qdot)
+            result = controller.command(PERIOD * tick, state if tick < 2 else None, q, qdot)
+        commands.append(np.concatenate([result.realised.wrench_B, result.realised.tau]))
+    np.testing.assert_array_equal(commands[0], commands[1])

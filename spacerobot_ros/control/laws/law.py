@@ -225,6 +225,11 @@ class ControlLaw(ABC):
         return self._actuation(reference)
 
     @property
+    def state(self) -> ControlState:
+        """A copy of the state at the last command."""
+        return ControlState.unstack(self._in["state"])
+
+    @property
     def error(self) -> Array:
         """The error (m,) at the last command, in the order of ``outputs.labels``."""
         return self._out["error"].copy()
