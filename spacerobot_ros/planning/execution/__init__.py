@@ -1,1 +1,1 @@
-"""Flying schedules: tracking, corrections, and the parts of them that need no ROS."""
+"""From goals to setpoints: the executive, its planning worker and trajectory tracker; no ROS."""

@@ -14,7 +14,7 @@ from spacerobot_ros.planning.methods.registry import METHODS
 
 @dataclass(frozen=True)
 class PlannerConfig(BelievedRobotConfig):
-    """How a planner plans, flies and corrects."""
+    """How a planner plans, tracks its schedules and corrects what remains."""
 
     method: str = parameter("auto", "gait method", choices=tuple(METHODS))
     tick_rate: float = parameter(
@@ -25,13 +25,13 @@ class PlannerConfig(BelievedRobotConfig):
     )
     world_frame: str = parameter("world", "frame that goals must be given in")
     position_tolerance: float = parameter(
-        0.001, "a goal is met within", unit="m", minimum=0.0, read_only=False
+        0.001, "a goal is reached within", unit="m", minimum=0.0, read_only=False
     )
     attitude_tolerance: float = parameter(
-        0.001, "a goal is met within", unit="rad", minimum=0.0, read_only=False
+        0.001, "a goal is reached within", unit="rad", minimum=0.0, read_only=False
     )
     joint_tolerance: float = parameter(
-        0.001, "a shape is met within", unit="m or rad", minimum=0.0, read_only=False
+        0.001, "a shape is reached within", unit="m or rad", minimum=0.0, read_only=False
     )
     output: str = parameter(
         "commands",
@@ -43,24 +43,27 @@ class PlannerConfig(BelievedRobotConfig):
     )
     abort_time: float = parameter(
         1.0,
-        "to rest along the gait after ~/abort, or for another goal",
+        "duration of the braking along the planned path, after ~/abort or for another goal",
         unit="s",
         minimum=0.01,
         maximum=1000.0,
     )
     drift_position: float = parameter(
-        0.0, "farther off the path the rest is planned again; 0: never", unit="m", minimum=0.0
+        0.0,
+        "tracking error of the base beyond which the remaining motion is planned again; 0: any",
+        unit="m",
+        minimum=0.0,
     )
     drift_attitude: float = parameter(0.0, "likewise", unit="rad", minimum=0.0)
     shape_gain: float = parameter(
-        2.0, "feedback on the shape while flying", unit="1/s", minimum=0.0, maximum=1000.0
+        2.0, "feedback on the shape while tracking", unit="1/s", minimum=0.0, maximum=1000.0
     )
     shape_deadband: float = parameter(
         0.0, "shape errors up to this are noise: no feedback", unit="m or rad", minimum=0.0
     )
     averaging: int = parameter(
         1,
-        "measured states at rest that are averaged to plan and to judge",
+        "measured states at rest that are averaged to plan and to evaluate",
         minimum=1,
         maximum=1000000.0,
     )
@@ -78,10 +81,10 @@ class PlannerConfig(BelievedRobotConfig):
     )
     plan_in_background: bool = parameter(
         False,
-        "plan in a thread from a robot at rest and go on answering; false: states wait (lockstep)",
+        "plan in a thread, from rest, while states are answered; false: states wait (lockstep)",
     )
     resume_file: str = parameter(
-        "", "keeps the present goal for a planner that starts again; '': none"
+        "", "file of the present goal, from which a planner that is restarted resumes; '': none"
     )
     options: Mapping[str, Any] = registered(METHODS)
 
@@ -92,5 +95,5 @@ class PlannerConfig(BelievedRobotConfig):
 
     @property
     def tolerance(self) -> Tolerance:
-        """How near to the goal is near enough."""
+        """Within which errors a goal is reached."""
         return Tolerance(self.position_tolerance, self.attitude_tolerance, self.joint_tolerance)

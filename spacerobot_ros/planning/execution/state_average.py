@@ -19,7 +19,7 @@ _AT_REST = 1e-9
 
 
 class StateAverage:
-    """Averages measured states and judges the momenta that they show.
+    """Averages measured states, and finds the total momenta from those at rest.
 
     While joints move, the momentum of a robot whose masses are not quite known is uncertain; at
     rest the base alone shows it, and without thrust it stays. So the momenta of a state are those

@@ -24,13 +24,13 @@ _LEAST_BAND = 1e-6
 
 
 class StuckJointWatch:
-    """Watches the joints of a flight, tick by tick.
+    """Watches the joints while a schedule is tracked, tick by tick.
 
     Since it was last seen to follow, every joint has gone over some range and was commanded to go
     over another; a joint is stuck when it was commanded to move in N ticks or more and the first
     range is a small part of the second. So joints that are not commanded to move, slow ones, and
     ones whose measurements are noisy are not taken for stuck. Where no joint moves at all they are
-    watched for longer: a plant that starts again takes a while to hear its commander.
+    watched for longer: a plant that is restarted takes a while to receive commands.
 
     Parameters
     ----------
@@ -38,20 +38,20 @@ class StuckJointWatch:
         Their number.
     ticks
         N; 0: nothing is ever stuck.
-    tick_period
-        s.
+    control_period
+        How long a command is held, s.
     band
         Measured shapes that are as near as this to the wanted ones are there, m or rad.
     """
 
-    def __init__(self, joints: int, ticks: int, tick_period: float, band: float = 0.0) -> None:
-        self._ticks, self._tick_period = ticks, tick_period
+    def __init__(self, joints: int, ticks: int, control_period: float, band: float = 0.0) -> None:
+        self._ticks, self._control_period = ticks, control_period
         self._band = max(band, _LEAST_BAND)
         self._joints, self._longest = joints, _PATIENCE * ticks
         self.restart()
 
     def restart(self) -> None:
-        """Begin with a new flight."""
+        """Begin with a new schedule."""
         n = self._joints
         self._suspicious, self._looks = False, 0
         self._moving = np.zeros(n, dtype=np.int64)
@@ -74,9 +74,9 @@ class StuckJointWatch:
             self._suspicious = True
             self._begin(np.ones(self._joints, dtype=np.bool_), q)
         _widen(self._gone, q)
-        self._commanded += velocity * self._tick_period
+        self._commanded += velocity * self._control_period
         _widen(self._asked, self._commanded)
-        self._moving += np.abs(velocity) * self._tick_period > _LEAST_BAND * _STUCK_SHARE
+        self._moving += np.abs(velocity) * self._control_period > _LEAST_BAND * _STUCK_SHARE
         due = self._moving >= self._window
         if not due.any():
             return []
