@@ -108,8 +108,7 @@ class MissionClient:
     @property
     def outcome(self) -> Outcome | None:
         """What became of the goal; None as long as it is followed."""
-        outcome: Outcome | None = self._done.result()
-        return outcome
+        return self._done.result()
 
     @property
     def sentence(self) -> str:
@@ -180,8 +179,7 @@ class MissionClient:
         self.node.destroy_timer(timer)
         if failures:
             raise failures[0]
-        assert self.outcome is not None
-        return self.outcome
+        return self._done.result()
 
     def _end(self, outcome: Outcome) -> None:
         if not self._done.done():

@@ -157,24 +157,6 @@ class MultiProcessStack(Stack):
             self.client.send(goal, self.scenario.end_effector_goal)
         self._transit(Transition.TRANSITION_ACTIVATE)
 
-    def spin(self, look: Callable[[], bool]) -> None:
-        """Run until the goal is decided, or until ``look``, called five times a second, is true.
-
-        On the way nodes are killed and started as the scenario says.
-
-        Raises
-        ------
-        SpaceRobotError
-            A node has ended by itself.
-        """
-
-        def supervise() -> bool:
-            self._kill_and_restart()
-            self.require_alive()
-            return look()
-
-        self.client.follow(self.executor, supervise)
-
     def finish(self) -> None:
         """Stop time, then end every node, the recorder, whose bag is completed, last.
 
@@ -229,8 +211,8 @@ class MultiProcessStack(Stack):
         os.killpg(self.processes[name].pid, signal.SIGKILL)
         self.processes[name].wait()
 
-    def _kill_and_restart(self) -> None:
-        """Kill and start the nodes that the scenario names for this time."""
+    def _supervise(self) -> None:
+        """Kill and start the nodes that the scenario names for this time; the others must run."""
         # A killed plant has no clock: the wall's goes on for it.
         factor = self.scenario.plant.real_time_factor
         since = factor * (time.monotonic() - self._clock_seen)
@@ -240,6 +222,7 @@ class MultiProcessStack(Stack):
         for name in started:
             again = {"resume_bag": str(self.bag or ""), "autostart": True}
             self.launch(name, **(again if name == "plant" else {}))
+        self.require_alive()
 
     def _end(self, name: str) -> int:
         process = self.processes[name]

@@ -138,20 +138,17 @@ class Scenario:
     @property
     def plant(self) -> PlantConfig:
         """The plant's configuration; see :meth:`config`."""
-        config: PlantConfig = self.config("plant")
-        return config
+        return self.config("plant")
 
     @property
     def planner(self) -> PlannerConfig:
         """The planner's configuration; see :meth:`config`."""
-        config: PlannerConfig = self.config("planner")
-        return config
+        return self.config("planner")
 
     @property
     def controller(self) -> ControllerConfig:
         """The controller's configuration; see :meth:`config`."""
-        config: ControllerConfig = self.config("coordinated_control")
-        return config
+        return self.config("coordinated_control")
 
     @property
     def lockstep(self) -> bool:

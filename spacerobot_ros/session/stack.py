@@ -51,6 +51,7 @@ class Stack(ABC):
     """Whether nodes may be killed and started again on the way."""
 
     client: MissionClient
+    executor: EventsExecutor
 
     def __init__(self, scenario: Scenario, bag: Path | None) -> None:
         if scenario.kills and (not self.can_kill or scenario.lockstep):
@@ -79,7 +80,6 @@ class Stack(ABC):
     def start(self, goal: Goal | None) -> None:
         """Send the goal, if there is one, and let time run."""
 
-    @abstractmethod
     def spin(self, look: Callable[[], bool]) -> None:
         """Run until the goal is decided, or until ``look``, called five times a second, is true.
 
@@ -88,6 +88,15 @@ class Stack(ABC):
         SpaceRobotError
             A node has ended by itself.
         """
+
+        def on_look() -> bool:
+            self._supervise()
+            return look()
+
+        self.client.follow(self.executor, on_look)
+
+    def _supervise(self) -> None:  # noqa: B027
+        """Look after the nodes, five times a second."""
 
     @abstractmethod
     def finish(self) -> None:
@@ -202,10 +211,6 @@ class InProcessStack(Stack):
 
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         timer = self.client.node.create_timer(0.001, launch, clock=steady)
-
-    def spin(self, look: Callable[[], bool]) -> None:
-        """Run until the goal is decided, or until ``look``, called five times a second, is true."""
-        self.client.follow(self.executor, look)
 
     def finish(self) -> None:
         """Stop the plant, record what is still on its way, and complete the bag."""

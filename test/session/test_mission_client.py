@@ -1,0 +1,160 @@
+"""The mission client: goals named by their stamps, and statuses of this goal only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped
+from support.ros_harness import LATCHED, Harness, Probe
+
+from spacerobot_ros.control.status import ControllerState, ControllerStatus
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.session.mission_client import MissionClient, Outcome
+
+NOW = 12_000_000_345
+GOAL = Goal.checked([1.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0])
+TOPICS = {"goal_pose": PoseStamped, "end_effector/goal_pose": PoseStamped}
+STATUS = {"planner": "planner/status", "coordinated_control": "controller/status"}
+
+
+@pytest.fixture
+def harness(ros_context: rclpy.Context) -> Iterator[Harness]:
+    harness = Harness(ros_context)
+    yield harness
+    harness.close()
+
+
+class Mission:
+    """A client, and a commander that only listens and publishes what it is given."""
+
+    def __init__(self, harness: Harness, decider: str) -> None:
+        self.harness = harness
+        self.ends = 0
+        self.client = MissionClient(
+            decider,
+            "world",
+            lambda: NOW,
+            end_effector=True,
+            on_end=self.on_end,
+            context=harness.context,
+        )
+        harness.add(self.client.node)
+        self.commander: Probe = harness.probe(TOPICS)
+        self.status = self.commander.create_publisher(DiagnosticStatus, STATUS[decider], LATCHED)
+        harness.spin_until(lambda: self.client.is_connected() and self.client.has_decider())
+        harness.spin_until(lambda: self.status.get_subscription_count() == 1)
+
+    def on_end(self) -> None:
+        self.ends += 1
+
+    def send(self, goal: Goal) -> str:
+        """Send a goal, and return its id as a commander makes it of the stamp."""
+        before = self.commander.count("end_effector/goal_pose")
+        self.client.send(GOAL, goal)
+        self.harness.spin_until(
+            lambda: (
+                self.commander.count("end_effector/goal_pose") > before
+                and self.commander.count("goal_pose") > before
+            )
+        )
+        base, tool = (self.commander.last(topic) for topic in TOPICS)
+        assert base.header == tool.header
+        assert base.header.frame_id == "world"
+        return f"{base.header.stamp.sec}.{base.header.stamp.nanosec:09d}"
+
+    def report(self, status: PlannerStatus | ControllerStatus) -> None:
+        """Publish a status, and wait for the client to receive it."""
+        values = [KeyValue(key=key, value=value) for key, value in status.to_values().items()]
+        self.status.publish(DiagnosticStatus(message=status.sentence, values=values))
+        self.harness.spin_until(lambda: self.client.status == status)
+
+
+@pytest.mark.parametrize("decider", STATUS)
+def test_only_the_status_of_the_goal_that_was_sent_decides_it(
+    harness: Harness, decider: str
+) -> None:
+    mission = Mission(harness, decider)
+    failed: PlannerStatus | ControllerStatus
+    kind, failed, reached = (
+        (PlannerStatus, PlannerStatus(PlannerState.FAILED), PlannerState.REACHED)
+        if decider == "planner"
+        else (ControllerStatus, ControllerStatus(ControllerState.FAILED), ControllerState.REACHED)
+    )
+    mission.report(failed)
+    first = mission.send(GOAL)
+    assert first == "12.000000346"
+    for other in ("", "unstamped-1", "12.000000345", "12.346"):
+        mission.report(kind(reached, f"Reached {other}.", goal_id=other))  # type: ignore[arg-type]
+        assert mission.client.outcome is None
+    mission.report(kind(reached, "Reached.", goal_id=first))  # type: ignore[arg-type]
+    assert mission.client.outcome is Outcome.REACHED
+    assert mission.client.sentence == "Reached."
+    assert mission.ends == 1
+
+
+def test_every_goal_has_an_id_of_its_own_though_time_stands_still(harness: Harness) -> None:
+    mission = Mission(harness, "planner")
+    assert [mission.send(GOAL) for _ in range(3)] == [f"12.000000{346 + n}" for n in range(3)]
+
+
+def test_the_first_gait_for_the_goal_is_kept(harness: Harness) -> None:
+    mission = Mission(harness, "planner")
+    goal_id = mission.send(GOAL)
+    statuses = [
+        PlannerStatus(
+            PlannerState.EXECUTING,
+            goal_id=identity,
+            method="auto",
+            duration_s=duration,
+            ends_at_s=9.0,
+            manoeuvre_time_s=duration,
+            notes={"c": [1.0, 2.0]},
+        )
+        for identity, duration in (("7.000000000", 1.0), (goal_id, 2.0), (goal_id, 3.0))
+    ]
+    for status in statuses:
+        mission.report(status)
+    assert mission.client.gait == statuses[1]
+    assert mission.client.ends_at == 9.0
+    assert mission.client.outcome is None
+
+
+def test_a_follower_stops_when_its_look_is_true(harness: Harness) -> None:
+    mission = Mission(harness, "planner")
+    looks: list[int] = []
+
+    def look() -> bool:
+        looks.append(0)
+        return len(looks) == 3
+
+    outcome = mission.client.follow(harness.executor, look, 0.01)
+    assert outcome is mission.client.outcome is Outcome.INTERRUPTED
+    assert (len(looks), mission.ends) == (3, 1)
+
+
+def test_a_follower_raises_what_its_look_raises(harness: Harness) -> None:
+    mission = Mission(harness, "planner")
+
+    def fail() -> bool:
+        raise SpaceRobotError("A node has ended.")
+
+    with pytest.raises(SpaceRobotError, match="A node has ended"):
+        mission.client.follow(harness.executor, fail, 0.01)
+    assert mission.client.outcome is Outcome.INTERRUPTED
+
+
+def test_the_pose_of_a_goal_is_that_of_the_message(harness: Harness) -> None:
+    mission = Mission(harness, "planner")
+    tool = Goal.checked([0.1, 0.2, 0.3], [0.0, 0.6, 0.0, 0.8])
+    mission.send(tool)
+    for topic, goal in (("goal_pose", GOAL), ("end_effector/goal_pose", tool)):
+        pose = mission.commander.last(topic).pose
+        p, o = pose.position, pose.orientation
+        np.testing.assert_array_equal([p.x, p.y, p.z], goal.position)
+        np.testing.assert_allclose([o.x, o.y, o.z, o.w], goal.quaternion, atol=1e-15)
