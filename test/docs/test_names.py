@@ -46,6 +46,26 @@ def test_files_that_a_page_names_exist(page: Path) -> None:
     assert missing == []
 
 
+def test_classes_that_the_page_of_the_architecture_names_exist() -> None:
+    package = "\n".join(
+        path.read_text(encoding="utf-8") for path in (ROOT / "spacerobot_ros").rglob("*.py")
+    )
+    foreign = {"PoseStamped", "JointState", "EventsExecutor"}
+    found = {
+        match[0]: match
+        for name in named(ROOT / "docs" / "architecture.md")
+        if (match := re.match(r"([A-Z][a-z]\w+)(?:\.(\w+))?", name)) and match[1] not in foreign
+    }
+    assert len(found) > 20
+    missing = [
+        name
+        for name, match in found.items()
+        if not re.search(rf"^class {match[1]}\b", package, re.MULTILINE)
+        or (match[2] and f"def {match[2]}(" not in package)
+    ]
+    assert missing == []
+
+
 def test_tests_that_the_page_of_faults_names_exist() -> None:
     text = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
     source = (ROOT / "test" / "nodes" / "test_faults_flight.py").read_text(encoding="utf-8")
