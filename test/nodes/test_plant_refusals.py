@@ -16,6 +16,7 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import PlantNode
+from spacerobot_ros.simulation.time_modes import PlantState
 
 REALTIME = {"time_mode": "realtime", "real_time_factor": 10.0, "command_timeout": 0.0}
 ARM = ["joint_1", "joint_2", "joint_3"]
@@ -39,6 +40,10 @@ def assert_nothing_moves(rig: Rig, states: int = 5) -> None:
     before = rig.probe.count("joint_states")
     rig.wait("joint_states", before + states)
     assert not any(any(m.velocity) for m in rig.probe.messages["joint_states"][before + 1 :])
+
+
+def assert_state(rig: Rig, state: PlantState) -> None:
+    assert rig.plant.state is state
 
 
 def test_a_command_older_than_the_one_in_force_is_refused(harness: Harness) -> None:
@@ -102,16 +107,25 @@ def test_abort_holds_everything_until_rearm(harness: Harness, mode: str) -> None
     rig = Rig(harness, {**REALTIME, "time_mode": mode})
     rig.send([0.3, 0.0, 0.0])
     wait_for_velocity(rig, 0.3)
+    assert_state(rig, PlantState.RUNNING)
     assert rig.trigger("plant/abort").success
+    assert_state(rig, PlantState.LATCHED)
     rig.send([0.3, 0.0, 0.0])
     wait_for_velocity(rig, 0.0)
     status = rig.diagnosis("commands")
     assert status.level == DiagnosticStatus.ERROR
     assert_one_sentence(status.message, "aborted on request")
+    rig.pause(True)
+    assert_state(rig, PlantState.PAUSED)
+    rig.pause(False)
+    assert_state(rig, PlantState.LATCHED)
     assert "aborted" in rig.trigger("plant/rearm").message
+    assert_state(rig, PlantState.RUNNING)
     rig.send([0.3, 0.0, 0.0])
     wait_for_velocity(rig, 0.3)
     assert "No fault" in rig.trigger("plant/rearm").message
+    rig.plant.trigger_deactivate()
+    assert_state(rig, PlantState.INACTIVE)
 
 
 @pytest.mark.parametrize(
