@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -243,6 +245,12 @@ def test_every_phase_is_reached_and_left_and_every_event_used() -> None:
     assert {t.target for t in TRANSITIONS} == set(Phase)
     assert {t.source for t in TRANSITIONS} == set(Phase)
     assert {t.event for t in TRANSITIONS} == set(Event)
+
+
+def test_the_state_machine_needs_no_ros() -> None:
+    load = "import sys, spacerobot_ros.planning.execution.executive; print('rclpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", load], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
 
 
 # -- why plans are requested ------------------------------------------------------------------
