@@ -8,6 +8,9 @@ STAMP := $(VENV)/stamp
 # -qq leaves errors only.
 PIP := $(BIN)/python3 -m pip -qq --disable-pip-version-check
 
+# The versions that were tested are those of one Python; on others pip chooses.
+TESTED := $(BIN)/python3 -c 'import sys; print("-cconstraints.txt" * (sys.version_info[:2] == (3, 11)))'
+
 # What decides on the dependencies, and what is installed with the package. Directories are among
 # the latter because a deleted file changes nothing else.
 DECLARATION := setup.py setup.cfg constraints.txt
@@ -119,7 +122,7 @@ $(STAMP)/demo $(STAMP)/test $(STAMP)/docs: $(DECLARATION) $(SOURCES) | $(STAMP)/
 	@rm -rf build/lib
 	@echo "Installing spacerobot_ros[$(EXTRAS)] into $(VENV)$(if $(ALL), (once; a minute or two)) ..."
 	@$(PIP) install --no-build-isolation \
-	    $(if $(ALL),-c constraints.txt '.[$(EXTRAS)]',--no-deps --force-reinstall .)
+	    $(if $(ALL),$$($(TESTED)) '.[$(EXTRAS)]',--no-deps --force-reinstall .)
 	@rm -rf build/lib build/bdist.* spacerobot_ros.egg-info
 	@rmdir build 2>/dev/null || true
 	@touch $@

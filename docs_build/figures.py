@@ -43,7 +43,7 @@ def _lie_bracket() -> dict[str, str]:
     return {
         "lie_bracket.zf": _vector(schedule.notes["zf"], 4),
         "lie_bracket.c": _vector(schedule.notes["c"], 4),
-        "lie_bracket.alpha": _vector(schedule.notes["alpha"], 3),
+        "lie_bracket.alpha": _vector(schedule.notes["alpha"], 4),
         "lie_bracket.duration": f"{schedule.duration:g}",
         "lie_bracket.final_position": _vector(trial.pose[:3], 4),
         "lie_bracket.final_attitude": _vector(rotvec_from_quaternion(trial.pose[3:]), 4),
@@ -84,7 +84,8 @@ def _area_loop() -> dict[str, str]:
             plant.step(rates)
         if cycle in (20, _CYCLES):
             left = attitude_error(plant.pose[3:], problem.goal.quaternion)
-            found[f"area_loop.left_after_{cycle}"] = _vector(np.degrees(left), 3)
+            digits = 3 if cycle == 20 else 4
+            found[f"area_loop.left_after_{cycle}"] = _vector(np.degrees(left), digits)
     return found
 
 
@@ -121,7 +122,7 @@ def _coordinated_control() -> dict[str, str]:
             error = controller.law.error
             if tick == 0:
                 force = matrix_from_quaternion(state.quaternion_WB) @ command.wrench_B[:3]
-                found[f"{key}.force_at_start"] = _vector(force[:2], 3)
+                found[f"{key}.force_at_start"] = _vector(force[:2], 2)
                 efforts = (command.wrench_B[5], *command.tau)
                 found[f"{key}.efforts_at_start"] = ", ".join(f"{x:.3f}" for x in efforts)
             elif tick == round(5.0 / period):
