@@ -34,10 +34,10 @@ def test_the_package_loads_neither_scipy_nor_matplotlib() -> None:
     assert not loaded("import spacerobot_ros").intersection(LIBRARIES)
 
 
-def test_planning_loads_neither_matplotlib_nor_ros() -> None:
+def test_planning_loads_neither_scipy_nor_matplotlib_nor_ros() -> None:
     modules = loaded("import spacerobot_ros\nspacerobot_ros.plan")
     assert "spacerobot_ros.planning.api" in modules
-    assert not modules.intersection({"matplotlib", "rclpy"})
+    assert not modules.intersection({"matplotlib", "rclpy", "scipy"})
 
 
 def test_every_command_is_listed_and_has_help() -> None:
