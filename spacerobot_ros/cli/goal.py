@@ -18,7 +18,7 @@ def command(
     namespace: str,
     timeout: float,
 ) -> None:
-    """Send a goal pose to a running stack and follow it until it is met or refused.
+    """Send a goal pose to a running stack and follow it until it is reached or refused.
 
     Exit code 0: the goal was reached; 1: it was not; 2: bad input.
     """

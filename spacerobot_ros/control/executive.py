@@ -282,9 +282,9 @@ class ControlExecutive:
             case ControllerState.TRACKING:
                 return f"Flying to the goal; {remaining} from the reference."
             case ControllerState.REACHED:
-                return f"The goal is met: {remaining} from it."
+                return f"The goal is reached: {remaining} from it."
             case ControllerState.FAILED:
-                return f"The goal is not met in time: {remaining} from it."
+                return f"The goal is not reached in time: {remaining} from it."
             case ControllerState.ABORTED:
                 return "Aborted on request; the robot holds."
             case ControllerState.ESTIMATING:

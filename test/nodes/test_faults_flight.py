@@ -291,7 +291,7 @@ def test_a_thruster_that_stays_on_is_too_much_and_said(harness: Harness) -> None
     )
     status = flight.fly(*THERE)
     assert values_of(status)["state"] == "failed"
-    assert_one_sentence(status.message, "not met")
+    assert_one_sentence(status.message, "not reached")
 
 
 @pytest.mark.slow
