@@ -15,7 +15,6 @@ from pathlib import Path
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 
-_ROUNDS = 3
 _OURS = "spacerobot_ros.cli.main:main"
 _ENTRY = re.compile(r"""["']\s*spacerobot\s*=\s*([\w.]+:\w+)\s*["']""")
 
@@ -90,7 +89,7 @@ class Checkout:
 
 
 def compare_checkouts(
-    other: Path, words: Sequence[str], show: Callable[[str], None], rounds: int = _ROUNDS
+    other: Path, words: Sequence[str], show: Callable[[str], None], rounds: int
 ) -> dict[str, Figures]:
     """Measure this checkout and another one alternately.
 

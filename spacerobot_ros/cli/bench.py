@@ -35,12 +35,20 @@ from spacerobot_ros.cli.options import PATH, json_option, write_json
     metavar="PATH",
     help="Measure the checkout at PATH in turns with this one, and print the ratios.",
 )
+@click.option(
+    "--rounds",
+    default=3,
+    show_default=True,
+    type=click.IntRange(min=1),
+    help="How often each checkout is measured; the medians are compared.",
+)
 def command(
     ticks: int,
     seconds: float | None,
     rates: tuple[float, ...],
     json_file: Path | None,
     against: Path | None,
+    rounds: int,
 ) -> None:
     """Measure the speed of the stack against a bare ping-pong in the same run."""
     figures: Mapping[str, Any]
@@ -51,7 +59,7 @@ def command(
         if seconds is not None:
             rate_words = [word for rate in rates for word in ("--rate", str(rate))]
             words = ["--real-time", str(seconds), *rate_words]
-        figures = compare_checkouts(against, words, click.echo)
+        figures = compare_checkouts(against, words, click.echo, rounds)
     elif seconds is None:
         from spacerobot_ros.benchmarks import bench
 

@@ -45,7 +45,7 @@ def test_medians_of_what_both_measure_in_turns(
     other = checkout(tmp_path, "b", [90.0, 100.0, 300.0], {"old_us": 3.0, "zero": 0.0})
     monkeypatch.setattr(against.Checkout, "ours", classmethod(lambda cls: cls.at(ours)))
     lines: list[str] = []
-    found = compare_checkouts(other, ["--ticks", "100"], lines.append)
+    found = compare_checkouts(other, ["--ticks", "100"], lines.append, 3)
     assert (tmp_path / "log").read_text() == "abbaab"
     assert lines[-1].split() == ["ticks_per_s", "110", "100", "1.100"]
     assert found["ratio"] == {"ticks_per_s": pytest.approx(1.1)}
@@ -67,7 +67,7 @@ def test_a_folder_without_a_checkout_is_refused(
     if declaration is not None:
         (tmp_path / "setup.py").write_text(declaration)
     with pytest.raises(ParameterError, match=sentence):
-        compare_checkouts(tmp_path, [], print)
+        compare_checkouts(tmp_path, [], print, 1)
 
 
 def test_a_benchmark_that_fails_is_one_sentence(tmp_path: Path) -> None:
