@@ -20,7 +20,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
-_OPENING = re.compile(r"^(?P<indent> *)(?P<fence>`{3,})(?P<language>[\w+-]+)(?P<marks>( +[^`]+)?)$")
+_OPENING = re.compile(r"^(?P<indent> *)(?P<fence>`{3,})(?P<language>[\w+-]*)(?P<marks>( +[^`]+)?)$")
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,11 @@ def replace_blocks(page: str, replacement: Callable[[Block], str | None]) -> str
             if text.strip() == opening["fence"]:
                 break
             inside.append(text.removeprefix(indent))
+        if not opening["language"]:
+            # Shown as it stands, also where it shows how a block is written.
+            lines += [line, *(indent + text if text else "" for text in inside)]
+            lines.append(indent + opening["fence"])
+            continue
         block = _block(opening["language"], opening["marks"], "\n".join(inside), number + 1)
         other = replacement(block)
         if other is not None:

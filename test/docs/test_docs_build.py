@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from docs_build.blocks import blocks
+from docs_build.blocks import blocks, replace_blocks
 from docs_build.diagrams import diagram
 from docs_build.equations import characters, with_equations
 from docs_build.hooks import prepared
@@ -46,6 +46,12 @@ def test_marks_of_a_block_are_read() -> None:
 def test_an_unknown_mark_is_refused() -> None:
     with pytest.raises(ValueError, match="Line 1: a block has the unknown mark 'runn'"):
         blocks("```sh runn\ntrue\n```")
+
+
+def test_a_block_without_a_language_is_shown_as_it_stands() -> None:
+    page = "````\n```sh run\nspacerobot scenarios\n```\n````\n```sh\ntrue\n```"
+    assert [block.text for block in blocks(page)] == ["true"]
+    assert replace_blocks(page, lambda block: None) == page
 
 
 def test_marks_are_not_on_the_page() -> None:
