@@ -110,7 +110,7 @@ def test_a_goal_is_reached_when_it_is_held_for_the_settling_time() -> None:
         assert loop.state == "tracking", "the time begins anew"
     loop.answer()
     assert loop.state == "reached"
-    assert_one_sentence(loop.status.sentence, "met")
+    assert_one_sentence(loop.status.sentence, "reached")
     assert (loop.status.goal_id, loop.status.state.level) == ("7", 0)
     loop.place = np.zeros(3)
     loop.answer(5)

@@ -128,7 +128,7 @@ def test_a_goal_is_reached_when_it_is_held_for_the_settling_time(harness: Harnes
         harness.settle(loop.probe)
         assert loop.status["state"] == "tracking"
     loop.answer()
-    assert_one_sentence(loop.wait_for("reached").message, "met")
+    assert_one_sentence(loop.wait_for("reached").message, "is reached")
 
 
 # -- gains ------------------------------------------------------------------------------------
