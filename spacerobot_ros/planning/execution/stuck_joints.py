@@ -29,8 +29,9 @@ class StuckJointWatch:
     Since it was last seen to follow, every joint has gone over some range and was commanded to go
     over another; a joint is stuck when it was commanded to move in N ticks or more and the first
     range is a small part of the second. So joints that are not commanded to move, slow ones, and
-    ones whose measurements are noisy are not taken for stuck. Where no joint moves at all they are
-    watched for longer: a plant that is restarted takes a while to receive commands.
+    ones whose measurements are noisy are not taken for stuck. Where no joint moves at all, or none
+    has moved for half of N ticks although several were commanded to, they are watched for longer:
+    a plant that is restarted takes a while to receive commands.
 
     Parameters
     ----------
@@ -58,6 +59,8 @@ class StuckJointWatch:
         self._window = np.full(n, self._ticks, dtype=np.int64)
         self._commanded = np.zeros(n)
         self._asked, self._gone = np.zeros((2, n)), np.zeros((2, n))
+        self._standstill_q, self._standstill_asked = np.full(n, np.inf), np.zeros(n)
+        self._standstill_ticks = 0
 
     def look(self, q: Array, wanted: Array, velocity: Array) -> list[int]:
         """Return which joints are stuck, mostly none.
@@ -73,6 +76,7 @@ class StuckJointWatch:
                 return []
             self._suspicious = True
             self._begin(np.ones(self._joints, dtype=np.bool_), q)
+        self._watch_standstill(q, velocity)
         _widen(self._gone, q)
         self._commanded += velocity * self._control_period
         _widen(self._asked, self._commanded)
@@ -84,7 +88,8 @@ class StuckJointWatch:
         stuck = due & (gone <= _STUCK_SHARE * asked) & (asked > self._band)
         moved = asked > self._band
         still = gone[moved] <= _STUCK_SHARE * asked[moved]
-        if np.count_nonzero(moved) > 1 and still.all() and self._window[due].max() < self._longest:
+        none_moves = (np.count_nonzero(moved) > 1 and still.all()) or self._at_standstill
+        if none_moves and self._window[due].max() < self._longest:
             # Joints do not all jam at once: commands do not arrive, perhaps not for long.
             stuck[:] = False
         follows = due & (gone >= _FOLLOWS_SHARE * asked)
@@ -92,6 +97,21 @@ class StuckJointWatch:
         self._window[due] *= 2
         self._begin(follows | stuck, q)
         return [int(i) for i in np.flatnonzero(stuck)]
+
+    def _watch_standstill(self, q: Array, velocity: Array) -> None:
+        """Note since when no joint has moved, and how far each was commanded to go meanwhile."""
+        if np.abs(q - self._standstill_q).max(initial=0.0) > self._band:
+            self._standstill_q[:] = q
+            self._standstill_asked[:] = 0.0
+            self._standstill_ticks = 0
+        self._standstill_asked += np.abs(velocity) * self._control_period
+        self._standstill_ticks += 1
+
+    @property
+    def _at_standstill(self) -> bool:
+        """Whether several joints were commanded to move for a while in which none has moved."""
+        asked = int(np.count_nonzero(self._standstill_asked > self._band))
+        return asked > 1 and 2 * self._standstill_ticks >= self._ticks
 
     def _begin(self, joints: npt.NDArray[np.bool_], q: Array) -> None:
         self._moving[joints], self._window[joints] = 0, self._ticks
