@@ -24,7 +24,7 @@ from spacerobot_ros import __version__
 from spacerobot_ros.bag import BagWriter, QosProfile, Recording, RecordingState
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns, header_stamp
+from spacerobot_ros.nodes.common.cdr import HEADER_STAMP, NANOSECONDS, first_time_ns
 from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode, RawInput, RawStream, Take
 from spacerobot_ros.nodes.common.process import run_node
@@ -310,7 +310,7 @@ class _Stamps:
 
     def time_ns(self, raw: bytes) -> int:
         """Return the time that a serialised message begins with, ns; 0 if it is before zero."""
-        stamp = header_stamp(raw)
+        stamp = raw[HEADER_STAMP]
         if stamp != self._stamp:
             self._stamp, self._time_ns = stamp, first_time_ns(raw)
         return self._time_ns

@@ -144,6 +144,8 @@ class CommandSource:
         Its name below the robot's namespace.
     quantity
         What its commands are.
+    limits
+        (size,) largest magnitude of each value.
     command
         (size,) what the actuators are to do now: joint by joint (m/s, rad/s, N or N m), or force
         (N) over torque (N m) at the origin of the base link, base components.
@@ -160,7 +162,7 @@ class CommandSource:
     """
 
     def __init__(self, topic: str, quantity: Quantity, limits: Array) -> None:
-        self.topic, self.quantity, self._limits = topic, quantity, limits
+        self.topic, self.quantity, self.limits = topic, quantity, limits
         self.command: Array = np.zeros(len(limits))
         self.stamp_ns: float = NEVER
         self.arrived = self.resting = False
@@ -179,16 +181,6 @@ class CommandSource:
         self.stamp_ns = stamp_ns
         self.arrived = True
         self.resting = False
-
-    def unsound(self, values: Array, *, clips: bool) -> Refusal | None:
-        """Return why values are refused whenever they come, if they are."""
-        # A sum is finite only if every term is; for a few numbers a list is summed fastest.
-        if not math.isfinite(sum(values.tolist())):
-            return Refusal(Reason.NOT_FINITE, f"a value is not finite: {values.tolist()}")
-        if not clips and np.any(np.abs(values) > self._limits):
-            limits = f"{values.tolist()} is beyond the limits {self._limits.tolist()}"
-            return Refusal(Reason.BEYOND_LIMITS, limits)
-        return None
 
 
 class CommandValidator:
@@ -330,9 +322,16 @@ class CommandValidator:
         return silent
 
     def _unsound(self, source: CommandSource, values: Array | CommandError) -> Refusal | None:
+        """Return why values are refused whenever they come, if they are."""
         if isinstance(values, CommandError):
             return Refusal(Reason.MALFORMED, str(values))
-        return source.unsound(values, clips=self._clips)
+        # A sum is finite only if every term is; for a few numbers a list is summed fastest.
+        if not math.isfinite(sum(values.tolist())):
+            return Refusal(Reason.NOT_FINITE, f"a value is not finite: {values.tolist()}")
+        if not self._clips and np.any(np.abs(values) > source.limits):
+            limits = f"{values.tolist()} is beyond the limits {source.limits.tolist()}"
+            return Refusal(Reason.BEYOND_LIMITS, limits)
+        return None
 
     def _untimely(self, source: CommandSource, stamp_ns: int, now_ns: int) -> Refusal | None:
         """Return why a command does not belong to this moment of real time, if it does not."""

@@ -40,7 +40,9 @@ _SIZES = {
     "uint32": 4, "int32": 4, "float": 4, "uint64": 8, "int64": 8, "double": 8,
 }  # fmt: skip
 _TIME = struct.Struct("<iI")
-_AFTER_STAMP = _ENCAPSULATION + _TIME.size
+HEADER_STAMP = slice(_ENCAPSULATION, _ENCAPSULATION + _TIME.size)
+"""Where the stamp of a serialised message is that begins with a header; bytes to compare."""
+
 NANOSECONDS = 1_000_000_000
 
 M = TypeVar("M")
@@ -157,11 +159,6 @@ class MessageTemplate:
 def stamp_bytes(time_ns: int) -> bytes:
     """Return a time as it stands in a serialised builtin_interfaces/Time."""
     return _TIME.pack(*divmod(time_ns, NANOSECONDS))
-
-
-def header_stamp(raw: bytes) -> bytes:
-    """Return the header stamp of a serialised message that begins with a header, to compare."""
-    return raw[_ENCAPSULATION:_AFTER_STAMP]
 
 
 def first_time_ns(raw: bytes) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from spacerobot_ros.nodes.common.cdr import header_stamp
+from spacerobot_ros.nodes.common.cdr import HEADER_STAMP
 
 
 class Pairing(str, Enum):
@@ -51,7 +51,6 @@ class StateSynchroniser:
         """The latest odom, serialised; empty before the first."""
         self.joint_states = b""
         """The latest joint_states, serialised; empty before the first."""
-        self._odom_stamp = self._joints_stamp = b""
         self._odom_fresh = self._joints_fresh = self._without_pose = False
         self._required: dict[str, bytes] = {}
         """Latest messages of the topics that are required beside odom and joint_states."""
@@ -65,12 +64,12 @@ class StateSynchroniser:
 
     def put_odom(self, raw: bytes) -> None:
         """Accept an odom message; poses are measured (again)."""
-        self.odom, self._odom_stamp = raw, header_stamp(raw)
+        self.odom = raw
         self._odom_fresh, self._without_pose = True, False
 
     def put_joint_states(self, raw: bytes) -> None:
         """Accept a joint_states message; see :meth:`overdue` for the state before."""
-        self.joint_states, self._joints_stamp = raw, header_stamp(raw)
+        self.joint_states = raw
         self._joints_fresh = True
 
     def put_required(self, topic: str, raw: bytes) -> None:
@@ -83,7 +82,8 @@ class StateSynchroniser:
 
     def ready(self) -> Pairing | None:
         """Hand over the state that is ready; None if there is none, or it was handed over."""
-        together = self._joints_stamp == self._odom_stamp
+        stamp = self.joint_states[HEADER_STAMP]
+        together = stamp == self.odom[HEADER_STAMP]
         if not self._pose_required:
             posed = self._odom_fresh and together
             self._odom_fresh = self._odom_fresh and not together
@@ -94,7 +94,7 @@ class StateSynchroniser:
         if (
             self._joints_fresh
             and (self._without_pose or (self._odom_fresh and together))
-            and all(header_stamp(raw) == self._joints_stamp for raw in self._required.values())
+            and all(raw[HEADER_STAMP] == stamp for raw in self._required.values())
         ):
             self._odom_fresh = self._joints_fresh = False
             return _WITHOUT_POSE if self._without_pose else _WHOLE
@@ -109,5 +109,5 @@ class StateSynchroniser:
         if not self._joints_fresh:
             return None
         self._joints_fresh = False
-        self._without_pose = self._joints_stamp != self._odom_stamp
+        self._without_pose = self.joint_states[HEADER_STAMP] != self.odom[HEADER_STAMP]
         return _WITHOUT_POSE if self._without_pose else _WHOLE
