@@ -89,6 +89,10 @@ docs: $(STAMP)/docs ## build the documentation site; see out/docs/index.html
 figures: $(STAMP)/docs ## compute the numbers of the documents again: docs/figures.json
 	$(BIN)/python3 -m docs_build.figures
 
+.PHONY: structure
+structure: ## count lines and modules of the package; AGAINST=PATH: of another checkout too
+	@$(PYTHON) -m docs_build.structure $(AGAINST)
+
 .PHONY: clean
 clean: ## remove .venv, caches, the site, and the demo's bag and report
 	rm -rf $(VENV) build/lib build/bdist.* spacerobot_ros.egg-info
