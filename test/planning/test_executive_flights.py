@@ -308,12 +308,14 @@ def searching() -> Searching:
 
 
 def wait(loop: Loop, goal_id: str, state: PlannerState = PlannerState.REACHED) -> None:
-    """Tick until this is the state of the goal; a thread that plans is left time for it."""
+    """Tick until this is the state of the goal; between ticks wait for a thread that plans."""
     end = time.monotonic() + 15.0
     while not any((s.goal_id, s.state) == (goal_id, state) for s in loop.statuses[-1:]):
         assert time.monotonic() < end, f"{goal_id} is not {state.value}: {loop.statuses}"
         loop.tick()
-        time.sleep(0.0002)
+        job = loop.executive._worker._job
+        if job is not None and job.is_alive():
+            job.join(0.005)
 
 
 def test_a_thread_plans_while_states_are_answered() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -236,6 +235,22 @@ def test_a_cancelled_plan_is_not_made(name: str) -> None:
     assert method.plan(requests(case)[0], Cancellation()).ticks > 0
 
 
+class Watched(Cancellation):
+    """Reports when a search has looked at it often enough to be in the middle."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.searched = threading.Event()
+        self._looks = 0
+
+    @property
+    def requested(self) -> bool:
+        self._looks += 1
+        if self._looks == 20:
+            self.searched.set()
+        return super().requested
+
+
 @pytest.mark.parametrize(
     "wrapped",
     [
@@ -258,7 +273,7 @@ def test_a_search_is_cancelled_from_another_thread(
     long = {"cache": 0, "intervals": 200, "starts": 1000, "answers": 1000, "time_budget": 1000.0}
     method = wrapped(robot, {"optimal": method_options("optimal", long)})
     case = replace(CASES["area_loop of six joints"], turns=((0.3, 0.2, -0.3),) * 2)
-    cancellation, ended = Cancellation(), list[BaseException]()
+    cancellation, ended = Watched(), list[BaseException]()
 
     def search() -> None:
         try:
@@ -268,7 +283,7 @@ def test_a_search_is_cancelled_from_another_thread(
 
     thread = threading.Thread(target=search, daemon=True)
     thread.start()
-    time.sleep(1.5)
+    assert cancellation.searched.wait(60.0)
     assert thread.is_alive()
     cancellation.cancel()
     # A step of the solver takes a fraction of a second.
