@@ -53,6 +53,10 @@ test-slow: $(STAMP)/test ## run the slow tests: long flights, builds with pip an
 fuzz: $(STAMP)/test ## try more than ten thousand inputs that nobody would send, and count them
 	SPACEROBOT_FUZZ=long $(BIN)/python3 -m pytest -q test/fuzz
 
+.PHONY: known-errors
+known-errors: $(STAMP)/test ## put each known error into the package; the tests must notice it; ONLY=WORD: some
+	PYTHONPATH=test $(BIN)/python3 -m support.known_errors $(ONLY)
+
 .PHONY: real-time
 real-time: $(STAMP)/demo ## fly ten minutes in real time in separate processes, at 100, then 200 and 500 Hz
 	$(BIN)/spacerobot bench --real-time 600 --rate 100

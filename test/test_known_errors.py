@@ -1,0 +1,104 @@
+"""The list of known errors fits the code; what tries them is itself tried on a small project."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+from support.known_errors import ROOT, KnownError, Outcome, Workplace, known_errors
+
+
+@cache
+def content(file: str) -> str:
+    return (ROOT / file).read_text("utf-8")
+
+
+def test_every_known_error_can_be_put_in_and_names_tests_that_exist() -> None:
+    errors = known_errors()
+    assert errors
+    problems = []
+    for error in errors:
+        try:
+            error.put_into(content(error.file))
+        except ValueError as problem:
+            problems.append(f"{error.source}: {problem}")
+        if not error.noticed_by:
+            problems.append(f"{error.source}: {error.line} No test notices it.")
+        for test in error.noticed_by:
+            file, *names = re.sub(r"\[.*", "", test).split("::")
+            if not (ROOT / file).is_file():
+                problems.append(f"{error.source}: there is no {file}.")
+            elif not all(re.search(rf"(def|class) {name}\b", content(file)) for name in names):
+                problems.append(f"{error.source}: {file} has no {'::'.join(names)}.")
+    assert not problems, "\n".join(problems)
+
+
+def test_no_error_is_listed_twice() -> None:
+    seen = [(error.file, error.before, error.after) for error in known_errors()]
+    assert len(seen) == len(set(seen))
+
+
+TEXT = """\
+def f(x):
+    if x > 0:
+        return 1
+
+    return x > 2
+"""
+
+
+def error(before: str, after: str) -> KnownError:
+    return KnownError("x.yaml", "x.py", before, after, "an error", ("test_x.py",))
+
+
+def test_a_text_within_a_line_is_replaced() -> None:
+    assert error("x > 0", "x >= 0").put_into(TEXT) == TEXT.replace("x > 0", "x >= 0")
+
+
+def test_lines_are_found_at_their_indent() -> None:
+    changed = error("if x > 0:\n    return 1\n\nreturn x > 2", "return 1\nreturn x").put_into(TEXT)
+    assert changed == "def f(x):\n    return 1\n    return x\n"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "sentence"),
+    [
+        ("x > 1", "x", "occurs 0 times"),
+        ("x > ", "x < ", "occurs 2 times"),
+        ("x > 0", "x > 0", "changes nothing"),
+        ("x > 0", "x > (", "is no Python"),
+        ("if x > 0:\nreturn 1", "pass", "occurs 0 times"),
+    ],
+)
+def test_what_does_not_fit_is_refused(before: str, after: str, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        error(before, after).put_into(TEXT)
+
+
+def test_an_entry_without_a_key_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.yaml").write_text("- {file: x.py, before: a, after: b}\n", "utf-8")
+    with pytest.raises(ValueError, match="has not the keys"):
+        known_errors(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_copy_says_what_the_tests_notice(tmp_path: Path) -> None:
+    project, module = tmp_path / "project", "spacerobot_ros/x.py"
+    for folder in ("spacerobot_ros", "test"):
+        (project / folder).mkdir(parents=True)
+    (project / module).write_text("def f(x):\n    return x + 1\n", "utf-8")
+    (project / "test" / "test_x.py").write_text(
+        "from spacerobot_ros.x import f\n\ndef test_f():\n    assert f(0) == 1\n", "utf-8"
+    )
+    place = Workplace(tmp_path / "copy", tmp_path / "cache", project)
+
+    def outcome(after: str, test: str) -> Outcome:
+        tests = (f"test/test_x.py::{test}",)
+        return place.try_error(KnownError("", module, "x + 1", after, "", tests))[0]
+
+    assert outcome("x + 2", "test_f") is Outcome.NOTICED
+    assert outcome("1 + x", "test_f") is Outcome.NOT_NOTICED
+    assert outcome("x + 2", "test_g") is Outcome.NOT_RUN
+    assert (tmp_path / "copy" / module).read_text("utf-8").endswith("x + 1\n")
