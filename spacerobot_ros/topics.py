@@ -297,6 +297,14 @@ _TABLE = (
         latched=True,
     ),
     Topic(
+        "plant/status",
+        _STATUS,
+        ("plant",),
+        "state of the plant, why, and the injected faults that are active: at once on every "
+        "change; `state` is inactive, running, resting, paused, latched or failed",
+        latched=True,
+    ),
+    Topic(
         "planner/status",
         _STATUS,
         ("planner",),
@@ -309,6 +317,13 @@ _TABLE = (
         ("coordinated_control",),
         "state of the controller, why, its goal, errors, and what saturation cost",
         latched=True,
+    ),
+    Topic(
+        "events",
+        _STATUS,
+        ("plant", "planner", "coordinated_control", "recorder", "replay"),
+        "one record for each change of state: `event` is its kind, `time` simulated, `wall_time` "
+        "since the epoch, both in s",
     ),
 )
 

@@ -221,6 +221,10 @@ class CommandValidator:
         """How many commands were refused, by reason."""
         self.fault = ""
         """Why nothing moves; empty while commands pass."""
+        self.fault_reason = ""
+        """The same as a word: that of the reason to refuse a command, ``abort``, ``watchdog``."""
+        self.timed_out = False
+        """Whether the last command was brought to rest because it was too old."""
 
     @property
     def complete(self) -> bool:
@@ -230,6 +234,11 @@ class CommandValidator:
             if source.required and not source.arrived:
                 return False
         return True
+
+    @property
+    def in_force(self) -> bool:
+        """Whether a command of any source is in force."""
+        return any(source.stamp_ns != NEVER for source in self.sources)
 
     def offer(
         self, source: CommandSource, stamp_ns: int, values: Array | CommandError, now_ns: int
@@ -287,19 +296,30 @@ class CommandValidator:
 
     def rest(self) -> None:
         """Command nothing any more."""
+        self.timed_out = False
         for source in self.sources:
             source.rest()
             source.arrived = False
 
-    def latch(self, sentence: str) -> None:
-        """Bring everything to rest until :meth:`rearm`; the first fault stays the one shown."""
-        self.fault = self.fault or sentence
+    def latch(self, reason: str, sentence: str) -> None:
+        """Bring everything to rest until :meth:`rearm`; the first fault stays the one shown.
+
+        Parameters
+        ----------
+        reason
+            A word: the value of a :class:`Reason`, ``abort`` or ``watchdog``.
+        sentence
+            What goes after "a fault is latched:".
+        """
+        if not self.fault:
+            self.fault, self.fault_reason = sentence, reason
+        self.timed_out = False
         for source in self.sources:
             source.rest()
 
     def rearm(self) -> str:
         """Let commands pass again; return the fault that was latched, empty if there was none."""
-        fault, self.fault = self.fault, ""
+        fault, self.fault, self.fault_reason = self.fault, "", ""
         return fault
 
     def require_commanded(self) -> None:
@@ -319,6 +339,7 @@ class CommandValidator:
             if self._timeout and source.stamp_ns != NEVER and age > self._timeout * _SECOND:
                 source.rest()
                 silent.append(source)
+        self.timed_out = self.timed_out or bool(silent)
         return silent
 
     def _unsound(self, source: CommandSource, values: Array | CommandError) -> Refusal | None:
@@ -355,7 +376,8 @@ class CommandValidator:
         self.counts[refusal.reason] += 1
         if refusal.reason not in self._latching or self.fault:
             return refusal
-        self.latch(f"a command on '{source.topic}' was refused: {refusal.clause}")
+        sentence = f"a command on '{source.topic}' was refused: {refusal.clause}"
+        self.latch(refusal.reason.value, sentence)
         return Refusal(refusal.reason, refusal.clause, latches=True)
 
 

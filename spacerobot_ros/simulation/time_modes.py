@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 
 from spacerobot_ros.simulation.commands import CommandValidator
 
@@ -14,18 +13,6 @@ _LONGEST_LAG = 10
 
 _CATCH_UP = 2
 """Ticks that a late plant takes at once: commands must get a word in between."""
-
-
-class PlantState(str, Enum):
-    """What a plant does with time and with commands."""
-
-    INACTIVE = "inactive"
-    """It publishes nothing and takes no command."""
-    RUNNING = "running"
-    PAUSED = "paused"
-    """Time stands still; commands are taken."""
-    LATCHED = "latched"
-    """Time goes on with everything at rest, until the fault is rearmed."""
 
 
 class Lockstep:

@@ -28,7 +28,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("control",),  # above planning, whose goals it takes
         ("planning",),
         ("model",),
-        ("parameters", "resources", "topics"),
+        ("events", "parameters", "resources", "topics"),
         ("errors",),
         ("__init__",),
     ),

@@ -26,10 +26,12 @@ PLANT = {
     "marker_period": 0.5,
     "diagnostics_period": 0.5,
 }
-LATCHED_TOPICS = ("/robot_description", "/gait_schedule", "/planned_path", "/planner/status")
+LATCHED_TOPICS = (
+    "/robot_description", "/gait_schedule", "/planned_path", "/planner/status", "/plant/status",
+)  # fmt: skip
 STREAMS = (
     "/clock", "/odom", "/base_pose", "/joint_states", "/joint_commands", "/momentum", "/markers",
-    "/diagnostics", "/goal_pose",
+    "/diagnostics", "/goal_pose", "/events",
 )  # fmt: skip
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 import traceback
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import State
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -29,13 +31,18 @@ from rclpy.timer import Timer
 from std_msgs.msg import String
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import robot_from_text, robot_of
 from spacerobot_ros.nodes.common.cdr import raw_publish
+from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """State and commands: reliable, deep enough for a reader that is briefly busy."""
+
+EVENTS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+"""Events: none may be lost, and a late subscriber gets none of before."""
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -140,6 +147,8 @@ class FlightNode(LifecycleNode):
             self._autostart = bool(values[AUTOSTART.name])
             self.config = configured(self.Config, values)
             self.add_on_set_parameters_callback(self._on_set_parameters)
+            self._events = self.create_publisher(DiagnosticStatus, "events", EVENTS)
+            self.prepare()
             self._permanent = set(self._entities())
             if self._autostart if autostart is None else autostart:
                 self.start()
@@ -188,6 +197,12 @@ class FlightNode(LifecycleNode):
         self.create_subscription(kind, topic, lambda raw: stream.take(raw), STREAM, raw=True)
         self.raw_streams.append(stream)
 
+    def report_event(self, event: Event) -> None:
+        """Publish an event of this node, once."""
+        values = event.to_values(time.time())
+        name, level = self.get_fully_qualified_name(), bytes([event.level])
+        self._events.publish(diagnostic_status(name, level, event.sentence, values))
+
     @property
     def parameter_values(self) -> dict[str, Value]:
         """The value of every parameter by its full name."""
@@ -205,6 +220,9 @@ class FlightNode(LifecycleNode):
         self._state_machine = None
 
     # -- hooks --------------------------------------------------------------------------------
+
+    def prepare(self) -> None:
+        """Create what stays from the construction of the node to its end, such as its status."""
 
     def configure(self) -> None:
         """Create what the node needs: model, publishers, subscriptions."""

@@ -6,6 +6,7 @@ import sys
 from functools import partial
 from typing import Any, ClassVar
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -15,7 +16,8 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import robot_of
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
-from spacerobot_ros.nodes.common.node import STREAM, FlightNode
+from spacerobot_ros.nodes.common.messages import diagnostic_status
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.plant.command_messages import CommandReader
 from spacerobot_ros.nodes.plant.diagnostics import PlantReport
@@ -25,13 +27,14 @@ from spacerobot_ros.simulation.building import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.reported_state import ReportedState
-from spacerobot_ros.simulation.time_modes import Lockstep, PlantState, RealTime
+from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
+from spacerobot_ros.simulation.time_modes import Lockstep, RealTime
 
 _LOOK_PERIOD = 0.1
 """How often a plant looks for new subscribers and commanders, wall s."""
 
 # Looked up for every command: an enum takes its time to find a member.
-_INACTIVE, _RUNNING = PlantState.INACTIVE, PlantState.RUNNING
+_INACTIVE, _RUNNING, _RESTING = PlantState.INACTIVE, PlantState.RUNNING, PlantState.RESTING
 
 
 class PlantNode(FlightNode):
@@ -48,7 +51,9 @@ class PlantNode(FlightNode):
     def __init__(self, name: str = "plant", **kwargs: Any) -> None:
         self._active = PlantState.INACTIVE
         self._when_active = PlantState.RUNNING
-        self._tick = 0
+        self._tick, self._period_ns = 0, 1
+        self.status = PlantStatus(PlantState.INACTIVE)
+        """What was published last on plant/status."""
         super().__init__(name, **kwargs)
 
     @property
@@ -64,10 +69,14 @@ class PlantNode(FlightNode):
     @property
     def state(self) -> PlantState:
         """What the plant does with time and with commands."""
-        latched = self._active is PlantState.RUNNING and self._commands.fault
-        return PlantState.LATCHED if latched else self._active
+        return self.status.state
 
     # -- life ---------------------------------------------------------------------------------
+
+    def prepare(self) -> None:
+        """Publish the status from the beginning: an unconfigured plant is inactive."""
+        self._status = self.create_publisher(DiagnosticStatus, "plant/status", LATCHED)
+        self._publish_status(PlantStatus(PlantState.INACTIVE, "The plant is not configured."))
 
     def configure(self) -> None:
         """Build the plant and its topics; nothing is published yet."""
@@ -90,6 +99,9 @@ class PlantNode(FlightNode):
             self._lockstep = Lockstep(self._commands)
         else:
             self._real_time = RealTime(self._period_ns, config.real_time_factor)
+        self._monitor = PlantMonitor(
+            self._commands, self.plant, lockstep=self._lockstep is not None
+        )
         self._publisher = StatePublisher(self, robot, self._reported, config.world_frame)
         self._markers = LinkMarkers(self, self.plant, config.world_frame)
         self._report = PlantReport(self, self.plant, self._commands, self._real_time)
@@ -104,6 +116,7 @@ class PlantNode(FlightNode):
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/abort", self._on_abort)
         self.create_service(Trigger, "~/rearm", self._on_rearm)
+        self._publish_status(self._monitor.status)
 
     def activate(self) -> None:
         """Publish the robot and its present state, and from now on step."""
@@ -120,6 +133,7 @@ class PlantNode(FlightNode):
                 self.create_timer(_LOOK_PERIOD, self._count_commanders, clock=steady),
             ]
         self._publish()
+        self._look_at_status()
 
     def deactivate(self) -> None:
         """Stop time; nothing is commanded when it goes on."""
@@ -129,6 +143,24 @@ class PlantNode(FlightNode):
             self.destroy_timer(timer)
         self._active = PlantState.INACTIVE
         self._commands.rest()
+        self._look_at_status()
+
+    def cleanup(self) -> None:
+        """Say that there is no plant any more."""
+        self._publish_status(PlantStatus(PlantState.INACTIVE, "The plant is not configured."))
+
+    def _look_at_status(self) -> None:
+        """Publish the status and what has happened, if anything has."""
+        events = self._monitor.update(self._active, self.time_ns / NANOSECONDS)
+        if self._monitor.status is not self.status:
+            self._publish_status(self._monitor.status)
+        for event in events:
+            self.report_event(event)
+
+    def _publish_status(self, status: PlantStatus) -> None:
+        self.status = status
+        name, level = self.get_fully_qualified_name(), bytes([status.level])
+        self._status.publish(diagnostic_status(name, level, status.sentence, status.to_values()))
 
     def _resumed(self, robot: SpaceRobot) -> tuple[InitialState | None, int]:
         """Return the state to start from (None: the configuration's) and its tick.
@@ -174,6 +206,8 @@ class PlantNode(FlightNode):
             self._report.limited()
         self._tick += 1
         self._publish()
+        if self._monitor.faults_changed:
+            self._look_at_status()
 
     def _publish(self) -> None:
         now = self._tick * self._period_ns
@@ -195,8 +229,11 @@ class PlantNode(FlightNode):
             return
         for _ in range(real_time.due(self._steady.now().nanoseconds, self._tick)):
             real_time.count_tick(self._steady.now().nanoseconds, self._tick)
-            for source in self._commands.drop_old(self.time_ns):
+            silent = self._commands.drop_old(self.time_ns)
+            for source in silent:
                 self._report.timed_out(source, self.config.command_timeout)
+            if silent:
+                self._look_at_status()
             self._step()
 
     def _on_look_round(self) -> None:
@@ -229,6 +266,10 @@ class PlantNode(FlightNode):
         refusal = reader.offer(self._commands, raw, self._tick * self._period_ns)
         if refusal is not None:
             self._report.refused(reader.source, refusal)
+            if refusal.latches:
+                self._look_at_status()
+        elif self.status.state is _RESTING:
+            self._look_at_status()
         if self._real_time is None:
             self._step_if_complete()
         elif reader.source is self._commands.sources[0]:
@@ -245,27 +286,35 @@ class PlantNode(FlightNode):
             self.plant.inject(message.data)
         except ParameterError as error:
             self.get_logger().warning(str(error))
+            return
+        self._look_at_status()
 
     # -- services -----------------------------------------------------------------------------
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.plant.reset()
         self._commands.rest()
+        self._monitor.resets += 1
         response.success = True
         response.message = "The robot is back in its initial state; time goes on."
         if self._active is not PlantState.INACTIVE:
             self._publish()
+        self._look_at_status()
         return response
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._commands.latch("aborted on request")
+        self._commands.latch("abort", "aborted on request")
         self._report.latched()
+        self._look_at_status()
         response.success = True
         response.message = "The joints come to rest; nothing moves until '~/rearm' is called."
         return response
 
     def _on_rearm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         fault = self._commands.rearm()
+        if fault:
+            self._monitor.rearms += 1
+            self._look_at_status()
         response.success = True
         response.message = (
             f"Commands pass again after: {fault}." if fault else "No fault was latched."
@@ -277,6 +326,7 @@ class PlantNode(FlightNode):
         before = self._active
         if before is not PlantState.INACTIVE:
             self._active = self._when_active
+        self._look_at_status()
         if (before, self._active) == (PlantState.PAUSED, PlantState.RUNNING):
             if self._real_time is None:
                 self._step_if_complete()

@@ -1,0 +1,107 @@
+"""Events of a flight: one record for each change of state of a node, as the topic events has it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+from spacerobot_ros.errors import SpaceRobotError
+
+
+class EventKind(str, Enum):
+    """What has happened; the value is the word ``event`` of the message."""
+
+    CONFIGURED = "configured"
+    ACTIVATED = "activated"
+    DEACTIVATED = "deactivated"
+    CLEANED_UP = "cleaned_up"
+    SHUT_DOWN = "shut_down"
+    FAILED = "failed"
+    """A node has met an error and works no more until it is configured or activated again."""
+
+    RUNNING = "running"
+    RESTING = "resting"
+    PAUSED = "paused"
+    RESUMED = "resumed"
+    RESET = "reset"
+    LATCHED = "latched"
+    REARMED = "rearmed"
+    FAULT_INJECTED = "fault_injected"
+    """A fault begins to act."""
+    FAULT_ENDED = "fault_ended"
+    FAULTS_CLEARED = "faults_cleared"
+
+    GOAL_ACCEPTED = "goal_accepted"
+    GOAL_REFUSED = "goal_refused"
+    GOAL_REACHED = "goal_reached"
+    GOAL_FAILED = "goal_failed"
+    GOAL_ABORTED = "goal_aborted"
+    PLAN_STARTED = "plan_started"
+    PLAN_READY = "plan_ready"
+    CORRECTION = "correction"
+    STUCK_JOINT = "stuck_joint"
+
+    RECORDING = "recording"
+    RECORDING_PAUSED = "recording_paused"
+    RECORDING_FAILED = "recording_failed"
+    FILE_SPLIT = "file_split"
+
+    NODE_SILENT = "node_silent"
+    NODE_BACK = "node_back"
+
+
+@dataclass(frozen=True)
+class Event:
+    """One change of state.
+
+    Attributes
+    ----------
+    kind
+        What has happened.
+    sentence
+        The same for people.
+    level
+        Of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR.
+    time_s
+        Simulated time, s; None where the node does not know it.
+    goal_id
+        The goal that the event is about; empty: none.
+    about
+        What else the event is about, by name.
+    """
+
+    kind: EventKind
+    sentence: str
+    level: int = 0
+    time_s: float | None = None
+    goal_id: str = ""
+    about: Mapping[str, str] = field(default_factory=dict)
+
+    def to_values(self, wall_time_s: float) -> dict[str, str]:
+        """Return the event as the key-value pairs of a DiagnosticStatus, sent at a wall time."""
+        values = {"event": self.kind.value}
+        if self.time_s is not None:
+            values["time"] = f"{self.time_s:.9f}"
+        values["wall_time"] = f"{wall_time_s:.6f}"
+        if self.goal_id:
+            values["goal_id"] = self.goal_id
+        return values | dict(self.about)
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, str], sentence: str = "", level: int = 0) -> Event:
+        """Return the event that :meth:`to_values` has turned into these pairs.
+
+        Raises
+        ------
+        SpaceRobotError
+            They are no event.
+        """
+        given = dict(values)
+        try:
+            kind, time = EventKind(given.pop("event")), given.pop("time", None)
+            time_s = None if time is None else float(time)
+        except (KeyError, ValueError) as error:
+            raise SpaceRobotError(f"This is no event of a flight: {error}.") from error
+        given.pop("wall_time", None)
+        return cls(kind, sentence, level, time_s, given.pop("goal_id", ""), given)

@@ -1,0 +1,236 @@
+"""What a plant reports of itself: whether it moves, why not, and what is injected."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import Enum
+
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.simulation.commands import CommandValidator
+from spacerobot_ros.simulation.faults import FaultyPlant
+
+_SEPARATOR = "; "
+
+
+class PlantState(str, Enum):
+    """What a plant does with time and with commands; the value of ``state`` in plant/status."""
+
+    INACTIVE = "inactive"
+    """It publishes no states and accepts no command."""
+    RUNNING = "running"
+    """A command is in force; in lockstep also: it waits for one."""
+    RESTING = "resting"
+    """Time goes on and no command is in force: none has come yet, or the last is too old."""
+    PAUSED = "paused"
+    """Time stands still; commands are accepted."""
+    LATCHED = "latched"
+    """Time goes on with everything at rest, until the fault is rearmed."""
+    FAILED = "failed"
+    """An error has stopped it: it is inactive until it is configured or activated again."""
+
+
+@dataclass(frozen=True)
+class PlantStatus:
+    """A status of the plant, as plant/status carries it.
+
+    Attributes
+    ----------
+    state
+        What it does.
+    sentence
+        The same for people, with the reason.
+    reason
+        Why, as a word. Latched, or paused and latched: the word of the reason to refuse a command,
+        ``abort`` or ``watchdog``; resting: ``no_command`` or ``timeout``; failed: ``model`` or
+        ``exception``; empty otherwise.
+    latched_fault
+        Why nothing moves until ``~/rearm``, in whatever state the plant is; empty: nothing is
+        latched.
+    time_s
+        Simulated time since which it is so, s.
+    rearms, resets
+        How often the plant was rearmed and reset: a subscriber that missed a status still notices.
+    faults
+        The injected faults that are active, each as its line.
+    """
+
+    state: PlantState
+    sentence: str = ""
+    reason: str = ""
+    latched_fault: str = ""
+    time_s: float = 0.0
+    rearms: int = 0
+    resets: int = 0
+    faults: tuple[str, ...] = ()
+
+    @property
+    def level(self) -> int:
+        """Level of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR."""
+        if self.latched_fault or self.state in (PlantState.LATCHED, PlantState.FAILED):
+            return 2
+        return 1 if self.reason == "timeout" or self.faults else 0
+
+    def to_values(self) -> dict[str, str]:
+        """Return the status as the key-value pairs of a DiagnosticStatus."""
+        return {
+            "state": self.state.value,
+            "reason": self.reason,
+            "latched_fault": self.latched_fault,
+            "time_s": f"{self.time_s:.9f}",
+            "rearms": str(self.rearms),
+            "resets": str(self.resets),
+            "faults": _SEPARATOR.join(self.faults),
+        }
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, str], sentence: str = "") -> PlantStatus:
+        """Return the status that :meth:`to_values` has turned into these pairs.
+
+        Raises
+        ------
+        SpaceRobotError
+            They are no status of a plant.
+        """
+        try:
+            faults = values.get("faults", "")
+            return cls(
+                state=PlantState(values["state"]),
+                sentence=sentence,
+                reason=values.get("reason", ""),
+                latched_fault=values.get("latched_fault", ""),
+                time_s=float(values.get("time_s", "0")),
+                rearms=int(values.get("rearms", "0")),
+                resets=int(values.get("resets", "0")),
+                faults=tuple(faults.split(_SEPARATOR)) if faults else (),
+            )
+        except (KeyError, ValueError) as error:
+            raise SpaceRobotError(f"This is no status of a plant: {error}.") from error
+
+
+class PlantMonitor:
+    """Follows what a plant does, and says what has changed.
+
+    Parameters
+    ----------
+    commands, plant
+        What is followed.
+    lockstep
+        Whether the plant waits for commands, and so never rests without one.
+    """
+
+    def __init__(self, commands: CommandValidator, plant: FaultyPlant, *, lockstep: bool) -> None:
+        self._commands, self._plant, self._lockstep = commands, plant, lockstep
+        self._faults = plant.active
+        self.rearms = self.resets = 0
+        """How often the plant was rearmed and reset; for the owner to count."""
+        self.status = PlantStatus(PlantState.INACTIVE, "The plant is inactive.")
+        """The status of the last update."""
+        self.failure = "", ""
+        """Reason and sentence of the error that stopped the plant; for the owner to set."""
+
+    @property
+    def faults_changed(self) -> bool:
+        """Whether other faults are active than at the last update."""
+        return self._plant.active is not self._faults
+
+    def update(self, activity: PlantState, time_s: float) -> list[Event]:
+        """Take up what has changed.
+
+        Parameters
+        ----------
+        activity
+            What the plant does with time: inactive, running, paused or failed.
+        time_s
+            Simulated time, s.
+
+        Returns
+        -------
+        list[Event]
+            What has happened; empty if the status is still true.
+        """
+        before, self._faults = self.status, self._plant.active
+        now = replace(
+            self._status(activity),
+            time_s=before.time_s,
+            rearms=self.rearms,
+            resets=self.resets,
+            faults=tuple(str(fault) for fault in self._faults),
+        )
+        if now == before:
+            return []
+        self.status = replace(now, time_s=time_s)
+        return _events(before, self.status)
+
+    def _status(self, activity: PlantState) -> PlantStatus:
+        """Return state, sentence and reason of this moment."""
+        commands, fault = self._commands, self._commands.fault
+        match activity:
+            case PlantState.INACTIVE:
+                sentence = "The plant is inactive"
+                if fault:
+                    sentence += f", and a fault is latched: {fault}"
+            case PlantState.FAILED:
+                reason, sentence = self.failure
+                return PlantStatus(activity, sentence, reason, fault)
+            case PlantState.PAUSED:
+                sentence = "Time stands still until '~/pause' ends it"
+                if fault:
+                    sentence += f", and a fault is latched: {fault}"
+            case _ if fault:
+                activity = PlantState.LATCHED
+                sentence = f"Nothing moves until '~/rearm' is called: {fault}"
+            case _ if self._lockstep:
+                sentence = "Every tick takes the command that answers its state"
+            case _ if commands.in_force:
+                sentence = "A command is in force"
+            case _:
+                activity = PlantState.RESTING
+                if commands.timed_out:
+                    sentence = "The joints are brought to rest: the last command is too old"
+                    return PlantStatus(activity, f"{sentence}.", "timeout")
+                sentence = "The joints rest until a command arrives"
+                return PlantStatus(activity, f"{sentence}.", "no_command")
+        return PlantStatus(activity, f"{sentence}.", commands.fault_reason, fault)
+
+
+def _events(before: PlantStatus, now: PlantStatus) -> list[Event]:
+    """Return what has happened between two statuses, in an order in which it can have happened."""
+    events: list[Event] = []
+
+    def add(kind: EventKind, sentence: str, level: int = 0, **about: str) -> None:
+        events.append(Event(kind, sentence, level, now.time_s, about=about))
+
+    if now.resets != before.resets:
+        add(EventKind.RESET, "The robot is back in its initial state.")
+    if now.rearms != before.rearms:
+        add(EventKind.REARMED, "Commands pass again.")
+    if now.latched_fault and now.latched_fault != before.latched_fault:
+        sentence = f"A fault is latched: {now.latched_fault}."
+        add(EventKind.LATCHED, sentence, 2, reason=now.reason)
+    for fault in now.faults:
+        if fault not in before.faults:
+            add(EventKind.FAULT_INJECTED, f"A fault begins: {fault}.", 1, fault=fault)
+    ended = [fault for fault in before.faults if fault not in now.faults]
+    for fault in ended:
+        add(EventKind.FAULT_ENDED, f"A fault has ended: {fault}.", fault=fault)
+    if ended and not now.faults:
+        add(EventKind.FAULTS_CLEARED, "No fault is active any more.")
+    if now.state is not before.state:
+        if before.state is PlantState.PAUSED and now.state is not PlantState.INACTIVE:
+            add(EventKind.RESUMED, "Time goes on.")
+        match now.state:
+            case PlantState.RUNNING:
+                add(EventKind.RUNNING, now.sentence)
+            case PlantState.RESTING:
+                level = 1 if now.reason == "timeout" else 0
+                add(EventKind.RESTING, now.sentence, level, reason=now.reason)
+            case PlantState.PAUSED:
+                add(EventKind.PAUSED, now.sentence)
+            case _:
+                pass  # Latched has its event already; activation and failures have those of a node.
+    elif now.reason != before.reason and now.state is PlantState.RESTING:
+        level = 1 if now.reason == "timeout" else 0
+        add(EventKind.RESTING, now.sentence, level, reason=now.reason)
+    return events

@@ -1,0 +1,171 @@
+"""What a plant reports of itself, without ROS: each change once, with its reason."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.commands import CommandValidator
+from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
+
+SECOND = 10**9
+SLIDERS = SpaceRobot.from_file(robot_file("sliding_masses"))
+FAST = np.array([0.1, 0.2, -0.3])
+
+
+class Rig:
+    """A plant, its commands and what follows them."""
+
+    def __init__(self, time_mode: str = "realtime", **parameters: Any) -> None:
+        config = PlantConfig(time_mode=time_mode, command_timeout=0.5, **parameters)
+        self.plant = build_plant(SLIDERS, config)
+        self.commands = CommandValidator(self.plant, config)
+        self.monitor = PlantMonitor(self.commands, self.plant, lockstep=time_mode == "lockstep")
+        self.now = 0
+
+    def events(self, activity: PlantState = PlantState.RUNNING) -> list[EventKind]:
+        """Update at this moment; what is true already is never reported again."""
+        events = self.monitor.update(activity, self.now / SECOND)
+        assert all(event.time_s == self.now / SECOND for event in events)
+        assert self.monitor.update(activity, self.now / SECOND + 1.0) == []
+        return [event.kind for event in events]
+
+    @property
+    def state(self) -> tuple[PlantState, str]:
+        return self.monitor.status.state, self.monitor.status.reason
+
+    def command(self) -> None:
+        assert self.commands.offer(self.commands.sources[0], self.now, FAST, self.now) is None
+
+
+def test_a_plant_in_real_time_rests_until_commanded_and_again_when_commands_are_old() -> None:
+    rig = Rig()
+    assert rig.events() == [EventKind.RESTING]
+    assert rig.state == (PlantState.RESTING, "no_command")
+    assert rig.monitor.status.level == 0
+    rig.now = SECOND
+    rig.command()
+    assert rig.events() == [EventKind.RUNNING]
+    assert rig.state == (PlantState.RUNNING, "")
+    rig.now = 2 * SECOND
+    rig.commands.drop_old(rig.now)
+    assert rig.events() == [EventKind.RESTING]
+    assert rig.state == (PlantState.RESTING, "timeout")
+    assert rig.monitor.status.level == 1
+    assert rig.monitor.status.time_s == 2.0
+    rig.commands.rest()
+    assert rig.events() == [EventKind.RESTING], "another reason"
+    assert rig.state == (PlantState.RESTING, "no_command")
+
+
+def test_a_plant_in_lockstep_that_waits_is_running() -> None:
+    rig = Rig("lockstep")
+    assert rig.events() == [EventKind.RUNNING]
+    rig.command()
+    assert rig.events() == []
+
+
+def test_a_latched_fault_shows_in_every_state() -> None:
+    rig = Rig()
+    rig.command()
+    rig.events()
+    rig.commands.latch("abort", "aborted on request")
+    assert rig.events() == [EventKind.LATCHED]
+    assert rig.state == (PlantState.LATCHED, "abort")
+    rig.commands.latch("watchdog", "a second fault")
+    assert rig.events() == [], "the first one stays"
+    assert rig.events(PlantState.PAUSED) == [EventKind.PAUSED]
+    assert rig.state == (PlantState.PAUSED, "abort")
+    assert rig.monitor.status.latched_fault == "aborted on request"
+    assert rig.monitor.status.level == 2
+    assert rig.events(PlantState.INACTIVE) == []
+    assert rig.state == (PlantState.INACTIVE, "abort")
+    assert rig.events() == []
+    assert rig.state == (PlantState.LATCHED, "abort")
+    rig.commands.rearm()
+    rig.monitor.rearms += 1
+    assert rig.events() == [EventKind.REARMED, EventKind.RESTING]
+    assert rig.monitor.status.rearms == 1
+    assert rig.monitor.status.latched_fault == ""
+
+
+def test_a_fault_that_latches_while_time_stands_still_is_reported_at_once() -> None:
+    rig = Rig()
+    rig.events(PlantState.PAUSED)
+    rig.commands.latch("abort", "aborted on request")
+    assert rig.events(PlantState.PAUSED) == [EventKind.LATCHED]
+    assert rig.state == (PlantState.PAUSED, "abort")
+    assert rig.events() == [EventKind.RESUMED]
+    assert rig.state == (PlantState.LATCHED, "abort")
+
+
+def test_a_reset_is_reported_even_where_the_state_stays() -> None:
+    rig = Rig("lockstep")
+    rig.events()
+    rig.monitor.resets += 1
+    assert rig.events() == [EventKind.RESET]
+    assert rig.monitor.status.resets == 1
+
+
+def test_faults_begin_and_end_one_by_one() -> None:
+    rig = Rig("lockstep", faults=("joint_slow slider_1 0.5 at 0 until 0.1",))
+    assert rig.events() == [EventKind.FAULT_INJECTED, EventKind.RUNNING]
+    assert len(rig.monitor.status.faults) == 1
+    rig.plant.inject("joint_stuck slider_2\njoint_slow slider_3 0.25")
+    assert rig.monitor.faults_changed
+    assert rig.events() == [EventKind.FAULT_INJECTED] * 2
+    assert not rig.monitor.faults_changed
+    rig.plant.step(FAST)
+    rig.plant.step(FAST)
+    assert rig.events() == [EventKind.FAULT_ENDED]
+    assert rig.monitor.status.faults == (
+        "joint_stuck slider_2 at 0",
+        "joint_slow slider_3 0.25 at 0",
+    )
+    rig.plant.inject("clear")
+    assert rig.events() == [EventKind.FAULT_ENDED] * 2 + [EventKind.FAULTS_CLEARED]
+    assert rig.monitor.status.faults == ()
+
+
+def test_a_failure_says_why() -> None:
+    rig = Rig()
+    rig.monitor.failure = "exception", "The plant has failed: no luck."
+    rig.events(PlantState.FAILED)
+    assert rig.state == (PlantState.FAILED, "exception")
+    assert rig.monitor.status.sentence == "The plant has failed: no luck."
+    assert rig.monitor.status.level == 2
+
+
+@pytest.mark.parametrize("state", PlantState)
+def test_a_status_survives_its_message(state: PlantState) -> None:
+    status = PlantStatus(
+        state, "Why.", "abort", "aborted on request", 1.25, 3, 4, ("a at 0", "b at 1 until 2")
+    )
+    assert PlantStatus.from_values(status.to_values(), "Why.") == status
+    assert PlantStatus.from_values(PlantStatus(state).to_values()) == PlantStatus(state)
+
+
+@pytest.mark.parametrize("values", [{}, {"state": "asleep"}, {"state": "paused", "resets": "x"}])
+def test_what_is_no_status_is_refused(values: dict[str, str]) -> None:
+    with pytest.raises(SpaceRobotError, match="no status of a plant"):
+        PlantStatus.from_values(values)
+
+
+def test_an_event_survives_its_message() -> None:
+    event = Event(EventKind.GOAL_REACHED, "It is reached.", 0, 2.5, "7", {"error": "0.1"})
+    values = event.to_values(1e9)
+    assert values["event"] == "goal_reached"
+    assert float(values["time"]) == 2.5
+    assert float(values["wall_time"]) == 1e9
+    assert Event.from_values(values, "It is reached.") == event
+    assert "time" not in Event(EventKind.NODE_SILENT, "").to_values(0.0)
+    with pytest.raises(SpaceRobotError, match="no event"):
+        Event.from_values({"event": "lunch"})
