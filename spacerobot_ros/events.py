@@ -78,12 +78,19 @@ class Event:
     goal_id: str = ""
     about: Mapping[str, str] = field(default_factory=dict)
 
-    def to_values(self, wall_time_s: float) -> dict[str, str]:
-        """Return the event as the key-value pairs of a DiagnosticStatus, sent at a wall time."""
+    def to_values(self, wall_time_s: float | None) -> dict[str, str]:
+        """Return the event as the key-value pairs of a DiagnosticStatus.
+
+        Parameters
+        ----------
+        wall_time_s
+            When it is sent, s since the epoch; None leaves it out.
+        """
         values = {"event": self.kind.value}
         if self.time_s is not None:
             values["time"] = f"{self.time_s:.9f}"
-        values["wall_time"] = f"{wall_time_s:.6f}"
+        if wall_time_s is not None:
+            values["wall_time"] = f"{wall_time_s:.6f}"
         if self.goal_id:
             values["goal_id"] = self.goal_id
         return values | dict(self.about)

@@ -323,7 +323,7 @@ _TABLE = (
         _STATUS,
         ("plant", "planner", "coordinated_control", "recorder", "replay"),
         "one record for each change of state: `event` is its kind, `time` simulated, `wall_time` "
-        "since the epoch, both in s",
+        "since the epoch (not in a lockstep run in one process), both in s",
     ),
 )
 

@@ -254,6 +254,7 @@ class InProcessStack(Stack):
             )
         except SpaceRobotError as error:
             raise ParameterError(f"Node '{name}': {error}") from error
+        node.events_have_wall_time = not self.scenario.lockstep
         self._nodes.append(node)
         return node
 

@@ -166,6 +166,6 @@ def test_an_event_survives_its_message() -> None:
     assert float(values["time"]) == 2.5
     assert float(values["wall_time"]) == 1e9
     assert Event.from_values(values, "It is reached.") == event
-    assert "time" not in Event(EventKind.NODE_SILENT, "").to_values(0.0)
+    assert Event(EventKind.NODE_SILENT, "").to_values(None) == {"event": "node_silent"}
     with pytest.raises(SpaceRobotError, match="no event"):
         Event.from_values({"event": "lunch"})

@@ -141,6 +141,8 @@ class FlightNode(LifecycleNode):
         """Called with an exit code by a node that has nothing left to do."""
         self.raw_streams: list[RawStream] = []
         """What passes through the node as bytes, from its configuration to its cleanup."""
+        self.events_have_wall_time = True
+        """Off in a run that is to be repeatable to the last message."""
         self._raising = False
         try:
             values = _declare(self, (AUTOSTART, *declared(self.Config)))
@@ -199,7 +201,7 @@ class FlightNode(LifecycleNode):
 
     def report_event(self, event: Event) -> None:
         """Publish an event of this node, once."""
-        values = event.to_values(time.time())
+        values = event.to_values(time.time() if self.events_have_wall_time else None)
         name, level = self.get_fully_qualified_name(), bytes([event.level])
         self._events.publish(diagnostic_status(name, level, event.sentence, values))
 
