@@ -76,6 +76,27 @@ def test_a_supervisor_can_take_the_plant_through_its_life(harness: Harness) -> N
     assert not plant.is_active
 
 
+def test_a_transition_that_is_not_possible_is_answered_and_changes_nothing(
+    harness: Harness,
+) -> None:
+    rig = Rig(harness)
+    change = rig.probe.create_client(ChangeState, "plant/change_state")
+
+    def succeeds(**transition: Any) -> bool:
+        request = ChangeState.Request(transition=Transition(**transition))
+        return bool(harness.call(change, request).success)
+
+    for number in (Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_CLEANUP, 99):
+        assert not succeeds(id=number)
+    assert not succeeds(label="configure")
+    assert rig.plant.is_active
+    np.testing.assert_array_equal(rig.step([0.2, 0.0, 0.0]).velocity, [0.2, 0.0, 0.0])
+    assert succeeds(label="deactivate")
+    assert not succeeds(id=Transition.TRANSITION_DEACTIVATE)
+    assert succeeds(id=Transition.TRANSITION_INACTIVE_SHUTDOWN)
+    assert not succeeds(id=Transition.TRANSITION_INACTIVE_SHUTDOWN)
+
+
 def test_a_deactivated_lockstep_plant_takes_no_command(harness: Harness) -> None:
     rig = Rig(harness)
     rig.plant.trigger_deactivate()

@@ -12,12 +12,14 @@ from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import State
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
@@ -144,6 +146,7 @@ class FlightNode(LifecycleNode):
         self.events_have_wall_time = True
         """Off in a run that is to be repeatable to the last message."""
         self._raising = False
+        self._guard_transitions()
         try:
             values = _declare(self, (AUTOSTART, *declared(self.Config)))
             self._autostart = bool(values[AUTOSTART.name])
@@ -285,6 +288,24 @@ class FlightNode(LifecycleNode):
             return TransitionCallbackReturn.ERROR
         self.fault = None
         return TransitionCallbackReturn.SUCCESS
+
+    def _guard_transitions(self) -> None:
+        """Have a request for an impossible transition answered instead of ending the process."""
+        service = self._service_change_state
+        change = service.callback
+
+        def answer(
+            request: ChangeState.Request, response: ChangeState.Response
+        ) -> ChangeState.Response:
+            try:
+                return change(request, response)
+            except RCLError:
+                wanted = request.transition.label or request.transition.id
+                self.get_logger().warning(f"The transition {wanted} is not possible now.")
+                response.success = False
+                return response
+
+        service.callback = answer
 
     def _entities(self) -> list[Any]:
         return [*self.timers, *self.subscriptions, *self.services, *self.publishers]
