@@ -3,28 +3,59 @@
 Without a compiler, or with ``SPACEROBOT_COMPILE=0``, the same functions run in CasADi's virtual
 machine: slower, with the same formulas. Compiled objects live in ``SPACEROBOT_CACHE_DIR``, by
 default ``$XDG_CACHE_HOME/spacerobot_ros`` (``~/.cache/spacerobot_ros``), named by what is in them.
+
+No object is loaded on trust. One from the cache is whole, of this user and of this function
+(:class:`.Cache`). One that the compiler has just delivered is an ELF file of this machine, complete
+by its own headers, and gave the virtual machine's numbers in a process of its own, which may crash.
+The compiler runs under a time limit, ``SPACEROBOT_COMPILE_TIMEOUT``.
 """
 
 from __future__ import annotations
 
 import hashlib
-import logging
+import json
+import math
 import os
 import shutil
+import signal
+import struct
 import subprocess
+import sys
 import sysconfig
 import tempfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.private_files import Cache, warn_once
 
-_LOG = logging.getLogger(__name__)
 # Contraction into fused multiply-adds would make the numbers depend on the processor.
 _FLAGS = ("-O2", "-fPIC", "-shared", "-ffp-contract=off")
+
+_COMPILE_TIMEOUT = 120.0
+"""Time that the compiler has for one function, s: ten times what the largest takes."""
+
+_TRIAL_TIMEOUT = 20.0
+"""Time that a new object has to prove itself, s."""
+
+_SAME = 1e-6
+"""Relative difference that numbers of the compiler and of the virtual machine may have."""
+
+_BEYOND = 1e9
+"""Results beyond it are near a singularity: rounding decides them."""
+
+_hung: set[str] = set()
+"""Compilers that have run into the time limit: the next function is not to wait as long again."""
+
+
+class _CompilationError(Exception):
+    """There is no usable object; the text is a clause that says why."""
 
 
 class BufferedFunction:
@@ -90,19 +121,31 @@ def dense_function(
 
 
 def compiled(function: ca.Function) -> ca.Function:
-    """Return the function as compiled C, or unchanged where that is not possible."""
-    compiler = c_compiler()
-    if compiler is None:
+    """Return the function as compiled C, or unchanged where that is not possible.
+
+    Raises
+    ------
+    ParameterError
+        ``SPACEROBOT_COMPILE_TIMEOUT`` is not a number of seconds.
+    """
+    if not _is_wanted():
         return function
-    library = _library(function, compiler)
-    if library is None:
+    compiler, limit = c_compiler(), _time_limit()
+    try:
+        if compiler is None:
+            raise _CompilationError("no C compiler (cc, gcc, clang or $CC) was found")
+        return _external(function, compiler, limit)
+    except _CompilationError as reason:
+        warn_once(
+            "Functions run in CasADi's virtual machine, slower and with the same formulas "
+            f"(SPACEROBOT_COMPILE=0 asks for it): {reason}."
+        )
         return function
-    return ca.external(function.name(), str(library))
 
 
 def c_compiler() -> str | None:
     """Return the C compiler in use: ``$CC``, ``cc``, ``gcc`` or ``clang``; None without one."""
-    if os.environ.get("SPACEROBOT_COMPILE", "1") == "0":
+    if not _is_wanted():
         return None
     for candidate in (os.environ.get("CC"), "cc", "gcc", "clang"):
         found = shutil.which(candidate) if candidate else None
@@ -120,35 +163,218 @@ def cache_directory() -> Path:
     return Path(base).expanduser() / "spacerobot_ros"
 
 
-def _library(function: ca.Function, compiler: str) -> Path | None:
-    generator = ca.CodeGenerator(function.name(), {"with_header": False})
+def _is_wanted() -> bool:
+    return os.environ.get("SPACEROBOT_COMPILE", "1") != "0"
+
+
+def _time_limit() -> float:
+    text = os.environ.get("SPACEROBOT_COMPILE_TIMEOUT")
+    if not text:
+        return _COMPILE_TIMEOUT
+    try:
+        limit = float(text)
+    except ValueError:
+        limit = math.nan
+    if not 0.0 < limit <= 1e6:
+        raise ParameterError(
+            f"SPACEROBOT_COMPILE_TIMEOUT is '{text}'; it must be a number of seconds above 0, at "
+            "most 1e6."
+        )
+    return limit
+
+
+def _external(function: ca.Function, compiler: str, limit: float) -> ca.Function:
+    """Return the function from the cache, or newly compiled.
+
+    Raises
+    ------
+    _CompilationError
+        It cannot be compiled.
+    """
+    name = function.name()
+    generator = ca.CodeGenerator(name, {"with_header": False})
     generator.add(function)
     source = generator.dump()
-    platform = f"{sysconfig.get_platform()} {compiler} {' '.join(_FLAGS)}"
-    digest = hashlib.sha256(f"{platform}\n{source}".encode()).hexdigest()[:24]
-    library = cache_directory() / f"{function.name()}-{digest}.so"
-    if library.exists():
-        return library
+    built_for = f"{sysconfig.get_platform()} {_c_library()} {compiler} {' '.join(_FLAGS)}"
+    key = hashlib.sha256(f"{built_for}\n{source}".encode()).hexdigest()
+    cache, file = Cache(cache_directory()), f"{name}-{key[:32]}.so"
+    if kept := cache.load(file, key):
+        try:
+            return ca.external(name, str(kept[0]))
+        except RuntimeError as error:
+            cache.discard(file, _first_line(str(error)))
+    if compiler in _hung:
+        raise _CompilationError(f"{compiler} did not end before, and is not called again")
     try:
-        library.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-            c_file = Path(folder, "function.c")
-            c_file.write_text(source, encoding="utf-8")
-            built = Path(folder, "function.so")
-            subprocess.run(
-                [compiler, *_FLAGS, "-o", str(built), str(c_file), "-lm"],
-                check=True,
-                capture_output=True,
-                text=True,
-            )
-            # Another process may build the same object: the last rename wins, both are whole.
-            built.replace(library)
-    except (OSError, subprocess.CalledProcessError) as error:
-        reason = getattr(error, "stderr", None) or error
-        _LOG.warning(
-            "The function %s could not be compiled and runs in the virtual machine, slower: %s",
-            function.name(),
-            str(reason).strip().splitlines()[:1],
+        with tempfile.TemporaryDirectory(prefix="spacerobot_ros_") as folder:
+            built = _built(source, compiler, Path(folder), limit)
+            _try(function, built)
+            kept_at = cache.store(file, key, built.read_bytes())
+            for path in (kept_at, built):
+                # A folder may forbid execution; what is loaded stays when its file is deleted.
+                with suppress(RuntimeError):
+                    if path is not None:
+                        return ca.external(name, str(path))
+    except OSError as error:
+        raise _CompilationError(error.strerror or str(error)) from None
+    raise _CompilationError("the compiled object cannot be loaded")
+
+
+@lru_cache(maxsize=1)
+def _c_library() -> str:
+    """Return name and version of the C library, which objects refer to."""
+    with suppress(AttributeError, ValueError, OSError):
+        return os.confstr("CS_GNU_LIBC_VERSION") or ""
+    return ""
+
+
+def _built(source: str, compiler: str, folder: Path, limit: float) -> Path:
+    """Return the object that the compiler makes of a source in a folder."""
+    c_file, built, output = (folder / name for name in ("function.c", "function.so", "output"))
+    c_file.write_text(source, encoding="utf-8")
+    command = [compiler, *_FLAGS, "-o", str(built), str(c_file), "-lm"]
+    code = _run(command, output, limit)
+    if code is None:
+        _hung.add(compiler)
+        raise _CompilationError(
+            f"{compiler} did not end within {limit:g} s (SPACEROBOT_COMPILE_TIMEOUT)"
         )
-        return None
-    return library
+    if code < 0:
+        raise _CompilationError(f"{compiler} was ended by {signal.Signals(-code).name}")
+    if code:
+        said = _first_line(output.read_text(encoding="utf-8", errors="replace"))
+        raise _CompilationError(f"{compiler} failed ({code}): {said}")
+    _require_object(built, compiler)
+    return built
+
+
+def _run(command: list[str], output: Path, limit: float) -> int | None:
+    """Run a command in a process group of its own; return its exit code, None beyond the limit."""
+    # Into a file: what the command has started may hold a pipe open for longer than it lives.
+    with output.open("wb") as file:
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        try:
+            return process.wait(limit)
+        except subprocess.TimeoutExpired:
+            return None
+        finally:
+            # An interrupt that comes meanwhile ends the command, too.
+            if process.poll() is None:
+                with suppress(OSError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+
+
+def _first_line(text: str) -> str:
+    return (text.strip().splitlines() or ["no reason given"])[0][:300]
+
+
+# -- new objects ------------------------------------------------------------------------------
+
+_IDENTITY = slice(4, 6)
+_SHARED_OBJECT = 3
+
+
+def _require_object(path: Path, compiler: str) -> None:
+    """Refuse what is not a complete ELF shared object of this machine.
+
+    Raises
+    ------
+    _CompilationError
+        It is not.
+    """
+    said = f"{compiler} reported success, but what it delivered"
+    try:
+        content = path.read_bytes()
+    except OSError:
+        raise _CompilationError(f"{said} is not there") from None
+    if not content:
+        raise _CompilationError(f"{said} is empty")
+    own = _own_header()
+    if own is None:
+        return  # Not a machine of ELF files: the trial is all there is.
+    order = "<" if own[5] == 1 else ">"
+    wide = own[4] == 2
+    # e_type, e_machine, e_version, e_entry, e_phoff, e_shoff, e_flags, then six half words.
+    header = struct.Struct(f"{order}HHI{'QQQ' if wide else 'III'}I6H")
+    if len(content) < 16 + header.size or content[:4] != own[:4]:
+        raise _CompilationError(f"{said} is not an object file")
+    kind, machine, _, _, _, sections, _, _, _, _, size, count, _ = header.unpack_from(content, 16)
+    if (
+        content[_IDENTITY] != own[_IDENTITY]
+        or machine != struct.unpack_from(f"{order}H", own, 18)[0]
+        or kind != _SHARED_OBJECT
+    ):
+        raise _CompilationError(f"{said} is not a shared object of this machine")
+    # Linkers write the table of sections last.
+    if sections + size * count > len(content):
+        raise _CompilationError(f"{said} is cut short")
+
+
+@lru_cache(maxsize=1)
+def _own_header() -> bytes | None:
+    """Return the ELF header of the running interpreter; None where it has none."""
+    with suppress(OSError), Path("/proc/self/exe").open("rb") as file:
+        header = file.read(64)
+        if header[:4] == b"\x7fELF":
+            return header
+    return None
+
+
+_TRIAL = """
+import ctypes, json, sys
+path, name, sizes, values, work = json.loads(sys.argv[1])
+library = ctypes.CDLL(path)
+real, integer = ctypes.c_double, ctypes.c_longlong
+inputs = [(real * len(v))(*v) for v in values]
+outputs = [(real * n)() for n in sizes]
+def pointers(arrays, count):
+    held = (ctypes.POINTER(real) * max(count, 1))()
+    for i, array in enumerate(arrays):
+        held[i] = ctypes.cast(array, ctypes.POINTER(real))
+    return held
+code = getattr(library, name)(
+    pointers(inputs, work[0]), pointers(outputs, work[1]),
+    (integer * max(work[2], 1))(), (real * max(work[3], 1))(), 0)
+print(json.dumps([code, [list(o) for o in outputs]]))
+"""
+
+
+def _try(function: ca.Function, path: Path) -> None:
+    """Have another process call a new object, and compare with the virtual machine.
+
+    Raises
+    ------
+    _CompilationError
+        The process crashed or hung, or the numbers differ.
+    """
+    values = [
+        (0.1 + 0.03 * np.arange(function.nnz_in(i)) + 0.07 * i) for i in range(function.n_in())
+    ]
+    expected = function.call([ca.DM(function.sparsity_in(i), v) for i, v in enumerate(values)])
+    sizes = [function.nnz_out(i) for i in range(function.n_out())]
+    work = [function.sz_arg(), function.sz_res(), function.sz_iw(), function.sz_w()]
+    task = json.dumps([str(path), function.name(), sizes, [v.tolist() for v in values], work])
+    output = path.with_name("trial")
+    # Isolated and without site: it starts in a few hundredths of a second.
+    code = _run([sys.executable, "-I", "-S", "-c", _TRIAL, task], output, _TRIAL_TIMEOUT)
+    new = f"the compiled object of {function.name()}"
+    if code != 0:
+        raise _CompilationError(f"{new} failed when it was tried")
+    try:
+        failed, results = json.loads(output.read_text(encoding="utf-8"))
+    except ValueError:
+        raise _CompilationError(f"{new} gave no numbers when it was tried") from None
+    for result, wanted in zip(results, expected, strict=True):
+        there, here = np.array(result), np.array(wanted.nonzeros())
+        with np.errstate(invalid="ignore"):
+            judged = np.isfinite(here) & (np.abs(here) < _BEYOND)
+            near = np.abs(there - here) <= _SAME * (1 + np.abs(here).max(initial=0, where=judged))
+        if failed or not np.all(near[judged]):
+            raise _CompilationError(f"{new} gives other numbers than it should")

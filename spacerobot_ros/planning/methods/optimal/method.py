@@ -8,14 +8,12 @@ at guesses with loops (:mod:`.initial_guesses`), made into held commands that en
 from __future__ import annotations
 
 import hashlib
+import io
 import json
-import logging
-import os
-import tempfile
+import math
 import zipfile
 from collections.abc import Mapping
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import casadi as ca
@@ -26,28 +24,38 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import attitude_error
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
+from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
 from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
 from spacerobot_ros.planning.methods.optimal.problem import (
+    BoundaryConditions,
     CandidateError,
     MotionLimits,
     PathConstraints,
     per_joint,
 )
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch, SearchBudget
-
-_LOG = logging.getLogger(__name__)
+from spacerobot_ros.private_files import Cache
 
 _CORRECTION_INTERVALS = 40
 
 _NOTHING_LEFT = 1e-10
 """A goal this near, rad, m and joint coordinates, is where the robot is."""
+
+_EQUAL = 1e-7
+"""What a manoeuvre that was kept may miss its ends by, rad, m and joint coordinates."""
+
+_LONGER, _MORE_TICKS = 1.25, 20
+"""What held commands take at most in place of optimal.longest: times it, and ticks more."""
+
+_ROUNDING = 1e-8
+"""What it may exceed a limit by, relative or in joint coordinates."""
 
 
 class OptimalGait(GaitMethod):
@@ -79,7 +87,7 @@ class OptimalGait(GaitMethod):
             self._specification.axes,
             self._constraints,
         )
-        self._cache = PlanCache() if chosen.cache else None
+        self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
 
     @classmethod
     def require_suitable(cls, robot: SpaceRobot) -> None:
@@ -118,8 +126,8 @@ class OptimalGait(GaitMethod):
         key = None
         if self._cache is not None and not correction:
             key = self._key(request)
-            if kept := self._cache.load(key):
-                return self._loaded(goal, kept)
+            if kept := self._loaded(self._cache, key, request, boundary, limits):
+                return kept
         found = self._search.search(
             boundary,
             limits,
@@ -135,7 +143,8 @@ class OptimalGait(GaitMethod):
         }
         schedule = self._schedule(state, goal, found.held.positions, notes)
         if self._cache is not None and key is not None:
-            self._cache.store(key, _arrays(schedule))
+            kept_plan = _KeptPlan(schedule.positions, notes)
+            self._cache.store(_file(key), key, kept_plan.to_bytes())
         return schedule
 
     def _intervals(self, correction: bool) -> int:
@@ -185,60 +194,112 @@ class OptimalGait(GaitMethod):
         }
         return plan_key(self.robot, numbers, values_of(self.options))
 
-    def _loaded(self, goal: Goal, kept: Mapping[str, Array]) -> GaitSchedule:
-        path = BasePath(*(kept[f"path_{part}"] for part in _PATH))
-        notes: Notes = {
-            name.removeprefix(_NOTE): value.tolist()
-            for name, value in kept.items()
-            if name.startswith(_NOTE)
-        }
-        return self._schedule_of(goal, kept["positions"], path, {**notes, "from_cache": 1.0})
-
-
-_PATH = ("time", "position", "quaternion")
-_NOTE = "note_"
-
-
-def _arrays(schedule: GaitSchedule) -> dict[str, Array]:
-    """Return what a schedule is made from again."""
-    return {
-        "positions": schedule.positions,
-        **{f"path_{part}": getattr(schedule.path, part) for part in _PATH},
-        **{f"{_NOTE}{name}": np.asarray(value) for name, value in schedule.notes.items()},
-    }
-
-
-class PlanCache:
-    """Arrays by a key; a file that cannot be read or written is as good as none."""
-
-    def __init__(self, folder: Path | None = None) -> None:
-        self.folder = folder or cache_directory() / "plans"
-
-    def load(self, key: str) -> dict[str, Array] | None:
-        """Return what was stored under a key, or None."""
-        try:
-            # A file that is opened here is closed where it turns out to be broken, too.
-            with self._file(key).open("rb") as file, np.load(file) as content:
-                return {name: content[name] for name in content.files}
-        except FileNotFoundError:
+    def _loaded(
+        self,
+        cache: Cache,
+        key: str,
+        request: PlanRequest,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+    ) -> GaitSchedule | None:
+        """Return the plan that was kept under a key, if it still does what it was made for."""
+        kept = cache.load(_file(key), key)
+        if kept is None:
             return None
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-            _LOG.warning("The plan %s cannot be read and is made anew: %s", self._file(key), error)
-            return None
-
-    def store(self, key: str, arrays: Mapping[str, Array]) -> None:
-        """Keep arrays under a key."""
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=self.folder, delete=False) as file:
-                np.savez(file, allow_pickle=False, **arrays)
-            # Whole or not at all, even if two processes write it.
-            os.replace(file.name, self._file(key))
-        except OSError as error:
-            _LOG.warning("The plan cannot be saved in %s: %s", self.folder, error)
+            plan = _KeptPlan.from_bytes(kept[1])
+            self._require_manoeuvre(plan.positions, request, boundary, limits)
+        except (ValueError, CandidateError) as reason:
+            cache.discard(_file(key), str(reason))
+            return None
+        notes: Notes = {**plan.notes, "from_cache": 1.0}
+        return self._schedule(request.state, request.goal, plan.positions, notes)
 
-    def _file(self, key: str) -> Path:
-        return self.folder / f"{key}.npz"
+    def _require_manoeuvre(
+        self,
+        positions: Array,
+        request: PlanRequest,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+    ) -> None:
+        """Refuse shapes (N + 1, n) at the ticks that a search for this request would not return.
+
+        Raises
+        ------
+        CandidateError
+            They are of another robot, miss an end, or exceed a limit or a path constraint.
+        """
+        period, state, robot = self.control_period, request.state, self.robot
+        if positions.ndim != 2 or positions.shape[1] != robot.n or len(positions) < 2:
+            raise CandidateError(f"it is of shape {positions.shape}, not of {robot.n} joints")
+        if not np.all(np.isfinite(positions)):
+            raise CandidateError("it is not finite")
+        wanted, duration = self.options.duration, (len(positions) - 1) * period
+        if wanted > 0 and abs(duration - wanted) > period:
+            raise CandidateError(f"it takes {duration:g} s, not {wanted:g} s")
+        if duration > _LONGER * self.options.longest + _MORE_TICKS * period:
+            raise CandidateError(f"it takes {duration:g} s")
+        first, last = positions[0], positions[-1]
+        if np.abs(first - boundary.start).max() > _EQUAL:
+            raise CandidateError("it begins in another shape")
+        if boundary.final is not None and np.abs(last - boundary.final).max() > _EQUAL:
+            raise CandidateError("it ends in another shape")
+        if boundary.center is not None:
+            beside = robot.center_of_mass(last) - boundary.center
+            if np.linalg.norm(beside) > _EQUAL:
+                raise CandidateError("it ends in another position")
+        factor, overrun = limits.excess(positions, period)
+        if factor > 1 + _ROUNDING or overrun > _ROUNDING:
+            raise CandidateError("it exceeds a limit of the joints")
+        attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
+        error = attitude_error(attitudes[-1], request.goal.quaternion)
+        if np.linalg.norm(self._specification.axes @ error) > _EQUAL:
+            raise CandidateError("it ends in another attitude")
+        self._constraints.check(positions, attitudes, period)
+
+
+def _file(key: str) -> str:
+    return f"{key[:32]}.npz"
+
+
+@dataclass(frozen=True)
+class _KeptPlan:
+    """What a schedule is made from again: shapes (N + 1, n) at the ticks, and what was noted."""
+
+    positions: Array
+    notes: Notes
+
+    def to_bytes(self) -> bytes:
+        """Return it as an archive of numpy."""
+        file = io.BytesIO()
+        noted = np.array(json.dumps(self.notes))
+        np.savez(file, allow_pickle=False, positions=self.positions, notes=noted)
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> _KeptPlan:
+        """Return it from an archive.
+
+        Raises
+        ------
+        ValueError
+            That holds something else.
+        """
+        try:
+            with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+                positions, notes = arrays["positions"], json.loads(str(arrays["notes"]))
+        except (OSError, EOFError, KeyError, MemoryError, zipfile.BadZipFile) as error:
+            raise ValueError(f"it holds no plan ({error})") from None
+        if positions.dtype != np.float64 or not isinstance(notes, dict):
+            raise ValueError("it holds something else than a plan")
+        if not all(_is_note(value) for value in notes.values()):
+            raise ValueError("its notes are not numbers")
+        return cls(positions, notes)
+
+
+def _is_note(value: object) -> bool:
+    values = value if isinstance(value, list) else [value]
+    return all(isinstance(each, float) and math.isfinite(each) for each in values)
 
 
 def plan_key(robot: SpaceRobot, numbers: Mapping[str, Array], options: Mapping[str, object]) -> str:
@@ -247,6 +308,7 @@ def plan_key(robot: SpaceRobot, numbers: Mapping[str, Array], options: Mapping[s
     for name in ("locked_inertia", "center_of_mass"):
         digest.update(robot.function(name, compile=False).serialize().encode())
     facts = {
+        "format": 2,
         "versions": [__version__, ca.__version__, np.__version__],
         "joints": robot.joint_names,
         "options": options,
@@ -255,4 +317,4 @@ def plan_key(robot: SpaceRobot, numbers: Mapping[str, Array], options: Mapping[s
         },
     }
     digest.update(json.dumps(facts, sort_keys=True, default=repr).encode())
-    return digest.hexdigest()[:32]
+    return digest.hexdigest()

@@ -1,0 +1,413 @@
+"""Compiled functions: what is loaded was checked, and nothing that happens to a cache harms."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import casadi as ca
+import pytest
+
+from spacerobot_ros import private_files
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model import compilation
+from spacerobot_ros.model.compilation import c_compiler, compiled
+
+Compiler = Callable[[str], Path]
+
+AFTER = 'while [ "$1" != -o ]; do shift; done; out=$2'
+"""Shell: the file that the compiler is to write."""
+
+
+@pytest.fixture(autouse=True)
+def cache(compiled_code: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Return the folder of this test's objects; nothing was said before.
+
+    The compiler hands out an object of the probe that was made once.
+    """
+    made = compiled_code / "probe.so"
+    if not made.exists():
+        script = f'#!/bin/sh\n{c_compiler()} "$@"; {AFTER}; cp "$out" {made}'
+        (compiled_code / "first").write_text(script, encoding="utf-8")
+        (compiled_code / "first").chmod(0o700)
+        monkeypatch.setenv("CC", str(compiled_code / "first"))
+        compiled(probe())
+    (compiled_code / "again").write_text(f'#!/bin/sh\n{AFTER}; cp {made} "$out"\n', "utf-8")
+    (compiled_code / "again").chmod(0o700)
+    monkeypatch.setenv("CC", str(compiled_code / "again"))
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(folder))
+    monkeypatch.delenv("SPACEROBOT_COMPILE_TIMEOUT", raising=False)
+    monkeypatch.setattr(private_files, "_reported", set())
+    monkeypatch.setattr(compilation, "_hung", set())
+    return folder
+
+
+@pytest.fixture
+def compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Compiler:
+    """Return what makes the machine's C compiler a shell script; ``$CC`` in it is the real one."""
+    monkeypatch.delenv("CC")
+    real = c_compiler()
+
+    def install(script: str) -> Path:
+        path = tmp_path / "cc"
+        path.write_text(f"#!/bin/sh\nCC={real}\n{script}\n", encoding="utf-8")
+        path.chmod(0o700)
+        monkeypatch.setenv("CC", str(path))
+        return path
+
+    return install
+
+
+def probe() -> ca.Function:
+    x = ca.SX.sym("x", 3)
+    return ca.Function("probe", [x], [2 * ca.sin(x)], ["x"], ["y"])
+
+
+def is_compiled() -> bool:
+    """Build the probe; it is right in any case."""
+    function = compiled(probe())
+    wanted = probe()([1, 2, 3])
+    assert float(ca.norm_inf(function([1, 2, 3]) - wanted)) < 1e-12
+    return str(function.class_name()) == "External"
+
+
+def only_file(cache: Path) -> Path:
+    (path,) = cache.iterdir()
+    return path
+
+
+def give_away(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a file or folder be of somebody else."""
+    if os.geteuid() == 0:
+        os.chown(path, 12345, 12345)
+    else:
+        monkeypatch.setattr("os.geteuid", lambda: os.getuid() + 1)
+
+
+DAMAGE: dict[str, Callable[[bytes], bytes]] = {
+    "truncated": lambda whole: whole[:5000],
+    "cut in its last line": lambda whole: whole[:-10],
+    "zeroed": lambda whole: bytes(len(whole)),
+    "empty": lambda _: b"",
+    "one bit": lambda whole: whole[:3000] + bytes([whole[3000] ^ 1]) + whole[3001:],
+    "longer": lambda whole: whole + b"x",
+    "without its last line": lambda whole: whole[: whole.rfind(b"\nspacerobot_ros cache")],
+    "text": lambda _: b"#!/bin/sh\n",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_object_is_made_anew(
+    damage: str, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert is_compiled()
+    kept = only_file(cache)
+    whole = kept.read_bytes()
+    kept.write_bytes(DAMAGE[damage](whole))
+    assert is_compiled()
+    assert "is thrown away and made anew: it is damaged" in caplog.text
+    assert only_file(cache).read_bytes() == whole
+    caplog.clear()
+    assert is_compiled()
+    assert not caplog.text
+
+
+def test_a_whole_object_is_not_made_again(cache: Path, compiler: Compiler) -> None:
+    compiler('exec $CC "$@"')
+    assert is_compiled()
+    compiler("exit 1")
+    assert is_compiled()
+    assert only_file(cache).stat().st_mode & 0o077 == 0
+
+
+def test_a_compiler_that_delivers_another_function_is_found_out(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    x = ca.SX.sym("x", 3)
+    wanted = ca.Function("probe", [x], [3 * ca.cos(x)], ["x"], ["y"])
+    assert compiled(wanted).class_name() != "External"
+    assert "gives other numbers" in caplog.text
+
+
+def test_an_object_under_the_name_of_another_is_not_loaded(
+    cache: Path, compiler: Compiler, caplog: pytest.LogCaptureFixture
+) -> None:
+    compiler('exec $CC "$@"')
+    x = ca.SX.sym("x", 3)
+    compiled(ca.Function("probe", [x], [3 * ca.cos(x)], ["x"], ["y"]))
+    other = only_file(cache)
+    content = other.read_bytes()
+    assert is_compiled()
+    (own,) = set(cache.iterdir()) - {other}
+    own.write_bytes(content)
+    assert is_compiled()
+    assert "thrown away" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("script", "reason"),
+    [
+        (f'{AFTER}; : > "$out"', "is empty"),
+        ("exit 0", "is not there"),
+        (f'{AFTER}; echo hello > "$out"', "is not an object file"),
+        (f'{AFTER}; head -c 4000 /dev/zero > "$out"', "is not an object file"),
+        (f'$CC "$@"; {AFTER}; head -c 5000 "$out" > "$out.1"; mv "$out.1" "$out"', "is cut short"),
+        (f'$CC "$@"; {AFTER}; printf "\\001" | dd of="$out" bs=1 seek=19 conv=notrunc 2>/dev/null',
+         "is not a shared object of this machine"),
+        (f'{AFTER}; cp /proc/self/exe "$out"', "is not a shared object|failed when it was tried"),
+        ('$CC -Dsin=cos "$@"', "gives other numbers"),
+        ('$CC -Dprobe=other "$@"', "failed when it was tried"),
+        ("echo no room >&2; exit 3", r"failed \(3\): no room"),
+        ("kill -9 $$", "was ended by SIGKILL"),
+        ("sleep 600", r"did not end within 0.3 s \(SPACEROBOT_COMPILE_TIMEOUT\)"),
+    ],
+)  # fmt: skip
+def test_a_compiler_that_fails_costs_speed_only(
+    script: str,
+    reason: str,
+    cache: Path,
+    compiler: Compiler,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    compiler(script)
+    if "sleep" in script:
+        monkeypatch.setenv("SPACEROBOT_COMPILE_TIMEOUT", "0.3")
+    assert not is_compiled()
+    assert len(caplog.records) == 1
+    assert caplog.records[0].levelname == "WARNING"
+    assert re.search(reason, caplog.text)
+    assert not cache.exists()
+
+
+def test_an_object_that_crashes_does_so_in_another_process(
+    compiler: Compiler, caplog: pytest.LogCaptureFixture
+) -> None:
+    compiler(
+        f'{AFTER}; echo "__attribute__((constructor)) void f(void) {{ __builtin_trap(); }}" '
+        '> "$out.c"; $CC -fPIC -shared -o "$out" "$out.c"'
+    )
+    assert not is_compiled()
+    assert "failed when it was tried" in caplog.text
+
+
+def test_a_compiler_that_hangs_is_waited_for_once_and_ended(
+    tmp_path: Path, compiler: Compiler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiler(f"sleep 600 & echo $! > {tmp_path}/child; wait")
+    monkeypatch.setenv("SPACEROBOT_COMPILE_TIMEOUT", "0.3")
+    began = time.monotonic()
+    for number in range(5):
+        x = ca.SX.sym("x")
+        compiled(ca.Function(f"f{number}", [x], [x]))
+    assert time.monotonic() - began < 1.4
+    child = int((tmp_path / "child").read_text())
+    status = Path(f"/proc/{child}/stat")
+    # What has ended may still wait for its parent to ask.
+    assert not status.exists() or status.read_text().split(")")[1].split()[0] == "Z"
+
+
+@pytest.mark.parametrize("text", ["soon", "0", "-1", "nan", "inf"])
+def test_a_time_limit_that_is_none_is_refused(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE_TIMEOUT", text)
+    with pytest.raises(ParameterError, match="number of seconds"):
+        compiled(probe())
+
+
+def test_no_compiler_is_said_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    assert not is_compiled()
+    assert not is_compiled()
+    assert len(caplog.records) == 1
+    assert "no C compiler" in caplog.text
+
+
+# -- who may write it -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", [0o770, 0o707, 0o777, 0o1777])
+def test_a_folder_that_others_may_write_is_not_used(
+    mode: int, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert is_compiled()
+    kept = only_file(cache)
+    kept.write_bytes(b"planted")
+    cache.chmod(mode)
+    assert is_compiled()
+    assert is_compiled()
+    assert kept.read_bytes() == b"planted"
+    (record,) = caplog.records
+    assert f"chmod go-w '{cache}'" in record.getMessage()
+    assert f"(mode {mode:o})" in record.getMessage()
+
+
+def test_a_folder_within_one_that_others_may_write_is_not_used(
+    cache: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """They could put another in its place; not where the sticky bit forbids it, as in /tmp."""
+    tmp_path.chmod(0o1777)
+    assert is_compiled()
+    assert only_file(cache)
+    tmp_path.chmod(0o777)
+    assert is_compiled()
+    assert f"chmod go-w '{tmp_path}'" in caplog.text
+
+
+def test_a_folder_of_somebody_else_is_not_used(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    cache.mkdir(mode=0o755)
+    give_away(cache, monkeypatch)
+    assert is_compiled()
+    assert is_compiled()
+    assert not list(cache.iterdir())
+    assert len(caplog.records) == 1
+    assert "belongs to user" in caplog.text
+    assert "SPACEROBOT_CACHE_DIR" in caplog.text
+
+
+@pytest.mark.parametrize("whose", ["writable", "foreign", "link", "fifo"])
+def test_a_file_that_others_could_have_written_is_replaced(
+    whose: str,
+    cache: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    assert is_compiled()
+    kept = only_file(cache)
+    if whose == "writable":
+        kept.chmod(0o666)
+    elif whose == "foreign":
+        if os.geteuid():
+            pytest.skip("only root gives files away")
+        give_away(kept, monkeypatch)
+    elif whose == "link":
+        kept.rename(tmp_path / "elsewhere")
+        kept.symlink_to(tmp_path / "elsewhere")
+    else:
+        kept.unlink()
+        os.mkfifo(kept)
+    assert is_compiled()
+    facts = only_file(cache).lstat()
+    assert stat.S_IMODE(facts.st_mode) == 0o600
+    assert facts.st_uid == os.geteuid()
+    assert stat.S_ISREG(facts.st_mode)
+    assert len(caplog.records) == 1
+    assert "thrown away" in caplog.text
+
+
+def test_a_link_to_a_folder_of_ones_own_is_followed(cache: Path, tmp_path: Path) -> None:
+    real = tmp_path / "disk"
+    real.mkdir()
+    cache.symlink_to(real)
+    assert is_compiled()
+    assert only_file(real)
+
+
+def test_a_link_to_a_folder_that_others_may_write_is_not(
+    cache: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    real = tmp_path / "disk"
+    real.mkdir()
+    real.chmod(0o777)
+    cache.symlink_to(real)
+    assert is_compiled()
+    assert not list(real.iterdir())
+    assert f"chmod go-w '{real}'" in caplog.text
+
+
+def test_whatever_the_umask_the_cache_is_for_its_user_alone(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deep = cache / "a" / "b"
+    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(deep))
+    before = os.umask(0)
+    try:
+        assert is_compiled()
+    finally:
+        os.umask(before)
+    for path in (cache, cache / "a", deep, only_file(deep)):
+        assert path.stat().st_mode & 0o077 == 0, path
+
+
+# -- places that take nothing -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("folder", ["/proc/none", "/dev/null", "/dev/null/cache"])
+def test_without_a_place_to_keep_it_an_object_is_used_all_the_same(
+    folder: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", folder)
+    assert is_compiled()
+    assert is_compiled()
+    assert len(caplog.records) == 1
+    assert folder in caplog.text
+
+
+def test_a_full_disk_keeps_nothing_and_harms_nothing(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("os.fsync", full)
+    assert is_compiled()
+    assert "No space left" in caplog.text
+    assert not list(cache.iterdir())
+
+
+def test_nothing_is_renamed_before_it_is_on_the_disk(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    fsync, replace = os.fsync, os.replace
+
+    def synced(number: int) -> None:
+        done.append("folder" if stat.S_ISDIR(os.fstat(number).st_mode) else "file")
+        fsync(number)
+
+    def replaced(one: str, other: Path) -> None:
+        done.append("name")
+        replace(one, other)
+
+    monkeypatch.setattr("os.fsync", synced)
+    monkeypatch.setattr("os.replace", replaced)
+    assert is_compiled()
+    assert only_file(cache)
+    assert done == ["file", "name", "folder"]
+
+
+def test_two_processes_that_build_one_object_both_have_it(cache: Path, compiler: Compiler) -> None:
+    """Either ends its compiler only when the other has begun."""
+    compiler(
+        f'touch {cache.parent}/began.$$; while [ "$(ls {cache.parent}/began.* | wc -l)" -lt 2 ]; '
+        'do sleep 0.01; done; exec $CC "$@"'
+    )
+    code = (
+        "import casadi as ca\n"
+        "from spacerobot_ros.model.compilation import compiled\n"
+        "x = ca.SX.sym('x', 3)\n"
+        "f = compiled(ca.Function('probe', [x], [2 * ca.sin(x)], ['x'], ['y']))\n"
+        "assert f.class_name() == 'External'\n"
+        "f([1, 2, 3])\n"
+    )
+    command = [sys.executable, "-c", code]
+    builders = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    for builder in builders:
+        _, said = builder.communicate(timeout=60)
+        assert (said, builder.returncode) == ("", 0)
+    assert only_file(cache)
+    compiler("exit 1")
+    assert is_compiled()
