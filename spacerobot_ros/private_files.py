@@ -72,8 +72,15 @@ def read_private(path: Path, *, follow: bool = False) -> bytes:
         return file.read(_LARGEST)
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Replace a file as a whole or not at all; it survives a loss of power, and is this user's.
+def write_whole(path: Path, content: bytes, *, durable: bool = True) -> None:
+    """Replace a file as a whole or not at all; it is this user's alone.
+
+    Parameters
+    ----------
+    path, content
+        The file, and what it is to hold.
+    durable
+        Whether to wait until the disk has it, so that it is whole after a loss of power, too.
 
     Raises
     ------
@@ -86,12 +93,15 @@ def write_whole(path: Path, content: bytes) -> None:
         with os.fdopen(number, "wb") as file:
             file.write(content)
             file.flush()
-            os.fsync(file.fileno())
+            if durable:
+                os.fsync(file.fileno())
         os.replace(name, path)
     except BaseException:
         with suppress(OSError):
             os.unlink(name)
         raise
+    if not durable:
+        return
     folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(folder)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -152,3 +154,57 @@ def test_a_file_that_holds_no_goal_is_refused(tmp_path: Path, text: str) -> None
 def test_a_file_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="cannot be written"):
         GoalFile(str(tmp_path / "none" / "goal.json")).save({BASE: IdentifiedGoal(GOAL)})
+
+
+def test_a_goal_that_others_could_have_written_is_not_flown_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "goal.json"
+    file = GoalFile(str(path))
+    before = os.umask(0)
+    try:
+        file.save({BASE: IdentifiedGoal(GOAL)})
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == 0o600
+    for mode in (0o620, 0o602, 0o666):
+        path.chmod(mode)
+        with pytest.raises(ParameterError, match="not flown to: others may write") as refusal:
+            file.load()
+        assert f"chmod go-w '{path}'" in str(refusal.value)
+    path.chmod(0o644)
+    assert BASE in file.load()
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(ParameterError, match="is not a regular file"):
+        file.load()
+    path.unlink()
+    file.save({BASE: IdentifiedGoal(GOAL)})
+    if os.geteuid() == 0:
+        os.chown(path, 12345, 12345)
+    else:
+        monkeypatch.setattr("os.geteuid", lambda: os.getuid() + 1)
+    with pytest.raises(ParameterError, match="belongs to user"):
+        file.load()
+
+
+def test_a_goal_file_is_replaced_as_a_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody foresees the name that it is written under, and a failure leaves the goal before."""
+    path = tmp_path / "goal.json"
+    file = GoalFile(str(path))
+    file.save({BASE: IdentifiedGoal(GOAL, "1.0")})
+    (tmp_path / "goal.json.new").symlink_to(tmp_path / "victim")
+
+    def failing(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as broken:
+        broken.setattr("os.replace", failing)
+        with pytest.raises(ParameterError, match="No space left"):
+            file.save({BASE: IdentifiedGoal(GOAL, "2.0")})
+    assert file.load()[BASE].goal_id == "1.0"
+    file.save({BASE: IdentifiedGoal(GOAL, "2.0")})
+    assert file.load()[BASE].goal_id == "2.0"
+    assert {each.name for each in tmp_path.iterdir()} == {"goal.json", "goal.json.new"}

@@ -12,7 +12,8 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 from visualization_msgs.msg import Marker
 
-from spacerobot_ros.errors import PlanningError, SpaceRobotError
+from spacerobot_ros.bag import message_definition
+from spacerobot_ros.errors import PlanningError, RecordingError, SpaceRobotError
 from spacerobot_ros.model.description import Array, Shape
 from spacerobot_ros.planning import Goal
 
@@ -27,15 +28,18 @@ _KINDS = {
 def message_class(type_name: str) -> Any:
     """Return the class of a type such as ``nav_msgs/msg/Odometry``.
 
+    Names come from bags, too: nothing is imported but packages whose definitions are installed.
+
     Raises
     ------
     SpaceRobotError
         Its package is not installed; the sentence goes after the name of a topic.
     """
     try:
+        message_definition(type_name)
         package, _, name = type_name.split("/")
         return getattr(importlib.import_module(f"{package}.msg"), name)
-    except (ImportError, AttributeError, ValueError):
+    except (ImportError, AttributeError, ValueError, RecordingError):
         raise SpaceRobotError(f"its type {type_name} is not installed here.") from None
 
 

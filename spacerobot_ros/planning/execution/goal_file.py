@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.planning.core.goal import Goal
+from spacerobot_ros.private_files import UntrustedFileError, read_private, write_whole
 
 BASE = "base"
 """Key of the goal of the base in the file."""
@@ -70,10 +70,9 @@ class GoalFile:
         if self._path is None:
             return
         text = json.dumps({key: _entry(goal) for key, goal in goals.items()})
-        whole = self._path.with_name(f"{self._path.name}.new")
         try:
-            whole.write_text(text, encoding="utf-8")
-            os.replace(whole, self._path)
+            # Commanders wait for no disk while they fly.
+            write_whole(self._path, text.encode(), durable=False)
         except OSError as error:
             raise ParameterError(
                 f"Parameter 'resume_file' is '{self._path}', which cannot be written: "
@@ -92,14 +91,18 @@ class GoalFile:
         Raises
         ------
         ParameterError
-            The file holds something else.
+            The file holds something else, or others could have written it.
         """
         if self._path is None:
             return {}
         try:
-            return self._parse(self._path.read_text(encoding="utf-8"))
+            return self._parse(read_private(self._path, follow=True).decode())
         except FileNotFoundError:
             return {}
+        except UntrustedFileError as error:
+            raise ParameterError(
+                f"Parameter 'resume_file' is '{self._path}', whose goal is not flown to: {error}"
+            ) from error
         except (OSError, ValueError, RecursionError, PlanningError) as error:
             why = str(error).rstrip(".")
             raise ParameterError(
