@@ -133,7 +133,7 @@ class RecorderNode(FlightNode):
         their publication, and a plant's commands as the plant received them. Other topics are
         subscribed, and so is what a node outside publishes too.
         """
-        self._taps.nodes = list(nodes)
+        self._taps.nodes = [*nodes, self]
 
     @property
     def topics(self) -> set[str]:

@@ -122,18 +122,12 @@ class PlantMonitor:
 
     def __init__(self, commands: CommandValidator, plant: FaultyPlant, *, lockstep: bool) -> None:
         self._commands, self._plant, self._lockstep = commands, plant, lockstep
-        self._faults = plant.active
         self.rearms = self.resets = 0
         """How often the plant was rearmed and reset; for the owner to count."""
         self.status = PlantStatus(PlantState.INACTIVE, "The plant is inactive.")
         """The status of the last update."""
         self.failure = "", ""
         """Reason and sentence of the error that stopped the plant; for the owner to set."""
-
-    @property
-    def faults_changed(self) -> bool:
-        """Whether other faults are active than at the last update."""
-        return self._plant.active is not self._faults
 
     def update(self, activity: PlantState, time_s: float) -> list[Event]:
         """Take up what has changed.
@@ -150,13 +144,13 @@ class PlantMonitor:
         list[Event]
             What has happened; empty if the status is still true.
         """
-        before, self._faults = self.status, self._plant.active
+        before = self.status
         now = replace(
             self._status(activity),
             time_s=before.time_s,
             rearms=self.rearms,
             resets=self.resets,
-            faults=tuple(str(fault) for fault in self._faults),
+            faults=tuple(str(fault) for fault in self._plant.active),
         )
         if now == before:
             return []

@@ -8,6 +8,9 @@ import time
 import traceback
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -27,13 +30,14 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_msgs.msg import String
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.events import Event
+from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import robot_from_text, robot_of
 from spacerobot_ros.nodes.common.cdr import raw_publish
@@ -119,6 +123,10 @@ class FlightNode(LifecycleNode):
     :meth:`configure`, :meth:`activate`, :meth:`deactivate` and :meth:`cleanup`, which raise
     :class:`SpaceRobotError` with a sentence when they cannot.
 
+    An exception of a callback (subscription, timer, service) ends neither the process nor the
+    executor: the node is deactivated, calls :meth:`on_failure`, and sends an event; a supervisor
+    may activate or configure it again.
+
     Parameters
     ----------
     name
@@ -143,6 +151,8 @@ class FlightNode(LifecycleNode):
         """Called with an exit code by a node that has nothing left to do."""
         self.raw_streams: list[RawStream] = []
         """What passes through the node as bytes, from its configuration to its cleanup."""
+        self._failure = ""
+        self._event_stream: RawOutput | None = None
         self.events_have_wall_time = True
         """Off in a run that is to be repeatable to the last message."""
         self._raising = False
@@ -152,8 +162,9 @@ class FlightNode(LifecycleNode):
             self._autostart = bool(values[AUTOSTART.name])
             self.config = configured(self.Config, values)
             self.add_on_set_parameters_callback(self._on_set_parameters)
-            self._events = self.create_publisher(DiagnosticStatus, "events", EVENTS)
+            self._event_stream = self.send_raw(DiagnosticStatus, "events", EVENTS)
             self.prepare()
+            self._permanent_streams = list(self.raw_streams)
             self._permanent = set(self._entities())
             if self._autostart if autostart is None else autostart:
                 self.start()
@@ -198,15 +209,99 @@ class FlightNode(LifecycleNode):
     def take_raw(self, kind: type[Any], topic: str, callback: Take) -> None:
         """Subscribe to serialised messages; a listener of the stream is shown them as well."""
         stream = RawInput(self.resolve_topic_name(topic), callback)
-        # Looked up for every message: a listener may come and go.
-        self.create_subscription(kind, topic, lambda raw: stream.take(raw), STREAM, raw=True)
+
+        def take(raw: bytes) -> None:
+            try:
+                stream.take(raw)  # Looked up for every message: a listener may come and go.
+            except Exception as error:
+                self._fail(f"a message on '{topic}'", error)
+
+        # Guarded already: one call less for each message.
+        super().create_subscription(kind, topic, take, STREAM, raw=True)
         self.raw_streams.append(stream)
 
     def report_event(self, event: Event) -> None:
-        """Publish an event of this node, once."""
+        """Publish an event of this node, once; its time is the node's unless it has one."""
+        if self._event_stream is None:
+            return
+        if event.time_s is None:
+            event = replace(event, time_s=self.simulated_time_s)
         values = event.to_values(time.time() if self.events_have_wall_time else None)
         name, level = self.get_fully_qualified_name(), bytes([event.level])
-        self._events.publish(diagnostic_status(name, level, event.sentence, values))
+        message = diagnostic_status(name, level, event.sentence, values)
+        self._event_stream.take(serialize_message(message))
+
+    @property
+    def simulated_time_s(self) -> float | None:
+        """Simulated time, s; None where the node does not know it."""
+        return None
+
+    # -- callbacks ----------------------------------------------------------------------------
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
+    ) -> Subscription:
+        """Subscribe with a callback whose exceptions end in :meth:`on_failure`."""
+        guarded = self._guarded(callback, f"a message on '{topic}'")
+        return super().create_subscription(msg_type, topic, guarded, *args, **kwargs)
+
+    def create_timer(
+        self, timer_period_sec: float, callback: Callable[[], Any], *args: Any, **kwargs: Any
+    ) -> Timer:
+        """Create a timer with a callback whose exceptions end in :meth:`on_failure`."""
+        guarded = self._guarded(callback, "a timer")
+        return super().create_timer(timer_period_sec, guarded, *args, **kwargs)
+
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
+    ) -> Service:
+        """Create a service with a callback whose exceptions end in :meth:`on_failure`."""
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return callback(request, response)
+            except Exception as error:
+                self._fail(f"the service '{srv_name}'", error)
+                if hasattr(response, "message"):
+                    response.success, response.message = False, self._failure
+                return response
+
+        return super().create_service(srv_type, srv_name, answer, *args, **kwargs)
+
+    def _guarded(self, callback: Callable[..., Any], what: str) -> Callable[..., None]:
+        def guarded(*given: Any) -> None:
+            try:
+                callback(*given)
+            except Exception as error:
+                self._fail(what, error)
+
+        return guarded
+
+    def _fail(self, what: str, error: Exception) -> None:
+        """Stop working after an exception of a callback; whoever spins the node goes on."""
+        self.get_logger().debug("".join(traceback.format_exception(error)))
+        if isinstance(error, SpaceRobotError):
+            sentence = str(error)
+        else:
+            sentence = f"Node '{self.get_name()}' has failed at {what}: {_described(error)}."
+        if sentence == self._failure:
+            return  # It is known, and may come with every message.
+        self._report_failure(sentence, error)
+        try:
+            if self.is_active:
+                self.trigger_deactivate()
+        except Exception as second:  # There must be an end to it.
+            self.get_logger().error(f"Node '{self.get_name()}' cannot stop: {_described(second)}.")
+        self.fault = SpaceRobotError(sentence)
+
+    def _report_failure(self, sentence: str, error: Exception) -> None:
+        self._failure = sentence
+        self.get_logger().error(sentence)
+        try:
+            self.on_failure(sentence, error)
+        except Exception as second:
+            self.get_logger().error(f"Node '{self.get_name()}': {_described(second)}.")
+        self.report_event(Event(EventKind.FAILED, sentence, level=2))
 
     @property
     def parameter_values(self) -> dict[str, Value]:
@@ -241,6 +336,9 @@ class FlightNode(LifecycleNode):
     def cleanup(self) -> None:
         """Give up what configure created."""
 
+    def on_failure(self, sentence: str, error: Exception) -> None:
+        """Say in the status of the node that an error stops it; it is deactivated then."""
+
     def drain(self, executor: EventsExecutor) -> None:
         """Take in what is still on its way before the node ends."""
 
@@ -250,28 +348,40 @@ class FlightNode(LifecycleNode):
     # -- life cycle ---------------------------------------------------------------------------
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run the hook."""
-        return self._run(self.configure)
+        """Run the hook; what it has created goes again where it fails."""
+        result = self._run(self.configure)
+        if result is TransitionCallbackReturn.FAILURE:
+            self._destroy_configured()
+        return self._report_transition(result, EventKind.CONFIGURED)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run the hook."""
-        return self._run(self.activate)
+        return self._report_transition(self._run(self.activate), EventKind.ACTIVATED)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run the hook."""
-        return self._run(self.deactivate)
+        return self._report_transition(self._run(self.deactivate), EventKind.DEACTIVATED)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run the hook and destroy the publishers, subscriptions and timers it leaves."""
         result = self._run(self.cleanup)
-        self.raw_streams.clear()
         self._destroy_configured()
-        return result
+        return self._report_transition(result, EventKind.CLEANED_UP)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop working and give everything up."""
         self._run(self.deactivate)
-        return self._run(self.cleanup)
+        return self._report_transition(self._run(self.cleanup), EventKind.SHUT_DOWN)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give everything up after a transition that failed; the node may be configured again."""
+        with suppress(Exception):  # What failed may have left anything.
+            self.cleanup()
+        self._destroy_configured()
+        if self._failure and self.fault is not None:
+            with suppress(Exception):
+                self.on_failure(self._failure, self.fault)
+        return TransitionCallbackReturn.SUCCESS
 
     def _run(self, hook: Callable[[], None]) -> TransitionCallbackReturn:
         try:
@@ -279,15 +389,27 @@ class FlightNode(LifecycleNode):
         except SpaceRobotError as error:
             self.fault = error
             if not self._raising:
-                self.get_logger().error(str(error))
+                self._report_failure(str(error), error)
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
             # rclpy drops what a transition raises; a defect must at least be seen.
-            self.fault = SpaceRobotError(f"Node '{self.get_name()}' failed: {error!r}.")
-            self.get_logger().error(traceback.format_exc())
+            sentence = f"Node '{self.get_name()}' has failed: {_described(error)}."
+            self.fault = SpaceRobotError(sentence)
+            self.get_logger().debug(traceback.format_exc())
+            self._report_failure(sentence, error)
             return TransitionCallbackReturn.ERROR
         self.fault = None
         return TransitionCallbackReturn.SUCCESS
+
+    def _report_transition(
+        self, result: TransitionCallbackReturn, kind: EventKind
+    ) -> TransitionCallbackReturn:
+        if result is TransitionCallbackReturn.SUCCESS:
+            if kind in (EventKind.CONFIGURED, EventKind.ACTIVATED):
+                self._failure = ""
+            words = kind.value.replace("_", " ")
+            self.report_event(Event(kind, f"Node '{self.get_name()}' is {words}."))
+        return result
 
     def _guard_transitions(self) -> None:
         """Have a request for an impossible transition answered instead of ending the process."""
@@ -312,6 +434,7 @@ class FlightNode(LifecycleNode):
 
     def _destroy_configured(self) -> None:
         """Destroy what configure made; the services of every ROS node stay for the next start."""
+        self.raw_streams[:] = self._permanent_streams
         destroy = {
             Timer: self.destroy_timer,
             Subscription: self.destroy_subscription,
@@ -323,12 +446,13 @@ class FlightNode(LifecycleNode):
                 next(act for kind, act in destroy.items() if isinstance(entity, kind))(entity)
 
     def _on_set_parameters(self, changes: list[RosParameter]) -> SetParametersResult:
-        given = {change.name: change.value for change in changes}
+        given, before = {change.name: change.value for change in changes}, self.config
         try:
             self.config = configured(self.Config, {**values_of(self.config), **given})
+            self.parameters_changed()
         except ParameterError as error:
+            self.config = before
             return SetParametersResult(successful=False, reason=str(error))
-        self.parameters_changed()
         return SetParametersResult(successful=True)
 
 
@@ -369,6 +493,14 @@ class RobotNode(FlightNode):
                 self.get_logger().error(f"robot_description: {error}")
                 return
             self._on_part()
+
+
+def _described(error: BaseException) -> str:
+    """Return type, text and place of an exception that no one expected."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    text = " ".join(str(error).split()).rstrip(".")
+    return f"{type(error).__name__}{': ' if text else ''}{text}{place}"
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
+from rclpy.timer import Timer
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -52,6 +53,8 @@ class PlantNode(FlightNode):
         self._active = PlantState.INACTIVE
         self._when_active = PlantState.RUNNING
         self._tick, self._period_ns = 0, 1
+        self._wall_timers: list[Timer] = []
+        self._monitor: PlantMonitor | None = None
         self.status = PlantStatus(PlantState.INACTIVE)
         """What was published last on plant/status."""
         super().__init__(name, **kwargs)
@@ -65,6 +68,11 @@ class PlantNode(FlightNode):
     def time_ns(self) -> int:
         """Simulated time of that tick, ns."""
         return self._tick * self._period_ns
+
+    @property
+    def simulated_time_s(self) -> float:
+        """The same, s."""
+        return self.time_ns / NANOSECONDS
 
     @property
     def state(self) -> PlantState:
@@ -116,6 +124,7 @@ class PlantNode(FlightNode):
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/abort", self._on_abort)
         self.create_service(Trigger, "~/rearm", self._on_rearm)
+        self._faults_seen = self.plant.active
         self._publish_status(self._monitor.status)
 
     def activate(self) -> None:
@@ -137,20 +146,35 @@ class PlantNode(FlightNode):
 
     def deactivate(self) -> None:
         """Stop time; nothing is commanded when it goes on."""
-        if self._active is PlantState.INACTIVE:
-            return
         for timer in self._wall_timers:
             self.destroy_timer(timer)
+        self._wall_timers = []
+        if self._active in (PlantState.INACTIVE, PlantState.FAILED):
+            return
         self._active = PlantState.INACTIVE
+        self._commands.rest()
+        self._look_at_status()
+
+    def on_failure(self, sentence: str, error: Exception) -> None:
+        """Report the failure, and command nothing when the plant is started again."""
+        self._active = PlantState.FAILED
+        reason = "model" if isinstance(error, SpaceRobotError) else "exception"
+        if self._monitor is None:
+            self._publish_status(PlantStatus(PlantState.FAILED, sentence, reason))
+            return
+        self._monitor.failure = reason, sentence
         self._commands.rest()
         self._look_at_status()
 
     def cleanup(self) -> None:
         """Say that there is no plant any more."""
+        self._active, self._monitor = PlantState.INACTIVE, None
         self._publish_status(PlantStatus(PlantState.INACTIVE, "The plant is not configured."))
 
     def _look_at_status(self) -> None:
         """Publish the status and what has happened, if anything has."""
+        assert self._monitor is not None
+        self._faults_seen = self.plant.active
         events = self._monitor.update(self._active, self.time_ns / NANOSECONDS)
         if self._monitor.status is not self.status:
             self._publish_status(self._monitor.status)
@@ -199,14 +223,13 @@ class PlantNode(FlightNode):
         try:
             limited = self.plant.step(*self._commands.begin_step())
         except SpaceRobotError as error:
-            self.get_logger().error(f"The plant stops at {self.time_ns / NANOSECONDS:g} s: {error}")
-            self.trigger_deactivate()
-            return
+            time = self.time_ns / NANOSECONDS
+            raise SpaceRobotError(f"The plant stops at {time:g} s: {error}") from error
         if limited:
             self._report.limited()
         self._tick += 1
         self._publish()
-        if self._monitor.faults_changed:
+        if self.plant.active is not self._faults_seen:
             self._look_at_status()
 
     def _publish(self) -> None:
@@ -294,6 +317,7 @@ class PlantNode(FlightNode):
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.plant.reset()
         self._commands.rest()
+        assert self._monitor is not None
         self._monitor.resets += 1
         response.success = True
         response.message = "The robot is back in its initial state; time goes on."
@@ -313,6 +337,7 @@ class PlantNode(FlightNode):
     def _on_rearm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         fault = self._commands.rearm()
         if fault:
+            assert self._monitor is not None
             self._monitor.rearms += 1
             self._look_at_status()
         response.success = True
