@@ -1,0 +1,438 @@
+"""What the commands print of a result, word for word, and the exit code that goes with it.
+
+The results are made by hand, so that every number on a line is another one.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from spacerobot_ros.bag.salvage import Salvaged
+from spacerobot_ros.cli.main import main
+from spacerobot_ros.cli.options import numbers
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.planning import METHODS, BasePath, GaitSchedule, Goal, PoseError
+from spacerobot_ros.session.run import RunResult
+from spacerobot_ros.simulation.trials import Problem, Record, Trial
+from spacerobot_ros.verification.comparison import Difference, Verification
+
+SUMMARY: dict[str, Any] = {
+    "scenario": "sliding_masses",
+    "method": "lie_bracket",
+    "message": "The goal is reached.",
+    "state": "reached",
+    "succeeded": True,
+    "final_position_m": [0.1234567, -2.0, 0.5],
+    "position_error_m": 0.0012345,
+    "final_attitude_rotvec_rad": [0.1, 0.2, -0.3],
+    "attitude_error_rad": 0.05,
+    "final_joint_positions": [0.4, -0.7, 1.5],
+    "manoeuvre_time_s": 12.5,
+    "corrections": 3,
+    "plan_time_s": 0.4567,
+    "ticks": 260,
+    "wall_time_s": 0.52,
+    "sim_time_s": 13.0,
+    "ticks_per_s": 500.0,
+    "real_time_factor": 25.0,
+    "linear_momentum_drift": 1.23e-15,
+    "angular_momentum_drift": 3.45e-14,
+    "momentum_drift": 3.45e-14,
+    "bag": "out/a.mcap",
+    "messages_recorded": 1234,
+    "gait": {"zf": [-2.4, 1.7, -1.4]},
+}
+
+LINES = """\
+sliding_masses, lie_bracket: The goal is reached.
+position    (0.12346, -2.00000, 0.50000) m, 0.00123 m from the goal
+attitude    (0.10000, 0.20000, -0.30000) rad, 0.05 rad = 2.86 deg from the goal
+shape       (0.40000, -0.70000, 1.50000)
+manoeuvre   12.5 s, 3 correction(s), planned in 0.457 s
+flight      260 ticks in 0.52 s: 500 ticks/s, 25 times real time
+momentum    changed by at most 1.2e-15 kg m/s and 3.4e-14 kg m^2/s
+bag         out/a.mcap (1234 messages)
+"""
+
+PUBLISHED = """\
+                            printed in the paper          here
+  zf                        (-2.3784, 1.6873, -1.3377)    (-2.4000, 1.7000, -1.4000)
+    -1.3377 is a misprint for -1.3771: eq. (9) gives that, and so does the printed c3
+  final_attitude_rotvec_rad (0.5342, -0.1511, 0.0943)     (0.1000, 0.2000, -0.3000)
+    carries integration error: its |r| is not the |r| of its own zf
+  final_position_m          (0.2995, -0.2557, 0.0931)     (0.1235, -2.0000, 0.5000)
+    likewise
+"""
+
+
+def run(patch: pytest.MonkeyPatch, summary: dict[str, Any], *words: str) -> Result:
+    """Run the command with a flight that comes to this summary."""
+    from spacerobot_ros.session import run as flights
+
+    patch.setattr(flights, "run_scenario", lambda *_, **__: RunResult(summary))
+    return CliRunner().invoke(main, ["run", "sliding_masses", *words])
+
+
+GOAL = ("--goal", "0", "0", "0", "0", "0", "0", "1")
+
+
+def test_the_lines_of_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = run(monkeypatch, SUMMARY, *GOAL)
+    assert result.stdout == LINES
+    assert result.stderr == ""
+    assert result.exit_code == 0
+
+
+def test_end_effector_and_propellant_have_lines_where_there_are_some(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    more = {
+        "end_effector_final_position_m": [1.0, -2.0, 3.0],
+        "end_effector_position_error_m": 0.045678,
+        "propellant_kg": 0.01234,
+    }
+    lines = run(monkeypatch, SUMMARY | more, *GOAL).stdout.splitlines()
+    tool, propellant = lines.pop(3), lines.pop(-2)
+    assert tool == "end-effector (1.00000, -2.00000, 3.00000) m, 0.0457 m from its goal"
+    assert propellant == "propellant  12.3 g"
+    assert lines == LINES.splitlines()
+    # None used is a number too.
+    assert "propellant  0.0 g" in run(monkeypatch, SUMMARY | {"propellant_kg": 0.0}, *GOAL).stdout
+
+
+def test_a_flight_that_misses_its_goal_is_exit_1_and_the_sentence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    missed = {"succeeded": False, "state": "failed", "message": "The goal is not reached."}
+    result = run(monkeypatch, SUMMARY | missed, *GOAL)
+    assert result.exit_code == 1
+    assert result.stderr == "The goal is not reached.\n"
+
+
+@pytest.mark.parametrize("state", ["reached", "failed"])
+def test_published_figures_stand_beside_those_of_the_published_flight(
+    monkeypatch: pytest.MonkeyPatch, state: str
+) -> None:
+    result = run(monkeypatch, SUMMARY | {"state": state}, "--method", "lie_bracket")
+    assert result.stdout == LINES + PUBLISHED
+
+
+@pytest.mark.parametrize(
+    ("words", "state"),
+    [
+        (("--method", "lie_bracket", *GOAL), "reached"),
+        (("--method", "lie_bracket", "--goal-rotvec", "0", "0", "0.1"), "reached"),
+        (("--method", "optimal"), "reached"),
+        ((), "reached"),
+        (("--method", "lie_bracket"), "interrupted"),
+        (("--method", "lie_bracket"), "refused"),
+    ],
+)
+def test_no_published_figures_for_another_goal_another_method_or_no_flight(
+    monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], state: str
+) -> None:
+    assert run(monkeypatch, SUMMARY | {"state": state}, *words).stdout == LINES
+
+
+def test_what_the_command_line_changes_reaches_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    from spacerobot_ros.session import run as flights
+
+    taken: list[Any] = []
+
+    def fly(scenario: Any, bag: Path, progress: Any, *, processes: bool) -> RunResult:
+        taken[:] = [scenario, bag, processes]
+        return RunResult(SUMMARY)
+
+    monkeypatch.setattr(flights, "run_scenario", fly)
+    runner = CliRunner()
+    runner.invoke(main, ["run", "sliding_masses"])
+    scenario, bag, processes = taken
+    assert (str(bag), processes, scenario.lockstep) == ("out/sliding_masses.mcap", False, True)
+    words = ["--goal", *"0120001", "--goal-rotvec", "0", "0", "1", "--realtime", "--processes"]
+    words += ["--bag", "b.mcap", "--set", "plant.tick_rate=50", "--method", "lie_bracket"]
+    runner.invoke(main, ["run", "sliding_masses", *words])
+    scenario, bag, processes = taken
+    assert (str(bag), processes) == ("b.mcap", True)
+    assert scenario.plant.time_mode == "realtime"
+    assert scenario.plant.real_time_factor == 1.0
+    assert scenario.plant.tick_rate == 50.0
+    assert scenario.planner.tick_rate == 20.0
+    assert scenario.planner.method == "lie_bracket"
+    assert scenario.planner.plan_in_background is True
+    assert scenario.goal.position.tolist() == [0.0, 1.0, 2.0]
+    half = math.sin(0.5), math.cos(0.5)
+    assert scenario.goal.quaternion == pytest.approx([0.0, 0.0, *half])
+    runner.invoke(main, ["run", "sliding_masses", "--realtime", "2.5"])
+    assert taken[0].plant.real_time_factor == 2.5
+    # What is set goes before what real time brings with it.
+    words = ["--realtime", "--set", "planner.plan_in_background=false"]
+    runner.invoke(main, ["run", "sliding_masses", *words])
+    assert taken[0].planner.plan_in_background is False
+    runner.invoke(main, ["run", "servicer", "--method", "transposed_jacobian"])
+    assert taken[0].controller.law == "transposed_jacobian"
+
+
+def test_numbers_for_people() -> None:
+    assert numbers([1.0, -0.123456789]) == "1.00000, -0.12346"
+    assert numbers([0.12345], 2) == "0.12"
+
+
+# -- plans ------------------------------------------------------------------------------------
+
+
+def trial(problem: Problem, name: str, reached: bool = True) -> Trial:
+    """Return a flight of two ticks and one more that ends 0.0123 m and 0.0456 rad off."""
+    n, tool = problem.robot.n, METHODS[name]
+    goal, pieces = Goal(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])), []
+    for ticks, first in ((2, 0.0), (1, 2.0)):
+        time = np.array([problem.control_period * k for k in range(ticks + 1)])
+        attitudes = np.tile([0.0, 0.0, 0.0, 1.0], (ticks + 1, 1))
+        # The joints are at the number of the tick.
+        shapes = np.tile(first + np.arange(ticks + 1.0)[:, np.newaxis], (1, n))
+        path = BasePath(time, np.zeros((ticks + 1, 3)), attitudes)
+        names = problem.robot.joint_names
+        notes: dict[str, list[float] | float | str] = {"ticks": float(ticks)}
+        schedule = GaitSchedule(name, names, problem.control_period, shapes, path, goal, notes)
+        pieces.append(schedule)
+    pose = np.array([0.1, 0.2, 0.3, 0.0, 0.0, math.sin(0.2), math.cos(0.2)])
+    error = PoseError(np.array([0.0, 0.0123, 0.0]), np.array([0.0, 0.0, 0.0456]))
+    return Trial(name, pieces, error, pose, 0, 0.6789, reached, tool.controls)
+
+
+def plan(patch: pytest.MonkeyPatch, reached: bool, *words: str) -> Result:
+    """Run the command with plans that come to the trial above."""
+    from spacerobot_ros.simulation import trials
+
+    patch.setenv("SPACEROBOT_COMPILE", "0")
+    patch.setattr(trials, "try_method", lambda problem, name: trial(problem, name, reached))
+    return CliRunner().invoke(main, ["plan", *words])
+
+
+PLANAR = ("planar_chain", "--method", "square_path", "--set", "planner.tick_rate=50")
+
+
+def test_the_lines_of_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = plan(monkeypatch, True, *PLANAR)
+    assert result.exit_code == 0
+    assert result.stderr == ""
+    # Three ticks at 50 Hz.
+    assert result.stdout == (
+        "planar_chain, square_path: 0.06 s, ends 0.0456 rad and 0.0123 m from the goal\n"
+        "planned in 0.679 s\n"
+    )
+
+
+def test_a_plan_that_misses_its_goal_is_exit_1_and_a_sentence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    result = plan(monkeypatch, False, *PLANAR)
+    assert result.exit_code == 1
+    assert result.stderr == (
+        "The goal is not reached within the planner's tolerance: "
+        "0.0456 rad and 0.0123 m from the goal.\n"
+    )
+
+
+def test_a_real_plan_that_misses_a_tight_tolerance_is_exit_1(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    words = (*PLANAR, "--set", "planner.attitude_tolerance=1e-17")
+    result = CliRunner().invoke(main, ["plan", *words])
+    assert result.exit_code == 1
+    assert "is not reached within the planner's tolerance" in result.stderr
+
+
+def test_the_json_of_a_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    target = tmp_path / "plan.json"
+    result = plan(monkeypatch, False, *PLANAR, "--json", str(target))
+    assert result.exit_code == 1, "what was planned is written before"
+    written = json.loads(target.read_text())
+    assert written["method"] == "square_path"
+    assert written["succeeded"] is False
+    assert written["manoeuvre_time_s"] == pytest.approx(0.06)
+    assert written["plan_time_s"] == 0.6789
+    assert written["final_position_m"] == [0.1, 0.2, 0.3]
+    assert written["final_attitude_rotvec_rad"] == pytest.approx([0.0, 0.0, 0.4])
+    assert written["position_error_m"] == pytest.approx(0.0123)
+    assert written["attitude_error_rad"] == pytest.approx(0.0456)
+    assert written["notes"] == {"ticks": 1.0}
+    # The second piece goes on where the first ends.
+    assert written["schedule"]["positions"] == [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0], [3.0, 3.0]]
+    assert written["schedule"]["tick_period_s"] == 0.02
+    assert written["path"]["time_s"] == pytest.approx([0.0, 0.02, 0.04, 0.04, 0.06])
+
+
+def test_a_comparison_has_a_row_for_each_method(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from spacerobot_ros.simulation import trials
+
+    def compare(problem: Problem) -> dict[str, Trial | PlanningError]:
+        refusal = PlanningError("It has no slider.")
+        found = {name: trial(problem, name) for name in ("square_path", "optimal")}
+        return {"lie_bracket": refusal, **found}
+
+    monkeypatch.setattr(trials, "compare", compare)
+    target = tmp_path / "plan.json"
+    result = plan(monkeypatch, True, *PLANAR, "--compare", "--json", str(target))
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines()[:5] == [
+        "method           manoeuvre  planned in      attitude      position",
+        "                         s           s       rad off         m off",
+        "lie_bracket   It has no slider.",
+        "square_path           0.06       0.679        0.0456      (0.0123)",
+        "optimal               0.06       0.679        0.0456        0.0123",
+    ]
+    compared = json.loads(target.read_text())["compared"]
+    assert compared["lie_bracket"] == "It has no slider."
+    assert compared["optimal"] == pytest.approx(0.06)
+    # The method that was asked for decides on the exit code.
+    words = ("planar_chain", "--method", "lie_bracket", "--compare")
+    assert plan(monkeypatch, True, *words).exit_code == 1
+
+
+@pytest.mark.parametrize(
+    ("missed", "missed_beside", "code"), [(1, 0, 1), (0, 1, 0), (0, 0, 0), (3, 2, 1)]
+)
+def test_random_goals_that_are_missed_are_exit_1(
+    monkeypatch: pytest.MonkeyPatch, missed: int, missed_beside: int, code: int
+) -> None:
+    from spacerobot_ros.simulation import trials
+
+    tried: list[Any] = []
+
+    def random_goals(problem: Problem, count: int, distance: float, angle: float) -> list[Goal]:
+        tried[:] = [count, distance, angle]
+        return [problem.goal] * count
+
+    def try_goals(
+        problem: Problem, goals: list[Goal], methods: list[str], show: Any
+    ) -> list[Record]:
+        tried.append(methods)
+        times = {"durations": [4.0, 1.0, 2.0], "plan_times": [0.1, 0.5, 0.2]}
+        refused = ["Too far.", "Too near.", "Too far."]
+        return [
+            Record(methods[0], 5, missed, refused, **times),
+            Record(methods[1], 0, missed_beside, [], [], []),
+        ]
+
+    monkeypatch.setattr(trials, "random_goals", random_goals)
+    monkeypatch.setattr(trials, "try_goals", try_goals)
+    words = ("--random", "9", "--within", "0.5", "90", "--beside", "optimal")
+    result = plan(monkeypatch, True, *PLANAR, *words)
+    assert result.exit_code == code
+    assert tried == [9, 0.5, pytest.approx(math.pi / 2), ["square_path", "optimal"]]
+    head, first, second, *reasons = result.stdout.splitlines()
+    assert head.split() == [
+        *("method", "goals", "met", "missed", "refused"),
+        *("shortest", "median", "longest", "planned", "in", "at", "most"),
+    ]
+    counts = [str(n) for n in (5 + missed + 3, 5, missed, 3)]
+    assert first.split() == ["square_path", *counts, "1", "2", "4", "0.2", "0.5"]
+    assert second.split() == ["optimal", str(missed_beside), "0", str(missed_beside), "0"]
+    assert reasons == ["square_path refused: Too far.", "square_path refused: Too near."]
+
+
+# -- bags -------------------------------------------------------------------------------------
+
+
+def verified(patch: pytest.MonkeyPatch, *words: str, **changes: Any) -> Result:
+    from spacerobot_ros.verification import comparison
+
+    at = Difference(1.25, "/odom", "pose.pose.position.y", 0.5, 0.25)
+    whole = Verification(340, 34.0, 1705, 1.5e-13, at, None)
+
+    def verify(path: Path, tolerance: float) -> Verification:
+        assert (str(path), tolerance) == ("a.mcap", changes.pop("tolerance", 1e-9))
+        return replace(whole, **changes)
+
+    patch.setattr(comparison, "verify_bag", verify)
+    return CliRunner().invoke(main, ["verify", "a.mcap", *words])
+
+
+def test_the_lines_of_a_verification(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = verified(monkeypatch)
+    assert result.exit_code == 0
+    assert result.stdout == (
+        "flown again 340 ticks, 34 s\n"
+        "compared    1705 messages\n"
+        "largest     1.5e-13, pose.pose.position.y of /odom at 1.25 s\n"
+        "verified    every published state is what the commands make it\n"
+    )
+    nothing = verified(monkeypatch, largest=0.0, largest_at=None).stdout.splitlines()
+    assert nothing[2] == "largest     0"
+    lenient = verified(monkeypatch, "--tolerance", "0.01", tolerance=0.01)
+    assert lenient.exit_code == 0, lenient.output
+
+
+def test_a_difference_is_exit_1_and_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    at = Difference(2.5, "/odom", "twist.twist.linear.x", 0.5, 0.25, " (a remark)")
+    result = verified(monkeypatch, difference=at)
+    assert result.exit_code == 1
+    assert "verified" not in result.stdout
+    assert result.stderr == (
+        "The bag differs: /odom at 2.5 s: twist.twist.linear.x is 0.5 in the bag "
+        "and 0.25 by its commands (a remark).\n"
+    )
+
+
+def test_the_lines_of_a_salvage(monkeypatch: pytest.MonkeyPatch) -> None:
+    from spacerobot_ros.bag import salvage
+
+    given: list[Any] = []
+
+    def save(path: Path, out: Path | None) -> Salvaged:
+        given[:] = [path, out]
+        return Salvaged(Path("b.mcap"), 123, 4.5, 6, 789)
+
+    monkeypatch.setattr(salvage, "salvage_bag", save)
+    result = CliRunner().invoke(main, ["salvage", "a.mcap"])
+    assert result.exit_code == 0
+    assert result.stdout == (
+        "saved       123 messages over 4.5 s\n"
+        "lost        789 bytes behind the last whole record, 6 damaged chunk(s)\n"
+        "bag         b.mcap\n"
+    )
+    assert given == [Path("a.mcap"), None]
+
+
+# -- goals ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("outcome", "code"),
+    [("reached", 0), ("failed", 1), ("refused", 1), ("aborted", 1), ("interrupted", 1)],
+)
+def test_only_a_goal_that_is_reached_is_exit_0(
+    monkeypatch: pytest.MonkeyPatch, outcome: str, code: int
+) -> None:
+    from spacerobot_ros.session import live
+    from spacerobot_ros.session.mission_client import Outcome
+
+    sent: list[Any] = []
+
+    def send(goal: Goal, show: Any, *, namespace: str, timeout: float) -> Outcome:
+        sent[:] = [goal.position.tolist(), goal.quaternion.tolist(), namespace, timeout]
+        show("A sentence.")
+        return Outcome(outcome)
+
+    monkeypatch.setattr(live, "send_goal", send)
+    runner = CliRunner()
+    words = ["--namespace", "/a", "--timeout", "7"]
+    result = runner.invoke(main, ["goal", "1", "-2", "3", *words])
+    assert (result.exit_code, result.stdout) == (code, "A sentence.\n")
+    assert sent == [[1.0, -2.0, 3.0], [0.0, 0.0, 0.0, 1.0], "/a", 7.0]
+    runner.invoke(main, ["goal", "1", "2", "3", "0.6", "0", "0.8", "0"])
+    assert sent == [[1.0, 2.0, 3.0], [0.6, 0.0, 0.8, 0.0], "", 0.0]
+    runner.invoke(main, ["goal", "1", "2", "3", "--rotvec", "0", "0", "1"])
+    assert sent[1] == pytest.approx([0.0, 0.0, math.sin(0.5), math.cos(0.5)])
+    assert runner.invoke(main, ["goal", "1", "2", "3", "4"]).exit_code == 2
