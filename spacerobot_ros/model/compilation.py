@@ -201,8 +201,11 @@ def _external(function: ca.Function, compiler: str, limit: float) -> ca.Function
     if kept := cache.load(file, key):
         try:
             return ca.external(name, str(kept[0]))
-        except RuntimeError as error:
-            cache.discard(file, _first_line(str(error)))
+        except RuntimeError:
+            warn_once(
+                f"The compiled functions in '{kept[0].parent}' are whole but cannot be loaded, as "
+                "on a file system that forbids execution; they are compiled at each start."
+            )
     if compiler in _hung:
         raise _CompilationError(f"{compiler} did not end before, and is not called again")
     try:
@@ -242,8 +245,9 @@ def _built(source: str, compiler: str, folder: Path, limit: float) -> Path:
     if code < 0:
         raise _CompilationError(f"{compiler} was ended by {signal.Signals(-code).name}")
     if code:
-        said = _first_line(output.read_text(encoding="utf-8", errors="replace"))
-        raise _CompilationError(f"{compiler} failed ({code}): {said}")
+        said = output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        reason = said[0][:300] if said else f"no reason given; is the disk of {folder.parent} full?"
+        raise _CompilationError(f"{compiler} failed ({code}): {reason}")
     _require_object(built, compiler)
     return built
 
@@ -258,6 +262,8 @@ def _run(command: list[str], output: Path, limit: float) -> int | None:
             stdout=file,
             stderr=subprocess.STDOUT,
             start_new_session=True,
+            # What it leaves behind when it is ended goes with the folder.
+            env={**os.environ, "TMPDIR": str(output.parent)},
         )
         try:
             return process.wait(limit)
@@ -269,10 +275,6 @@ def _run(command: list[str], output: Path, limit: float) -> int | None:
                 with suppress(OSError):
                     os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
-
-
-def _first_line(text: str) -> str:
-    return (text.strip().splitlines() or ["no reason given"])[0][:300]
 
 
 # -- new objects ------------------------------------------------------------------------------

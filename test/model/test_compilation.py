@@ -356,6 +356,25 @@ def test_without_a_place_to_keep_it_an_object_is_used_all_the_same(
     assert folder in caplog.text
 
 
+def test_a_folder_that_forbids_execution_is_said_once(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    load = ca.external
+
+    def external(name: str, path: str) -> ca.Function:
+        if Path(path).parent == cache:
+            raise RuntimeError("failed to map segment from shared object")
+        return load(name, path)
+
+    monkeypatch.setattr(ca, "external", external)
+    assert is_compiled()
+    assert is_compiled()
+    assert is_compiled()
+    assert only_file(cache)
+    (record,) = caplog.records
+    assert "forbids execution" in record.getMessage()
+
+
 def test_a_full_disk_keeps_nothing_and_harms_nothing(
     cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
