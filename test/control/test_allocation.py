@@ -108,6 +108,32 @@ def test_the_nearest_is_given_of_what_cannot_be_given(seed: int) -> None:
     assert np.linalg.norm(found.met - wanted) > 1e-3
 
 
+def test_of_a_wrench_in_an_unreachable_direction_the_bounds_leave_what_can_be_given() -> None:
+    """Two push along x, one weakly along y, none along z: z is lost, x and y keep their ratio."""
+    wrenches = np.zeros((6, 3))
+    wrenches[0, :2], wrenches[1, 2] = 2.0, 1.0
+    allocation = ThrusterAllocation(wrenches, np.array([1.0, 1.5, 1.0]))
+    for size in (1.0, 8.0, 1e3):
+        found = allocation.allocate(size * np.array([1.0, 0.5, 0.7, 0, 0, 0]), np.ones(3))
+        given_ = min(size, 2.0)
+        np.testing.assert_allclose(found.met, [given_, given_ / 2, 0, 0, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bounded_thrusters_give_the_direction_that_unbounded_ones_would(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    wrenches, cost = random_table(rng, 5)
+    allocation = ThrusterAllocation(wrenches, cost)
+    wanted = rng.normal(size=6) * 100.0
+    free = allocation.allocate(wanted, np.full(5, np.inf))
+    most = rng.uniform(0.2, 1.0, 5) * float(free.levels.max()) / 3.0
+    found = allocation.allocate(wanted, most)
+    part = float(found.met @ free.met / (free.met @ free.met))
+    np.testing.assert_allclose(found.met, part * free.met, atol=1e-6)
+    used = free.levels > 1e-9 * free.levels.max()
+    assert part == pytest.approx(min(1.0, *(most / np.maximum(free.levels, 1e-12))[used]), rel=1e-6)
+
+
 def test_excluded_thrusters_are_replaced_as_long_as_the_others_suffice() -> None:
     rng = np.random.default_rng(3)
     allocation = ThrusterAllocation(SERVICER.wrenches, SERVICER.mass_flow)

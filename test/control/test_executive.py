@@ -38,6 +38,9 @@ from spacerobot_ros.control.reference import HeldVelocityReference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, PlanningError, SpaceRobotError
 from spacerobot_ros.parameters import configured
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
+from spacerobot_ros.simulation import EffortPlant, InitialState
 
 AIM = np.array([0.5, 0.25, 0.0])
 SHAPE_IS_CONTROLLED: dict[str, Any] = {"base_outputs": "x y rz", "joint_outputs": "shoulder elbow"}
@@ -115,6 +118,50 @@ def test_a_goal_is_reached_when_it_is_held_for_the_settling_time() -> None:
     loop.place = np.zeros(3)
     loop.answer(5)
     assert loop.state == "reached", "it was reached, wherever the robot is pushed to later"
+
+
+def test_the_settling_time_of_a_goal_begins_with_the_goal() -> None:
+    """Where one goal was nearly settled, the next one at the same place settles all over."""
+    loop = ExecutiveLoop(settle_time=0.03, time_limit=1.0)
+    loop.aim(base=goal_at([0.0, 0.0, 0.0], "first"))
+    loop.answer(3)
+    loop.aim(base=goal_at([0.0, 0.0, 0.0], "second"))
+    for _ in range(3):
+        loop.answer()
+        assert (loop.state, loop.status.goal_id) == ("tracking", "second")
+    loop.answer()
+    assert (loop.state, loop.status.goal_id) == ("reached", "second")
+
+
+TOLERANCES = {"position_tolerance": 1e-3, "attitude_tolerance": 4e-3, "joint_tolerance": 16e-3}
+
+
+def beside(kind: str, by: float) -> tuple[dict[str, Any], dict[str, IdentifiedGoal]]:
+    """Return settings, and goals that the robot misses by so much in one kind of error alone."""
+    turned = np.array([0.0, 0.0, math.sin(by / 2), math.cos(by / 2)])
+    match kind:
+        case "position":
+            return {}, {"end_effector": goal_at(TIP + np.array([0.0, by, 0.0]))}
+        case "attitude":
+            return {}, {"base": IdentifiedGoal(Goal(np.zeros(3), turned))}
+    return SHAPE_IS_CONTROLLED, {"base": goal_at(np.zeros(3), shape=SHAPE + np.array([0.0, -by]))}
+
+
+@pytest.mark.parametrize("kind", ["position", "attitude", "joint"])
+def test_each_kind_of_error_has_a_tolerance_of_its_own(kind: str) -> None:
+    names = list(TOLERANCES)
+    # Each tolerance is once the smallest, once in the middle, once the largest of the three.
+    for turn in range(3):
+        values = [*TOLERANCES.values()][turn:] + [*TOLERANCES.values()][:turn]
+        limits: dict[str, Any] = dict(zip(names, values, strict=True))
+        limit = limits[f"{kind}_tolerance"]
+        for share, state in ((0.99, "reached"), (1.01, "tracking")):
+            settings, goals = beside(kind, share * limit)
+            loop = ExecutiveLoop(settle_time=0.0, **settings, **limits)
+            loop.answer()
+            loop.aim(**goals)
+            loop.answer()
+            assert loop.state == state, (limits, share)
 
 
 def test_a_goal_is_not_reached_before_the_reference_is() -> None:
@@ -209,6 +256,32 @@ def test_abort_holds_the_robot_where_it_is() -> None:
     assert (loop.state, loop.status.goal_id) == ("tracking", "5")
 
 
+@pytest.mark.parametrize("key", ["base", "end_effector"])
+def test_an_abort_gives_up_every_goal(key: str) -> None:
+    """Also the other of two, and one that still waits for a state: nothing moves afterwards."""
+    loop = ExecutiveLoop()
+    loop.answer()
+    up = np.array([0.0, 1.0, 0.0])
+    loop.aim(base=goal_at(AIM), end_effector=goal_at(TIP + up))
+    loop.answer()
+    loop.aim(**{key: goal_at(-AIM)})
+    loop.executive.abort()
+    for _ in range(2):
+        np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
+        assert loop.state == "aborted"
+    # A goal of one alone does not bring back that of the other.
+    loop.aim(base=goal_at(AIM))
+    np.testing.assert_allclose(loop.answer()[0][:3], KP * AIM, atol=1e-12)
+
+
+def test_an_abort_holds_the_shape_that_the_joints_have() -> None:
+    loop = ExecutiveLoop(**SHAPE_IS_CONTROLLED)
+    loop.aim(base=goal_at(np.zeros(3), shape=SHAPE + 0.5))
+    assert np.all(loop.answer()[1] > 0.0)
+    loop.executive.abort()
+    np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
+
+
 def test_an_abort_is_about_the_goal_that_still_waits() -> None:
     loop = ExecutiveLoop()
     loop.aim(base=goal_at(AIM, "flown"))
@@ -264,6 +337,38 @@ def test_the_base_is_estimated_for_a_while_and_then_the_thrusters_are_off() -> N
     loop.rates = np.zeros(2)
     np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
     assert loop.state == "tracking"
+
+
+def test_the_estimate_takes_what_the_thrusters_gave_and_not_what_was_wanted() -> None:
+    """Of 300 N that a far goal wants they give 5: so much the momentum grows, and no more."""
+    robot, force = planar_manipulator(), 5.0
+    loop = ExecutiveLoop(estimation_time=1.0, max_force=force)
+    loop.aim(base=goal_at([10.0, 0.0, 0.0]))
+    assert np.linalg.norm(loop.answer()[0][:3]) == pytest.approx(force)
+    for ticks in range(1, 6):
+        loop.answer(measured=False)
+        state = loop.executive.controller.law.state
+        momentum, _, _ = robot.momentum(
+            state.quaternion_WB, state.q, state.v_WB_B, state.omega_WB_B, state.qdot
+        )
+        np.testing.assert_allclose(momentum, [force * ticks * PERIOD, 0.0, 0.0], atol=1e-3)
+
+
+def test_joints_that_are_stopped_do_not_swing_back() -> None:
+    """Critically damped from where they are: the rates decay as exp(-2 t/s), over qdot / 2."""
+    loop = ExecutiveLoop()
+    rates = np.array([0.3, -0.2])
+    plant = EffortPlant(
+        planar_manipulator(), PERIOD, InitialState(joint_positions=SHAPE, joint_velocities=rates)
+    )
+    for tick in range(300):
+        result = loop.executive.command(tick * PERIOD, None, plant.q, plant.qdot)
+        assert not result.realised.wrench_B.any()
+        plant.step(result.realised.tau, np.zeros(6))
+        expected = rates * math.exp(-2.0 * (tick + 1) * PERIOD)
+        np.testing.assert_allclose(plant.qdot, expected, atol=0.01)
+        assert np.all(plant.qdot * rates > 0.0), "no joint turns back"
+    np.testing.assert_allclose(plant.q, SHAPE + rates / 2.0, atol=0.01)
 
 
 def test_without_odom_from_the_beginning_nothing_is_thrust_and_the_goal_waits() -> None:
@@ -423,6 +528,17 @@ def test_a_reference_from_outside_is_followed_and_what_it_lacks_is_held() -> Non
     wrench, effort = loop.answer(reference=bent)
     assert np.abs(wrench).max() < 1e-12
     assert np.all(effort > 0.0)
+
+
+def test_a_reference_of_the_end_effector_from_outside_is_followed() -> None:
+    loop = ExecutiveLoop()
+    loop.answer()
+    up = np.array([0.0, 0.5, 0.0])
+    reference = Reference(end_effector=PoseReference(TIP + up, UPRIGHT))
+    np.testing.assert_allclose(loop.answer(reference=reference)[0][:3], KP * up, atol=1e-12)
+    # The base's own goal goes on beside it.
+    loop.aim(base=goal_at(AIM))
+    np.testing.assert_allclose(loop.answer(reference=reference)[0][:3], KP * (AIM + up), atol=1e-12)
 
 
 @given(st.lists(st.floats(-2.0, 2.0), min_size=2, max_size=6))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -114,6 +114,33 @@ def test_limits_are_kept_and_one_is_used_up(seed: int) -> None:
             ]
         used.append(max(demands))
     assert 0.999 < max(used) <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("group", ["base", "end_effector", "joints"])
+@pytest.mark.parametrize("kind", ["position", "attitude"])
+@pytest.mark.parametrize("bound", ["speed", "acceleration"])
+def test_every_limit_sets_the_pace_where_it_alone_is_small(
+    group: str, kind: str, bound: str
+) -> None:
+    """The duration by hand: a quintic over d has rates up to 15/8 d/T, and 10/sqrt(3) d/T^2."""
+    prefix = "joint_" if group == "joints" else "angular_" if kind == "attitude" else ""
+    wide = {limit.name: 1e3 for limit in fields(MotionLimits)}
+    small = 0.05
+    limits = MotionLimits(**{**wide, prefix + bound: small})
+    # Distance and angle differ, and so do those of base and end-effector.
+    far = {"base": pose([1, 2, -2], [0.6, 0, 0]), "end_effector": pose([0, 5, 0], [0, 0, 0.8])}
+    still = pose([0, 0, 0])
+    d = {"base": (3.0, 0.6), "end_effector": (5.0, 0.8)}.get(group, (0.7, 0.7))
+    start = Reference(still, still, JointReference.at_rest(np.zeros(2)))
+    goal = replace(start, joints=JointReference.at_rest(np.array([-0.7, 0.2])))
+    if group != "joints":
+        base, end_effector = (far[n] if n == group else still for n in far)
+        goal = Reference(base, end_effector, start.joints)
+    length = d[1] if kind == "attitude" else d[0]
+    wanted = 15 / 8 * length / small
+    if bound == "acceleration":
+        wanted = np.sqrt(10 / np.sqrt(3) * length / small)
+    assert QuinticReference(start, goal, limits).duration == pytest.approx(wanted, rel=1e-12)
 
 
 def test_positions_move_on_a_line_and_attitudes_about_one_axis() -> None:

@@ -129,6 +129,17 @@ def test_what_is_beyond_the_thrust_is_dropped_and_told() -> None:
     assert pulses.unmet[0] == 0.0
 
 
+@pytest.mark.parametrize("shortest", [0.012, 0.035, 0.05])
+def test_pulses_under_way_count_towards_what_may_be_owed(shortest: float) -> None:
+    """However much is wanted: once nothing is, a thruster gives a shortest pulse and a tick."""
+    rng = np.random.default_rng(4)
+    pulses, force = ThrusterModulator(pair(shortest), TICK), 2.0
+    for tick in range(60):
+        pulses.fire(along_x(float(rng.uniform(20.0, 500.0)) if tick % 9 < 6 else 0.0))
+        outstanding = pulses.owed + pulses.under_way
+        assert abs(outstanding[0]) <= force * (shortest + TICK) + 1e-9, tick
+
+
 def test_a_direction_without_thrusters_is_told() -> None:
     pulses = ThrusterModulator(pair(0.0), TICK)
     on_time = pulses.fire(np.array([1.0, 0.5, 0, 0, 0, -0.25]))

@@ -269,3 +269,28 @@ def test_a_goal_that_is_met_already_moves_nothing(arm: SpaceRobot) -> None:
     state = RobotState(np.zeros(3), turned(1, 2, 3).as_quat(), np.array([0.4, -1.2, 0.3]))
     schedule = planner(arm).plan(state, goal_of(turned(1, 2, 3.01)))
     assert (schedule.ticks, schedule.partial) == (0, False)
+
+
+@pytest.mark.parametrize(
+    ("nominal", "joint"),
+    [
+        ((2.99, -0.8, 1.5), 0),
+        ((-2.99, -0.8, 1.5), 0),
+        ((0.0, 0.395, 1.5), 1),
+        ((0.0, -0.8, 2.79), 2),
+    ],
+)
+def test_a_loop_near_a_limit_is_moved_and_not_cut_off(
+    arm: SpaceRobot, nominal: tuple[float, float, float], joint: int
+) -> None:
+    """Its edges are as long as the areas need; cut off, the base would turn less."""
+    method = planner(arm, nominal=nominal)
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.array(nominal))
+    schedule = method.plan(state, goal_of(turned(1.0, -1.5, 2.0)))
+    edges = np.array(schedule.notes["edges"])
+    assert edges[joint] / 2 > min(
+        arm.upper[joint] - nominal[joint], nominal[joint] - arm.lower[joint]
+    )
+    np.testing.assert_allclose(np.ptp(schedule.positions, axis=0), edges, rtol=1e-9)
+    assert np.all(schedule.positions >= arm.lower - 1e-12)
+    assert np.all(schedule.positions <= arm.upper + 1e-12)

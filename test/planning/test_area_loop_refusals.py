@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,10 @@ from support.planners import Planner, planner_of
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import METHODS, Goal, RobotState, Tolerance
+from spacerobot_ros.planning import METHODS, Goal, PlanRequest, RobotState, Tolerance
+from spacerobot_ros.planning.methods import area_loop
+from spacerobot_ros.planning.methods.area_loop import EdgePath, edge_path
+from spacerobot_ros.planning.methods.nominal_shape import NominalChoice, NominalShape
 
 Array = npt.NDArray[np.float64]
 
@@ -145,3 +149,27 @@ def test_options_that_do_not_fit_the_robot(
 ) -> None:
     with pytest.raises(ParameterError, match=reason):
         planner(arm, **options)
+
+
+def test_loops_that_turn_the_wrong_way_are_given_up_however_small(
+    arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The method believes in the opposite of the true curvature."""
+    method = METHODS["area_loop"](arm, 0.25, 0.05)
+    choose = NominalChoice.at
+
+    def opposite(self: NominalChoice, *args: Any) -> NominalShape:
+        chosen = choose(self, *args)
+        return replace(chosen, M=-chosen.M)
+
+    tried: list[Array] = []
+
+    def counted(areas: Array, longest: Array) -> EdgePath:
+        tried.append(areas)
+        assert len(tried) < 20, "it goes on for ever"
+        return edge_path(areas, longest)
+
+    monkeypatch.setattr(NominalChoice, "at", opposite)
+    monkeypatch.setattr(area_loop, "edge_path", counted)
+    with pytest.raises(PlanningError, match="however small, brings the base nearer"):
+        method.plan(PlanRequest(at(NOMINAL), GOAL, Tolerance(1.0, 1e-3)))

@@ -22,6 +22,7 @@ from spacerobot_ros.planning.core.controllability import (
     brackets_at,
     curvature_matrices,
     curvatures,
+    require_three_slots,
     sample_shapes,
     sliding_masses,
 )
@@ -165,3 +166,31 @@ def test_which_methods_suit_the_robots_of_the_papers(name: str, suits: set[str])
     for sentence in filter(None, objections.values()):
         assert name in sentence
         assert sentence.endswith(".")
+
+
+def test_slots_count_by_their_directions_and_not_by_their_size() -> None:
+    robot = robot_named("sliding_masses")
+    require_three_slots(robot, 1e-11 * np.eye(3))
+    require_three_slots(robot, np.diag([1.0, 1.0, 1e-8]))
+    for thin in (1e-10, 0.0):
+        with pytest.raises(PlanningError, match="of rank 2"):
+            require_three_slots(robot, 1e3 * np.diag([1.0, 1.0, thin]))
+
+
+def test_brackets_count_by_their_directions_and_not_by_their_size() -> None:
+    """A base that is a thousand times as heavy turns as little, and still about three axes; where
+    all slots are almost in one plane, the brackets turn it about one, however much."""
+    q = np.array([0.3, -0.2, 0.25])
+    robot = paper_robot()
+    heavy = replace(robot, mass=1e3 * robot.mass, inertia=1e3 * robot.inertia)
+    found = brackets_at(SpaceRobot.from_urdf(heavy.urdf), q)
+    assert found.rank == 3
+    assert found.singular_values.max() < 1e-5
+    for tilt, rank in ((1e-2, 3), (1e-8, 1)):
+        slots = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.6, 0.8, tilt]])
+        sliders = tuple(
+            replace(slider, direction=slot / np.linalg.norm(slot))
+            for slider, slot in zip(robot.sliders, slots, strict=True)
+        )
+        flat = SpaceRobot.from_urdf(replace(robot, sliders=sliders).urdf)
+        assert brackets_at(flat, q).rank == rank, tilt

@@ -42,6 +42,22 @@ def test_a_goal_is_judged_by_what_is_controlled() -> None:
     assert not Tolerance(0.5, 0.21).admits(error)
 
 
+@pytest.mark.parametrize("part", ["position", "attitude", "shape"])
+def test_each_part_of_a_goal_has_a_tolerance_of_its_own(part: str) -> None:
+    names = ["position", "attitude", "shape"]
+    # Each tolerance is once the smallest, once in the middle, once the largest of the three.
+    for turn in range(3):
+        values = np.roll([1e-3, 4e-3, 16e-3], turn)
+        tolerance = Tolerance(**dict(zip(names, values.tolist(), strict=True)))
+        for share, admitted in ((0.99, True), (1.01, False)):
+            by = share * getattr(tolerance, part)
+            error = {name: by * np.array([0.0, 0.0, name == part]) for name in names}
+            remaining = PoseError(error["position"], error["attitude"], error["shape"])
+            assert tolerance.admits(remaining, frozenset({"position", "attitude", "shape"})) is (
+                admitted
+            ), (tolerance, share)
+
+
 @pytest.mark.parametrize(
     ("position", "quaternion", "mention"),
     [

@@ -99,6 +99,18 @@ def test_a_stuck_joint_is_found_in_noise(band: float) -> None:
     assert found[0] < 20.0
 
 
+def slow_ramp(time: float) -> Array:
+    return np.array([0.04 * time, -0.03 * time, 0.0])
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_noise_that_hides_a_stuck_joint_for_a_while_does_not_hide_it_for_ever(joint: int) -> None:
+    """Over a window the noise is a tenth of the way: that is not following, only unclear."""
+    found = watched(slow_ramp, from_time(10.0, joint), noise=1e-3, band=8e-3)
+    assert list(found) == [joint]
+    assert found[joint] < 20.0
+
+
 def test_nobody_looks_when_told_not_to() -> None:
     assert watched(ramp, from_time(0.0, 0), least=0) == {}
 

@@ -93,6 +93,16 @@ def test_a_bad_command_is_a_tick_at_rest(values: Any, reason: Reason) -> None:
     assert rig.in_force() == list(FAST)
 
 
+def test_a_tick_takes_no_second_command_also_after_a_bad_one() -> None:
+    rig = Rig(beyond_limits="refuse")
+    assert rig.reason(0, 0, np.array([0.0, 0.0, -9.0])) is Reason.BEYOND_LIMITS
+    assert rig.reason(0, 0, FAST) is Reason.STALE
+    assert rig.in_force() == [0.0, 0.0, 0.0]
+    assert rig.offer(TICK, TICK, FAST) is None
+    assert rig.reason(TICK, TICK, -FAST) is Reason.STALE
+    assert rig.in_force() == list(FAST)
+
+
 def test_beyond_the_limits_is_for_the_plant_to_clip_unless_it_is_refused() -> None:
     assert Rig().offer(0, 0, np.array([0.0, 0.0, -9.0])) is None
     limit = np.array(SLIDERS.velocity_limit)
@@ -168,6 +178,18 @@ def test_a_latched_fault_refuses_everything_until_it_is_rearmed() -> None:
     assert rig.offer(3 * TICK, 3 * TICK) is None
 
 
+def test_the_first_of_several_latched_faults_is_the_one_shown() -> None:
+    rig = Rig(latched_faults="not_finite malformed")
+    rig.commands.latch("abort", "An operator has aborted.")
+    rig.commands.latch("watchdog", "A joint is too hot.")
+    assert rig.reason(0, 0, np.full(3, np.nan)) is Reason.NOT_FINITE
+    assert rig.commands.fault == "An operator has aborted."
+    assert rig.commands.fault_reason == "abort"
+    assert rig.commands.rearm() == "An operator has aborted."
+    rig.commands.latch("watchdog", "A joint is too hot.")
+    assert rig.commands.fault == "A joint is too hot."
+
+
 def test_latching_takes_back_what_was_accepted_in_the_same_tick() -> None:
     rig = Rig(ARM, actuation="effort", latched_faults="malformed")
     wrench = rig.commands.sources[1]
@@ -204,6 +226,21 @@ def test_motors_brake_and_leave_the_momenta() -> None:
         rig.plant.step(*rig.commands.begin_step())
     assert np.abs(rig.plant.qdot).max() < 1e-9
     np.testing.assert_allclose(rig.plant.momentum[:6], momenta, atol=1e-12)
+
+
+@pytest.mark.parametrize("tick_rate", [4.0, 10.0, 35.0])
+def test_slow_plants_brake_without_a_joint_turning_back(tick_rate: float) -> None:
+    """Efforts are held over a tick: half of a rate a tick is what they may take."""
+    rates = (0.2, -0.3, 0.25)
+    rig = Rig(ARM, actuation="effort", tick_rate=tick_rate, initial_joint_velocities=rates)
+    rig.commands.rest()
+    before = rig.plant.qdot.copy()
+    for _ in range(20):
+        rig.plant.step(*rig.commands.begin_step())
+        share = rig.plant.qdot / before
+        assert np.all((share > 0.3) & (share < 0.7)), share
+        before = rig.plant.qdot.copy()
+    assert np.abs(before).max() < 1e-5
 
 
 def test_names_and_lengths() -> None:

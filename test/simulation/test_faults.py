@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +125,19 @@ def test_faults_are_active_from_their_start_until_before_their_end() -> None:
         3.0: ["thruster_off", "sensor_delay"],
         9.0: ["thruster_off", "sensor_delay"],
     }
+
+
+@pytest.mark.parametrize("rate", [30, 60, 7])
+def test_times_of_faults_are_exact_where_a_tick_is_no_decimal_number(rate: int) -> None:
+    """A fault from a to b is active in the ticks k with a <= k / rate < b, as fractions."""
+    tenths = range(0, 50, 3)
+    lines = [f"actuator_bias elbow_pitch {n} at {n / 10} until {(n + 3) / 10}" for n in tenths]
+    plant = arm(*lines, tick=1 / rate)
+    for k in range(int(5.5 * rate)):
+        time = Fraction(k, rate)
+        wanted = [n for n in tenths if Fraction(n, 10) <= time < Fraction(n + 3, 10)]
+        assert [fault.value for fault in plant.active] == wanted, k
+        plant.step(np.zeros(3))
 
 
 # -- joints under velocity commands -----------------------------------------------------------

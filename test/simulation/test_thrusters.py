@@ -109,6 +109,20 @@ def test_a_thruster_may_be_weak_dead_or_stuck() -> None:
     assert broken.momentum[1] == pytest.approx(-10.0 * 0.5, rel=0.05)
 
 
+def test_propellant_is_what_the_thrust_took_whatever_was_commanded() -> None:
+    """By hand: F dt / (g0 Isp) of every thruster, weak, dead and stuck ones too."""
+    plant = flying()
+    plant.thruster_health[:] = np.linspace(0.0, 1.0, 24)
+    plant.stuck_on[5] = True
+    used, rng = 0.0, np.random.default_rng(8)
+    for _ in range(40):
+        plant.step(np.zeros(6), wanted(rng))
+        np.testing.assert_allclose(plant.thrust, 10.0 * plant.thruster_health * plant.duty)
+        used += TICK * float(plant.thrust.sum()) / (9.80665 * 290.0)
+    assert plant.propellant == pytest.approx(used, rel=1e-12)
+    assert used > 0.0
+
+
 def test_allocation_that_knows_of_a_dead_thruster_gives_the_whole_wrench() -> None:
     push = np.array([15.0, 0.0, 0.0, 0.0, 1.0, 0.0])
     plant = flying(excluded="plus_x_1 plus_y_3")
