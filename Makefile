@@ -57,6 +57,12 @@ fuzz: $(STAMP)/test ## try more than ten thousand inputs that nobody would send,
 known-errors: $(STAMP)/test ## put each known error into the package; the tests must notice it; ONLY=WORD: some
 	PYTHONPATH=test $(BIN)/python3 -m support.known_errors $(ONLY)
 
+MUTANTS := 400
+SEED := 1
+.PHONY: mutants
+mutants: $(STAMP)/mutants ## put random errors into the package; see out/mutants; MUTANTS=400 SEED=1
+	PYTHONPATH=.:test nice $(BIN)/python3 test/mutation/run.py --sample $(MUTANTS) --seed $(SEED)
+
 .PHONY: real-time
 real-time: $(STAMP)/demo ## fly ten minutes in real time in separate processes, at 100, then 200 and 500 Hz
 	$(BIN)/spacerobot bench --real-time 600 --rate 100
@@ -122,11 +128,12 @@ $(STAMP)/venv:
 
 $(STAMP)/demo: EXTRAS := jazzy,viewer
 $(STAMP)/test: EXTRAS := jazzy,test
+$(STAMP)/mutants: EXTRAS := jazzy,test,mutants
 $(STAMP)/docs: EXTRAS := jazzy,docs
 
 # A changed declaration or a new stamp: the package with its dependencies. Changed sources: the
 # package alone. What is left in build/lib would be installed again, deleted files too.
-$(STAMP)/demo $(STAMP)/test $(STAMP)/docs: $(DECLARATION) $(SOURCES) | $(STAMP)/venv
+$(STAMP)/demo $(STAMP)/test $(STAMP)/mutants $(STAMP)/docs: $(DECLARATION) $(SOURCES) | $(STAMP)/venv
 	@rm -rf build/lib
 	@echo "Installing spacerobot_ros[$(EXTRAS)] into $(VENV)$(if $(ALL), (once; a minute or two)) ..."
 	@$(PIP) install --no-build-isolation \

@@ -106,5 +106,6 @@ setup(
             "setuptools",
             "types-PyYAML",
         ],
+        "mutants": ["cosmic_ray>=8.4", "coverage>=7"],
     },
 )

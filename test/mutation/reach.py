@@ -1,0 +1,50 @@
+"""A plugin of pytest: writes down which test reaches which line, and how long each takes.
+
+Loaded by `-p` with SPACEROBOT_REACH set to the folder that gets the files of each worker.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from coverage import Coverage
+
+_FOLDER = Path(os.environ["SPACEROBOT_REACH"])
+_WORKER = os.environ.get("PYTEST_XDIST_WORKER", "main")
+
+_measured: dict[str, tuple[float, bool]] = {}
+"""Seconds of each test with its fixtures, and whether it passed."""
+
+_coverage = Coverage(
+    data_file=str(_FOLDER / f"lines-{_WORKER}"),
+    source=[os.environ["SPACEROBOT_REACH_SOURCE"]],
+    config_file=False,
+)
+# When the plugin is imported, so that the lines of modules that are imported later are seen.
+_coverage.start()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    _coverage.switch_context(item.nodeid)
+    try:
+        return (yield)
+    finally:
+        _coverage.switch_context("")
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    seconds, passed = _measured.get(report.nodeid, (0.0, True))
+    _measured[report.nodeid] = (seconds + report.duration, passed and report.passed)
+
+
+def pytest_sessionfinish(session: Any) -> None:
+    _coverage.stop()
+    _coverage.save()
+    if _WORKER != "main" or not session.config.getoption("numprocesses", None):
+        (_FOLDER / f"tests-{_WORKER}.json").write_text(json.dumps(_measured))
