@@ -43,6 +43,7 @@ import casadi as ca
 import numpy as np
 
 from spacerobot_ros.model.compilation import dense_function
+from spacerobot_ros.model.dynamics import inertia_matrix
 from spacerobot_ros.model.kinematics import TreeKinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
 
@@ -101,17 +102,84 @@ class Factor:
 
 
 @dataclass(frozen=True)
-class ShapeSystem:
-    """What the free base leaves of the inertia: see the module for the symbols.
+class Composites:
+    """The bodies beyond each joint taken as one, base components: see the module for the symbols.
 
-    ``J[k]`` (3, 3) is the second moment of mass of body k about its own centre; ``S[j]``, ``B[j]``
-    (6,) belong to the joint that carries body j (zero for the base); ``D`` is the factor of the
-    system's rotational inertia, ``K`` (n, n) the shape's inertia matrix.
+    ``J[k]`` (3, 3) is the second moment of mass of body k about its own centre. ``S[j]`` (6,) is
+    the motion of a unit rate of the joint that carries body j, ``P[j]`` (6,) the momentum of its
+    composite (both zero for the base); ``rotational`` (3, 3) is the system's rotational inertia.
     """
 
     kin: TreeKinematics
     J: tuple[ca.SX, ...]
     S: tuple[ca.SX, ...]
+    P: tuple[ca.SX, ...]
+    rotational: ca.SX
+
+    @property
+    def mass(self) -> float:
+        """Mass of the system, kg."""
+        return self.kin.robot.total_mass
+
+    @property
+    def D(self) -> ca.SX:
+        """Locked inertia (3, 3) about the system's centre of mass, kg m^2 (paper 4, eq. 16a)."""
+        return self.rotational
+
+    @property
+    def D_q(self) -> ca.SX:
+        """Angular momentum (3, n) of unit joint rates about that centre (paper 4, eq. 16a).
+
+        The momentum about the centre of mass does not depend on how that centre moves, so the
+        composites' momenta at the common point are it.
+        """
+        return ca.horzcat(ca.SX(3, 0), *(P[:3] for P in self.P[1:]))
+
+    @property
+    def D_qq(self) -> ca.SX:
+        """Inertia matrix (n, n) of the joint rates where base and centre rest (eq. 16b)."""
+        n = self.kin.n
+        D_qq = ca.SX(n, n)
+        for j in range(1, n + 1):
+            carriers = self.kin.ancestors(j)
+            for i in range(1, j + 1):
+                carried = ca.dot(self.S[i], self.P[j]) if i in carriers else 0
+                shared = ca.dot(self.P[i][3:], self.P[j][3:]) / self.mass
+                D_qq[i - 1, j - 1] = D_qq[j - 1, i - 1] = carried - shared
+        return D_qq
+
+    @property
+    def H_plus(self) -> ca.SX:
+        """Inertia matrix (6 + n, 6 + n) of ``[v_cm; omega; qdot]`` (paper 4, eq. 15)."""
+        return inertia_matrix(self.mass, self.D, self.D_q, self.D_qq)
+
+
+def composites(kin: TreeKinematics) -> Composites:
+    """Add up the bodies inward (Featherstone, table 6.2)."""
+    n, c = kin.n, kin.r_BC_B
+    J = tuple(_second_moment(kin, k) for k in range(n + 1))
+    composite = []
+    for k in range(n + 1):
+        rho = kin.com[k] - c
+        h = kin.mass(k) * rho
+        composite.append(SpatialInertia(kin.mass(k), h, J[k] + _symmetric(h @ rho.T)))
+    S, P = ([ca.SX(6, 1)] * (n + 1) for _ in range(2))
+    for k in range(n, 0, -1):
+        S[k] = _joint_motion(kin, k)
+        P[k] = composite[k] @ S[k]
+        composite[kin.parent(k)] += composite[k]
+    return Composites(kin, J, tuple(S), tuple(P), _rotational(composite[0].J))
+
+
+@dataclass(frozen=True)
+class ShapeSystem:
+    """What the free base leaves of the inertia: see the module for the symbols.
+
+    ``B[j]`` (6,) belongs to the joint that carries body j (zero for the base); ``D`` is the factor
+    of the system's rotational inertia, ``K`` (n, n) the shape's inertia matrix.
+    """
+
+    parts: Composites
     B: tuple[ca.SX, ...]
     D: Factor
     K: ca.SX
@@ -130,28 +198,18 @@ class ShapeSystem:
 
 
 def shape_system(kin: TreeKinematics) -> ShapeSystem:
-    """Build the composites inward (Featherstone, table 6.2) and eliminate the base."""
-    n, c = kin.n, kin.r_BC_B
-    J = tuple(_second_moment(kin, k) for k in range(n + 1))
-    composite = []
-    for k in range(n + 1):
-        rho = kin.com[k] - c
-        h = kin.mass(k) * rho
-        composite.append(SpatialInertia(kin.mass(k), h, J[k] + _symmetric(h @ rho.T)))
-    S, P = ([ca.SX(6, 1)] * (n + 1) for _ in range(2))
-    for k in range(n, 0, -1):
-        S[k] = _joint_motion(kin, k)
-        P[k] = composite[k] @ S[k]
-        composite[kin.parent(k)] += composite[k]
-    D = Factor(_rotational(composite[0].J))
-    B = [ca.vertcat(D.solve(p[:3]), p[3:] * (1 / kin.robot.total_mass)) for p in P]
+    """Eliminate the base from the composites."""
+    parts = composites(kin)
+    S, P, n = parts.S, parts.P, kin.n
+    D = Factor(parts.rotational)
+    B = [ca.vertcat(D.solve(p[:3]), p[3:] * (1 / parts.mass)) for p in P]
     K = ca.SX(n, n)
     for j in range(1, n + 1):
         carriers = kin.ancestors(j)
         for i in range(1, j + 1):
             motion = S[i] - B[i] if i in carriers else -B[i]
             K[i - 1, j - 1] = K[j - 1, i - 1] = ca.dot(motion, P[j])
-    return ShapeSystem(kin, J, tuple(S), tuple(B), D, K)
+    return ShapeSystem(parts, tuple(B), D, K)
 
 
 def motion_forces(system: ShapeSystem, omega: ca.SX, qdot: ca.SX) -> tuple[ca.SX, ...]:
@@ -163,7 +221,7 @@ def motion_forces(system: ShapeSystem, omega: ca.SX, qdot: ca.SX) -> tuple[ca.SX
     body's origin. The base's origin is taken as unaccelerated: what a common acceleration adds to
     ``S_j' f_j``, ``B_j' f_0`` takes off in ``Q_j``.
     """
-    kin = system.kin
+    kin = system.parts.kin
     omegas, alphas = [omega], [ca.SX(3, 1)]
     A, accelerations = [_turning(omega, ca.SX(3, 1))], [ca.SX(3, 1)]
     for k in range(1, kin.n + 1):
@@ -188,7 +246,7 @@ def motion_forces(system: ShapeSystem, omega: ca.SX, qdot: ca.SX) -> tuple[ca.SX
         arm = kin.R[k] @ _constant(kin.robot.bodies[k].inertia.com)
         force = kin.mass(k) * (accelerations[k] + A[k] @ arm)
         # The moment is the integral of rho x A rho over the body: the axial vector of A J.
-        AJ = A[k] @ system.J[k]
+        AJ = A[k] @ system.parts.J[k]
         spin = ca.vertcat(AJ[2, 1] - AJ[1, 2], AJ[0, 2] - AJ[2, 0], AJ[1, 0] - AJ[0, 1])
         forces.append(ca.vertcat(ca.cross(kin.com[k] - kin.r_BC_B, force) + spin, force))
     for k in range(kin.n, 0, -1):
@@ -207,8 +265,8 @@ def shape_forces(
     f = motion_forces(system, omega, qdot)
     excess = f[0] - external
     Q = [
-        tau[k - 1] - ca.dot(system.S[k], f[k]) + ca.dot(system.B[k], excess)
-        for k in range(1, system.kin.n + 1)
+        tau[k - 1] - ca.dot(system.parts.S[k], f[k]) + ca.dot(system.B[k], excess)
+        for k in range(1, system.parts.kin.n + 1)
     ]
     return ca.vertcat(*Q), -excess[:3]
 

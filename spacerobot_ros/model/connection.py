@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import casadi as ca
 
-from spacerobot_ros.model.dynamics import BarycentricInertia, solve_positive_definite
+from spacerobot_ros.model.composite_rigid_body import Composites
+from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.kinematics import TreeKinematics
 
 
@@ -44,7 +45,7 @@ def momentum_of_bodies(
 
 def base_twist(
     kin: TreeKinematics,
-    inertia: BarycentricInertia,
+    inertia: Composites,
     qdot: ca.SX,
     p_B: ca.SX,
     L_B: ca.SX,
@@ -60,7 +61,7 @@ def base_twist(
     return v, omega
 
 
-def connection(kin: TreeKinematics, inertia: BarycentricInertia) -> ca.SX:
+def connection(kin: TreeKinematics, inertia: Composites) -> ca.SX:
     """Return ``A(q)`` (6, n) of ``[v_WB_B; omega_WB_B] = -A(q) qdot``, zero momentum (paper 1, 3).
 
     The lower half is ``D^-1 D_q``; the upper keeps the system's centre of mass at rest:

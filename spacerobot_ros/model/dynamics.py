@@ -36,14 +36,19 @@ class BarycentricInertia:
     @property
     def H_plus(self) -> ca.SX:
         """The inertia matrix (6 + n, 6 + n) of ``[v_cm; omega; qdot]``, eq. (15)."""
-        n = self.D_qq.shape[0]
-        return ca.blockcat(
-            [
-                [self.mass * ca.SX.eye(3), ca.SX(3, 3), ca.SX(3, n)],
-                [ca.SX(3, 3), self.D, self.D_q],
-                [ca.SX(n, 3), self.D_q.T, self.D_qq],
-            ]
-        )
+        return inertia_matrix(self.mass, self.D, self.D_q, self.D_qq)
+
+
+def inertia_matrix(mass: float, D: ca.SX, D_q: ca.SX, D_qq: ca.SX) -> ca.SX:
+    """Return ``H+`` (6 + n, 6 + n) from its blocks, eq. (15)."""
+    n = D_qq.shape[0]
+    return ca.blockcat(
+        [
+            [mass * ca.SX.eye(3), ca.SX(3, 3), ca.SX(3, n)],
+            [ca.SX(3, 3), D, D_q],
+            [ca.SX(n, 3), D_q.T, D_qq],
+        ]
+    )
 
 
 def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:

@@ -19,6 +19,7 @@ from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.compilation import BufferedFunction, compiled, dense_function
 from spacerobot_ros.model.composite_rigid_body import (
     composite_dynamics,
+    composites,
     shape_equations,
     state_rate,
     state_slices,
@@ -64,7 +65,7 @@ class SpaceRobot:
         self.velocity_limit = description.limits("velocity")
         self.effort_limit = description.limits("effort")
         self._kin = tree_kinematics(description)
-        self._inertia = barycentric_inertia(self._kin)
+        self._inertia = composites(self._kin)
         self._symbolic: dict[str, ca.Function] = {}
         self._compiled: dict[str, ca.Function] = {}
         self._buffers: dict[str, BufferedFunction] = {}
@@ -276,7 +277,8 @@ class SpaceRobot:
         _, *velocities = state.values()
         wrench, tau = ca.SX.sym("wrench_B", 6), ca.SX.sym("tau", self.n)
         forces = generalised_forces(self._kin, wrench, tau)
-        acceleration = forward_dynamics(self._inertia, bias(self._kin, *velocities), forces)
+        inertia = barycentric_inertia(self._kin)
+        acceleration = forward_dynamics(inertia, bias(self._kin, *velocities), forces)
         inputs = {**state, "wrench_B": wrench, "tau": tau}
         return dense_function("forward_dynamics", inputs, {"z0ddot": acceleration})
 
