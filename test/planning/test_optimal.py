@@ -25,7 +25,6 @@ QUICK: dict[str, Any] = {
     "answers": 1,
     "intervals": 40,
     "control_period": PERIOD,
-    "time_budget": 60.0,
 }
 ARM_START = np.array([0.0, -np.pi / 4, np.pi / 2])
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, RobotState, plan
+from spacerobot_ros.planning.methods.optimal import multiple_shooting, search
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import Transcription
 from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
 from spacerobot_ros.planning.methods.optimal.problem import PathConstraints
@@ -111,8 +112,55 @@ def test_a_search_cut_short_gives_the_best_so_far(arm: SpaceRobot) -> None:
     turn = [0.5, -0.6, 0.4]
     hasty = of_arm(arm, turn, time_budget=0.7, answers=12)
     assert float(str(hasty.notes["starts"])) < 12
+    assert "optimal.time_budget, 0.7 s" in str(hasty.notes["cut_short"])
     assert reached(hasty, turn) <= 1e-6
     assert_within(hasty, arm.velocity_limit, arm.velocity_limit / 0.5)
+
+
+class SlowClock:
+    """A machine so busy that 10 s go by whenever it is asked for the time."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def monotonic(self) -> float:
+        self.now += 10.0
+        return self.now
+
+
+def test_a_plan_is_the_same_on_a_busy_machine(
+    arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    turn = [0.2, -0.3, 0.25]
+    quiet = of_arm(arm, turn, answers=2)
+    for module in (multiple_shooting, search):
+        monkeypatch.setattr(module, "time", SlowClock())
+    busy = of_arm(arm, turn, answers=2)
+    assert busy.positions.tobytes() == quiet.positions.tobytes()
+    assert busy.notes == quiet.notes
+    assert "cut_short" not in quiet.notes
+
+
+def test_a_plan_that_was_cut_short_is_not_kept(
+    arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
+    turn = [0.2, -0.3, 0.25]
+    hasty = of_arm(arm, turn, answers=12, time_budget=0.5, cache=1)
+    assert "cut_short" in hasty.notes
+    assert not list(tmp_path.rglob("*.npz"))
+    whole = of_arm(arm, turn, time_budget=600.0, cache=1)
+    assert "cut_short" not in whole.notes
+    assert len(list(tmp_path.rglob("*.npz"))) == 1
+
+
+def test_every_start_has_a_limit_of_its_own(arm: SpaceRobot) -> None:
+    asked: dict[str, Any] = {"iterations": 2, "starts": 4}
+    with pytest.raises(PlanningError, match=r"from 4 start\(s\): .* More optimal\.starts") as one:
+        of_arm(arm, [0.5, -0.6, 0.4], **asked)
+    with pytest.raises(PlanningError) as two:
+        of_arm(arm, [0.5, -0.6, 0.4], **asked)
+    assert str(one.value) == str(two.value)
 
 
 # -- refusals ---------------------------------------------------------------------------------

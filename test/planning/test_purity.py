@@ -38,7 +38,6 @@ FEW_STARTS = {
     "starts": 1,
     "answers": 1,
     "intervals": 12,
-    "time_budget": 300.0,
 }
 
 
@@ -270,7 +269,7 @@ def test_a_search_is_cancelled_from_another_thread(
     wrapped: Callable[[SpaceRobot, dict[str, Any]], GaitMethod],
 ) -> None:
     robot = robot_named("servicer")
-    long = {"cache": 0, "intervals": 200, "starts": 1000, "answers": 1000, "time_budget": 1000.0}
+    long = {"cache": 0, "intervals": 200, "starts": 1000, "answers": 1000}
     method = wrapped(robot, {"optimal": method_options("optimal", long)})
     case = replace(CASES["area_loop of six joints"], turns=((0.3, 0.2, -0.3),) * 2)
     cancellation, ended = Watched(), list[BaseException]()

@@ -63,7 +63,8 @@ class OptimalGait(GaitMethod):
 
     It reaches the attitude; the position where sliders can put the base anywhere, or where the
     options ask for it; and the final shape where the goal gives one. The search has a budget of
-    wall time: equal requests have equal schedules as long as it is not used up.
+    starts and of steps of the solver, so equal requests have equal schedules on any machine, idle
+    or busy; only where the user limits its wall time as well, they need not.
     """
 
     name: ClassVar[str] = "optimal"
@@ -95,7 +96,7 @@ class OptimalGait(GaitMethod):
         GoalSpecification.of(robot, OptimalOptions()).require_suitable(robot)
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
-        """Plan within the time budget; see :meth:`GaitMethod.plan`.
+        """Plan within the search budget; see :meth:`GaitMethod.plan`.
 
         A correction takes the smallest way instead of the fastest, and may use the margins.
         """
@@ -141,8 +142,14 @@ class OptimalGait(GaitMethod):
             "durations": list(found.solutions),
             "solution_time": found.solution_time,
         }
+        if found.cut_short:
+            notes["cut_short"] = (
+                f"The search used up optimal.time_budget, {self.options.time_budget:g} s, after "
+                f"{found.starts} start(s); a longer one may find a faster manoeuvre."
+            )
         schedule = self._schedule(state, goal, found.held.positions, notes)
-        if self._cache is not None and key is not None:
+        # What a busy machine made of the goal is not to be flown on a quiet one.
+        if self._cache is not None and key is not None and not found.cut_short:
             kept_plan = _KeptPlan(schedule.positions, notes)
             self._cache.store(_file(key), key, kept_plan.to_bytes())
         return schedule
@@ -158,6 +165,7 @@ class OptimalGait(GaitMethod):
             longest=chosen.longest,
             starts=chosen.starts,
             solutions=1 if correction else chosen.answers,
+            iterations=chosen.iterations,
             time_budget=chosen.time_budget,
             gentle=correction,
         )

@@ -36,7 +36,7 @@ from spacerobot_ros.model.symbolic_rotations import (
     quaternion_multiply,
     relative_vector,
 )
-from spacerobot_ros.planning.core.cancellation import Cancellation
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -58,7 +58,6 @@ _OPTIONS = {
     "ipopt.mu_strategy": "adaptive",
     "ipopt.tol": 1e-4,
     "ipopt.constr_viol_tol": 1e-6,
-    "ipopt.max_iter": 1000,
 }
 
 
@@ -273,21 +272,24 @@ class StopRule:
 
     Attributes
     ----------
-    deadline, last_call
-        ``time.monotonic()``, s, at which it stops with a feasible iterate, and without one.
+    iterations
+        Steps that it takes at most.
     cancellation
         Stops it at its next iterate.
+    deadline, last_call
+        ``time.monotonic()``, s, at which it stops with a feasible iterate, and without one;
+        infinite where no wall time limits the search.
     """
 
-    deadline: float
-    last_call: float
-    cancellation: Cancellation
+    iterations: int
+    cancellation: Cancellation = NEVER
+    deadline: float = math.inf
+    last_call: float = math.inf
 
-    def now(self, *, found: bool) -> bool:
-        """Whether to stop now; ``found``: there is a feasible iterate."""
-        return self.cancellation.requested or time.monotonic() > (
-            self.deadline if found else self.last_call
-        )
+    def expired(self, *, found: bool) -> bool:
+        """Whether the wall time is used up; ``found``: there is a feasible iterate."""
+        end = self.deadline if found else self.last_call
+        return end < math.inf and time.monotonic() > end
 
 
 class MultipleShooting:
@@ -447,7 +449,7 @@ class _Watch(ca.Callback):
 
     def begin(self, stop: StopRule) -> None:
         """Begin with the next problem."""
-        self.best, self._least, self._stop = None, math.inf, stop
+        self.best, self._least, self._stop, self._iterates = None, math.inf, stop, 0
 
     def get_n_in(self) -> int:
         """Return the number of what a solver reports."""
@@ -469,4 +471,11 @@ class _Watch(ca.Callback):
             worst = max(float((self._lower - g).max()), float((g - self._upper).max()))
             if worst <= _FEASIBLE:
                 self.best, self._least = arguments[0].full().ravel(), f
-        return [float(self._stop.now(found=self.best is not None))]
+        self._iterates += 1
+        stops = (
+            # The first iterate is the guess itself.
+            self._iterates > self._stop.iterations
+            or self._stop.cancellation.requested
+            or self._stop.expired(found=self.best is not None)
+        )
+        return [float(stops)]

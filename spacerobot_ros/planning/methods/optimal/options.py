@@ -83,11 +83,15 @@ class OptimalOptions:
     answers: int = parameter(
         3, "manoeuvres to find, of which the fastest is taken", minimum=1, maximum=10000
     )
+    iterations: int = parameter(
+        300, "steps of the solver from one guess at most", minimum=1, maximum=100000
+    )
     time_budget: float = parameter(
-        8.0,
-        "wall time to search; 5 times that if nothing is found",
+        0.0,
+        "wall time to search, 5 times that if nothing is found; 0: no limit. A plan that it cuts "
+        "short depends on how busy the machine is",
         unit="s",
-        minimum=0.1,
+        minimum=0.0,
         maximum=1e9,
     )
     longest: float = parameter(

@@ -1,8 +1,9 @@
-"""The search for the fastest manoeuvre: guesses, solutions, held commands, until time is up."""
+"""The search for the fastest manoeuvre: guesses, solutions, held commands."""
 
 from __future__ import annotations
 
 import logging
+import math
 import time
 from dataclasses import dataclass, field, replace
 
@@ -48,7 +49,7 @@ _ROOM_IN_GIVEN_TIME = 0.99
 
 @dataclass(frozen=True)
 class SearchBudget:
-    """How long and how hard to search.
+    """How hard to search.
 
     Attributes
     ----------
@@ -58,8 +59,10 @@ class SearchBudget:
         Longest manoeuvre, s.
     starts, solutions
         Guesses that are tried at most, and manoeuvres that are enough.
+    iterations
+        Steps of the solver from each guess at most.
     time_budget
-        Wall time, s.
+        Wall time, s; 0: no limit, and the result depends on the counts above alone.
     gentle
         Prefer the path of least effort, whose turn of the base depends least on masses that are
         not quite known.
@@ -69,6 +72,7 @@ class SearchBudget:
     longest: float
     starts: int
     solutions: int
+    iterations: int
     time_budget: float
     gentle: bool = False
 
@@ -89,6 +93,8 @@ class Manoeuvre:
         Guesses that were tried.
     solutions
         Durations of all manoeuvres that were found, s.
+    cut_short
+        Whether the wall time was used up before the search had come to its end.
     """
 
     held: HeldCommands
@@ -96,6 +102,7 @@ class Manoeuvre:
     solution_time: float
     starts: int = 1
     solutions: list[float] = field(default_factory=list)
+    cut_short: bool = False
 
 
 class ManoeuvreSearch:
@@ -143,7 +150,9 @@ class ManoeuvreSearch:
             The search was cancelled.
         """
         began = time.monotonic()
-        deadline, last_call = (began + x * budget.time_budget for x in (1.0, _LAST_CALL))
+        deadline = last_call = math.inf
+        if budget.time_budget > 0:
+            deadline, last_call = (began + x * budget.time_budget for x in (1.0, _LAST_CALL))
         solver = self._solver(intervals, boundary.center is not None)
         curvature = self._robot.function("curvature", compile=False)
         guesses = InitialGuesses(turn_function(self._robot), curvature, intervals)
@@ -151,7 +160,8 @@ class ManoeuvreSearch:
         starts, rejection = 0, ""
         for guess in guesses.of(boundary, limits, boundary.likely):
             # Until something is found the search may go on beyond its time.
-            stop = StopRule(deadline, deadline if found else last_call, cancellation)
+            last = deadline if found else last_call
+            stop = StopRule(budget.iterations, cancellation, deadline, last)
             try:
                 solution = self._solution(solver, boundary, limits, guess, stop, budget)
                 cancellation.raise_if_requested()
@@ -168,17 +178,21 @@ class ManoeuvreSearch:
                 time.monotonic() - began,
                 solver.iterations,
             )
-            enough = len(found) >= budget.solutions or starts >= budget.starts
-            if enough or time.monotonic() >= (deadline if found else last_call):
+            # What was cut short within its last start is no less so.
+            cut_short = stop.expired(found=bool(found))
+            if cut_short or len(found) >= budget.solutions or starts >= budget.starts:
                 break
         if not found:
+            within = f" within optimal.time_budget {budget.time_budget:g} s" if cut_short else ""
+            longer = "A longer optimal.time_budget, more" if cut_short else "More"
             raise PlanningError(
-                f"No manoeuvre to the goal was found from {starts} start(s) in "
-                f"{time.monotonic() - began:.3g} s: {rejection}. A longer optimal.time_budget or "
-                "optimal.longest, more optimal.intervals, or a smaller goal may help."
+                f"No manoeuvre to the goal was found from {starts} start(s){within}: {rejection}. "
+                f"{longer} optimal.starts, optimal.iterations or optimal.intervals, a longer "
+                "optimal.longest, or a smaller goal may help."
             )
         best = min(found, key=lambda one: one.duration)
-        return replace(best, starts=starts, solutions=[one.duration for one in found])
+        durations = [one.duration for one in found]
+        return replace(best, starts=starts, solutions=durations, cut_short=cut_short)
 
     def _solver(self, intervals: int, position: bool) -> MultipleShooting:
         key = intervals, position
