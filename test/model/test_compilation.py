@@ -8,7 +8,6 @@ import re
 import stat
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -202,14 +201,13 @@ def test_an_object_that_crashes_does_so_in_another_process(
 def test_a_compiler_that_hangs_is_waited_for_once_and_ended(
     tmp_path: Path, compiler: Compiler, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    compiler(f"sleep 600 & echo $! > {tmp_path}/child; wait")
-    monkeypatch.setenv("SPACEROBOT_COMPILE_TIMEOUT", "0.3")
-    began = time.monotonic()
+    compiler(f"sleep 600 & echo $! >> {tmp_path}/children; wait")
+    monkeypatch.setenv("SPACEROBOT_COMPILE_TIMEOUT", "1.0")
     for number in range(5):
         x = ca.SX.sym("x")
         compiled(ca.Function(f"f{number}", [x], [x]))
-    assert time.monotonic() - began < 1.4
-    child = int((tmp_path / "child").read_text())
+    # One line: the compiler was called once.
+    child = int((tmp_path / "children").read_text())
     status = Path(f"/proc/{child}/stat")
     # What has ended may still wait for its parent to ask.
     assert not status.exists() or status.read_text().split(")")[1].split()[0] == "Z"
