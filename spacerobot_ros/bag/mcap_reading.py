@@ -200,13 +200,16 @@ def _clusters(
         and index.message_end_time >= start_ns
     ]
     cluster: list[ChunkIndex] = []
-    latest = 0
+    latest = farthest = 0
     for index in sorted(wanted, key=lambda i: (i.message_start_time, i.chunk_start_offset)):
-        if cluster and index.message_start_time >= latest:
+        start = index.message_start_time, index.chunk_start_offset
+        # Of equal times the messages of chunks that were written before come first.
+        if cluster and start >= (latest, farthest):
             yield cluster
             cluster = []
         cluster.append(index)
         latest = max(latest, index.message_end_time)
+        farthest = max(farthest, index.chunk_start_offset)
     if cluster:
         yield cluster
 

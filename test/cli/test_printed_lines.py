@@ -268,6 +268,7 @@ def test_the_json_of_a_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
     # The second piece goes on where the first ends.
     assert written["schedule"]["positions"] == [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0], [3.0, 3.0]]
     assert written["schedule"]["tick_period_s"] == 0.02
+    assert written["final_joint_positions"] == [3.0, 3.0]
     assert written["path"]["time_s"] == pytest.approx([0.0, 0.02, 0.04, 0.04, 0.06])
 
 

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.nodes import NODE_TYPES
-from spacerobot_ros.session.scenario import CONFIGS, NODES, load_scenario, scenario_names
+from spacerobot_ros.session.scenario import (
+    CONFIGS,
+    NODES,
+    Kill,
+    load_scenario,
+    parse_kills,
+    scenario_names,
+)
 
 
 def test_the_configurations_are_those_of_the_nodes() -> None:
@@ -61,3 +69,48 @@ def test_another_goal_has_no_published_figures() -> None:
     other = scenario.with_goal(rotvec=(0.0, 0.0, 0.1))
     assert not other.published
     assert other.goal.position.tolist() == scenario.goal.position.tolist()
+
+
+def test_a_bag_holds_published_figures_of_the_method_that_is_flown_only() -> None:
+    scenario = load_scenario("sliding_masses")
+    papers_own = scenario.with_overrides("planner", {"method": "lie_bracket"})
+    assert json.loads(scenario.records(["plant"])["scenario"]["published"]) == []
+    kept = json.loads(papers_own.records(["plant"])["scenario"]["published"])
+    assert [row["quantity"] for row in kept][:3] == ["zf", "c", "alpha"]
+    assert kept[1] == {"quantity": "c", "printed": [-0.0476, 0.0337, -0.0275], "note": ""}
+    other = papers_own.with_goal(pose=(0.0, 0.1, 0.2, 0.0, 0.0, 0.0, 1.0))
+    assert json.loads(other.records(["plant"])["scenario"]["published"]) == []
+
+
+def test_real_time_plans_beside_the_flight_and_says_how_the_recorder_does() -> None:
+    scenario = load_scenario("sliding_masses").in_real_time(2.5)
+    assert (scenario.plant.time_mode, scenario.plant.real_time_factor) == ("realtime", 2.5)
+    assert scenario.planner.plan_in_background is True
+    assert scenario.config("recorder").diagnostics_period == 1.0
+
+
+def test_another_pose_keeps_the_shape_that_is_wanted() -> None:
+    scenario = load_scenario("planar_chain")
+    shape = scenario.goal.joint_positions
+    assert shape is not None
+    for words in (
+        {"pose": (0.0, 0.1, 0.2, 0.0, 0.0, 0.0, 1.0)},
+        {"rotvec": (0.0, 0.0, 0.1)},
+    ):
+        kept = scenario.with_goal(**words).goal.joint_positions
+        assert kept is not None
+        assert kept.tolist() == shape.tolist()
+
+
+def test_kills_are_read_in_order_of_time() -> None:
+    lines = ["plant at 20", "planner at 5.5 until 7", "coordinated_control at 6"]
+    assert parse_kills(lines, "a test") == (
+        Kill("planner", 5.5, 7.0),
+        Kill("coordinated_control", 6.0, float("inf")),
+        Kill("plant", 20.0, float("inf")),
+    )
+    for line in ("plant at 5 until 5", "plant at 5 until 4", "plant at -1", "plant at nan"):
+        with pytest.raises(ParameterError, match="the second after the first"):
+            parse_kills([line], "a test")
+    with pytest.raises(ParameterError, match="names 'recorder'"):
+        parse_kills(["recorder at 5"], "a test")

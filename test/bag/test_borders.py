@@ -1,0 +1,297 @@
+"""Reading and writing at the borders: equal times, ends of windows, limits met exactly.
+
+What a bag holds is read with the mcap library alone, or was written with it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import random
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+from std_msgs.msg import UInt8, UInt8MultiArray
+from support.made_bags import joint_states, made_bag
+
+from spacerobot_ros.bag import BagWriter, QosProfile, RecordingError, TopicSeries, read_bag
+from spacerobot_ros.bag.mcap_reading import messages_in_time_order
+from spacerobot_ros.bag.playback import Playback
+from spacerobot_ros.bag.rosbag2 import INFINITE_NS
+from spacerobot_ros.bag.salvage import salvage_bag
+
+STRING = "std_msgs/msg/String"
+S = 10**9
+
+
+def string(text: str) -> bytes:
+    """Serialise a std_msgs/String by hand."""
+    data = text.encode() + b"\0"
+    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
+
+
+# -- the order of messages --------------------------------------------------------------------
+
+
+def written(path: Path, times: list[int], chunked: bool, chunk_size: int) -> Path:
+    """Write messages on two topics in turn, with publish times of their own."""
+    with path.open("wb") as file:
+        writer = Writer(
+            file, chunk_size=chunk_size, use_chunking=chunked, compression=CompressionType.NONE
+        )
+        writer.start("ros2")
+        schema = writer.register_schema(STRING, "ros2msg", b"string data")
+        channels = [writer.register_channel(topic, "cdr", schema) for topic in ("/a", "/b")]
+        for n, time in enumerate(times):
+            writer.add_message(channels[n % 2], time, string(f"{n:03d}"), 1000 + n)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+@pytest.mark.parametrize("spread", [2, 5, 40])
+def test_messages_come_by_time_and_those_of_one_time_as_they_were_written(
+    tmp_path: Path, chunked: bool, spread: int
+) -> None:
+    """Against a stable sort; many of the times are equal, within chunks and across them."""
+    chance = random.Random(spread)
+    for turn in range(12):
+        times = [10 + chance.randrange(spread) for _ in range(40)]
+        path = written(tmp_path / f"{turn}.mcap", times, chunked, chance.choice([60, 150, 400]))
+        order = sorted(range(len(times)), key=times.__getitem__)
+        found = list(messages_in_time_order(path, {1, 2}))
+        assert [data[8:-1] for *_, data in found] == [b"%03d" % n for n in order]
+        assert [log for _, log, _, _ in found] == [times[n] for n in order]
+        assert [publish for _, _, publish, _ in found] == [1000 + n for n in order]
+        # A window holds both of its ends, and one topic is every second message.
+        start, end = sorted(chance.sample(range(8, 12 + spread), 2))
+        part = messages_in_time_order(path, {2}, start, end)
+        wanted = [n for n in order if start <= times[n] <= end and n % 2]
+        assert [data[8:-1] for *_, data in part] == [b"%03d" % n for n in wanted]
+
+
+def test_messages_in_order_are_read_chunk_by_chunk(tmp_path: Path) -> None:
+    """Chunks that share one time are no reason to hold all of them in memory."""
+    path = written(tmp_path / "a.mcap", [n // 3 for n in range(300)], True, 200)
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert len(summary.chunk_indexes) > 30
+    from spacerobot_ros.bag.mcap_reading import _clusters
+
+    groups = list(_clusters(summary, {1, 2}, 0, S))
+    assert max(map(len, groups)) == 1
+
+
+# -- replay -----------------------------------------------------------------------------------
+
+
+LATCHED = QosProfile(depth=1, durability="transient_local")
+
+
+def replayed(path: Path, start: float) -> Playback:
+    """Replay /a every 0.1 s for 1 s, and /latched at 0, 0.2 and 0.3 s."""
+    with BagWriter(path) as writer:
+        a = writer.add_topic("/a", STRING)
+        latched = writer.add_topic("/latched", STRING, LATCHED)
+        for n in range(11):
+            if n in (0, 2, 3):
+                writer.write(latched, string(f"latched {n}"), 77 * S + n * S // 10, 0)
+            writer.write(a, string(f"{n}"), 77 * S + n * S // 10, 0)
+    return Playback(read_bag(path), start=start)
+
+
+@pytest.mark.parametrize(
+    ("start", "expected"),
+    [
+        (0.0, ["latched 0", "0"]),
+        (0.2, ["latched 0", "latched 2", "2"]),
+        (0.3, ["latched 2", "latched 3", "3"]),
+        (0.35, ["latched 3"]),
+    ],
+)
+def test_what_was_latched_comes_once(tmp_path: Path, start: float, expected: list[str]) -> None:
+    playback = replayed(tmp_path / "a.mcap", start)
+    playback.run(5 * S)
+    due = playback.due(5 * S, 100)
+    assert [message.data[8:-1].decode() for message in due] == expected
+    # What was sent before is due at the start: a clock made of it does not go back.
+    assert {message.log_time_ns for message in due} == {77 * S + round(start * S)}
+
+
+def test_the_time_of_a_late_replay_is_not_ahead_of_what_is_still_to_come(tmp_path: Path) -> None:
+    playback = replayed(tmp_path / "a.mcap", 0.0)
+    playback.run(5 * S)
+    assert playback.bag_time(9 * S) == 77 * S
+    playback.due(5 * S, 100)
+    assert playback.bag_time(9 * S) == 77 * S + S // 10
+    playback.due(9 * S, 100)
+    assert playback.ended
+    assert playback.bag_time(9 * S) == 81 * S
+
+
+# -- writing ----------------------------------------------------------------------------------
+
+
+def bag_of(path: Path, times: list[float], **options: Any) -> Path:
+    with BagWriter(path, chunk_size=1, **options) as writer:
+        writer.add_topic("/silent", STRING)
+        channel = writer.add_topic("/a", STRING)
+        for n, time in enumerate(times):
+            writer.write(channel, string(f"{n}"), round(time * S), round(time * S))
+    return path
+
+
+def test_a_file_is_full_when_it_lasts_exactly_as_long_as_it_may(tmp_path: Path) -> None:
+    bag_of(tmp_path / "a.mcap", [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0], max_duration_ns=S)
+    times = []
+    for n in range(3):
+        with (tmp_path / f"a_{n}.mcap").open("rb") as file:
+            # As a stream: a message whose channel or schema did not come before is an error.
+            found = NonSeekingReader(file).iter_messages(log_time_order=False)
+            times.append([message.log_time / S for _, _, message in found])
+            file.seek(0)
+            assert list(StreamReader(file, validate_crcs=True).records)
+    assert times == [[0.0, 0.5, 1.0], [1.5, 2.0, 2.5], [3.0]]
+
+
+def test_the_statistics_of_messages_that_were_written_out_of_order(tmp_path: Path) -> None:
+    path = bag_of(tmp_path / "a.mcap", [5.0, 9.0, 3.0, 4.0])
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        content = {m.name: m.metadata for m in make_reader(file).iter_metadata()}
+    assert summary is not None
+    assert summary.statistics is not None
+    statistics = summary.statistics
+    assert (statistics.message_start_time, statistics.message_end_time) == (3 * S, 9 * S)
+    assert (statistics.channel_count, statistics.schema_count) == (2, 1)
+    assert (statistics.chunk_count, statistics.message_count) == (4, 4)
+    told = yaml.safe_load(content["rosbag2"]["serialized_metadata"])
+    assert told["starting_time"]["nanoseconds_since_epoch"] == 3 * S
+    assert told["duration"]["nanoseconds"] == 6 * S
+    bag = read_bag(path)
+    assert (bag.start_time, bag.end_time) == (3.0, 9.0)
+
+
+def test_what_waits_in_memory_is_counted_until_it_is_written(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        channel = writer.add_topic("/a", STRING)
+        before, size = writer.bytes_waiting, writer.bytes_written
+        for _ in range(3):
+            writer.write(channel, string("x" * 91), 1, 1)
+        # A record is 9 + 22 bytes of head, 4 + 4 of the message, 91 of text and its zero.
+        assert writer.bytes_waiting - before == 3 * (9 + 22 + 4 + 4 + 91 + 1)
+        assert writer.bytes_written == size
+        writer.flush()
+        assert writer.bytes_waiting == 0
+        assert writer.bytes_written == (tmp_path / "a.mcap").stat().st_size > size
+
+
+# -- reading ----------------------------------------------------------------------------------
+
+
+def test_a_topic_of_two_publishers_is_one_topic(tmp_path: Path) -> None:
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        schema = writer.register_schema(STRING, "ros2msg", b"string data")
+        channels = [writer.register_channel("/a", "cdr", schema) for _ in range(2)]
+        for n in range(5):
+            writer.add_message(channels[n > 2], n, string(f"{n}"), n)
+        writer.finish()
+    assert channels[0] != channels[1]
+    bag = read_bag(tmp_path / "a.mcap")
+    assert bag.message_count("/a") == bag.message_count() == 5
+    assert [message.data for _, message in bag.messages("/a")] == list("01234")
+
+
+def test_a_folder_is_read_where_it_holds_one_file(tmp_path: Path) -> None:
+    bag_of(tmp_path / "one" / "a.mcap", [1.0])
+    assert read_bag(tmp_path / "one").message_count() == 1
+    bag_of(tmp_path / "one" / "b.mcap", [1.0])
+    with pytest.raises(RecordingError, match="holds 2 MCAP files"):
+        read_bag(tmp_path / "one")
+
+
+def test_bytes_are_not_signed(tmp_path: Path) -> None:
+    with made_bag(tmp_path / "a.mcap") as (_, say):
+        for n in (0, 127, 128, 255):
+            say("/one", UInt8(data=n), 0.0)
+            say("/many", UInt8MultiArray(data=[n, 255 - n]), 0.0)
+    bag = read_bag(tmp_path / "a.mcap")
+    np.testing.assert_array_equal(bag["/one"].field("data"), [0, 127, 128, 255])
+    many = bag["/many"].field("data")
+    np.testing.assert_array_equal(many, [[0, 255], [127, 128], [128, 127], [255, 0]])
+
+
+def test_a_message_with_too_many_numbers_has_none_in_a_table(tmp_path: Path) -> None:
+    with made_bag(tmp_path / "a.mcap") as (_, say):
+        for n in (2, 3, 1, 2):
+            names, numbers = list("abc")[:n], [float(k + 1) for k in range(n)]
+            say("/joints", joint_states(0.0, names, numbers, numbers), 0.0)
+    series: TopicSeries = read_bag(tmp_path / "a.mcap")["/joints"]
+    nan = np.nan
+    table = series.table(["position", "velocity"], 4)
+    np.testing.assert_array_equal(
+        table, [[1, 2, 1, 2], [nan, nan, nan, nan], [nan, nan, nan, nan], [1, 2, 1, 2]]
+    )
+
+
+def test_durations_beyond_the_longest_are_the_longest() -> None:
+    """Connext's infinite duration, for one, is more than a duration of ROS holds."""
+    text = "- deadline: {sec: 9223372036854775807, nsec: 4294967295}\n  lifespan: {sec: 2, nsec: 5}"
+    (profile,) = QosProfile.from_yaml(text)
+    assert profile.deadline_ns == INFINITE_NS
+    assert profile.lifespan_ns == 2 * S + 5
+    (again,) = QosProfile.from_yaml(profile.to_yaml())
+    assert again == profile
+
+
+# -- salvage ----------------------------------------------------------------------------------
+
+
+def ends_of_records(content: bytes | bytearray) -> list[tuple[int, int]]:
+    """Return opcode and end of every record of a file, from its bytes."""
+    ends, position = [], 8
+    while position < len(content) - 8:
+        opcode, length = struct.unpack_from("<BQ", content, position)
+        position += 9 + length
+        ends.append((opcode, position))
+    return ends
+
+
+def test_what_is_lost_behind_the_last_whole_record_is_counted(tmp_path: Path) -> None:
+    whole = bag_of(tmp_path / "a.mcap", [float(n) for n in range(6)]).read_bytes()
+    records = ends_of_records(whole)
+    data_end = next(end for opcode, end in records if opcode == 0x0F)
+    cut = tmp_path / "cut.mcap"
+    chance = random.Random(1)
+    exact = [end for _, end in records if end < data_end][-4:]
+    for length in [*exact, *(chance.randrange(exact[0], data_end - 1) for _ in range(12))]:
+        cut.write_bytes(whole[:length])
+        saved = salvage_bag(cut)
+        last = max(end for _, end in records if end <= length)
+        assert saved.lost_bytes == length - last
+        assert saved.duration == pytest.approx(saved.messages - 1)
+        with saved.path.open("rb") as file:
+            names = [metadata.name for metadata in make_reader(file).iter_metadata()]
+        assert names.count("rosbag2") == 1
+        saved.path.unlink()
+
+
+def test_a_bag_whose_statistics_are_wrong_is_salvaged(tmp_path: Path) -> None:
+    path = bag_of(tmp_path / "a.mcap", [0.0, 1.0, 2.0])
+    content = bytearray(path.read_bytes())
+    records = ends_of_records(content)
+    (end,) = (end for (_, end), (opcode, _) in itertools.pairwise(records) if opcode == 11)
+    (count,) = struct.unpack_from("<Q", content, end + 9)
+    assert count == 3
+    struct.pack_into("<Q", content, end + 9, 4)
+    path.write_bytes(content)
+    assert salvage_bag(path).messages == 3

@@ -1,0 +1,180 @@
+"""The summary of a flight, from a bag written by hand: every number is computed in the test."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from support.made_bags import array, joint_states, made_bag, odometry, pose
+
+from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.status import (
+    PlannerState,
+    PlannerStatistics,
+    PlannerStatus,
+)
+from spacerobot_ros.session import run
+from spacerobot_ros.session.mission_client import Outcome
+from spacerobot_ros.session.scenario import Scenario, load_scenario
+
+HALF = math.sin(0.05), math.cos(0.05)
+"""Of a quaternion that turns by 0.1 rad."""
+
+STILL = (0.0,) * 6
+NAMES = ["slider_1", "slider_2"]
+RATES = [[0.0, 0.0], [0.5, -0.25], [-0.75, 0.125], [0.25, 0.0]]
+GOAL = Goal.checked([1.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0])
+
+
+@dataclass
+class Client:
+    """What a mission client knows at the end."""
+
+    outcome: Outcome | None = Outcome.REACHED
+    status: Any = None
+    gait: PlannerStatus | None = None
+    sentence: str = "The goal is reached."
+
+
+@dataclass
+class Flown:
+    """What a stack knows at the end."""
+
+    scenario: Scenario
+    bag: Path
+    client: Client
+    statistics: PlannerStatistics
+
+
+def summary(path: Path, wall_time: float = 0.5, **options: Any) -> dict[str, Any]:
+    """Write four ticks of 0.25 s from 2 s on, and sum them up.
+
+    The base ends 0.1 rad and (0.3, 0, -0.4) m from the goal; momenta swing and come back.
+    """
+    scenario = options.pop("scenario", load_scenario("sliding_masses").with_goal(_pose(GOAL)))
+    more = options.pop("more", lambda say, time, k: None)
+    true = options.pop("true", False)
+    with made_bag(path) as (_, say):
+        for k, rates in enumerate(RATES):
+            time = 2.0 + 0.25 * k
+            where = odometry(time, 0.7, 2.0, 3.4 * (k == 3), 0.0, HALF[0], 0.0, HALF[1], *STILL)
+            joints = joint_states(time, NAMES, [0.1 * k, 0.2 * k], rates)
+            for topic, message in (("odom", where), ("joint_states", joints)):
+                if true:
+                    say(f"/{topic}_true", message, time)
+            if true:
+                where = odometry(time, 99.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, *STILL)
+                joints = joint_states(time, NAMES, [9.0, 9.0], [9.0, 9.0])
+            say("/odom", where, time)
+            say("/joint_states", joints, time)
+            swing = (0.0, 3.0, -4.0, 0.0)[k]
+            say("/momentum", array(5.0 + 3 * swing, 4 * swing, 0, 0, -swing, 7.0, 1.0), time)
+            more(say, time, k)
+        say("/diagnostics", DiagnosticArray(), 9.0)
+    flown = Flown(scenario, path, options.pop("client", Client()), PlannerStatistics(0.75, 2, 100))
+    assert not options
+    return run._summary(flown, wall_time)  # type: ignore[arg-type]
+
+
+def _pose(goal: Goal) -> list[float]:
+    return [*goal.position.tolist(), *goal.quaternion.tolist()]
+
+
+@pytest.mark.parametrize("true", [False, True])
+def test_the_numbers_of_a_flight(tmp_path: Path, true: bool) -> None:
+    """Beside noisy sensors the truth counts."""
+    found = summary(tmp_path / "a.mcap", true=true)
+    assert found["scenario"] == "sliding_masses"
+    assert found["goal"] == _pose(GOAL)
+    assert found["final_position_m"] == [0.7, 2.0, 3.4]
+    assert found["position_error_m"] == pytest.approx(0.5)
+    assert found["final_attitude_rotvec_rad"] == pytest.approx([0.0, 0.1, 0.0])
+    assert found["attitude_error_rad"] == pytest.approx(0.1)
+    assert found["joint_names"] == NAMES
+    assert found["final_joint_positions"] == pytest.approx([0.3, 0.6])
+    assert found["peak_joint_velocities"] == [0.75, 0.25]
+    assert found["sim_time_s"] == 0.75
+    assert (found["ticks"], found["ticks_per_s"]) == (3, 6.0)
+    assert found["real_time_factor"] == 1.5
+    assert found["wall_time_s"] == 0.5
+    # |(3, 4)| times the largest swing of 4; the angular momentum swings by that alone.
+    assert found["linear_momentum_drift"] == pytest.approx(20.0)
+    assert found["angular_momentum_drift"] == pytest.approx(4.0)
+    assert found["momentum_drift"] == pytest.approx(20.0)
+    assert found["messages_recorded"] == 4 * (5 if true else 3) + 1
+    assert found["plan_time_s"] == 0.75
+    assert (found["succeeded"], found["state"]) == (True, "reached")
+    assert "propellant_kg" not in found
+    assert "end_effector_position_error_m" not in found
+
+
+def test_momenta_that_thrusters_have_put_in_are_no_drift(tmp_path: Path) -> None:
+    def more(say: Any, time: float, k: int) -> None:
+        swing = (0.0, 3.0, -4.0, 0.0)[k]
+        leak = 0.5 * (k == 2)
+        expected = array(5.0 + 3 * swing, 4 * swing - leak, 0, 0, -swing, 7.0 - leak / 2)
+        say("/momentum_expected", expected, time)
+
+    found = summary(tmp_path / "a.mcap", more=more)
+    assert found["linear_momentum_drift"] == pytest.approx(0.5)
+    assert found["angular_momentum_drift"] == pytest.approx(0.25)
+    assert found["momentum_drift"] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_end_effector_and_the_propellant(tmp_path: Path, turned: bool) -> None:
+    def more(say: Any, time: float, k: int) -> None:
+        say("/end_effector_pose", pose(time, 0.0, 3.0 + k, 4.0, *(0.0, 0.0), *HALF), time)
+        status = DiagnosticStatus(values=[KeyValue(key="propellant_kg", value=f"{0.25 * k}")])
+        # The last one that says something counts.
+        others = DiagnosticStatus(values=[KeyValue(key="pulses", value="9")])
+        say("/diagnostics", DiagnosticArray(status=[status] if k < 3 else [others]), time)
+
+    label = "end_effector.rx" if turned else "end_effector.x"
+    command = CommandReport("a_law", False, 1.0, 0.0, 0.0, 0.0, 0.0, {label: 0.1, "base.rx": 1.0})
+    status = ControllerStatus(ControllerState.REACHED, "Reached.", command=command)
+    scenario = load_scenario("servicer").with_goal(_pose(GOAL))
+    goal = Goal.checked([0.0, 6.0, 3.0], [0.0, 0.0, 0.0, 1.0])
+    scenario = replace(scenario, end_effector_goal=goal)
+    client = Client(status=status)
+    found = summary(tmp_path / "a.mcap", scenario=scenario, more=more, client=client)
+    assert found["end_effector_final_position_m"] == [0.0, 6.0, 4.0]
+    assert found["end_effector_position_error_m"] == pytest.approx(1.0)
+    assert ("end_effector_attitude_error_rad" in found) == turned
+    if turned:
+        assert found["end_effector_attitude_error_rad"] == pytest.approx(0.1)
+    assert found["propellant_kg"] == 0.5
+    assert found["method"] == scenario.controller.law
+    # Without schedules the manoeuvre is the flight.
+    assert found["manoeuvre_time_s"] == 0.75
+
+
+def test_what_the_planner_reports(tmp_path: Path) -> None:
+    gait = PlannerStatus(
+        PlannerState.EXECUTING, "Flying.", method="square_path", duration_s=3.5, notes={"c": 1.0}
+    )
+    last = PlannerStatus(
+        PlannerState.FAILED, "Missed.", corrections=4, manoeuvre_time_s=12.5, duration_s=1.0
+    )
+    client = Client(Outcome.FAILED, last, gait, "Missed.")
+    found = summary(tmp_path / "a.mcap", client=client)
+    assert found["method"] == "square_path"
+    assert found["gait"] == {"duration_s": 3.5, "c": 1.0}
+    assert found["manoeuvre_time_s"] == 12.5
+    assert found["corrections"] == 4
+    assert (found["succeeded"], found["state"]) == (False, "failed")
+    assert found["message"] == "Missed."
+
+
+@pytest.mark.parametrize("outcome", [None, Outcome.INTERRUPTED])
+def test_an_interrupted_flight_says_so(tmp_path: Path, outcome: Outcome | None) -> None:
+    found = summary(tmp_path / "a.mcap", client=Client(outcome, sentence="Flying."))
+    assert found["message"] == "Interrupted after 0.75 s of simulated time."
+    assert (found["succeeded"], found["state"]) == (False, "interrupted")
+    assert found["method"] == load_scenario("sliding_masses").planner.method
+    assert found["gait"] == {}
