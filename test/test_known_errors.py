@@ -21,7 +21,7 @@ def test_every_known_error_can_be_put_in_and_names_tests_that_exist() -> None:
     problems = []
     for error in errors:
         try:
-            error.put_into(content(error.file))
+            error.replaced(content(error.file))
         except ValueError as problem:
             problems.append(f"{error.source}: {problem}")
         if not error.noticed_by:

@@ -62,23 +62,34 @@ class KnownError:
         ValueError
             The text before is not there exactly once, or the file is no Python afterwards.
         """
-        pattern = _pattern(self.before)
-        found = [match.start() for match in pattern.finditer(text)]
-        if len(found) != 1:
-            raise ValueError(f"{self.line} The text before occurs {len(found)} times.")
-
-        def replaced(match: re.Match[str]) -> str:
-            indent = match["indent"] if "indent" in pattern.groupindex else ""
-            return indent + self.after.replace("\n", f"\n{indent}")
-
-        changed = pattern.sub(replaced, text)
-        if changed == text:
-            raise ValueError(f"{self.line} It changes nothing.")
+        changed = self.replaced(text)
         if self.file.endswith(".py"):
             try:
                 ast.parse(changed)
             except SyntaxError as error:
                 raise ValueError(f"{self.line} The file is no Python afterwards: {error}") from None
+        return changed
+
+    def replaced(self, text: str) -> str:
+        """Return the text of the file with the error in it, not parsed: that takes most of a test.
+
+        Raises
+        ------
+        ValueError
+            The text before is not there exactly once.
+        """
+        pattern = _pattern(self.before)
+        found = [match.start() for match in pattern.finditer(text)]
+        if len(found) != 1:
+            raise ValueError(f"{self.line} The text before occurs {len(found)} times.")
+
+        def replacement(match: re.Match[str]) -> str:
+            indent = match["indent"] if "indent" in pattern.groupindex else ""
+            return indent + self.after.replace("\n", f"\n{indent}")
+
+        changed = pattern.sub(replacement, text)
+        if changed == text:
+            raise ValueError(f"{self.line} It changes nothing.")
         return changed
 
 
