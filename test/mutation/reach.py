@@ -9,7 +9,6 @@ import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from coverage import Coverage
@@ -43,8 +42,9 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     _measured[report.nodeid] = (seconds + report.duration, passed and report.passed)
 
 
-def pytest_sessionfinish(session: Any) -> None:
+def pytest_sessionfinish(session: pytest.Session) -> None:
     _coverage.stop()
+    if _WORKER == "main" and session.config.getoption("numprocesses", None):
+        return  # It has run no test: its workers have.
     _coverage.save()
-    if _WORKER != "main" or not session.config.getoption("numprocesses", None):
-        (_FOLDER / f"tests-{_WORKER}.json").write_text(json.dumps(_measured))
+    (_FOLDER / f"tests-{_WORKER}.json").write_text(json.dumps(_measured))

@@ -153,6 +153,36 @@ def test_a_silent_reference_is_known_with_the_next_joints() -> None:
     assert control.handed == [(WHOLE, 1), (WHOLE, 2)]
 
 
+@pytest.mark.parametrize("late", ["joint_reference", "base_reference"])
+def test_every_reference_must_be_of_the_same_tick(late: str) -> None:
+    """One of two that is of the tick before: the state waits, and then goes without an answer."""
+    control = Commander(pose_required=True)
+    other = {"joint_reference": "base_reference"}.get(late, "joint_reference")
+    for topic in (late, other):
+        control.states.require(topic)
+        control.states.put_required(topic, joints(1))
+    control.odom(1)
+    control.joints(1)
+    assert control.handed == [(WHOLE, 1)]
+    control.odom(2)
+    control.states.put_required(other, joints(2))
+    control.joints(2)
+    assert control.handed == [(WHOLE, 1)], "the other reference is of tick 1"
+    control.states.put_required(late, joints(2))
+    assert control.states.ready() is WHOLE
+    control.odom(3)
+    control.states.put_required(other, joints(3))
+    control.joints(3)
+    # The pose is there: what is missing is no loss of the pose, now or later.
+    assert control.states.overdue() is WHOLE
+    control.states.put_required(late, joints(4))
+    control.states.put_required(other, joints(4))
+    control.joints(4)
+    assert len(control.handed) == 1, "it waits for its odom"
+    control.odom(4)
+    assert control.handed[1:] == [(WHOLE, 4)]
+
+
 def test_a_reference_that_is_no_longer_required_is_forgotten() -> None:
     control = Commander(pose_required=True)
     control.reference(1)

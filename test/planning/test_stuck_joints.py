@@ -99,16 +99,36 @@ def test_a_stuck_joint_is_found_in_noise(band: float) -> None:
     assert found[0] < 20.0
 
 
-def slow_ramp(time: float) -> Array:
-    return np.array([0.04 * time, -0.03 * time, 0.0])
+def found_at(goes: Callable[[int], float], ticks: int = 10 * NEEDED) -> int | None:
+    """Return the tick at which the first joint is found stuck, counted from the first one watched.
+
+    It is commanded 1 mm a tick and goes, from tick 0, as the function of the tick says (mm); the
+    second joint follows.
+    """
+    watch = StuckJointWatch(3, NEEDED, TICK)
+    velocity = np.array([1e-3, 1e-3, 0.0]) / TICK
+    for tick in range(-15, ticks):
+        q = np.array([goes(max(tick, 0)), tick, 0.0]) * 1e-3
+        wanted = np.array([tick + 30.0, tick + 1e-3, 0.0]) * 1e-3
+        stuck = watch.look(q, wanted, velocity)
+        assert stuck in ([], [0])
+        if stuck:
+            return tick + 1
+    return None
 
 
-@pytest.mark.parametrize("joint", [0, 1])
-def test_noise_that_hides_a_stuck_joint_for_a_while_does_not_hide_it_for_ever(joint: int) -> None:
-    """Over a window the noise is a tenth of the way: that is not following, only unclear."""
-    found = watched(slow_ramp, from_time(10.0, joint), noise=1e-3, band=8e-3)
-    assert list(found) == [joint]
-    assert found[joint] < 20.0
+def test_noise_that_hides_a_stuck_joint_for_a_while_does_not_hide_it_for_ever() -> None:
+    """Noise of a tenth of the way is not following: twice the way is waited for, then more."""
+    assert found_at(lambda _: 0.0) == NEEDED
+    assert found_at(lambda tick: 0.09 * NEEDED * (tick % 2)) == 2 * NEEDED
+    assert found_at(lambda tick: 0.19 * NEEDED * (tick % 2)) == 4 * NEEDED
+
+
+def test_what_a_slow_joint_has_gone_counts_until_it_has_followed() -> None:
+    """One that stops after a while is compared with all the way since it was last seen to follow:
+    slow until then, it is given longer; having followed, it is not."""
+    for share, found in ((0.18, 4), (0.45, 16), (0.55, 2)):
+        assert found_at(lambda tick, s=share: s * min(tick, NEEDED), 20 * NEEDED) == found * NEEDED  # type: ignore[misc]
 
 
 def test_nobody_looks_when_told_not_to() -> None:

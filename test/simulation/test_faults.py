@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from fractions import Fraction
 from pathlib import Path
@@ -127,16 +128,22 @@ def test_faults_are_active_from_their_start_until_before_their_end() -> None:
     }
 
 
-@pytest.mark.parametrize("rate", [30, 60, 7])
+@pytest.mark.parametrize("rate", [30, 50, 60, 7])
 def test_times_of_faults_are_exact_where_a_tick_is_no_decimal_number(rate: int) -> None:
-    """A fault from a to b is active in the ticks k with a <= k / rate < b, as fractions."""
-    tenths = range(0, 50, 3)
-    lines = [f"actuator_bias elbow_pitch {n} at {n / 10} until {(n + 3) / 10}" for n in tenths]
+    """A fault from a to b is active in the ticks k with a <= k / rate < b, as fractions.
+
+    111 / 30 is 3.7, and 111 times the float 1 / 30 is less; 8.3 over 1 / 30 is more than 249.
+    """
+    times = [Fraction(k, rate) for k in range(10 * rate) if (100 * Fraction(k, rate)) % 1 == 0]
+    lines = [
+        f"actuator_bias elbow_pitch {n} at {float(a)} until {float(b)}"
+        for n, (a, b) in enumerate(itertools.pairwise(times))
+    ]
     plant = arm(*lines, tick=1 / rate)
-    for k in range(int(5.5 * rate)):
-        time = Fraction(k, rate)
-        wanted = [n for n in tenths if Fraction(n, 10) <= time < Fraction(n + 3, 10)]
-        assert [fault.value for fault in plant.active] == wanted, k
+    for k in range(round(times[-1] * rate)):
+        (fault,) = plant.active
+        wanted = sum(1 for time in times if time <= Fraction(k, rate)) - 1
+        assert fault.value == wanted, k
         plant.step(np.zeros(3))
 
 
