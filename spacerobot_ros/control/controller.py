@@ -121,6 +121,10 @@ class CoordinatedController:
         self._profile = self._profile_type(start, goal, motion)
         self._began = time
 
+    def shift_time(self, seconds: float) -> None:
+        """Let the reference go on from where it is when time has jumped by some s."""
+        self._began += seconds
+
     def follow(self, reference: Reference) -> None:
         """Track a reference from outside at the next command; the profile gives what it lacks."""
         self._followed = reference

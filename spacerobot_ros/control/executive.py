@@ -65,11 +65,18 @@ class ControlExecutive:
         self._config = config
         self._report, self._warn = report, warn
         self._file = goal_file if goal_file is not None else GoalFile("", GOAL_KEYS)
+        self._longest_gap = max(_GAP, _GAP_PERIODS * config.control_period)
         self.reset()
 
     def reset(self) -> None:
         """Drop goals and measurements: the next state is the first. The goal file stays."""
         self.controller.reset()
+        self._time: float | None = None
+        """Time of the last state, s."""
+        self._hold_here = False
+        """Whether the robot is to hold where it is at the next measured state, without a goal."""
+        self._abort_sentence = ""
+        """The sentence of the status while the state is aborted."""
         self._pending: dict[str, IdentifiedGoal] = {}
         """Goals that are accepted and wait for the next measured state."""
         self._abort_requested = False
@@ -149,9 +156,48 @@ class ControlExecutive:
 
     def abort(self) -> None:
         """Give up every goal; from the next measured state on the robot holds where it is then."""
+        self._give_up("Aborted on request; the robot holds.")
+        self._abort_requested = True
+
+    def plant_stopped(self, why: str, commanded_until_ns: int | None = None) -> bool:
+        """Give up every goal at once: the plant does not obey commands any more.
+
+        Parameters
+        ----------
+        why
+            What the plant reports, as a clause; it becomes part of the status.
+        commanded_until_ns
+            For a plant that rests because commands did not come: the stamp of the last one that it
+            had. Goals that were begun later go on. None: it obeys nothing.
+
+        Returns
+        -------
+        bool
+            Whether a goal was given up.
+        """
+        pursued = self._goal_state is ControllerState.TRACKING
+        if commanded_until_ns is not None:
+            if not pursued or commanded_until_ns < round(self._started * 1e9):
+                return False
+        elif not (pursued or self._pending):
+            self._file.delete()
+            return False
+        self._give_up(f"Aborted: {why}")
+        self._hold_here = True
+        # At once: the next measured state may be long in coming.
+        self._goal_state = self._reported_state = ControllerState.ABORTED
+        self._publish(ControllerState.ABORTED, self._abort_sentence)
+        return True
+
+    def plant_obeys_again(self) -> None:
+        """Hold where the robot is at the next measured state, not where it was before."""
+        self._hold_here = True
+
+    def _give_up(self, sentence: str) -> None:
+        """Drop every goal and its file; the sentence is the status from now on."""
         self._goal_id = self._latest_id()
         self._pending.clear()
-        self._abort_requested = True
+        self._abort_sentence = sentence
         self._file.delete()
 
     # -- states -------------------------------------------------------------------------------
@@ -173,8 +219,11 @@ class ControlExecutive:
         NotFiniteError
             A measurement is not finite.
         """
+        if self._time is not None and not 0 <= time - self._time <= self._longest_gap:
+            self._shift_time(time - self._time)
+        self._time = time
         if measured is not None:
-            if self._abort_requested:
+            if self._abort_requested or self._hold_here:
                 self._hold(time, measured)
             if self._pending:
                 self._begin(time, measured)
@@ -200,16 +249,26 @@ class ControlExecutive:
         self._command_report = _command_report(self.controller, result)
         self._publish(state, self._sentence(state), self._goal_id)
 
+    def _shift_time(self, seconds: float) -> None:
+        """Go on with the goal as if time had not jumped: a jump is no progress of it."""
+        self.controller.shift_time(seconds)
+        self._started += seconds
+        self._next_report += seconds
+        self._within_since = None
+
     def _hold(self, time: float, state: ControlState) -> None:
-        """Abort: hold everything where it is."""
+        """Hold everything where it is, after an abort or when the plant obeys again."""
         law = self.controller.law
         here = Reference.present(law.robot, state, law.outputs.selection.end_effector_link)
         self.controller.set_goals(
             time, state, base=here.base, end_effector=here.end_effector, joints=state.q.copy()
         )
-        self._abort_requested = False
-        self._goal_state = self._reported_state = ControllerState.ABORTED
-        self._publish(ControllerState.ABORTED, self._sentence(ControllerState.ABORTED))
+        if self._abort_requested:
+            self._goal_state = self._reported_state = ControllerState.ABORTED
+            self._publish(ControllerState.ABORTED, self._sentence(ControllerState.ABORTED))
+        elif self._goal_state is not ControllerState.ABORTED:
+            self._goal_state, self._goal_id = ControllerState.HOLDING, ""
+        self._abort_requested = self._hold_here = False
 
     def _begin(self, time: float, state: ControlState) -> None:
         """Start towards the goals that are pending."""
@@ -286,7 +345,7 @@ class ControlExecutive:
             case ControllerState.FAILED:
                 return f"The goal is not reached in time: {remaining} from it."
             case ControllerState.ABORTED:
-                return "Aborted on request; the robot holds."
+                return self._abort_sentence
             case ControllerState.ESTIMATING:
                 elapsed = self.controller.estimated_for
                 return f"The base is not measured; it is estimated since {elapsed:.3g} s."
@@ -295,6 +354,9 @@ class ControlExecutive:
             case ControllerState.REFUSED:
                 raise ValueError("a refusal has a sentence of its own")
 
+
+_GAP, _GAP_PERIODS = 1.0, 10
+"""Longest time between two states beyond which time has jumped: s, or control periods."""
 
 _ROUNDING = 1e-9
 """By how much sums of control periods may be off a time, s."""

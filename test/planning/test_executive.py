@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.planner_loop import HERE, NEAR, Loop, Place, StubMethod
+from support.planner_loop import HERE, NEAR, TICK_NS, Loop, Place, StubMethod, goal_at
 
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
 from spacerobot_ros.planning.execution.state_machine import (
     TRANSITIONS,
     Event,
@@ -136,6 +137,27 @@ def stop(loop: Loop) -> None:
     loop.stop()
 
 
+def stopped_plant(loop: Loop) -> None:
+    loop.executive.plant_stopped("The plant is latched.")
+    loop._take()
+
+
+def reset_plant(loop: Loop) -> None:
+    loop.plant.reset()
+    loop.executive.plant_reset()
+    loop._take()
+
+
+def jump(seconds: float) -> Act:
+    """Let the time of the states jump, and show one of them."""
+
+    def act(loop: Loop) -> None:
+        loop.measured.stamp_ns += round(seconds * 1e9)
+        loop.tick(base=False)
+
+    return act
+
+
 def to(phase: Phase, *, base: bool = True) -> Act:
     return lambda loop: until(loop, phase, base=base)
 
@@ -192,6 +214,23 @@ HAPPENS: dict[tuple[Phase, Event, Phase], tuple[Callable[..., Any], ...]] = {
         *(lambda: evaluating(overshoot=0.5, max_corrections=0), tick),
     ),
     (P.EVALUATING, E.ABORTED, P.IDLE): (evaluating, abort),
+    (P.MEASURING, E.PLANT_STOPPED, P.IDLE): (measuring, stopped_plant),
+    (P.PLANNING, E.PLANT_STOPPED, P.IDLE): (planning, stopped_plant),
+    (P.EXECUTING, E.PLANT_STOPPED, P.IDLE): (executing, stopped_plant),
+    (P.BRAKING, E.PLANT_STOPPED, P.IDLE): (braking, stopped_plant),
+    (P.EVALUATING, E.PLANT_STOPPED, P.IDLE): (evaluating, stopped_plant),
+    (P.PLANNING, E.PLANT_RESET, P.MEASURING): (planning, reset_plant),
+    (P.PLANNING, E.PLANT_RESET, P.EVALUATING): (*(braking_off_path, to(P.PLANNING), reset_plant),),
+    (P.EXECUTING, E.PLANT_RESET, P.EVALUATING): (executing, reset_plant),
+    (P.EXECUTING, E.PLANT_RESET, P.MEASURING): (executing, propose(OTHER), reset_plant),
+    (P.BRAKING, E.PLANT_RESET, P.IDLE): (braking, reset_plant),
+    (P.BRAKING, E.PLANT_RESET, P.MEASURING): (braking, propose(OTHER), reset_plant),
+    (P.BRAKING, E.PLANT_RESET, P.EVALUATING): (long_braking, reset_plant),
+    (P.EXECUTING, E.TIME_JUMPED, P.EVALUATING): (long_flight, jump(1e6)),
+    (P.EXECUTING, E.TIME_JUMPED, P.MEASURING): (long_flight, propose(OTHER), jump(-1.0)),
+    (P.BRAKING, E.TIME_JUMPED, P.IDLE): (braking, jump(-100.0)),
+    (P.BRAKING, E.TIME_JUMPED, P.MEASURING): (braking, propose(OTHER), jump(1e6)),
+    (P.BRAKING, E.TIME_JUMPED, P.EVALUATING): (long_braking, jump(1e6)),
     (P.IDLE, E.DEACTIVATED, P.IDLE): (resting, stop),
     (P.MEASURING, E.DEACTIVATED, P.IDLE): (measuring, stop),
     (P.PLANNING, E.DEACTIVATED, P.IDLE): (planning, stop),
@@ -393,6 +432,97 @@ def test_the_next_goal_takes_the_result_of_a_refused_one_along() -> None:
     assert (reached.goal_id, reached.corrections) == ("goal-1", 0)
 
 
+# -- a plant that does not obey, and times that are not its own -------------------------------
+
+
+@pytest.mark.parametrize("start", [measuring, planning, executing, evaluating])
+def test_a_plant_that_stops_ends_the_goal_with_its_reason(
+    start: Callable[[], Loop], tmp_path: Path
+) -> None:
+    loop = start()
+    loop.executive._file = GoalFile(str(tmp_path / "goal.json"))
+    loop.executive._file.save({BASE: IdentifiedGoal(goal_at(NEAR), "goal-1")})
+    assert loop.executive.plant_stopped("The plant is latched: a fuse is blown.")
+    loop.tick()
+    status = loop.statuses[-1]
+    assert (status.state, status.goal_id) == (PlannerState.ABORTED, "goal-1")
+    assert status.sentence == "Aborted: The plant is latched: a fuse is blown."
+    assert not (tmp_path / "goal.json").exists()
+    # Nothing moves, whatever was being planned, until there is another goal.
+    loop.held.release()
+    loop.tick(60)
+    assert not any(loop.speeds[-60:])
+    assert loop.statuses[-1] is status
+    assert not loop.executive.plant_stopped("The plant is latched still.")
+    loop.propose(OTHER)
+    for _ in range(250):
+        loop.held.release()
+        loop.tick()
+    assert (loop.states[-1], loop.statuses[-1].goal_id) == ("reached", "goal-2")
+
+
+def test_braking_for_an_aborted_goal_ends_where_the_plant_stops() -> None:
+    loop = braking()
+    before = len(loop.statuses)
+    assert not loop.executive.plant_stopped("The plant is latched.")
+    loop.tick(20)
+    assert not any(loop.speeds[-20:])
+    assert len(loop.statuses) == before
+
+
+def test_a_plant_that_rested_before_the_goal_was_commanded_ends_nothing() -> None:
+    """While a plan is made at once no command comes, and a plant in real time rests."""
+    loop = resting(ticks=40)
+    loop.tick(10)
+    loop.propose(NEAR)
+    loop.tick()
+    (start,) = loop.starts
+    assert not loop.executive.plant_stopped("Too late.", start.stamp_ns - TICK_NS)
+    assert loop.executive.plant_stopped("Too late.", start.stamp_ns)
+    # A goal that nothing was commanded for is not touched.
+    loop.propose(OTHER)
+    assert not loop.executive.plant_stopped("Too late.", loop.measured.stamp_ns)
+    assert loop.executive.phase is Phase.MEASURING
+
+
+@pytest.mark.parametrize("seconds", [1e6, 12.0, -3.0])
+def test_a_time_without_a_plan_is_no_end_of_a_schedule(seconds: float) -> None:
+    loop = resting(ticks=40, max_corrections=0)
+    loop.tick(60)
+    loop.propose(NEAR)
+    loop.tick(20)
+    jump(seconds)(loop)
+    assert not any(loop.speeds[-1:])
+    assert any("has jumped" in notice for notice in loop.notices)
+    # The rest is planned again, which is no correction.
+    status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
+    assert (status.state, status.corrections) == (PlannerState.REACHED, 0)
+    assert len(loop.starts) == 2
+
+
+def test_a_gap_within_the_schedule_is_flown_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = executing(ticks=80)
+    requested = reasons(loop, monkeypatch)
+    loop.tick(20)
+    jump(2.0)(loop)
+    assert loop.executive.phase is Phase.EXECUTING
+    loop.until(PlannerState.REACHED)
+    assert requested == []
+
+
+def test_a_reset_is_planned_for_from_where_the_robot_is_then(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    loop = executing(ticks=40, max_corrections=0)
+    requested = reasons(loop, monkeypatch)
+    loop.tick(20)
+    reset_plant(loop)
+    status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
+    assert (status.state, status.corrections) == (PlannerState.REACHED, 0)
+    assert requested == [PlanReason.REPLAN]
+    np.testing.assert_array_equal(stub_of(loop).requests[-1].state.q, np.zeros(3))
+
+
 # -- what the statuses say --------------------------------------------------------------------
 
 
@@ -460,6 +590,10 @@ ACTIONS: dict[str, Callable[[Loop], object]] = {
     "far": lambda loop: loop.propose(FAR),
     "abort": lambda loop: loop.abort(),
     "stop": lambda loop: loop.stop(),
+    "latch": stopped_plant,
+    "told of reset": reset_plant,
+    "later": jump(50.0),
+    "earlier": lambda loop: jump(-min(3.0, loop.measured.stamp_ns / 1e9))(loop),
     "tick": lambda loop: loop.tick(),
     "ticks": lambda loop: loop.tick(7),
     "many": lambda loop: loop.tick(50),

@@ -48,6 +48,10 @@ from spacerobot_ros.planning.execution.worker import (
 _EXECUTING, _EVALUATING = Phase.EXECUTING, Phase.EVALUATING
 
 
+_GAP, _GAP_PERIODS = 1.0, 10
+"""Longest time between two states beyond which time has jumped: s, or control periods."""
+
+
 class Severity(Enum):
     """How grave a notice is."""
 
@@ -178,6 +182,9 @@ class Executive:
         """What is to be published and logged, in order; the node takes it out."""
         self._plan_time, self._plans, self._commands = 0.0, 0, 0
         self._stamp_ns = 0
+        self._commanded_from_ns = 0
+        """Stamp of the first state that is answered for what is executed or planned now."""
+        self._longest_gap = round(max(_GAP, _GAP_PERIODS * config.control_period) * 1e9)
 
     @property
     def phase(self) -> Phase:
@@ -236,6 +243,60 @@ class Executive:
         )
         return sentence
 
+    def plant_stopped(self, why: str, commanded_until_ns: int | None = None) -> bool:
+        """Give up every goal at once: the plant does not obey commands any more.
+
+        The goal file is deleted, and nothing is tracked or planned until there is a new goal.
+
+        Parameters
+        ----------
+        why
+            What the plant reports, as a clause; it becomes part of the status.
+        commanded_until_ns
+            For a plant that rests because commands did not come: the stamp of the last one that it
+            had. A goal for which nothing was commanded until then goes on. None: it obeys nothing.
+
+        Returns
+        -------
+        bool
+            Whether a goal was given up.
+        """
+        late = commanded_until_ns is not None and (
+            self._pursuit is None or commanded_until_ns < self._commanded_from_ns
+        )
+        if late:
+            return False
+        self._file.delete()
+        if self.phase is Phase.IDLE:
+            return False
+        goal_id, pursued = self._goal_id(), self._proposed or self._ticket or self._pursuit
+        self._tracker.stop()
+        self._worker.cancel()
+        self._average.restart()
+        self._proposed = self._ticket = self._pursuit = None
+        self._go(Event.PLANT_STOPPED, Phase.IDLE)
+        if pursued is None:
+            return False
+        self.outputs.append(PlannerStatus(PlannerState.ABORTED, f"Aborted: {why}", goal_id=goal_id))
+        return True
+
+    def plant_reset(self) -> None:
+        """Plan again for the present goal, if any: the robot is in another state than before."""
+        self._average.restart()
+        if self.phase in (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING):
+            return
+        self._tracker.stop()
+        if self._ticket is not None:
+            # What is planned begins at a state that is gone.
+            self._worker.cancel()
+            ticket, self._ticket = self._ticket, None
+            if ticket.reason in (PlanReason.NEW_GOAL, PlanReason.BLEND):
+                self._proposed = self._proposed or ticket.identified
+        if self._pursuit is not None:
+            self._pursuit.next_plan = PlanReason.REPLAN
+        self._go(Event.PLANT_RESET, self._phase_at_rest())
+        self._notice(Severity.WARNING, "The plant was reset: the motion is planned again.")
+
     def stop(self) -> None:
         """Give up everything at once and wait for the worker to end; the goal file stays."""
         self._tracker.stop()
@@ -254,6 +315,8 @@ class Executive:
     def update(self, measured: MeasuredState) -> Setpoint:
         """Return the setpoint for a measured state; see :attr:`setpoint`."""
         stamp, q, tracker = measured.stamp_ns, measured.q, self._tracker
+        if not 0 <= stamp - self._stamp_ns <= self._longest_gap and tracker.active:
+            self._on_time_jump(stamp)
         self._stamp_ns = stamp
         if tracker.ended(stamp, q):
             self._on_end()
@@ -378,7 +441,7 @@ class Executive:
             correction=ticket.reason in (PlanReason.CORRECTION, PlanReason.CONTINUATION),
             previous=None if pursuit is None else pursuit.schedule,
         )
-        self._ticket = ticket
+        self._ticket, self._commanded_from_ns = ticket, self._stamp_ns
         self._go(Event.PLAN_REQUESTED, Phase.PLANNING)
         self._worker.submit(
             PlanningTask(
@@ -468,6 +531,7 @@ class Executive:
         pursuit = self._pursuit
         assert pursuit is not None
         self._tracker.start(schedule, self._stamp_ns)
+        self._commanded_from_ns = self._stamp_ns
         pursuit.schedule = schedule
         pursuit.manoeuvre_time += schedule.duration
         pursuit.ends_at = self._stamp_ns / 1e9 + schedule.duration
@@ -497,6 +561,22 @@ class Executive:
         self._tracker.stop(at_last_shape=not at_rest)
         self._average.restart()
         self._go(Event.AT_REST if at_rest else Event.SCHEDULE_ENDED, self._phase_at_rest())
+
+    def _on_time_jump(self, stamp_ns: int) -> None:
+        """Plan the remaining motion where what is tracked has no shape for the time now."""
+        if self._tracker.covers(stamp_ns):
+            return
+        self._tracker.stop()
+        self._average.restart()
+        if self._pursuit is not None:
+            self._pursuit.next_plan = PlanReason.REPLAN
+        self._go(Event.TIME_JUMPED, self._phase_at_rest())
+        before, now = self._stamp_ns / 1e9, stamp_ns / 1e9
+        self._notice(
+            Severity.WARNING,
+            f"The time of the states has jumped from {before:.9g} s to {now:.9g} s, where no "
+            "motion is planned.",
+        )
 
     def _on_stuck(self, stuck: Sequence[int]) -> None:
         """Stop, and plan the remaining motion with the joints that are not stuck."""

@@ -55,6 +55,9 @@ class Event(Enum):
     JOINTS_STUCK = "joints stuck"
     """Joints do not follow."""
 
+    TIME_JUMPED = "time jumped"
+    """The time of the states is another one, at which nothing is planned."""
+
     REACHED = "reached"
     """The goal is reached within tolerance."""
 
@@ -63,6 +66,12 @@ class Event(Enum):
 
     ABORTED = "aborted"
     """The goal is given up on request."""
+
+    PLANT_STOPPED = "plant stopped"
+    """The plant has stopped obeying commands: the goal is given up at once."""
+
+    PLANT_RESET = "plant reset"
+    """The plant is in another state than before: nothing is planned from there."""
 
     DEACTIVATED = "deactivated"
     """Everything is given up at once."""
@@ -85,22 +94,28 @@ _TABLE: dict[tuple[Phase, Event], tuple[Phase, ...]] = {
     (Phase.PLANNING, Event.REFUSED): (
         *(Phase.IDLE, Phase.MEASURING, Phase.EXECUTING, Phase.BRAKING, Phase.EVALUATING),
     ),
+    (Phase.PLANNING, Event.PLANT_RESET): (Phase.MEASURING, Phase.EVALUATING),
     (Phase.PLANNING, Event.ABORTED): (Phase.IDLE,),
     (Phase.EXECUTING, Event.NEW_GOAL): (Phase.BRAKING,),
     (Phase.EXECUTING, Event.PLAN_REQUESTED): (Phase.PLANNING,),
     (Phase.EXECUTING, Event.SCHEDULE_ENDED): (Phase.EVALUATING, Phase.MEASURING),
     (Phase.EXECUTING, Event.TRACKING_ERROR): (Phase.BRAKING,),
     (Phase.EXECUTING, Event.JOINTS_STUCK): (Phase.EVALUATING, Phase.MEASURING),
+    (Phase.EXECUTING, Event.TIME_JUMPED): (Phase.EVALUATING, Phase.MEASURING),
+    (Phase.EXECUTING, Event.PLANT_RESET): (Phase.EVALUATING, Phase.MEASURING),
     (Phase.EXECUTING, Event.ABORTED): (Phase.BRAKING,),
     (Phase.BRAKING, Event.PLAN_REQUESTED): (Phase.PLANNING,),
     (Phase.BRAKING, Event.AT_REST): (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING),
     (Phase.BRAKING, Event.JOINTS_STUCK): (Phase.EVALUATING, Phase.MEASURING),
+    (Phase.BRAKING, Event.TIME_JUMPED): (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING),
+    (Phase.BRAKING, Event.PLANT_RESET): (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING),
     (Phase.BRAKING, Event.ABORTED): (Phase.BRAKING,),
     (Phase.EVALUATING, Event.NEW_GOAL): (Phase.MEASURING,),
     (Phase.EVALUATING, Event.PLAN_REQUESTED): (Phase.PLANNING,),
     (Phase.EVALUATING, Event.REACHED): (Phase.IDLE,),
     (Phase.EVALUATING, Event.FAILED): (Phase.IDLE,),
     (Phase.EVALUATING, Event.ABORTED): (Phase.IDLE,),
+    **{(phase, Event.PLANT_STOPPED): (Phase.IDLE,) for phase in Phase if phase is not Phase.IDLE},
     **{(phase, Event.DEACTIVATED): (Phase.IDLE,) for phase in Phase},
 }
 

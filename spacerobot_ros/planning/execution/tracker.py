@@ -84,6 +84,10 @@ class ScheduleFollower:
         far = np.abs(self._positions[-1] - q).max(initial=0.0) > max(_AT_END, self._deadband)
         return not far or late > _LONGEST_SETTLING * 1e9
 
+    def covers(self, stamp_ns: int) -> bool:
+        """Whether the schedule says where the shape is to be at a time, or its end still does."""
+        return self._start_ns <= stamp_ns <= self._end_ns + _LONGEST_SETTLING * 1e9
+
     def braking(self, stamp_ns: int, duration: float) -> BrakingFollower:
         """Return what brakes along this schedule to rest within ``duration`` s from now."""
         return BrakingFollower(self.schedule, self._start_ns, stamp_ns, duration, self._gain)
@@ -134,6 +138,10 @@ class BrakingFollower:
         self._begin = (stamp_ns - start_ns) / 1e9
         self._stamp_ns, self._duration = stamp_ns, duration
         self._gain = min(shape_gain, 1.0 / schedule.control_period)
+
+    def covers(self, stamp_ns: int) -> bool:
+        """Whether the shape is on its way to rest at a time."""
+        return 0 <= stamp_ns - self._stamp_ns <= self._duration * 1e9
 
     def ended(self, stamp_ns: int, q: Array) -> bool:
         """Whether the shape is at rest."""
@@ -257,6 +265,10 @@ class TrajectoryTracker:
     def brake(self, stamp_ns: int) -> None:
         """Brake along the planned path from now on."""
         self._follower = self.braked(stamp_ns)
+
+    def covers(self, stamp_ns: int) -> bool:
+        """Whether what is tracked has a shape for a time."""
+        return self._follower is not None and self._follower.covers(stamp_ns)
 
     def ended(self, stamp_ns: int, q: Array) -> bool:
         """Whether the schedule is over, or the braking."""
