@@ -159,16 +159,20 @@ class ControlExecutive:
         self._give_up("Aborted on request; the robot holds.")
         self._abort_requested = True
 
-    def plant_stopped(self, why: str, commanded_until_ns: int | None = None) -> bool:
+    def plant_stopped(
+        self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
+    ) -> bool:
         """Give up every goal at once: the plant does not obey commands any more.
 
         Parameters
         ----------
         why
-            What the plant reports, as a clause; it becomes part of the status.
+            The sentence of the plant; it becomes part of the status.
         commanded_until_ns
             For a plant that rests because commands did not come: the stamp of the last one that it
             had. Goals that were begun later go on. None: it obeys nothing.
+        rests_since_ns
+            Since when it rests then, ns; every goal that was begun before is given up.
 
         Returns
         -------
@@ -182,7 +186,7 @@ class ControlExecutive:
         elif not (pursued or self._pending):
             self._file.delete()
             return False
-        self._give_up(f"Aborted: {why}")
+        self._give_up(f"Aborted by the plant: {why}")
         self._hold_here = True
         # At once: the next measured state may be long in coming.
         self._goal_state = self._reported_state = ControllerState.ABORTED

@@ -225,6 +225,10 @@ class CommandValidator:
         """The same as a word: that of the reason to refuse a command, ``abort``, ``watchdog``."""
         self.timed_out = False
         """Whether the last command was brought to rest because it was too old."""
+        self.timeouts = 0
+        """How often that has happened."""
+        self.last_stamp_ns: float = NEVER
+        """The stamp of the command that was the last one then."""
 
     @property
     def complete(self) -> bool:
@@ -333,13 +337,17 @@ class CommandValidator:
 
     def drop_old(self, now_ns: int) -> list[CommandSource]:
         """Bring to rest the sources without a command for the timeout, and return them."""
-        silent = []
+        silent, last = [], NEVER
         for source in self.sources:
             age = now_ns - source.stamp_ns
             if self._timeout and source.stamp_ns != NEVER and age > self._timeout * _SECOND:
+                last = max(last, source.stamp_ns)
                 source.rest()
                 silent.append(source)
         self.timed_out = self.timed_out or bool(silent)
+        if silent and not self.in_force:
+            self.timeouts += 1
+            self.last_stamp_ns = last
         return silent
 
     def _unsound(self, source: CommandSource, values: Array | CommandError) -> Refusal | None:

@@ -13,6 +13,8 @@ from spacerobot_ros.simulation.faults import FaultyPlant
 
 _SEPARATOR = "; "
 
+_SECOND = 1e9
+
 
 class PlantState(str, Enum):
     """What a plant does with time and with commands; the value of ``state`` in plant/status."""
@@ -54,6 +56,10 @@ class PlantStatus:
         How often the plant was rearmed and reset: a subscriber that missed a status still notices.
     faults
         The injected faults that are active, each as its line.
+    timeouts
+        How often it has come to rest because no command came in time.
+    last_command_s
+        Stamp of the last command before the latest of these, s; None: there was none.
     """
 
     state: PlantState
@@ -64,6 +70,8 @@ class PlantStatus:
     rearms: int = 0
     resets: int = 0
     faults: tuple[str, ...] = ()
+    timeouts: int = 0
+    last_command_s: float | None = None
 
     @property
     def level(self) -> int:
@@ -74,15 +82,18 @@ class PlantStatus:
 
     def to_values(self) -> dict[str, str]:
         """Return the status as the key-value pairs of a DiagnosticStatus."""
-        return {
+        values = {
             "state": self.state.value,
             "reason": self.reason,
             "latched_fault": self.latched_fault,
             "time_s": f"{self.time_s:.9f}",
             "rearms": str(self.rearms),
             "resets": str(self.resets),
-            "faults": _SEPARATOR.join(self.faults),
+            "timeouts": str(self.timeouts),
         }
+        if self.last_command_s is not None:
+            values["last_command_s"] = f"{self.last_command_s:.9f}"
+        return values | {"faults": _SEPARATOR.join(self.faults)}
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], sentence: str = "") -> PlantStatus:
@@ -94,7 +105,7 @@ class PlantStatus:
             They are no status of a plant.
         """
         try:
-            faults = values.get("faults", "")
+            faults, last = values.get("faults", ""), values.get("last_command_s")
             return cls(
                 state=PlantState(values["state"]),
                 sentence=sentence,
@@ -103,6 +114,8 @@ class PlantStatus:
                 time_s=float(values.get("time_s", "0")),
                 rearms=int(values.get("rearms", "0")),
                 resets=int(values.get("resets", "0")),
+                timeouts=int(values.get("timeouts", "0")),
+                last_command_s=None if last is None else float(last),
                 faults=tuple(faults.split(_SEPARATOR)) if faults else (),
             )
         except (KeyError, ValueError) as error:
@@ -150,6 +163,10 @@ class PlantMonitor:
             time_s=before.time_s,
             rearms=self.rearms,
             resets=self.resets,
+            timeouts=self._commands.timeouts,
+            last_command_s=(
+                self._commands.last_stamp_ns / _SECOND if self._commands.timeouts else None
+            ),
             faults=tuple(str(fault) for fault in self._plant.active),
         )
         if now == before:

@@ -446,7 +446,7 @@ def test_a_plant_that_stops_ends_the_goal_with_its_reason(
     loop.tick()
     status = loop.statuses[-1]
     assert (status.state, status.goal_id) == (PlannerState.ABORTED, "goal-1")
-    assert status.sentence == "Aborted: The plant is latched: a fuse is blown."
+    assert status.sentence == "Aborted by the plant: The plant is latched: a fuse is blown."
     assert not (tmp_path / "goal.json").exists()
     # Nothing moves, whatever was being planned, until there is another goal.
     loop.held.release()
@@ -477,12 +477,25 @@ def test_a_plant_that_rested_before_the_goal_was_commanded_ends_nothing() -> Non
     loop.propose(NEAR)
     loop.tick()
     (start,) = loop.starts
-    assert not loop.executive.plant_stopped("Too late.", start.stamp_ns - TICK_NS)
-    assert loop.executive.plant_stopped("Too late.", start.stamp_ns)
+    assert not loop.executive.plant_stopped("Too late.", start.stamp_ns - TICK_NS, 10**12)
+    assert loop.executive.plant_stopped("Too late.", start.stamp_ns, 10**12)
     # A goal that nothing was commanded for is not touched.
     loop.propose(OTHER)
-    assert not loop.executive.plant_stopped("Too late.", loop.measured.stamp_ns)
+    assert not loop.executive.plant_stopped("Too late.", loop.measured.stamp_ns, 10**12)
     assert loop.executive.phase is Phase.MEASURING
+
+
+@pytest.mark.parametrize(("rests_after", "aborted"), [(0, True), (500_000_000, False)])
+def test_a_plant_that_rested_before_joints_were_taken_for_stuck_tells_why(
+    rests_after: int, aborted: bool
+) -> None:
+    """What it did while the plan without these joints was made is that plan's fault."""
+    loop = stuck(executing(held=True, ticks=400, stuck_ticks=5))
+    quick_without_joints(loop)
+    until(loop, Phase.PLANNING)
+    planned_from = loop.measured.stamp_ns - TICK_NS
+    last, rests = planned_from - TICK_NS, planned_from + rests_after
+    assert loop.executive.plant_stopped("It is too old.", last, rests) == aborted
 
 
 @pytest.mark.parametrize("seconds", [1e6, 12.0, -3.0])

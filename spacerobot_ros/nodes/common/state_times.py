@@ -78,9 +78,9 @@ class StateTimes:
         """Why the last one was, as a sentence."""
 
     @property
-    def in_doubt(self) -> bool:
-        """Whether a state is set aside, which :meth:`believed` may hand over."""
-        return self._doubtful is not None
+    def now_ns(self) -> int:
+        """The stamp of the last state that was admitted, ns; 0 before the first."""
+        return self._last_ns
 
     def admits(self, joint_states: bytes) -> bool:
         """Return whether a joint_states message is of the present time; else it is set aside."""

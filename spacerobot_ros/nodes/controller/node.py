@@ -28,8 +28,9 @@ from spacerobot_ros.nodes.common.cdr import (
     TemplateReader,
     stamp_bytes,
 )
+from spacerobot_ros.nodes.common.commander import Change, CommanderNode, Stopped
 from spacerobot_ros.nodes.common.messages import diagnostic_status, goal_of
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, RobotNode
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.state_synchroniser import Pairing, StateSynchroniser
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
@@ -38,7 +39,7 @@ JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
 """Topics of references from outside; where one has a publisher, every state waits for it."""
 
 
-class CoordinatedControlNode(RobotNode):
+class CoordinatedControlNode(CommanderNode):
     """Closes the loop over spacecraft and arm (paper 4): one command for every measured state.
 
     ``goal_pose`` is where the base is to be, ``end_effector/goal_pose`` where the end-effector is.
@@ -67,13 +68,12 @@ class CoordinatedControlNode(RobotNode):
         self._joint_commands = self.send_raw(JointState, "joint_commands")
         self._base_wrench = self.send_raw(WrenchStamped, "base_wrench")
         self._status = self.create_publisher(DiagnosticStatus, "controller/status", LATCHED)
+        self.listen(self.config.control_period)
         self.find_robot()
         for topic, key in (("goal_pose", BASE), ("end_effector/goal_pose", END_EFFECTOR)):
             self.create_subscription(
                 PoseStamped, topic, lambda message, key=key: self._on_goal(key, message), STREAM
             )
-        self.create_subscription(Odometry, "odom", self._on_odom, STREAM, raw=True)
-        self.create_subscription(JointState, "joint_states", self._on_joints, STREAM, raw=True)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
             self.create_subscription(
                 kind, topic, lambda raw, topic=topic: self._on_reference(topic, raw), STREAM,
@@ -148,6 +148,9 @@ class CoordinatedControlNode(RobotNode):
         except PlanningError as error:
             self._refuse(error, goal_id)
             return
+        if self._plant.blocked:
+            self._refuse(PlanningError(self._plant.blocked), goal_id)
+            return
         identified = IdentifiedGoal(goal, goal_id)
         if self._robot is None:
             self._waiting[key] = identified
@@ -179,13 +182,29 @@ class CoordinatedControlNode(RobotNode):
         if status.state.level:
             self.get_logger().warning(status.sentence, throttle_duration_sec=5.0)
 
-    # -- states -------------------------------------------------------------------------------
+    # -- what the plant publishes -------------------------------------------------------------
 
-    def _on_odom(self, raw: bytes) -> None:
+    def _plant_stopped(self, stopped: Stopped) -> None:
+        if self._robot is not None:
+            self._executive.plant_stopped(
+                stopped.why, stopped.commanded_until_ns, stopped.rests_since_ns
+            )
+        elif self._waiting and stopped.commanded_until_ns is None:
+            *_, goal = self._waiting.values()
+            self._waiting = {}
+            self._goal_file.delete()
+            sentence = f"Aborted by the plant: {stopped.why}"
+            self._publish_status(ControllerStatus(ControllerState.ABORTED, sentence, goal.goal_id))
+
+    def _plant_changed(self, change: Change) -> None:
+        if change is Change.OBEYS and self._robot is not None:
+            self._executive.plant_obeys_again()
+
+    def _take_odom(self, raw: bytes) -> None:
         self._states.put_odom(raw)
         self._on_part()
 
-    def _on_joints(self, raw: bytes) -> None:
+    def _take_joints(self, raw: bytes) -> None:
         overdue = self._states.overdue() if self._running and self._robot is not None else None
         if overdue is not None:
             # An answer to a lost pose would come a tick late; what it estimates goes on from there.

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Path
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
@@ -18,8 +18,9 @@ from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import stamp_bytes
+from spacerobot_ros.nodes.common.commander import Change, CommanderNode, Stopped
 from spacerobot_ros.nodes.common.messages import goal_of, shape_of
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, RobotNode
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.state_synchroniser import Pairing, StateSynchroniser
 from spacerobot_ros.nodes.planner.messages import (
@@ -51,7 +52,7 @@ from spacerobot_ros.planning.execution.worker import LONGEST_END
 _WITHOUT_POSE, _LATE_POSE = Pairing.WITHOUT_POSE, Pairing.LATE_POSE
 
 
-class PlannerNode(RobotNode):
+class PlannerNode(CommanderNode):
     """Turns goal poses into gaits and publishes their velocities, one command for every state.
 
     A goal is planned from the next measured state. When its schedule has ended the measured pose
@@ -95,11 +96,10 @@ class PlannerNode(RobotNode):
         self._path_topic = self.create_publisher(Path, "planned_path", LATCHED)
         self._markers_topic = self.create_publisher(MarkerArray, "markers", STREAM)
         self._status_topic = self.create_publisher(DiagnosticStatus, "planner/status", LATCHED)
+        self.listen(config.control_period)
         self.find_robot()
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal, STREAM)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
-        self.create_subscription(Odometry, "odom", self._on_odom, STREAM, raw=True)
-        self.create_subscription(JointState, "joint_states", self._on_joints, STREAM, raw=True)
         self.create_service(Trigger, "~/abort", self._on_abort)
         self.create_service(Trigger, "~/statistics", self._on_statistics)
 
@@ -151,6 +151,10 @@ class PlannerNode(RobotNode):
         except PlanningError as error:
             self._publish_status(PlannerStatus(PlannerState.REFUSED, str(error), goal_id=goal_id))
             return
+        if self._plant.blocked:
+            refusal = PlannerStatus(PlannerState.REFUSED, self._plant.blocked, goal_id=goal_id)
+            self._publish_status(refusal)
+            return
         identified = IdentifiedGoal(goal, goal_id)
         self._propose(identified)
         if self._executive is None:
@@ -186,15 +190,36 @@ class PlannerNode(RobotNode):
         response.success, response.message = True, self.statistics.to_json()
         return response
 
-    # -- states -------------------------------------------------------------------------------
+    # -- what the plant publishes -------------------------------------------------------------
 
-    def _on_odom(self, raw: bytes) -> None:
+    def _plant_stopped(self, stopped: Stopped) -> None:
+        waiting, self._waiting = self._waiting, None
+        if self._executive is not None:
+            self._executive.plant_stopped(
+                stopped.why, stopped.commanded_until_ns, stopped.rests_since_ns
+            )
+            self._publish_outputs(self._executive)
+        elif waiting is not None and stopped.commanded_until_ns is None:
+            self._goal_file.delete()
+            sentence = f"Aborted by the plant: {stopped.why}"
+            self._publish_status(
+                PlannerStatus(PlannerState.ABORTED, sentence, goal_id=waiting.goal_id)
+            )
+        else:
+            self._waiting = waiting
+
+    def _plant_changed(self, change: Change) -> None:
+        if change is Change.RESET and self._executive is not None:
+            self._executive.plant_reset()
+            self._publish_outputs(self._executive)
+
+    def _take_odom(self, raw: bytes) -> None:
         self._states.put_odom(raw)
         # With a goal to plan for or to evaluate, even a pose that comes after its joints counts.
         if self._executive is not None and self._executive.measuring:
             self._on_part()
 
-    def _on_joints(self, raw: bytes) -> None:
+    def _take_joints(self, raw: bytes) -> None:
         self._states.put_joint_states(raw)
         self._on_part()
 

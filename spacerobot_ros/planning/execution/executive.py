@@ -110,6 +110,8 @@ class _Pursuit:
     identified: IdentifiedGoal
     schedule: GaitSchedule
     """The schedule that was executed last."""
+    begins_ns: int
+    """Stamp of the state from which the first one was planned."""
     corrections: int = 0
     manoeuvre_time: float = 0.0
     """Duration of all its schedules, s."""
@@ -243,7 +245,9 @@ class Executive:
         )
         return sentence
 
-    def plant_stopped(self, why: str, commanded_until_ns: int | None = None) -> bool:
+    def plant_stopped(
+        self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
+    ) -> bool:
         """Give up every goal at once: the plant does not obey commands any more.
 
         The goal file is deleted, and nothing is tracked or planned until there is a new goal.
@@ -251,20 +255,22 @@ class Executive:
         Parameters
         ----------
         why
-            What the plant reports, as a clause; it becomes part of the status.
+            The sentence of the plant; it becomes part of the status.
         commanded_until_ns
             For a plant that rests because commands did not come: the stamp of the last one that it
-            had. A goal for which nothing was commanded until then goes on. None: it obeys nothing.
+            had. None: it obeys nothing.
+        rests_since_ns
+            Since when it rests then, ns. A goal goes on for which nothing was commanded until then,
+            and one whose plan has taken so long that no state was answered.
 
         Returns
         -------
         bool
             Whether a goal was given up.
         """
-        late = commanded_until_ns is not None and (
-            self._pursuit is None or commanded_until_ns < self._commanded_from_ns
-        )
-        if late:
+        if commanded_until_ns is not None and not self._was_obeyed(
+            commanded_until_ns, rests_since_ns
+        ):
             return False
         self._file.delete()
         if self.phase is Phase.IDLE:
@@ -277,8 +283,16 @@ class Executive:
         self._go(Event.PLANT_STOPPED, Phase.IDLE)
         if pursued is None:
             return False
-        self.outputs.append(PlannerStatus(PlannerState.ABORTED, f"Aborted: {why}", goal_id=goal_id))
+        sentence = f"Aborted by the plant: {why}"
+        self.outputs.append(PlannerStatus(PlannerState.ABORTED, sentence, goal_id=goal_id))
         return True
+
+    def _was_obeyed(self, commanded_until_ns: int, rests_since_ns: int) -> bool:
+        """Whether a plant has obeyed the present goal before it came to rest."""
+        pursuit, since = self._pursuit, self._commanded_from_ns
+        if pursuit is None or commanded_until_ns < pursuit.begins_ns:
+            return False
+        return commanded_until_ns >= since or rests_since_ns <= since
 
     def plant_reset(self) -> None:
         """Plan again for the present goal, if any: the robot is in another state than before."""
@@ -479,7 +493,7 @@ class Executive:
         pursuit = self._pursuit
         match ticket.reason, result:
             case PlanReason.NEW_GOAL | PlanReason.BLEND, Planned(schedule=schedule):
-                self._accept(_Pursuit(ticket.identified, schedule))
+                self._accept(_Pursuit(ticket.identified, schedule, self._stamp_ns))
                 self._execute(schedule)
             case PlanReason.NEW_GOAL | PlanReason.BLEND, Refused(reason=reason):
                 earlier = " The earlier goal is still pursued." if pursuit is not None else ""

@@ -1,0 +1,212 @@
+"""What the nodes that command a plant share: they listen to its state and to its status."""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import abstractmethod
+from dataclasses import dataclass
+from enum import Enum
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Odometry
+from rclpy.clock import Clock, ClockType
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.nodes.common.cdr import NANOSECONDS
+from spacerobot_ros.nodes.common.messages import diagnostic_status
+from spacerobot_ros.nodes.common.node import STREAM, RobotNode
+from spacerobot_ros.nodes.common.state_times import StateTimes
+from spacerobot_ros.simulation.status import PlantState, PlantStatus
+
+_LOOK_PERIOD = 0.1
+"""Wall s between two looks at states that were set aside."""
+
+_REPORT_PERIOD = 1.0
+"""Least wall s between two diagnostics about ignored states."""
+
+_STATUSES = QoSProfile(
+    depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+"""Every status counts, not only the last: deeper than what latecomers get."""
+
+
+@dataclass(frozen=True)
+class Stopped:
+    """The plant does not do what it is commanded.
+
+    Attributes
+    ----------
+    why
+        The plant's sentence.
+    commanded_until_ns
+        Where it rests because no command came: the stamp of the last one; None: it obeys nothing.
+    rests_since_ns
+        Since when it rests then, as far as is known.
+    """
+
+    why: str
+    commanded_until_ns: int | None = None
+    rests_since_ns: int = 0
+
+
+class Change(Enum):
+    """What else a plant reports."""
+
+    OBEYS = "obeys"
+    """Commands pass again."""
+    RESET = "reset"
+    """The robot is back in its initial state."""
+
+
+class PlantListener:
+    """What a commander knows of its plant from plant/status; nothing, if none is published."""
+
+    def __init__(self) -> None:
+        self._status: PlantStatus | None = None
+        self._name = "plant"
+
+    @property
+    def blocked(self) -> str:
+        """Why no goal is accepted now, as a sentence; empty: goals are."""
+        status = self._status
+        if status is None:
+            return ""
+        if status.latched_fault:
+            return f"The plant is latched: {status.latched_fault}; call '{self._name}/rearm' first."
+        if status.state is PlantState.FAILED:
+            return f"The plant has failed: {status.sentence}"
+        return ""
+
+    @property
+    def paused(self) -> bool:
+        """Whether the plant's time stands still."""
+        return self._status is not None and self._status.state is PlantState.PAUSED
+
+    def take(self, status: PlantStatus, name: str = "plant") -> list[Stopped | Change]:
+        """Take up a status of the plant of this name; return what a commander has to do about it.
+
+        Statuses may be missed: the counters of a plant tell what has happened in between.
+        """
+        before, was_blocked = self._status, bool(self.blocked)
+        self._status, self._name = status, name
+        news: list[Stopped | Change] = []
+        if self.blocked:
+            if before is None or not was_blocked or status.latched_fault != before.latched_fault:
+                news.append(Stopped(status.sentence))
+            return news
+        if before is None:
+            return news
+        if status.rearms > before.rearms and not was_blocked:
+            news.append(Stopped("Commands pass again after a fault was latched."))
+        if status.timeouts > before.timeouts or (
+            status.reason == "timeout" and before.reason != "timeout"
+        ):
+            rested = _rested(status)
+            if rested is not None:
+                news.append(rested)
+        if status.resets > before.resets:
+            news.append(Change.RESET)
+        if was_blocked or status.rearms > before.rearms:
+            news.append(Change.OBEYS)
+        return news
+
+
+def _rested(status: PlantStatus) -> Stopped | None:
+    """Return that a plant rests, or has rested meanwhile; None if it says nonsense of the time."""
+    last, since = status.last_command_s, status.time_s
+    last = since if last is None else last
+    why = status.sentence
+    if status.reason != "timeout":
+        since, why = last, "The joints were brought to rest: no command came in time."
+    if not (math.isfinite(last) and math.isfinite(since)):
+        return None
+    return Stopped(why, round(last * NANOSECONDS), round(since * NANOSECONDS))
+
+
+class CommanderNode(RobotNode):
+    """A node that answers the states of a plant with commands.
+
+    It answers only states of the plant's present time (:class:`StateTimes`), and gives up its goals
+    when the plant reports that it does not obey (:class:`PlantListener`).
+    """
+
+    def listen(self, control_period: float) -> None:
+        """Subscribe to what the plant publishes; to be called while the node is configured."""
+        self._times = StateTimes(control_period)
+        self._plant = PlantListener()
+        self._ignored_reported, self._next_report = 0, 0.0
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
+        self.create_subscription(DiagnosticStatus, "plant/status", self._on_plant_status, _STATUSES)
+        self.create_subscription(Odometry, "odom", self._on_odom, STREAM, raw=True)
+        self.create_subscription(JointState, "joint_states", self._on_joints, STREAM, raw=True)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_LOOK_PERIOD, self._look_at_times, clock=steady)
+
+    # -- hooks --------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _take_odom(self, raw: bytes) -> None:
+        """Take up an odom message of the present time."""
+
+    @abstractmethod
+    def _take_joints(self, raw: bytes) -> None:
+        """Take up a joint_states message of the present time."""
+
+    @abstractmethod
+    def _plant_stopped(self, stopped: Stopped) -> None:
+        """Give up the goals."""
+
+    @abstractmethod
+    def _plant_changed(self, change: Change) -> None:
+        """Do what the change asks for."""
+
+    # -- what the plant publishes -------------------------------------------------------------
+
+    def _on_odom(self, raw: bytes) -> None:
+        if self._times.admits_odom(raw):
+            self._take_odom(raw)
+
+    def _on_joints(self, raw: bytes) -> None:
+        if self._times.admits(raw):
+            self._take_joints(raw)
+
+    def _look_at_times(self) -> None:
+        """Take up a state that was set aside once it is believed, and report those ignored."""
+        times = self._times
+        # A plant that is paused publishes nothing that could contradict it.
+        believed = None if self._plant.paused else times.believed()
+        if believed is not None:
+            odom, joint_states = believed
+            if odom:
+                self._take_odom(odom)
+            self._take_joints(joint_states)
+        if times.ignored > self._ignored_reported and time.monotonic() >= self._next_report:
+            self._ignored_reported = times.ignored
+            self._next_report = time.monotonic() + _REPORT_PERIOD
+            self.get_logger().warning(times.last_ignored)
+            self._publish_diagnostics(times)
+
+    def _publish_diagnostics(self, times: StateTimes) -> None:
+        """Publish how many states were ignored, and why the last one was."""
+        name, level = f"{self.get_fully_qualified_name()}: states", DiagnosticStatus.WARN
+        status = diagnostic_status(name, level, times.last_ignored, {"ignored": times.ignored})
+        array = DiagnosticArray(status=[status])
+        array.header.stamp.sec, array.header.stamp.nanosec = divmod(times.now_ns, NANOSECONDS)
+        self._diagnostics.publish(array)
+
+    def _on_plant_status(self, message: DiagnosticStatus) -> None:
+        values = {pair.key: pair.value for pair in message.values}
+        try:
+            status = PlantStatus.from_values(values, message.message)
+        except SpaceRobotError as error:
+            self.get_logger().warning(f"plant/status: {error}", throttle_duration_sec=5.0)
+            return
+        for news in self._plant.take(status, message.name or "plant"):
+            match news:
+                case Stopped():
+                    self._plant_stopped(news)
+                case Change():
+                    self._plant_changed(news)

@@ -1,0 +1,95 @@
+"""What commanders make of the statuses of their plant."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from support.sentences import assert_one_sentence
+
+from spacerobot_ros.nodes.common.commander import Change, PlantListener, Stopped
+from spacerobot_ros.simulation.status import PlantState, PlantStatus
+
+RUNNING = PlantStatus(PlantState.RUNNING, "A command is in force.")
+LATCHED = PlantStatus(
+    PlantState.LATCHED, "Nothing moves: a fuse.", "abort", "a fuse is blown", time_s=2.0
+)
+RESTING = PlantStatus(
+    PlantState.RESTING, "It is too old.", "timeout", timeouts=1, last_command_s=1.5, time_s=2.0
+)
+AGAIN = replace(RUNNING, rearms=1, time_s=3.0)
+
+
+def listener(*statuses: PlantStatus) -> PlantListener:
+    made = PlantListener()
+    for status in statuses:
+        made.take(status, "/robot/plant")
+    return made
+
+
+def test_a_latched_plant_stops_commanders_once_and_goals_are_refused() -> None:
+    one = listener(RUNNING)
+    assert one.blocked == ""
+    assert one.take(LATCHED, "/robot/plant") == [Stopped("Nothing moves: a fuse.")]
+    assert one.take(replace(LATCHED, faults=("joint_stuck a",)), "/robot/plant") == []
+    assert_one_sentence(one.blocked, "a fuse is blown", "/robot/plant/rearm")
+    # Paused or inactive it is latched as well.
+    for state in (PlantState.PAUSED, PlantState.INACTIVE):
+        assert one.take(replace(LATCHED, state=state), "/robot/plant") == []
+        assert one.blocked
+    assert one.take(AGAIN) == [Change.OBEYS]
+    assert one.blocked == ""
+
+
+def test_a_commander_that_comes_later_learns_that_the_plant_is_latched() -> None:
+    assert listener().take(LATCHED) == [Stopped("Nothing moves: a fuse.")]
+    assert listener().take(RUNNING) == []
+    assert listener().take(RESTING) == []
+
+
+def test_a_latch_that_was_missed_is_noticed_by_the_rearming() -> None:
+    (stopped, change) = listener(RUNNING).take(AGAIN)
+    assert isinstance(stopped, Stopped)
+    assert_one_sentence(stopped.why, "latched")
+    assert change is Change.OBEYS
+    assert listener(RUNNING, LATCHED).take(replace(LATCHED, rearms=1)) == []
+
+
+def test_a_plant_that_fails_stops_commanders() -> None:
+    one = listener(RUNNING)
+    failed = PlantStatus(PlantState.FAILED, "Its model has no inertia.", "model")
+    assert one.take(failed) == [Stopped("Its model has no inertia.")]
+    assert_one_sentence(one.blocked, "failed", "Its model has no inertia.")
+    assert one.take(RUNNING) == [Change.OBEYS]
+
+
+def test_a_plant_that_rests_stops_what_was_commanded_before() -> None:
+    assert listener(RUNNING).take(RESTING) == [
+        Stopped("It is too old.", 1_500_000_000, 2_000_000_000)
+    ]
+    assert listener(RUNNING, RESTING).take(replace(RUNNING, timeouts=1)) == []
+    # Missed: it runs again.
+    (stopped,) = listener(RUNNING).take(replace(RUNNING, timeouts=1, last_command_s=1.5))
+    assert isinstance(stopped, Stopped)
+    assert stopped.commanded_until_ns == 1_500_000_000
+    assert_one_sentence(stopped.why, "rest")
+    # A plant without counters says when it came to rest.
+    plain = PlantStatus(PlantState.RESTING, "It rests.", "timeout", time_s=2.0)
+    assert listener(RUNNING).take(plain) == [Stopped("It rests.", 2 * 10**9, 2 * 10**9)]
+    assert listener(RUNNING).take(replace(plain, reason="no_command")) == []
+    assert listener(RUNNING).take(replace(plain, time_s=float("nan"))) == []
+
+
+def test_pauses_and_restarts_stop_nothing() -> None:
+    one = listener(replace(RUNNING, rearms=2, resets=3, timeouts=4))
+    assert one.take(replace(RUNNING, state=PlantState.PAUSED, rearms=2, resets=3, timeouts=4)) == []
+    assert one.paused
+    assert one.take(PlantStatus(PlantState.INACTIVE, "The plant is not configured.")) == []
+    assert one.take(PlantStatus(PlantState.RESTING, "No command yet.", "no_command")) == []
+    assert one.take(RUNNING) == []
+    assert not one.paused
+
+
+def test_a_reset_is_reported_once() -> None:
+    one = listener(RUNNING)
+    assert one.take(replace(RUNNING, resets=1)) == [Change.RESET]
+    assert one.take(replace(RUNNING, resets=1, time_s=9.0)) == []

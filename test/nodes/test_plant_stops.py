@@ -1,0 +1,231 @@
+"""Goals of planner and controller when the plant does not obey, and states of other times."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+from support.control_loop import STATUS, Loop, pose
+from support.planner_flight import NEAR, PLANNER, Flight, stamp_of, values_of
+from support.ros_harness import LATCHED, Harness
+from support.sentences import assert_one_sentence
+
+from spacerobot_ros.simulation.status import PlantState, PlantStatus
+
+pytestmark = pytest.mark.usefixtures("one_plant")
+
+REAL_TIME = {"time_mode": "realtime", "real_time_factor": 10.0, "command_timeout": 0.5}
+BACKGROUND = {"plan_in_background": True}
+OTHER = ([-0.03, 0.0, 0.01], [0.0, 0.0, 0.0])
+SLOW = {**PLANNER, "lie_bracket.t1": 4.0}
+"""A slide of 4 s."""
+
+
+def call(flight: Flight, service: str, kind: Any = Trigger) -> Any:
+    request = kind.Request(data=True) if kind is SetBool else kind.Request()
+    return flight.harness.call(flight.probe.create_client(kind, f"plant/{service}"), request)
+
+
+def place(flight: Flight) -> list[float]:
+    return list(flight.probe.last("joint_states").position)
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_an_abort_of_the_plant_ends_the_goal_until_there_is_another(
+    harness: Harness, tmp_path: Path, mode: str
+) -> None:
+    plant = REAL_TIME if mode == "realtime" else {}
+    file = tmp_path / "goal.json"
+    flight = Flight(harness, {**SLOW, "resume_file": str(file)}, plant)
+    flight.start()
+    flight.send(NEAR)
+    flight.wait("executing")
+    flight.ticks(15)
+    assert file.exists()
+    call(flight, "abort")
+    status = flight.wait("aborted")
+    assert_one_sentence(status.message, "aborted on request", "'~/rearm'")
+    assert not file.exists()
+    # As long as any watch for joints that do not follow could take.
+    flight.ticks(60)
+    rest = place(flight)
+    flight.send(OTHER)
+    refused = flight.wait("refused")
+    assert_one_sentence(refused.message, "latched", "/plant/rearm")
+    call(flight, "rearm")
+    flight.ticks(60)
+    assert place(flight) == rest
+    assert flight.states == ["idle", "executing", "aborted", "refused"]
+    flight.decide(NEAR)
+    assert flight.states[-1] == "reached"
+
+
+def test_a_planner_that_stood_still_ends_its_goal_with_the_true_reason(harness: Harness) -> None:
+    flight = Flight(harness, {**SLOW, **BACKGROUND}, REAL_TIME)
+    flight.start()
+    flight.send(NEAR)
+    flight.wait("executing")
+    flight.ticks(10)
+    harness.executor.remove_node(flight.planner)
+    flight.ticks(120)
+    harness.executor.add_node(flight.planner)
+    status = flight.wait("aborted")
+    assert_one_sentence(status.message, "too old")
+    flight.ticks(10)  # Commands that were on their way.
+    rest = place(flight)
+    flight.ticks(60)
+    assert place(flight) == rest
+    assert flight.states == ["idle", "executing", "aborted"]
+    flight.decide(NEAR)
+    assert flight.states[-1] == "reached"
+
+
+def test_a_pause_ends_nothing_and_a_goal_may_come_in_it(harness: Harness) -> None:
+    flight = Flight(harness, plant=REAL_TIME)
+    flight.start()
+    flight.send(NEAR)
+    flight.wait("executing")
+    call(flight, "pause", SetBool)
+    harness.spin_until(lambda: flight.plant.state is PlantState.PAUSED, "the pause")
+    harness.spin_for(0.2)
+    flight.send(OTHER)
+    harness.settle(flight.probe)
+    client = flight.probe.create_client(SetBool, "plant/pause")
+    harness.call(client, SetBool.Request(data=False))
+    flight.wait("reached", "failed", "aborted")
+    assert flight.states[-1] == "reached"
+    assert max(flight.error_to(OTHER)) <= 1e-3
+
+
+def test_a_goal_on_file_is_not_resumed_while_the_plant_is_latched(
+    harness: Harness, tmp_path: Path
+) -> None:
+    file = tmp_path / "goal.json"
+    file.write_text('{"base": {"position": [0.05, 0, 0], "quaternion": [0, 0, 0, 1], '
+                    '"joint_positions": null, "id": "7.000000000"}}')  # fmt: skip
+    flight = Flight(harness, {"resume_file": str(file)})
+    flight.start()
+    call(flight, "abort")
+    flight.planner.trigger_deactivate()
+    flight.planner.trigger_activate()
+    flight.ticks(5)
+    assert not file.exists()
+    assert not np.any(place(flight))
+
+
+@pytest.mark.parametrize("ahead", [1e6, 3.0, -0.5])
+def test_a_state_of_another_time_does_not_end_a_flight(harness: Harness, ahead: float) -> None:
+    flight = Flight(harness, {**SLOW, "max_corrections": 0})
+    rogue = flight.probe.create_publisher(JointState, "joint_states", 10)
+    diagnostics = harness.probe({"/diagnostics": DiagnosticArray}, name="doctor")
+    harness.connect()
+    flight.start()
+    flight.send(NEAR)
+    flight.wait("executing")
+    flight.ticks(15)
+    message = flight.probe.last("joint_states")
+    stamp = round((message.header.stamp.sec + ahead) * 1e9) + message.header.stamp.nanosec
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+    before = flight.probe.count("joint_commands")
+    rogue.publish(message)
+    flight.wait("reached", "failed")
+    assert flight.states == ["idle", "executing", "reached"]
+    answered = [stamp_of(m) for m in flight.probe.messages["joint_commands"][before:]]
+    assert answered == sorted(set(answered))
+    harness.spin_until(lambda: diagnostics.count("/diagnostics"), "a word about what is ignored")
+    (status,) = diagnostics.last("/diagnostics").status
+    assert (status.name, status.level) == ("/planner: states", DiagnosticStatus.WARN)
+    assert_one_sentence(status.message, "joint_states", "stamp")
+    assert values_of(status)["ignored"] == "1"
+
+
+# -- the controller ---------------------------------------------------------------------------
+
+
+def plant_status(loop: Loop, status: PlantStatus) -> None:
+    """Publish a status of the plant, and let it arrive."""
+    from spacerobot_ros.nodes.common.messages import diagnostic_status
+
+    if not hasattr(loop, "plant_topic"):
+        loop.plant_topic = loop.probe.create_publisher(  # type: ignore[attr-defined]
+            DiagnosticStatus, "plant/status", LATCHED
+        )
+        loop.harness.matched(loop.plant_topic)  # type: ignore[attr-defined]
+    loop.plant_topic.publish(  # type: ignore[attr-defined]
+        diagnostic_status("/plant", bytes([status.level]), status.sentence, status.to_values())
+    )
+    loop.harness.settle(loop.probe)
+
+
+RUNNING = PlantStatus(PlantState.RUNNING, "A command is in force.")
+LATCHED_PLANT = PlantStatus(PlantState.LATCHED, "Nothing moves: a fuse.", "abort", "a fuse")
+
+
+def test_a_latched_plant_ends_the_goals_of_the_controller(harness: Harness, tmp_path: Path) -> None:
+    file = tmp_path / "goals.json"
+    loop = Loop(harness, resume_file=str(file))
+    plant_status(loop, RUNNING)
+    loop.aim(base=pose([1.0, 0.0, 0.0]))
+    loop.answer()
+    loop.wait_for("tracking")
+    assert file.exists()
+    plant_status(loop, LATCHED_PLANT)
+    status = loop.wait_for("aborted")
+    assert_one_sentence(status.message, "Nothing moves: a fuse.")
+    assert not file.exists()
+    loop.aim(base=pose([1.0, 0.0, 0.0]))
+    assert_one_sentence(loop.wait_for("refused").message, "latched", "/plant/rearm")
+    # The robot drifts meanwhile; it is held where it is when commands pass again.
+    loop.place = np.array([0.3, 0.0, 0.0])
+    loop.answer()
+    plant_status(loop, PlantStatus(PlantState.RUNNING, "Again.", rearms=1))
+    loop.place = np.array([0.5, 0.0, 0.0])
+    wrench, effort = loop.answer()
+    np.testing.assert_allclose(wrench, 0.0, atol=1e-12)
+    np.testing.assert_allclose(effort, 0.0, atol=1e-12)
+    assert loop.status["state"] in ("aborted", "refused")
+    loop.aim(base=pose([1.0, 0.0, 0.0]))
+    loop.answer()
+    loop.wait_for("tracking")
+
+
+def test_states_of_another_time_do_not_disturb_the_controller(harness: Harness) -> None:
+    loop = Loop(harness, time_limit=5.0)
+    loop.aim(base=pose([1.0, 0.0, 0.0]))
+    for _ in range(3):
+        before = loop.answer()[0]
+    tick = loop.tick
+    for jump in (10**8, 300, -2):
+        loop.tick = tick + jump - 1
+        loop.show()
+        harness.settle(loop.probe)
+        loop.tick = tick
+        tick += 1
+        after = loop.answer()[0]
+        np.testing.assert_allclose(after, before, rtol=1e-9)
+        assert loop.status["state"] == "tracking"
+    assert loop.probe.count("joint_commands") == 6
+    assert {values_of(s)["state"] for s in loop.probe.messages[STATUS]} <= {"holding", "tracking"}
+
+
+def test_a_restarted_plant_does_not_end_the_goal_of_the_controller(harness: Harness) -> None:
+    """Its time begins again; the time limit of the goal is not over for that."""
+    loop = Loop(harness, time_limit=0.1)
+    loop.tick = 10**6
+    loop.aim(base=pose([1.0, 0.0, 0.0]))
+    loop.answer()
+    loop.tick = 0
+    loop.answer()
+    loop.answer()
+    loop.tick = 10**7
+    loop.answer()
+    loop.answer()
+    assert loop.status["state"] == "tracking"
+    for _ in range(12):
+        loop.answer()
+    loop.wait_for("failed")

@@ -1,0 +1,170 @@
+"""Which stamps of states are believed: lost messages, restarts, times that are not the plant's."""
+
+from __future__ import annotations
+
+import pytest
+from nav_msgs.msg import Odometry
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
+
+from spacerobot_ros.nodes.common.state_times import StateTimes
+
+PERIOD = 0.05
+
+
+def message(kind: type[Odometry] | type[JointState], seconds: float) -> bytes:
+    made = kind()
+    made.header.frame_id = "world"
+    stamp = divmod(round(seconds * 1e9), 1_000_000_000)
+    made.header.stamp.sec, made.header.stamp.nanosec = stamp
+    return bytes(serialize_message(made))
+
+
+class Listener:
+    """States as they come in real time, and which of them are believed."""
+
+    def __init__(self, pace: float = 1.0) -> None:
+        self.wall, self.pace, self.time = 100.0, pace, 40.0
+        self.times = StateTimes(PERIOD, clock=lambda: self.wall)
+        self.believed: list[float] = []
+        """The times of the states that were admitted, s."""
+
+    def states(self, count: int) -> None:
+        """Let the plant publish states, one a control period."""
+        for _ in range(count):
+            self.wait(PERIOD / self.pace)
+            self.time += PERIOD
+            assert self.odom(self.time)
+            assert self.joints(self.time)
+
+    def odom(self, seconds: float) -> bool:
+        return self.times.admits_odom(message(Odometry, seconds))
+
+    def joints(self, seconds: float) -> bool:
+        admitted = self.times.admits(message(JointState, seconds))
+        if admitted:
+            self.believed.append(seconds)
+        return admitted
+
+    def wait(self, wall: float) -> None:
+        """Let wall time pass, and look as often as a node does."""
+        for _ in range(int(wall / 0.1)):
+            self.wall += 0.1
+            self.look()
+        self.wall += wall % 0.1
+
+    def look(self) -> tuple[bytes, bytes] | None:
+        return self.times.believed()
+
+
+@pytest.mark.parametrize("pace", [1.0, 10.0, 500.0])
+@pytest.mark.parametrize("ahead", [1e6, 2e9 - 100, 3.0, 0.493, -0.05, -3.0, -39.0])
+def test_one_state_of_another_time_is_ignored_and_counted(ahead: float, pace: float) -> None:
+    if pace > 100 and 0 < ahead < 2 * PERIOD + 2 * pace * PERIOD / pace:
+        pytest.skip("as near as lost messages")
+    listener = Listener(pace)
+    listener.states(20)
+    assert not listener.odom(listener.time + ahead) or abs(ahead) <= 1.5 * PERIOD
+    assert not listener.joints(listener.time + ahead)
+    assert listener.look() is None
+    listener.states(20)
+    assert len(listener.believed) == 40
+    assert listener.times.ignored >= 1
+    where = "ahead of" if ahead > 0 else "behind"
+    assert where in listener.times.last_ignored
+    assert "stamp" in listener.times.last_ignored
+
+
+def test_a_second_publisher_of_another_time_never_takes_over() -> None:
+    listener = Listener()
+    listener.states(5)
+    for tick in range(100):
+        listener.states(1)
+        for part in range(3):
+            assert not listener.joints(listener.time + 3.0 + part * 0.01)
+            assert not listener.joints(1e6 + tick)
+    assert len(listener.believed) == 105
+
+
+def test_lost_states_are_explained_by_the_wall_time_without_them() -> None:
+    listener = Listener()
+    listener.states(20)
+    # This node is stopped for 6 s: the first states of its queue are lost, and the rest come in a
+    # burst.
+    listener.wall += 6.0
+    listener.time += 1.0
+    for _ in range(100):
+        listener.time += PERIOD
+        assert listener.odom(listener.time)
+        assert listener.joints(listener.time)
+    listener.states(5)
+    assert listener.times.ignored == 0
+
+
+def test_a_stamp_that_is_shown_again_is_of_the_present_time() -> None:
+    listener = Listener()
+    listener.states(3)
+    assert listener.joints(listener.time)
+    listener.wall += 100.0
+    assert listener.odom(listener.time)
+    assert listener.joints(listener.time)
+
+
+@pytest.mark.parametrize("at", [0.0, 39.8, 1e6])
+def test_a_restarted_plant_is_believed_when_nothing_contradicts_it(at: float) -> None:
+    """In lockstep it publishes one state, and waits for the answer."""
+    listener = Listener()
+    listener.states(20)
+    listener.wall += 2.0
+    assert not listener.odom(at)
+    assert not listener.joints(at)
+    looks = 0
+    while (believed := listener.look()) is None:
+        looks += 1
+        listener.wall += 0.1
+        assert looks < 5
+    assert looks >= 2
+    assert believed == (message(Odometry, at), message(JointState, at))
+    assert listener.joints(at + PERIOD)
+    assert not listener.joints(listener.time + PERIOD)
+    assert listener.times.ignored == 0
+
+
+def test_a_node_that_stood_still_itself_believes_no_other_time_for_it() -> None:
+    listener = Listener()
+    listener.states(20)
+    assert not listener.joints(1e6)
+    # Its own callbacks, the look among them, come late and at once; the plant's states after them.
+    listener.wall += 3.0
+    assert listener.look() is None
+    listener.time += PERIOD
+    assert listener.joints(listener.time)
+    assert listener.look() is None
+
+
+def test_a_plant_of_another_rate_is_understood_after_two_states() -> None:
+    listener = Listener()
+    listener.states(1)
+    step = 4 * PERIOD
+    for _ in range(2):
+        # In lockstep every state comes as soon as the one before is answered.
+        listener.time += step
+        assert not listener.joints(listener.time)
+        for _ in range(3):
+            listener.wall += 0.1
+            listener.look()
+    for _ in range(50):
+        listener.time += step
+        listener.wall += 1e-4
+        assert listener.joints(listener.time)
+
+
+def test_the_first_state_is_believed_whatever_its_stamp() -> None:
+    listener = Listener()
+    assert listener.odom(1e6)
+    assert listener.joints(1e6)
+    # If it was not the plant's, the plant's are believed when it does not come again.
+    assert not listener.joints(10.0)
+    listener.wall += 0.25
+    assert listener.look() is None
+    assert listener.look() is not None
