@@ -168,3 +168,14 @@ def test_the_first_state_is_believed_whatever_its_stamp() -> None:
     listener.wall += 0.25
     assert listener.look() is None
     assert listener.look() is not None
+
+
+def test_a_state_of_another_robot_tells_nothing_about_the_time() -> None:
+    listener = Listener()
+    assert listener.joints(1e6)
+    listener.times.withdraw()
+    listener.states(10)
+    assert listener.joints(listener.time + PERIOD)
+    listener.times.withdraw()
+    listener.states(10)
+    assert listener.times.ignored == 0

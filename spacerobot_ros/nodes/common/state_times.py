@@ -20,6 +20,9 @@ _PACE_SLACK = 2.0
 _LOOKS = 2
 """Looks without a state of the old time before another time is believed."""
 
+_NONE = -1
+"""The stamp of no state."""
+
 _LONGEST_STEP = 100
 """Control periods that the states of a plant with another rate may be apart."""
 
@@ -65,7 +68,7 @@ class StateTimes:
         """Time between two states as far as is known, ns."""
         self._longest = -1
         """Largest plausible step without a loss, ns; negative before the first state."""
-        self._last_ns, self._wall = 0, 0.0
+        self._last_ns, self._before_ns, self._wall = 0, _NONE, 0.0
         self._origin_ns, self._origin_wall = 0, 0.0
         """The first state of this time, from which its pace is measured."""
         self._doubtful: _Doubtful | None = None
@@ -88,10 +91,19 @@ class StateTimes:
         if not 0 <= stamp - self._last_ns <= self._longest and not self._explained(stamp):
             self._doubt(joint_states, stamp)
             return False
-        self._last_ns, self._wall = stamp, self._clock()
+        self._before_ns, self._last_ns = self._last_ns, stamp
+        self._wall = self._clock()
         if self._doubtful is not None or self._doubtful_odom:
             self._ignore()
         return True
+
+    def withdraw(self) -> None:
+        """Take back the state that was admitted last: it is not one of the robot."""
+        if self._before_ns == _NONE:
+            self._longest, self._last_ns = -1, 0
+        else:
+            self._last_ns = self._origin_ns = self._before_ns
+            self._origin_wall = self._wall
 
     def admits_odom(self, odom: bytes) -> bool:
         """Return whether an odom message is of the present time; else it is set aside.
@@ -124,6 +136,7 @@ class StateTimes:
         if self._longest < 0:
             self._longest = round(_STEP_SLACK * self._step)
             self._origin_ns, self._origin_wall = stamp, now
+            self._last_ns = _NONE
             return True
         return 0 <= stamp - self._last_ns <= self._loss(now)
 
@@ -160,7 +173,7 @@ class StateTimes:
             self._step = jump
             self._longest = round(_STEP_SLACK * jump)
         self._jump_ns = jump
-        self._last_ns, self._wall = stamp, now
+        self._before_ns, self._last_ns, self._wall = self._last_ns, stamp, now
         self._origin_ns, self._origin_wall = stamp, now
         odom, self._doubtful, self._doubtful_odom = self._doubtful_odom, None, b""
         same = odom[HEADER_STAMP] == doubtful.joint_states[HEADER_STAMP]
@@ -174,7 +187,7 @@ class StateTimes:
                 ("joint_states", b"" if self._doubtful is None else self._doubtful.joint_states),
                 ("odom", self._doubtful_odom),
             )
-            if raw
+            if raw and first_time_ns(raw) != self._last_ns
         ]
         self._doubtful, self._doubtful_odom = None, b""
         for name, raw in parts:

@@ -227,12 +227,17 @@ class CoordinatedControlNode(CommanderNode):
         """Answer one state with one command of the same stamp."""
         try:
             stamp = self._joints.accept(self._states.joint_states)
+        except CommandError as error:
+            self._times.withdraw()
+            self._log_refusal(error)
+            return
+        try:
             q, qdot = self._joints.values["position"], self._joints.values["velocity"]
             measured = self._measured(q, qdot) if pairing is Pairing.WHOLE else None
             now = stamp / NANOSECONDS
             result = self._executive.command(now, measured, q, qdot, self._reference())
         except (CommandError, NotFiniteError) as error:
-            self.get_logger().error(f"The state is refused: {error}", throttle_duration_sec=5.0)
+            self._log_refusal(error)
             return
         self._effort[:] = result.realised.tau
         self._wrench[:] = result.realised.wrench_B
@@ -241,6 +246,9 @@ class CoordinatedControlNode(CommanderNode):
             self._base_wrench.take(self._wrench_message.serialised(stamped))
             self._joint_commands.take(self._joint_message.serialised(stamped))
         self._executive.evaluate(now, result)
+
+    def _log_refusal(self, error: CommandError | NotFiniteError) -> None:
+        self.get_logger().error(f"The state is refused: {error}", throttle_duration_sec=5.0)
 
     def _measured(self, q: Array, qdot: Array) -> ControlState:
         pose, twist = _pose_and_twist(self._odom, self._states.odom)

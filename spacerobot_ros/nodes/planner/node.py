@@ -236,6 +236,7 @@ class PlannerNode(CommanderNode):
         try:
             measured.accept(states.joint_states, odom)
         except CommandError as error:
+            self._times.withdraw()
             self.get_logger().error(f"joint_states: {error}.", throttle_duration_sec=5.0)
             return
         if pairing is _LATE_POSE:
