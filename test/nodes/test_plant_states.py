@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from scipy.spatial.transform import Rotation
@@ -57,6 +57,7 @@ def test_activation_publishes_the_state_of_tick_0_and_the_clock_first(harness: H
     assert not set(rig.probe.order) & set(STATE), "published before activation"
     rig.activate()
     harness.settle(rig.probe)
+    print(rig.probe.order)
     states = [topic for topic in rig.probe.order if topic in STATE]
     assert sorted(states) == sorted(STATE), "every topic once"
     assert states[0] == "/clock"
@@ -251,3 +252,17 @@ def test_a_reader_that_comes_during_a_pause_gets_the_state_after_it(harness: Har
     harness.spin_for(0.35)
     rig.pause(False)
     harness.spin_until(lambda: late.count("joint_states"), "the waiting state after the pause")
+
+
+def test_a_status_is_published_before_the_states_that_it_is_true_of(harness: Harness) -> None:
+    rig = Rig(harness, topics={"plant/status": DiagnosticStatus})
+    rig.step([0.1, 0.0, 0.0])
+    harness.settle(rig.probe)
+    # From here on: right after discovery the order of topics is not kept.
+    before = len(rig.probe.order)
+    rig.plant.trigger_deactivate()
+    rig.activate()
+    rig.trigger("plant/reset")
+    rig.wait("odom", 4)
+    states = [t for t in rig.probe.order[before:] if t in ("plant/status", "odom")]
+    assert states == ["plant/status", "plant/status", "odom", "plant/status", "odom"]

@@ -141,8 +141,8 @@ class PlantNode(FlightNode):
                 self.create_timer(self._real_time.period, self._on_wall_tick, clock=steady),
                 self.create_timer(_LOOK_PERIOD, self._count_commanders, clock=steady),
             ]
-        self._publish()
         self._look_at_status()
+        self._publish()
 
     def deactivate(self) -> None:
         """Stop time; nothing is commanded when it goes on."""
@@ -321,9 +321,10 @@ class PlantNode(FlightNode):
         self._monitor.resets += 1
         response.success = True
         response.message = "The robot is back in its initial state; time goes on."
+        # A commander is to know of the reset before it answers a state of it.
+        self._look_at_status()
         if self._active is not PlantState.INACTIVE:
             self._publish()
-        self._look_at_status()
         return response
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
