@@ -27,6 +27,8 @@ class Lockstep:
     def __init__(self, commands: CommandValidator) -> None:
         self._commands = commands
         self._looked_at = -1
+        self.waits = False
+        """Whether the plant was waiting in the same tick at the last two looks."""
 
     @property
     def may_step(self) -> bool:
@@ -40,8 +42,8 @@ class Lockstep:
         it sees another state. So the plant steps without a command if it was still waiting in the
         same tick when it looked last.
         """
-        waited, self._looked_at = self._looked_at == tick, tick
-        return (waited and pose_lost) or self.may_step
+        self.waits, self._looked_at = self._looked_at == tick, tick
+        return (self.waits and pose_lost) or self.may_step
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,22 @@ def test_a_planner_is_cleaned_up_and_configured_again(harness: Harness) -> None:
     assert values_of(flight.decide(TURNED))["state"] == "reached"
 
 
+def test_a_planner_that_is_configured_again_in_flight_is_shown_the_state_it_has_missed(
+    harness: Harness,
+) -> None:
+    flight = Flight(harness)
+    flight.send(NEAR)
+    flight.start()
+    flight.wait("executing")
+    # No time between these: the plant sees as many subscriptions as before.
+    for name in ("deactivate", "cleanup", "configure", "activate"):
+        trigger = getattr(flight.planner, f"trigger_{name}")
+        assert trigger() is TransitionCallbackReturn.SUCCESS
+    harness.connect()
+    flight.ticks(5)
+    assert values_of(flight.decide(NEAR))["state"] == "reached"
+
+
 # -- parameters -------------------------------------------------------------------------------
 
 

@@ -133,7 +133,8 @@ class PlantNode(FlightNode):
         self._publisher.publish_description()
         self._steady = steady = Clock(clock_type=ClockType.STEADY_TIME)
         if self._real_time is None:
-            self._look_round()
+            self._publisher.has_new_readers()
+            self._look_for_commanders()
             self._wall_timers = [self.create_timer(_LOOK_PERIOD, self._on_look_round, clock=steady)]
         else:
             self._real_time.start(steady.now().nanoseconds, self._tick)
@@ -263,17 +264,14 @@ class PlantNode(FlightNode):
         """A lockstep plant waits for ever if nobody saw its last state: show it to newcomers."""
         if self._active is not PlantState.RUNNING:
             return  # A subscriber that comes now is shown the state after the pause.
-        before = self._readers
-        self._look_round()
-        if self._readers > before:
-            self._publisher.publish(self.time_ns, all_topics=True)
+        self._look_for_commanders()
         assert self._lockstep is not None
         if self._lockstep.looks(self._tick, pose_lost=self._reported.sensors.dropout):
             self._step()
+        elif self._lockstep.waits and self._publisher.has_new_readers():
+            self._publisher.publish(self.time_ns, all_topics=True)
 
-    def _look_round(self) -> None:
-        """See who listens and who commands."""
-        self._readers = self._publisher.readers()
+    def _look_for_commanders(self) -> None:
         self._count_commanders()
         self._commands.require_commanded()
 

@@ -40,6 +40,8 @@ class StatePublisher:
     ) -> None:
         self._node, self._robot, self._state, self._world = node, robot, state, world_frame
         self._outputs: dict[str, RawOutput] = {}
+        self._readers: frozenset[bytes] = frozenset()
+        self._matched = 0
         self._description = node.create_publisher(String, "robot_description", LATCHED)
         self.rebuild()
 
@@ -71,9 +73,22 @@ class StatePublisher:
             if template is not lost:
                 output.take(template.serialised(stamp))
 
-    def readers(self) -> int:
-        """Return how many subscriptions the state topics have now."""
-        return sum(output.readers() for output in self._outputs.values())
+    def has_new_readers(self) -> bool:
+        """Whether somebody subscribes to the state who did not at the last call.
+
+        Takes a millisecond. A subscription that is replaced by another leaves their number; one
+        that is known of may be matched later.
+        """
+        outputs = self._outputs.values()
+        readers = frozenset(
+            bytes(reader.endpoint_gid)
+            for output in outputs
+            for reader in self._node.get_subscriptions_info_by_topic(output.topic)
+        )
+        matched = sum(output.readers() for output in outputs)
+        new = bool(readers - self._readers) or matched > self._matched
+        self._readers, self._matched = readers, matched
+        return new
 
     def _output(self, topic: Topic) -> RawOutput:
         if topic.name not in self._outputs:
