@@ -1,8 +1,9 @@
 """Which commands reach the actuators of a plant: the one rule set, for its node and for bags.
 
-A command comes from a *source* (one topic) with a stamp and values. In lockstep the command of a
-tick is the first one that is stamped with it; a refused one makes it a tick at rest. In real time
-the last accepted command holds until it is older than the timeout.
+A command comes from a *source* (one topic) with a stamp and values, and answers the state of that
+stamp. In lockstep the command of a tick is the first one that is stamped with it; a refused one
+makes it a tick at rest. In real time a command answers any state that was published lately, and
+holds until it is older than the timeout; one publisher commands, not two by turns.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -31,8 +33,17 @@ NEVER = -math.inf
 
 _SECOND = 10**9
 
+_UNNUMBERED = 2**63
+"""Middleware that does not number messages says a larger number."""
+
+_MOST_PUBLISHERS = 100
+"""So many that have sent once are remembered."""
+
 _START = 1.0
 """How long a stamp of zero is that of the first state where commands never grow old, s."""
+
+_STAMP_ROUNDING = 1_000
+"""By how much a stamp may be off its state where a commander keeps time in floating point, ns."""
 
 _BRAKING_RATE = 20.0
 """Joint rates decay as exp(-20 t/s) while the motors are strong enough."""
@@ -52,11 +63,13 @@ class Reason(str, Enum):
     STALE = "stale"
     EARLY = "early"
     """Stamped ahead of the plant's time."""
+    UNKNOWN_STATE = "unknown_state"
+    """Stamped between two ticks: there is no such state."""
     OUT_OF_ORDER = "out_of_order"
     """Stamped before the command that is in force."""
     BEYOND_LIMITS = "beyond_limits"
     SECOND_COMMANDER = "second_commander"
-    """Another commander has already answered the same state."""
+    """Another commander has already answered the same state, or two send by turns."""
     LATCHED = "latched"
     """A fault is latched: nothing moves until it is rearmed."""
 
@@ -135,6 +148,56 @@ def require_frame(frame: str, base_link: str) -> None:
         raise CommandError(f"the wrench is in frame '{frame}'; it is taken in '{base_link}'")
 
 
+class Senders:
+    """Tells the publishers of one topic apart, by the numbers that each gives its messages.
+
+    A publisher numbers its messages one by one, so a message belongs to the publisher whose last
+    one has the number before. Other numbers are those of a publisher that has not sent before, or
+    was started again. A publisher that comes back after another has sent, and was not silent
+    meanwhile, shares the topic with it; one that takes over for good does not.
+
+    Parameters
+    ----------
+    silence_ns
+        Simulated time without a message after which a publisher has handed over, ns.
+
+    Attributes
+    ----------
+    current
+        A number for the publisher of the last message; None where the middleware numbers nothing.
+    by_turns
+        Whether that publisher and another one send by turns.
+    """
+
+    def __init__(self, silence_ns: int) -> None:
+        self.current: int | None = None
+        self.by_turns = False
+        self._silence = silence_ns
+        self._next = -1
+        self._heard = 0
+        self._publishers = 0
+        self._others: dict[int, tuple[int, int]] = {}
+        """Of publishers that another one has followed, by their next number: which, and when."""
+
+    def note(self, number: int, now_ns: int) -> None:
+        """Note the number of a message that comes at a simulated time (ns)."""
+        if number == self._next:
+            self._next, self._heard, self.by_turns = number + 1, now_ns, False
+            return
+        if not 0 < number < _UNNUMBERED:
+            self.current = None
+            return
+        if self.current is not None:
+            self._others[self._next] = self.current, self._heard
+        publisher, heard = self._others.pop(number, (0, 0))
+        self.by_turns = bool(publisher) and now_ns - heard <= self._silence
+        if not publisher:
+            self._publishers = publisher = self._publishers + 1
+        if len(self._others) > _MOST_PUBLISHERS:
+            del self._others[next(iter(self._others))]
+        self.current, self._next, self._heard = publisher, number + 1, now_ns
+
+
 class CommandSource:
     """One topic that commands a plant.
 
@@ -159,10 +222,18 @@ class CommandSource:
         Whether a lockstep plant waits for its commands.
     commanders
         How many publish on the topic, as far as is known.
+    senders
+        Which of them has sent the last message.
+    sender
+        Which of them has sent the command in force.
     """
 
-    def __init__(self, topic: str, quantity: Quantity, limits: Array) -> None:
+    def __init__(
+        self, topic: str, quantity: Quantity, limits: Array, senders: Senders | None = None
+    ) -> None:
         self.topic, self.quantity, self.limits = topic, quantity, limits
+        self.senders = senders or Senders(_SECOND)
+        self.sender: int | None = None
         self.command: Array = np.zeros(len(limits))
         self.stamp_ns: float = NEVER
         self.arrived = self.resting = False
@@ -179,6 +250,7 @@ class CommandSource:
         """Put a command into force."""
         self.command[:] = values
         self.stamp_ns = stamp_ns
+        self.sender = self.senders.current
         self.arrived = True
         self.resting = False
 
@@ -201,19 +273,22 @@ class CommandValidator:
 
     def __init__(self, plant: Plant, config: PlantConfig) -> None:
         robot = plant.robot
-        self.sources = [CommandSource("joint_commands", "velocity", robot.velocity_limit)]
+        silence_ns = round((config.command_timeout or _START) * _SECOND)
+        joints = partial(CommandSource, "joint_commands", senders=Senders(silence_ns))
+        self.sources = [joints("velocity", robot.velocity_limit)]
         """Those whose commands are the arguments of a step, in that order: the joints' first."""
         self._brakes: _JointBrakes | None = None
         if config.actuation == "effort":
             self.sources = [
-                CommandSource("joint_commands", "effort", robot.effort_limit),
-                CommandSource("base_wrench", "wrench", np.full(6, np.inf)),
+                joints("effort", robot.effort_limit),
+                CommandSource("base_wrench", "wrench", np.full(6, np.inf), Senders(silence_ns)),
             ]
             # Velocity servos stop at once; motors have to brake.
             self._brakes = _JointBrakes(plant, config.control_period)
         self._commands = [source.command for source in self.sources]
         self._lockstep = config.time_mode == "lockstep"
-        self._timeout = config.command_timeout
+        self._timeout, self._period = config.command_timeout, config.period_ns
+        self._earliest = 0
         self._clips = config.beyond_limits == "clip"
         self._one_commander = config.second_commander == "refuse"
         self._latching = _latching(config.latched_faults)
@@ -267,28 +342,34 @@ class CommandValidator:
         """
         if self._lockstep:
             if stamp_ns != now_ns or source.arrived:
-                return self._refuse(source, _not_this_tick(stamp_ns, now_ns))
-            refusal = self._unsound(source, values)
+                return self._refuse(source, _not_this_tick(stamp_ns, now_ns), now_ns)
+            refusal = self._superseded(stamp_ns) or self._unsound(source, values)
         else:
-            if not stamp_ns and now_ns > (self._timeout or _START) * _SECOND:
-                stamp_ns = now_ns  # An unset stamp means now; at the start it is the first state's.
-            refusal = self._untimely(source, stamp_ns, now_ns) or self._unsound(source, values)
+            if not stamp_ns and (self._earliest or now_ns > (self._timeout or _START) * _SECOND):
+                # An unset stamp means now; at the start it is the first state's.
+                stamp_ns = now_ns
+                refusal = self._untimely(source, stamp_ns, now_ns)
+            else:
+                if stamp_ns % self._period:
+                    stamp_ns = self._rounded(stamp_ns)
+                refusal = self._untimely(source, stamp_ns, now_ns) or self._superseded(stamp_ns)
+            refusal = refusal or self._unsound(source, values)
         if refusal is None and self.fault:
             refusal = Refusal(Reason.LATCHED, self.fault)
         if refusal is None:
             assert not isinstance(values, CommandError)
             source.accept(values, stamp_ns)
             return None
-        refusal = self._refuse(source, refusal)
+        refusal = self._refuse(source, refusal, now_ns)
         if self._lockstep:
             # Time must go on for the others: a bad command is a tick at rest.
             source.rest()
             source.arrived = True
         return refusal
 
-    def unreadable(self, source: CommandSource, error: CommandError) -> Refusal:
+    def unreadable(self, source: CommandSource, error: CommandError, now_ns: int) -> Refusal:
         """Refuse bytes that are no message: they have no stamp, and so answer no tick."""
-        return self._refuse(source, Refusal(Reason.MALFORMED, str(error)))
+        return self._refuse(source, Refusal(Reason.MALFORMED, str(error)), now_ns)
 
     def begin_step(self) -> list[Array]:
         """Return the commands to step under, a writable array for each source."""
@@ -298,6 +379,11 @@ class CommandValidator:
             self._commands[0][:] = self._brakes.efforts()
         return self._commands
 
+    def begin(self, now_ns: int) -> None:
+        """Command nothing, and accept from now on what answers the state of this time or later."""
+        self.rest()
+        self._earliest = now_ns
+
     def rest(self) -> None:
         """Command nothing any more."""
         self.timed_out = False
@@ -305,8 +391,10 @@ class CommandValidator:
             source.rest()
             source.arrived = False
 
-    def latch(self, reason: str, sentence: str) -> None:
+    def latch(self, reason: str, sentence: str, now_ns: int) -> None:
         """Bring everything to rest until :meth:`rearm`; the first fault stays the one shown.
+
+        What answers a state from before the fault is refused even after it is rearmed.
 
         Parameters
         ----------
@@ -314,9 +402,12 @@ class CommandValidator:
             A word: the value of a :class:`Reason`, ``abort`` or ``watchdog``.
         sentence
             What goes after "a fault is latched:".
+        now_ns
+            Simulated time of the plant's state.
         """
         if not self.fault:
             self.fault, self.fault_reason = sentence, reason
+            self._earliest = now_ns + self._period
         self.timed_out = False
         for source in self.sources:
             source.rest()
@@ -362,30 +453,54 @@ class CommandValidator:
             return Refusal(Reason.BEYOND_LIMITS, limits)
         return None
 
+    def _rounded(self, stamp_ns: int) -> int:
+        """Return the tick that a stamp means, if it is off by rounding only."""
+        tick = (stamp_ns + self._period // 2) // self._period * self._period
+        return tick if abs(stamp_ns - tick) <= _STAMP_ROUNDING else stamp_ns
+
+    def _superseded(self, stamp_ns: int) -> Refusal | None:
+        """Return why a command answers a state that counts no more, if it does."""
+        if stamp_ns >= self._earliest:
+            return None
+        return Refusal(
+            Reason.STALE, "it answers a state from before the plant was started, reset or stopped"
+        )
+
     def _untimely(self, source: CommandSource, stamp_ns: int, now_ns: int) -> Refusal | None:
         """Return why a command does not belong to this moment of real time, if it does not."""
+        if source.senders.by_turns and self._one_commander:
+            return Refusal(Reason.SECOND_COMMANDER, "two publishers command by turns")
         age = (now_ns - stamp_ns) / _SECOND
         if self._timeout and age > self._timeout:
             return Refusal(Reason.STALE, f"it is {age:.3g} s old")
-        if self._timeout and -age > self._timeout:
+        if age < 0:
             return Refusal(Reason.EARLY, f"it is {-age:.3g} s ahead of time")
+        if stamp_ns % self._period:
+            period = self._period / _SECOND
+            return Refusal(
+                Reason.UNKNOWN_STATE,
+                f"it is stamped {stamp_ns / _SECOND:.9g} s, and states have multiples of "
+                f"{period:.9g} s",
+            )
         late = (source.stamp_ns - stamp_ns) / _SECOND
         if late > 0:
             return Refusal(Reason.OUT_OF_ORDER, f"it is {late:.3g} s older than the one in force")
         if late == 0 and source.commanders > 1 and self._one_commander:
-            return Refusal(
-                Reason.SECOND_COMMANDER,
-                f"the same state was answered before, and {source.commanders} nodes command",
-            )
+            senders = source.senders
+            if senders.current is None or senders.current != source.sender:
+                return Refusal(
+                    Reason.SECOND_COMMANDER,
+                    f"the same state was answered before, and {source.commanders} nodes command",
+                )
         return None
 
-    def _refuse(self, source: CommandSource, refusal: Refusal) -> Refusal:
+    def _refuse(self, source: CommandSource, refusal: Refusal, now_ns: int) -> Refusal:
         """Count a refused command; where its reason latches, everything comes to rest."""
         self.counts[refusal.reason] += 1
         if refusal.reason not in self._latching or self.fault:
             return refusal
         sentence = f"a command on '{source.topic}' was refused: {refusal.clause}"
-        self.latch(refusal.reason.value, sentence)
+        self.latch(refusal.reason.value, sentence, now_ns)
         return Refusal(refusal.reason, refusal.clause, latches=True)
 
 

@@ -67,13 +67,15 @@ class PlantConfig(RobotConfig):
     )
     second_commander: str = parameter(
         "refuse",
-        "realtime: a second answer to the same state, from another commander",
+        "realtime: a second answer to the same state from another commander, and two commanders "
+        "that send by turns",
         choices=("refuse", "accept"),
     )
     latched_faults: str = parameter(
         "second_commander",
         "reasons to refuse a command after which nothing moves until ~/rearm, separated by "
-        "spaces: malformed not_finite stale early out_of_order beyond_limits second_commander",
+        "spaces: malformed not_finite stale early unknown_state out_of_order beyond_limits "
+        "second_commander",
     )
     integration_step: float = parameter(
         0.0, "longest step; 0: 0.01 (velocity), 0.001 (effort)", unit="s", minimum=0.0

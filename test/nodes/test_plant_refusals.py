@@ -49,6 +49,7 @@ def assert_state(rig: Rig, state: PlantState) -> None:
 def test_a_command_older_than_the_one_in_force_is_refused(harness: Harness) -> None:
     rig = Rig(harness, REALTIME)
     stamp = started(rig)
+    harness.spin_until(lambda: rig.now_ns > stamp, "a third state")
     rig.send([0.1, 0.0, 0.0], stamp_ns=stamp + TICK_NS)
     wait_for_velocity(rig, 0.1)
     rig.send([0.3, 0.0, 0.0], stamp_ns=stamp)
@@ -79,6 +80,47 @@ def test_a_second_commander_latches_a_fault_until_it_is_rearmed(harness: Harness
     rig.wait_for_refusals(int(rig.diagnosed("commands", "refused")))
     assert_nothing_moves(rig)
     assert "answered before" in rig.trigger("plant/rearm").message
+    rig.send([0.2, 0.0, 0.0])
+    wait_for_velocity(rig, 0.2)
+
+
+@pytest.mark.parametrize("ahead_s", [0.493, 0.0, -0.1])
+def test_two_that_send_by_turns_latch_whatever_their_stamps(
+    harness: Harness, ahead_s: float
+) -> None:
+    rig = Rig(harness, {**REALTIME, "command_timeout": 0.5, "real_time_factor": 1.0})
+    rogue = harness.probe({}, name="rogue")
+    other = rogue.create_publisher(JointState, "joint_commands", 100)
+    harness.connect()
+    started(rig)
+    # The first answers every state, the second one in eight of them.
+    rig.probe.react["joint_states"] = lambda _: rig.send([0.0, 0.0, 0.0])
+
+    def intrude(state: JointState) -> None:
+        answer(state)
+        if rig.probe.count("joint_states") % 8 == 0:
+            message = command_at(rig.now_ns + round(ahead_s * 1e9))
+            message.velocity = [0.3]
+            other.publish(message)
+
+    answer = rig.probe.react["joint_states"]
+    rig.probe.react["joint_states"] = intrude
+    harness.spin_until(lambda: rig.plant.state is PlantState.LATCHED, "a latched fault")
+    assert rig.plant.status.reason == "second_commander"
+    assert_nothing_moves(rig)
+    moved = sum(any(m.velocity) for m in rig.probe.messages["joint_states"])
+    assert moved <= 2
+
+
+@pytest.mark.parametrize("timeout", [0.0, 1.0])
+def test_a_stamp_ahead_of_time_never_moves_a_joint(harness: Harness, timeout: float) -> None:
+    rig = Rig(harness, {**REALTIME, "command_timeout": timeout})
+    stamp = started(rig)
+    for count, ahead in enumerate((2 * 10**9 * 10**9, 10**9, 10 * TICK_NS + 1000), 1):
+        rig.send([0.3, 0.3, 0.3], stamp_ns=stamp + ahead)
+        rig.wait_for_refusals(count)
+    assert rig.diagnosed("commands", "refused.early") >= 2
+    assert_nothing_moves(rig, 15)
     rig.send([0.2, 0.0, 0.0])
     wait_for_velocity(rig, 0.2)
 

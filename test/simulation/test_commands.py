@@ -121,7 +121,193 @@ def test_real_time_refuses_what_is_old_early_or_out_of_order() -> None:
     assert refusal is not None
     assert refusal.reason is Reason.SECOND_COMMANDER
     assert refusal.latches, "by default"
-    assert rig.offer(now + TICK, now) == Refusal(Reason.LATCHED, rig.commands.fault)
+    assert rig.offer(now + TICK, now + TICK) == Refusal(Reason.LATCHED, rig.commands.fault)
+
+
+@pytest.mark.parametrize("timeout", [0.5, 0.0])
+@pytest.mark.parametrize("ahead_ns", [2_000, TICK, 493_000_000, SECOND, 2_000_000_000 * SECOND])
+def test_a_stamp_ahead_of_the_plant_is_refused_however_old_commands_may_be(
+    timeout: float, ahead_ns: int
+) -> None:
+    rig, now = Rig(time_mode="realtime", command_timeout=timeout), 10 * SECOND
+    assert rig.reason(now + ahead_ns, now) is Reason.EARLY
+    assert not rig.commands.in_force
+    assert rig.offer(now, now) is None, "it does not lock others out"
+
+
+def test_a_stamp_between_two_states_is_refused() -> None:
+    rig, now = real_time(), 10 * SECOND
+    for offset in (TICK // 2, 7_000_000, 2_000, TICK - 2_000):
+        assert rig.reason(now - offset, now) is Reason.UNKNOWN_STATE
+    assert not rig.commands.in_force
+
+
+@pytest.mark.parametrize("tick_rate", [20.0, 3.0, 1000.0])
+def test_a_stamp_that_went_through_floating_point_is_that_of_its_state(tick_rate: float) -> None:
+    rig = real_time(tick_rate=tick_rate)
+    period = rig.config.period_ns
+    for tick in (1_000, 1_001, 77_777, 3_000_000):
+        stamp = int(tick * period / SECOND * 1e9)
+        for off in (-900, -1, 0, 1, 900):
+            assert rig.offer(stamp + off, tick * period) is None
+            assert rig.joints.stamp_ns == tick * period
+    # Rounding away from the plant's time is that of this state, and not of the next one.
+    assert rig.reason((tick + 1) * period, tick * period) is Reason.EARLY
+
+
+def test_an_early_command_does_not_lock_out_those_that_follow() -> None:
+    rig = Rig(time_mode="realtime", command_timeout=0.0)
+    assert rig.reason(2_000_000_000 * SECOND, SECOND) is Reason.EARLY
+    assert rig.offer(SECOND, SECOND) is None
+    assert rig.commands.counts == {Reason.EARLY: 1}
+
+
+class Publisher:
+    """One publisher, which numbers its messages as middleware does."""
+
+    def __init__(self, rig: Rig, sent: int = 0) -> None:
+        self.rig, self.sent = rig, sent
+
+    def send(self, now_ns: int, stamp_ns: int | None = None) -> Reason | None:
+        self.sent += 1
+        self.rig.joints.senders.note(self.sent, now_ns)
+        refusal = self.rig.offer(now_ns if stamp_ns is None else stamp_ns, now_ns)
+        return None if refusal is None else refusal.reason
+
+
+def two_publishers(rig: Rig) -> tuple[Publisher, Publisher]:
+    rig.joints.commanders = 2
+    return Publisher(rig, sent=5), Publisher(rig)
+
+
+@pytest.mark.parametrize("ahead_ns", [-2 * TICK, 0, 493_000_000, 7])
+def test_two_that_send_by_turns_latch_whatever_the_stamps_of_the_second(ahead_ns: int) -> None:
+    rig = real_time()
+    planner, rogue = two_publishers(rig)
+    now = 10 * SECOND
+    for tick in range(40):
+        state = now + tick * TICK
+        first = planner.send(state)
+        if rig.commands.fault:
+            break
+        assert first is None
+        if tick % 8 == 7:
+            rogue.send(state + TICK // 2, state + ahead_ns)
+    assert tick == 8, "at once, or with the next command of the first"
+    assert rig.commands.fault_reason == "second_commander"
+    assert rig.commands.counts[Reason.SECOND_COMMANDER] >= 1
+    assert not rig.commands.in_force
+    assert planner.send(state + TICK) is Reason.LATCHED
+
+
+def test_where_it_does_not_latch_the_second_commander_is_counted_and_refused() -> None:
+    rig = real_time(latched_faults="")
+    planner, rogue = two_publishers(rig)
+    accepted = 0
+    for tick in range(200, 400):
+        state = tick * TICK
+        planner.send(state)
+        if tick % 8 == 0:
+            accepted += rogue.send(state + 1, state) is None
+    assert accepted <= 1, "at most before it was known"
+    assert rig.commands.fault == ""
+    assert rig.commands.counts[Reason.SECOND_COMMANDER] >= 25
+
+
+def test_two_commanders_by_turns_may_be_accepted() -> None:
+    rig = real_time(second_commander="accept")
+    planner, rogue = two_publishers(rig)
+    for tick in range(200, 220):
+        assert planner.send(tick * TICK) is None
+        assert rogue.send(tick * TICK) is None
+
+
+def test_one_commander_may_send_again_though_another_publisher_is_there() -> None:
+    rig = real_time()
+    planner, _ = two_publishers(rig)
+    for tick in range(200, 220):
+        for _ in range(3):
+            assert planner.send(tick * TICK) is None
+
+
+def test_the_same_state_from_another_publisher_is_refused_at_once() -> None:
+    rig = real_time()
+    planner, rogue = two_publishers(rig)
+    assert planner.send(10 * SECOND) is None
+    assert rogue.send(10 * SECOND) is Reason.SECOND_COMMANDER
+    assert rig.commands.fault
+
+
+@pytest.mark.parametrize("commanders", [1, 2])
+def test_a_commander_that_is_killed_and_started_again_is_one(commanders: int) -> None:
+    # The middleware counts a killed publisher for some time.
+    rig, now = real_time(), 10 * SECOND
+    rig.joints.commanders = commanders
+    for life in range(5):
+        planner = Publisher(rig)
+        for _ in range(3 + life):
+            now += TICK
+            assert planner.send(now) is None
+
+
+def test_commanders_that_hand_over_in_order_are_no_second_ones() -> None:
+    rig, now = real_time(), 10 * SECOND
+    planner, control = two_publishers(rig)
+    for publisher in (planner, control, planner, control):
+        for _ in range(20):  # longer than a command holds
+            now += TICK
+            assert publisher.send(now) is None
+
+
+def test_a_lost_message_is_no_second_commander() -> None:
+    rig, now = real_time(), 10 * SECOND
+    planner, _ = two_publishers(rig)
+    for tick in range(20):
+        planner.sent += tick % 3
+        assert planner.send(now + tick * TICK) is None
+
+
+def test_without_numbers_only_the_state_tells_commanders_apart() -> None:
+    rig = real_time()
+    rig.joints.commanders = 2
+    for tick in range(200, 205):
+        rig.joints.senders.note(2**64 - 1, tick * TICK)
+        assert rig.offer(tick * TICK, tick * TICK) is None
+    assert rig.reason(tick * TICK, tick * TICK) is Reason.SECOND_COMMANDER
+
+
+def test_a_coincidence_of_numbers_hides_a_second_commander_for_one_message_only() -> None:
+    rig = real_time()
+    planner, rogue = two_publishers(rig)
+    rogue.sent = planner.sent + 8  # Its first number continues the planner's.
+    for tick in range(200, 240):
+        if planner.send(tick * TICK) or (tick % 8 == 7 and rogue.send(tick * TICK + 1)):
+            break
+    assert rig.commands.fault_reason == "second_commander"
+    assert tick < 220
+
+
+def test_commands_from_before_a_start_a_reset_or_a_fault_are_refused() -> None:
+    rig, now = real_time(), 10 * SECOND
+    assert rig.offer(now, now) is None
+    rig.commands.begin(now + TICK)
+    assert rig.reason(now, now + TICK) is Reason.STALE
+    assert rig.offer(now + TICK, now + TICK) is None
+    rig.commands.latch("abort", "aborted on request", now + TICK)
+    rig.commands.rearm()
+    assert rig.reason(now + TICK, now + 2 * TICK) is Reason.STALE, "sent before the abort"
+    assert rig.offer(0, now + 2 * TICK) is None, "an unset stamp means now"
+    assert rig.offer(now + 2 * TICK, now + 2 * TICK) is None
+
+
+def test_in_lockstep_what_was_sent_before_a_fault_is_a_tick_at_rest() -> None:
+    rig = Rig()
+    rig.commands.latch("abort", "aborted on request", TICK)
+    rig.commands.rearm()
+    assert rig.reason(TICK, TICK) is Reason.STALE
+    assert rig.commands.complete, "time goes on"
+    assert rig.in_force() == [0.0, 0.0, 0.0]
+    assert rig.offer(2 * TICK, 2 * TICK) is None
 
 
 def test_two_commanders_may_be_accepted() -> None:

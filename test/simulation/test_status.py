@@ -77,10 +77,10 @@ def test_a_latched_fault_shows_in_every_state() -> None:
     rig = Rig()
     rig.command()
     rig.events()
-    rig.commands.latch("abort", "aborted on request")
+    rig.commands.latch("abort", "aborted on request", rig.now)
     assert rig.events() == [EventKind.LATCHED]
     assert rig.state == (PlantState.LATCHED, "abort")
-    rig.commands.latch("watchdog", "a second fault")
+    rig.commands.latch("watchdog", "a second fault", rig.now)
     assert rig.events() == [], "the first one stays"
     assert rig.events(PlantState.PAUSED) == [EventKind.PAUSED]
     assert rig.state == (PlantState.PAUSED, "abort")
@@ -100,7 +100,7 @@ def test_a_latched_fault_shows_in_every_state() -> None:
 def test_a_fault_that_latches_while_time_stands_still_is_reported_at_once() -> None:
     rig = Rig()
     rig.events(PlantState.PAUSED)
-    rig.commands.latch("abort", "aborted on request")
+    rig.commands.latch("abort", "aborted on request", rig.now)
     assert rig.events(PlantState.PAUSED) == [EventKind.LATCHED]
     assert rig.state == (PlantState.PAUSED, "abort")
     assert rig.events() == [EventKind.RESUMED]

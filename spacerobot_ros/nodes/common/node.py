@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import sys
 import time
@@ -67,6 +68,8 @@ _INTEGERS = -(2**63), 2**63 - 1
 """Bounds that descriptors can hold."""
 
 Take = Callable[[bytes], None]
+
+_TWO_PARAMETERS = inspect.signature(lambda message, information: None)
 
 
 class RawStream:
@@ -206,16 +209,33 @@ class FlightNode(LifecycleNode):
         self.raw_streams.append(stream)
         return stream
 
-    def take_raw(self, kind: type[Any], topic: str, callback: Take) -> None:
-        """Subscribe to serialised messages; a listener of the stream is shown them as well."""
+    def take_raw(
+        self, kind: type[Any], topic: str, callback: Take, number: Callable[[int], None]
+    ) -> None:
+        """Subscribe to serialised messages; a listener of the stream is shown them as well.
+
+        Parameters
+        ----------
+        kind, topic
+            Of the messages.
+        callback
+            What is done with each.
+        number
+            Called before with the number that its publisher has given to the message.
+        """
         stream = RawInput(self.resolve_topic_name(topic), callback)
 
-        def take(raw: bytes) -> None:
+        def take(*given: Any) -> None:
+            # rclpy's events executor hands over message and information as one tuple (7.1).
+            raw, info = given[0] if len(given) == 1 else given
             try:
+                number(info["publication_sequence_number"])
                 stream.take(raw)  # Looked up for every message: a listener may come and go.
             except Exception as error:
                 self._fail(f"a message on '{topic}'", error)
 
+        # By the number of parameters rclpy finds out that the information is wanted.
+        take.__signature__ = _TWO_PARAMETERS  # type: ignore[attr-defined]
         # Guarded already: one call less for each message.
         super().create_subscription(kind, topic, take, STREAM, raw=True)
         self.raw_streams.append(stream)

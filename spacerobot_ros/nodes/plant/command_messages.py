@@ -47,7 +47,7 @@ class CommandReader:
         try:
             stamp = self._reader.accept(raw)
         except UnreadableError as error:
-            return commands.unreadable(self.source, error)
+            return commands.unreadable(self.source, error, now_ns)
         except CommandError as error:
             return commands.offer(self.source, self._reader.stamp_ns, error, now_ns)
         return commands.offer(self.source, stamp, self._values, now_ns)

@@ -25,7 +25,7 @@ from spacerobot_ros.nodes.plant.diagnostics import PlantReport
 from spacerobot_ros.nodes.plant.publisher import LinkMarkers, StatePublisher
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.building import build_plant
-from spacerobot_ros.simulation.commands import CommandValidator
+from spacerobot_ros.simulation.commands import CommandValidator, Senders
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.reported_state import ReportedState
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
@@ -118,7 +118,12 @@ class PlantNode(FlightNode):
         self._report_ticks = self._ticks(config.diagnostics_period)
         for source in self._commands.sources:
             reader = CommandReader(source, robot)
-            self.take_raw(reader.message_type, source.topic, partial(self._on_command, reader))
+            self.take_raw(
+                reader.message_type,
+                source.topic,
+                partial(self._on_command, reader),
+                partial(self._on_number, source.senders),
+            )
         self.create_subscription(String, "fault_injection", self._on_fault, STREAM)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
@@ -130,6 +135,7 @@ class PlantNode(FlightNode):
     def activate(self) -> None:
         """Publish the robot and its present state, and from now on step."""
         self._active = self._when_active
+        self._commands.begin(self.time_ns)
         self._publisher.publish_description()
         self._steady = steady = Clock(clock_type=ClockType.STEADY_TIME)
         if self._real_time is None:
@@ -281,6 +287,9 @@ class PlantNode(FlightNode):
 
     # -- commands -----------------------------------------------------------------------------
 
+    def _on_number(self, senders: Senders, number: int) -> None:
+        senders.note(number, self._tick * self._period_ns)
+
     def _on_command(self, reader: CommandReader, raw: bytes) -> None:
         if self._active is _INACTIVE:
             return
@@ -314,7 +323,7 @@ class PlantNode(FlightNode):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.plant.reset()
-        self._commands.rest()
+        self._commands.begin(self.time_ns)
         assert self._monitor is not None
         self._monitor.resets += 1
         response.success = True
@@ -326,7 +335,7 @@ class PlantNode(FlightNode):
         return response
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._commands.latch("abort", "aborted on request")
+        self._commands.latch("abort", "aborted on request", self.time_ns)
         self._report.latched()
         self._look_at_status()
         response.success = True
