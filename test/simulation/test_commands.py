@@ -366,13 +366,13 @@ def test_a_latched_fault_refuses_everything_until_it_is_rearmed() -> None:
 
 def test_the_first_of_several_latched_faults_is_the_one_shown() -> None:
     rig = Rig(latched_faults="not_finite malformed")
-    rig.commands.latch("abort", "An operator has aborted.")
-    rig.commands.latch("watchdog", "A joint is too hot.")
+    rig.commands.latch("abort", "An operator has aborted.", 0)
+    rig.commands.latch("watchdog", "A joint is too hot.", 0)
     assert rig.reason(0, 0, np.full(3, np.nan)) is Reason.NOT_FINITE
     assert rig.commands.fault == "An operator has aborted."
     assert rig.commands.fault_reason == "abort"
     assert rig.commands.rearm() == "An operator has aborted."
-    rig.commands.latch("watchdog", "A joint is too hot.")
+    rig.commands.latch("watchdog", "A joint is too hot.", 0)
     assert rig.commands.fault == "A joint is too hot."
 
 
