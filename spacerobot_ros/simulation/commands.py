@@ -45,6 +45,8 @@ _START = 1.0
 _STAMP_ROUNDING = 1_000
 """By how much a stamp may be off its state where a commander keeps time in floating point, ns."""
 
+_SUPERSEDED = "it answers a state from before the plant was started, reset or stopped"
+
 _BRAKING_RATE = 20.0
 """Joint rates decay as exp(-20 t/s) while the motors are strong enough."""
 
@@ -340,22 +342,22 @@ class CommandValidator:
         Refusal or None
             Why it is refused; None if it is in force now.
         """
+        unset = False
         if self._lockstep:
             if stamp_ns != now_ns or source.arrived:
                 return self._refuse(source, _not_this_tick(stamp_ns, now_ns), now_ns)
-            refusal = self._superseded(stamp_ns) or self._unsound(source, values)
+            refusal = self._unsound(source, values)
         else:
             if not stamp_ns and (self._earliest or now_ns > (self._timeout or _START) * _SECOND):
                 # An unset stamp means now; at the start it is the first state's.
-                stamp_ns = now_ns
-                refusal = self._untimely(source, stamp_ns, now_ns)
-            else:
-                if stamp_ns % self._period:
-                    stamp_ns = self._rounded(stamp_ns)
-                refusal = self._untimely(source, stamp_ns, now_ns) or self._superseded(stamp_ns)
-            refusal = refusal or self._unsound(source, values)
+                stamp_ns, unset = now_ns, True
+            elif stamp_ns % self._period:
+                stamp_ns = self._rounded(stamp_ns)
+            refusal = self._untimely(source, stamp_ns, now_ns) or self._unsound(source, values)
         if refusal is None and self.fault:
             refusal = Refusal(Reason.LATCHED, self.fault)
+        if stamp_ns < self._earliest and refusal is None and not unset:
+            refusal = Refusal(Reason.STALE, _SUPERSEDED)
         if refusal is None:
             assert not isinstance(values, CommandError)
             source.accept(values, stamp_ns)
@@ -457,14 +459,6 @@ class CommandValidator:
         """Return the tick that a stamp means, if it is off by rounding only."""
         tick = (stamp_ns + self._period // 2) // self._period * self._period
         return tick if abs(stamp_ns - tick) <= _STAMP_ROUNDING else stamp_ns
-
-    def _superseded(self, stamp_ns: int) -> Refusal | None:
-        """Return why a command answers a state that counts no more, if it does."""
-        if stamp_ns >= self._earliest:
-            return None
-        return Refusal(
-            Reason.STALE, "it answers a state from before the plant was started, reset or stopped"
-        )
 
     def _untimely(self, source: CommandSource, stamp_ns: int, now_ns: int) -> Refusal | None:
         """Return why a command does not belong to this moment of real time, if it does not."""
