@@ -57,6 +57,10 @@ fuzz: $(STAMP)/test ## try more than ten thousand inputs that nobody would send,
 known-errors: $(STAMP)/test ## put each known error into the package; the tests must notice it; ONLY=WORD: some
 	PYTHONPATH=test $(BIN)/python3 -m support.known_errors $(ONLY)
 
+.PHONY: expected
+expected: $(STAMP)/test ## write what the tests expect of parameters and plans anew, where a change is wanted
+	PYTHONPATH=.:test $(BIN)/python3 -m support.expected
+
 MUTANTS := 400
 SEED := 1
 .PHONY: mutants

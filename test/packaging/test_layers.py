@@ -161,3 +161,34 @@ def test_modules_do_not_import_each_other_in_a_circle() -> None:
 
     for module in sources():
         visit(module, ())
+
+
+# -- values -----------------------------------------------------------------------------------
+
+MUTABLE = {
+    "spacerobot_ros.nodes.common.cdr.Layout",
+    "spacerobot_ros.planning.execution.executive._Pursuit",
+    "spacerobot_ros.report.figures_time.Group",
+    "spacerobot_ros.report.solids.Solids",
+    "spacerobot_ros.simulation.trials.Record",
+    "spacerobot_ros.verification.comparison._Resimulation",
+}
+"""Dataclasses that change: records in the making. All others are values."""
+
+
+def dataclasses_of(path: Path) -> Iterator[tuple[str, bool]]:
+    """Yield every dataclass of a module, and whether it is frozen."""
+    module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if not isinstance(node, ast.ClassDef):
+            continue
+        for decorator in node.decorator_list:
+            text = ast.unparse(decorator)
+            if text.partition("(")[0] == "dataclass":
+                yield f"{module}.{node.name}", "frozen=True" in text
+
+
+def test_values_are_frozen() -> None:
+    found = dict(each for path in (ROOT / PACKAGE).rglob("*.py") for each in dataclasses_of(path))
+    assert len(found) > 50
+    assert {name for name, frozen in found.items() if not frozen} == MUTABLE

@@ -79,6 +79,15 @@ def test_a_status_has_the_keys_that_belong_to_it() -> None:
     refused = PlannerStatus(
         PlannerState.REFUSED, "No.", goal_id="3.000000000", goal=goal_values(GOAL)
     )
+    # Where a schedule begins or has ended its times are there, also those that are not given.
+    assert PlannerStatus(PlannerState.EXECUTING, ends_at_s=2.5, method="stub").to_values() == {
+        "state": "executing",
+        "corrections": "0",
+        "manoeuvre_time_s": "0",
+        "ends_at_s": "2.5",
+        "method": "stub",
+        "duration_s": "0",
+    }
     assert refused.to_values() == {
         "state": "refused",
         "corrections": "0",
@@ -104,6 +113,7 @@ def test_statistics_survive_their_message() -> None:
         "commands_published": 98_001,
     }
     assert PlannerStatistics.from_json(statistics.to_json()) == statistics
+    assert PlannerStatistics() == PlannerStatistics(0.0, 0, 0)
 
 
 def test_goal_ids_are_the_stamps() -> None:

@@ -1,0 +1,216 @@
+"""What users' files and earlier flights rely on: the parameters, and the plans of some goals.
+
+``test/expected`` keeps both; a test compares. Where a change is wanted, ``make expected`` writes
+them anew, and the difference shows what has changed for users.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.bag.config import RecorderConfig, ReplayConfig
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.parameters import Parameter, declared
+from spacerobot_ros.planning import GaitSchedule, Goal, PlanRequest, RobotState, Tolerance, plan
+from spacerobot_ros.planning.analysis import analyze
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.config import PlantConfig
+
+FOLDER = Path(__file__).parents[1] / "expected"
+PARAMETERS, PLANS = FOLDER / "parameters.json", FOLDER / "plans.json"
+
+_CONFIGURATIONS = {
+    "plant": PlantConfig,
+    "planner": PlannerConfig,
+    "coordinated_control": ControllerConfig,
+    "recorder": RecorderConfig,
+    "replay": ReplayConfig,
+}
+
+ARM, SERVICER = (0.0, -0.8, 1.5), (0.0, -1.2, 2.0, 0.0, 0.8, 0.0)
+
+_PLANS: dict[str, dict[str, Any]] = {
+    "slide and turn": {
+        "robot": "sliding_masses",
+        "method": "lie_bracket",
+        "position": (0.05, -0.03, 0.02),
+        "rotvec": (0.04, -0.02, 0.03),
+    },
+    "large turn by sliders": {
+        "robot": "sliding_masses",
+        "method": "lie_bracket",
+        "position": (0.1, 0.2, -0.1),
+        "rotvec": (0.3, -0.1, 0.2),
+        "tolerance": Tolerance(1e-3, 1e-3),
+        "n1": 2,
+        "t1": 3.0,
+        "cycle_period": 1.0,
+        "cycles": 0,
+    },
+    "square": {
+        "robot": "planar_chain",
+        "method": "square_path",
+        "rotvec": (0.0, 0.0, 0.5),
+        "start": (0.3, -0.4),
+    },
+    "two squares and a shape": {
+        "robot": "planar_chain",
+        "method": "square_path",
+        "rotvec": (0.0, 0.0, -2.5),
+        "start": (0.9, 0.4),
+        "joint_positions": (0.2, 0.7),
+    },
+    "small square": {
+        "robot": "planar_chain",
+        "method": "square_path",
+        "rotvec": (0.0, 0.0, 1e-3),
+        "start": (0.0, 0.0),
+        "tolerance": Tolerance(1.0, 1e-5),
+    },
+    "box": {
+        "robot": "three_joint_arm",
+        "method": "area_loop",
+        "rotvec": (0.1, -0.05, 0.08),
+        "start": ARM,
+    },
+    "cycles ahead and a shape": {
+        "robot": "three_joint_arm",
+        "method": "area_loop",
+        "rotvec": (0.02, -0.05, 0.0),
+        "start": (1.0, -0.8, -1.5),
+        "joint_positions": (0.2, -0.3, 0.4),
+        "cycles_per_plan": 3,
+        "k": 0.5,
+    },
+    "three of six joints": {
+        "robot": "servicer",
+        "method": "area_loop",
+        "rotvec": (0.02, -0.05, 0.01),
+        "start": SERVICER,
+    },
+}
+
+
+def parameters() -> dict[str, dict[str, Any]]:
+    """Return what is declared of every parameter but its description, by node and name."""
+    return {
+        node: {each.name: _declaration(each) for each in declared(config)}
+        for node, config in _CONFIGURATIONS.items()
+    }
+
+
+def plans() -> dict[str, dict[str, Any]]:
+    """Return numbers of the plans of some goals by every method but ``optimal``."""
+    found = {name: _numbers(plan(**options)) for name, options in _PLANS.items()}
+    servicer = SpaceRobot.from_file(robot_file("servicer"))
+    stuck = RemainingJointsGait(
+        servicer,
+        0.05,
+        0.01,
+        stuck={servicer.joint_names[2]: 1.9, servicer.joint_names[5]: 0.1},
+        method="area_loop",
+        options={},
+    )
+    shape = np.array(SERVICER)
+    shape[[2, 5]] = 1.9, 0.1
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), shape)
+    goal = Goal.checked([0, 0, 0], [0.01, 0.0, -0.02, 1.0])
+    request = PlanRequest(state, goal, Tolerance(1.0, 1e-4))
+    found["without two joints"] = _numbers(stuck.plan(request))
+    for robot in ("sliding_masses", "planar_chain", "three_joint_arm", "servicer"):
+        result = analyze(SpaceRobot.from_file(robot_file(robot)))
+        conditions = result.conditions[np.isfinite(result.conditions)]
+        found[f"analysis of {robot}"] = {
+            "chosen": result.chosen,
+            "shape": result.shape.tolist(),
+            "objections": dict(result.objections),
+            "ranks": [
+                [each.rank, each.needed]
+                for each in (result.at_shape, result.anywhere, result.planar, result.sliding)
+            ],
+            "singular_values": result.anywhere.singular_values.tolist(),
+            "conditions": [len(conditions), *np.percentile(conditions, [0, 50, 90]).tolist()]
+            if conditions.size
+            else [],
+        }
+    return found
+
+
+def _declaration(parameter: Parameter) -> dict[str, Any]:
+    found: dict[str, Any] = {"default": parameter.default}
+    if isinstance(parameter.default, tuple):
+        found["default"] = list(parameter.default)
+    if math.isfinite(parameter.minimum):
+        found["minimum"] = parameter.minimum
+    if math.isfinite(parameter.maximum):
+        found["maximum"] = parameter.maximum
+    if parameter.choices:
+        found["choices"] = list(parameter.choices)
+    if parameter.length is not None:
+        found["length"] = parameter.length
+    if parameter.unit:
+        found["unit"] = parameter.unit
+    for flag in ("read_only", "texts", "of_joints"):
+        if getattr(parameter, flag):
+            found[flag] = True
+    return found
+
+
+def _numbers(schedule: GaitSchedule) -> dict[str, Any]:
+    ticks = np.linspace(0, schedule.ticks, 9).round().astype(int)
+    path = schedule.path
+    return {
+        "method": schedule.method,
+        "ticks": schedule.ticks,
+        "partial": schedule.partial,
+        "controls": sorted(schedule.controls),
+        "shapes": schedule.positions[ticks].tolist(),
+        "fastest": np.abs(schedule.velocities).max(axis=0).tolist(),
+        "poses_of_the_path": len(path.time),
+        "end": [*path.position[-1].tolist(), *path.quaternion[-1].tolist()],
+        "notes": {key: _plain(note) for key, note in schedule.notes.items()},
+    }
+
+
+def _plain(note: Any) -> Any:
+    return note if isinstance(note, (str, float)) else [float(x) for x in note]
+
+
+def differences(found: Any, kept: Any, where: str = "") -> list[str]:
+    """Return where two trees of values differ; numbers may by rounding."""
+    if isinstance(kept, dict) and isinstance(found, dict):
+        lines = [
+            f"{where}/{key}: {'gone' if key in kept else 'new'}" for key in found.keys() ^ kept
+        ]
+        for key in found.keys() & kept.keys():
+            lines += differences(found[key], kept[key], f"{where}/{key}")
+        return sorted(lines)
+    if isinstance(kept, list) and isinstance(found, list) and len(kept) == len(found):
+        return [
+            line
+            for i, (a, b) in enumerate(zip(found, kept, strict=True))
+            for line in differences(a, b, f"{where}/{i}")
+        ]
+    if isinstance(kept, float) and isinstance(found, (int, float)):
+        close = abs(found - kept) <= 1e-6 * abs(kept) + 1e-7
+        return [] if close else [f"{where}: {found}, not {kept}"]
+    return [] if found == kept else [f"{where}: {found!r}, not {kept!r}"]
+
+
+def main() -> None:
+    """Write both files."""
+    for path, content in ((PARAMETERS, parameters()), (PLANS, plans())):
+        path.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
+        print(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,48 @@
+"""Parameters and plans stay what users' files and earlier flights rely on."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from support.expected import PARAMETERS, PLANS, differences, parameters, plans
+
+WRITE = "If this is wanted, `make expected` writes the file anew."
+
+
+def as_kept(found: dict[str, Any]) -> Any:
+    return json.loads(json.dumps(found))
+
+
+def test_parameters_keep_names_types_defaults_and_limits() -> None:
+    kept = json.loads(PARAMETERS.read_text("utf-8"))
+    found = as_kept(parameters())
+    assert {node: sorted(kept[node].keys() - found[node].keys()) for node in kept} == {
+        node: [] for node in kept
+    }, "parameters are gone"
+    # New ones are no difference for anybody's files.
+    listed = {node: {name: found[node][name] for name in kept[node]} for node in kept}
+    assert not differences(listed, kept), WRITE
+    for node, entries in kept.items():
+        for name, entry in entries.items():
+            assert type(found[node][name]["default"]) is type(entry["default"]), (node, name)
+
+
+def test_plans_stay_as_they_are() -> None:
+    problems = differences(as_kept(plans()), json.loads(PLANS.read_text("utf-8")))
+    assert not problems, "\n".join([*problems[:40], WRITE])
+
+
+def test_differences_are_found_beyond_rounding() -> None:
+    kept = {"a": [1.0, 2], "b": {"c": "x", "d": True, "gone": 1}}
+    assert differences(kept, kept) == []
+    assert differences({"a": [1.0 + 1e-7, 2], "b": kept["b"]}, kept) == []
+    assert differences({"a": [1.00001, 3], "b": {"c": "y", "d": False, "new": 1}}, kept) == [
+        "/a/0: 1.00001, not 1.0",
+        "/a/1: 3, not 2",
+        "/b/c: 'y', not 'x'",
+        "/b/d: False, not True",
+        "/b/gone: gone",
+        "/b/new: new",
+    ]
+    assert differences([1.0], [1.0, 2.0]) == [": [1.0], not [1.0, 2.0]"]
