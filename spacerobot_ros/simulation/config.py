@@ -9,6 +9,12 @@ from spacerobot_ros.parameters import group, parameter
 
 _SECOND = 10**9
 
+_LARGEST = 1e6
+"""Largest error of a sensor, m or rad (a second): more is no measurement, and its square counts."""
+
+_FAR = 1e9
+"""Largest quantity of an initial state, and longest time, SI."""
+
 
 def period_ns(tick_rate: float) -> int:
     """Return the duration of a tick in ns: stamps are whole multiples of it."""
@@ -20,27 +26,45 @@ class SensorConfig:
     """How the sensors err: 1 sigma of their noise, their biases, and the seed."""
 
     position_noise: float = parameter(
-        0.0, "1 sigma an axis of odom, in world", unit="m", minimum=0.0
+        0.0, "1 sigma an axis of odom, in world", unit="m", minimum=0.0, maximum=_LARGEST
     )
     attitude_noise: float = parameter(
-        0.0, "likewise, a rotation vector in base", unit="rad", minimum=0.0
+        0.0, "likewise, a rotation vector in base", unit="rad", minimum=0.0, maximum=_LARGEST
     )
-    velocity_noise: float = parameter(0.0, "likewise, of the twist", unit="m/s", minimum=0.0)
-    angular_velocity_noise: float = parameter(0.0, "likewise", unit="rad/s", minimum=0.0)
+    velocity_noise: float = parameter(
+        0.0, "likewise, of the twist", unit="m/s", minimum=0.0, maximum=_LARGEST
+    )
+    angular_velocity_noise: float = parameter(
+        0.0, "likewise", unit="rad/s", minimum=0.0, maximum=_LARGEST
+    )
     joint_noise: float = parameter(
-        0.0, "1 sigma of every joint position", unit="m or rad", minimum=0.0
+        0.0, "1 sigma of every joint position", unit="m or rad", minimum=0.0, maximum=_LARGEST
     )
     joint_rate_noise: float = parameter(
-        0.0, "of every joint velocity", unit="m/s or rad/s", minimum=0.0
+        0.0, "of every joint velocity", unit="m/s or rad/s", minimum=0.0, maximum=_LARGEST
     )
     position_bias: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0), "of odom, in world", unit="m", length=3
+        (0.0, 0.0, 0.0),
+        "of odom, in world",
+        unit="m",
+        minimum=-_LARGEST,
+        maximum=_LARGEST,
+        length=3,
     )
     attitude_bias: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0), "rotation vector in base", unit="rad", length=3
+        (0.0, 0.0, 0.0),
+        "rotation vector in base",
+        unit="rad",
+        minimum=-_LARGEST,
+        maximum=_LARGEST,
+        length=3,
     )
     joint_bias: tuple[float, ...] = parameter(
-        (), "by joint order of the URDF; []: none", unit="m or rad"
+        (),
+        "by joint order of the URDF; []: none",
+        unit="m or rad",
+        minimum=-_LARGEST,
+        maximum=_LARGEST,
     )
     seed: int = parameter(0, "of the noise of sensors and actuators", minimum=0)
 
@@ -60,7 +84,11 @@ class PlantConfig(RobotConfig):
         1.0, "simulated over wall time", minimum=0.001, maximum=1000.0
     )
     command_timeout: float = parameter(
-        0.5, "realtime: older commands stop the joints; 0: never", unit="s", minimum=0.0
+        0.5,
+        "realtime: older commands stop the joints; 0: never",
+        unit="s",
+        minimum=0.0,
+        maximum=_FAR,
     )
     beyond_limits: str = parameter(
         "clip", "commands beyond the rate or effort limits of the URDF", choices=("clip", "refuse")
@@ -78,7 +106,7 @@ class PlantConfig(RobotConfig):
         "second_commander",
     )
     integration_step: float = parameter(
-        0.0, "longest step; 0: 0.01 (velocity), 0.001 (effort)", unit="s", minimum=0.0
+        0.0, "longest step; 0: 0.01 (velocity), 0.001 (effort)", unit="s", minimum=0.0, maximum=_FAR
     )
     thrusters: str = parameter("", "'urdf': those of the robot's URDF; a YAML file; '': any wrench")
     thrusters_excluded: str = parameter(
@@ -87,37 +115,47 @@ class PlantConfig(RobotConfig):
     world_frame: str = parameter("world", "name of the inertial frame")
     end_effector_frame: str = parameter("", "link of end_effector_pose; '': 'end_effector', if any")
     base_pose_period: float = parameter(
-        0.0, "simulated time between base_pose; 0: every tick", unit="s", minimum=0.0
+        0.0, "simulated time between base_pose; 0: every tick", unit="s", minimum=0.0, maximum=_FAR
     )
     marker_period: float = parameter(
-        0.5, "simulated time between markers; 0: none", unit="s", minimum=0.0
+        0.5, "simulated time between markers; 0: none", unit="s", minimum=0.0, maximum=_FAR
     )
     diagnostics_period: float = parameter(
-        1.0, "simulated time between diagnostics; 0: none", unit="s", minimum=0.0
+        1.0, "simulated time between diagnostics; 0: none", unit="s", minimum=0.0, maximum=_FAR
     )
     resume_bag: str = parameter(
         "", "bag from whose last state and time to go on; '': the initial state"
     )
     initial_position: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0), "base link in the world", unit="m", length=3
+        (0.0, 0.0, 0.0), "base link in the world", unit="m", minimum=-_FAR, maximum=_FAR, length=3
     )
     initial_orientation: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0, 1.0), "quaternion x, y, z, w", length=4
     )
     initial_joint_positions: tuple[float, ...] = parameter(
-        (), "by joint order of the URDF; []: zero", unit="m or rad"
+        (), "by joint order of the URDF; []: zero", unit="m or rad", minimum=-_FAR, maximum=_FAR
     )
     initial_joint_velocities: tuple[float, ...] = parameter(
-        (), "likewise, under efforts; []: zero", unit="m/s or rad/s"
+        (), "likewise, under efforts; []: zero", unit="m/s or rad/s", minimum=-_FAR, maximum=_FAR
     )
     initial_center_of_mass: tuple[float, ...] = parameter(
-        (), "of the system in the world, instead of initial_position", unit="m", length=3
+        (),
+        "of the system in the world, instead of initial_position",
+        unit="m",
+        minimum=-_FAR,
+        maximum=_FAR,
+        length=3,
     )
     linear_momentum: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0), "total, in world", unit="kg m/s", length=3
+        (0.0, 0.0, 0.0), "total, in world", unit="kg m/s", minimum=-_FAR, maximum=_FAR, length=3
     )
     angular_momentum: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0), "total, about the centre of mass, in world", unit="kg m^2/s", length=3
+        (0.0, 0.0, 0.0),
+        "total, about the centre of mass, in world",
+        unit="kg m^2/s",
+        minimum=-_FAR,
+        maximum=_FAR,
+        length=3,
     )
     faults: tuple[str, ...] = parameter(
         (),

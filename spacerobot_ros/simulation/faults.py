@@ -19,6 +19,15 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.simulation.plant import Plant, WrappedPlant
 from spacerobot_ros.simulation.thrusters import thrusters_in
 
+_LARGEST = 1e6
+"""Largest value of a fault, in its unit: more is beyond every robot, and squares would overflow."""
+
+_LONGEST = 1e9
+"""Largest time of a fault, s."""
+
+_MOST_FAULTS = 1000
+"""More at once take longer than a tick to look through."""
+
 _ROUNDING = 1e-6
 """Share of a tick by which the time of a fault may be off by rounding."""
 
@@ -50,8 +59,8 @@ class FaultKind:
 
     targets: tuple[str, ...]
     value: str = ""
-    minimum: float = -math.inf
-    maximum: float = math.inf
+    minimum: float = -_LARGEST
+    maximum: float = _LARGEST
     sensor: bool = False
 
 
@@ -88,8 +97,9 @@ class Fault:
 
     def __str__(self) -> str:
         value = f" {self.value:g}" if KINDS[self.kind].value else ""
-        until = f" until {self.end:g}" if math.isfinite(self.end) else ""
-        return f"{self.kind} {self.target}{value} at {self.start:g}{until}"
+        # Six digits would make a fault of a long flight begin and end at the same time.
+        until = f" until {self.end:.12g}" if math.isfinite(self.end) else ""
+        return f"{self.kind} {self.target}{value} at {self.start:.12g}{until}"
 
 
 @dataclass(frozen=True)
@@ -141,7 +151,7 @@ def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
         raise refusal("it must be KIND TARGET [VALUE] [at SECONDS] [until SECONDS]")
     name, target, *rest = words
     if name not in KINDS:
-        raise refusal(f"there is no kind '{name}'; there are {', '.join(KINDS)}")
+        raise refusal(f"there is no kind '{name[:40]}'; there are {', '.join(KINDS)}")
     kind = KINDS[name]
     known = targets.of(kind)
     if not known:
@@ -154,13 +164,16 @@ def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
             raise refusal(f"{name} needs a value: {kind.value}")
         value = _number(rest.pop(0), refusal)
         if not kind.minimum <= value <= kind.maximum:
-            top = f" to {kind.maximum:g}" if math.isfinite(kind.maximum) else " up"
-            raise refusal(f"its value is {value:g} and must be from {kind.minimum:g}{top}")
+            raise refusal(
+                f"its value is {value:g} and must be from {kind.minimum:g} to {kind.maximum:g}"
+            )
     times = {"at": now, "until": math.inf}
     if rest[0::2] not in ([], ["at"], ["until"], ["at", "until"]) or len(rest) % 2:
         raise refusal(f"after {name} {target} come only 'at SECONDS' and 'until SECONDS'")
     for word, text in zip(rest[0::2], rest[1::2], strict=True):
         times[word] = _number(text, refusal)
+        if abs(times[word]) > _LONGEST:
+            raise refusal(f"its time is {times[word]:g} s and must be at most {_LONGEST:g} s")
     if not times["until"] > times["at"]:
         raise refusal(f"it ends at {times['until']:g} s and begins at {times['at']:g} s")
     return Fault(name, target, value, times["at"], times["until"])
@@ -172,7 +185,7 @@ def _number(text: str, refusal: Callable[[str], ParameterError]) -> float:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise refusal(f"'{text}' is not a finite number")
+        raise refusal(f"'{text[:40]}' is not a finite number")
     return number
 
 
@@ -202,9 +215,15 @@ class FaultTimeline:
         Raises
         ------
         ParameterError
-            A line is no fault; none is added.
+            A line is no fault, or there are too many; none is added.
         """
-        self.faults += [parse_fault(line, self._targets, now) for line in lines if line.strip()]
+        added = [parse_fault(line, self._targets, now) for line in lines if line.strip()]
+        if len(self.faults) + len(added) > _MOST_FAULTS:
+            raise ParameterError(
+                f"{len(added)} more fault(s) are refused: there are {len(self.faults)}, and at "
+                f"most {_MOST_FAULTS}; inject 'clear' first."
+            )
+        self.faults += added
         self.next_change = -math.inf
 
     def clear(self) -> None:

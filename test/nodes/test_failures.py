@@ -9,6 +9,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.plant_rig import Rig
 from support.ros_harness import Harness
@@ -102,3 +103,16 @@ def test_a_step_that_raises_leaves_a_plant_that_says_why_and_can_be_started_agai
     assert rig.plant.state in (PlantState.RUNNING, PlantState.RESTING)
     rig.wait("joint_states", before + 1)
     assert list(rig.step([0.2, 0.0, 0.0]).velocity) == [0.2, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    "line", ["sensor_noise position 1e200", "sensor_noise joints 1e155", "sensor_delay odom 1e9"]
+)
+def test_a_fault_of_any_size_stops_no_plant(harness: Harness, line: str) -> None:
+    rig = Rig(harness)
+    faults = rig.probe.create_publisher(String, "fault_injection", 10)
+    harness.connect()
+    faults.publish(String(data=line))
+    rig.wait_for_log("is refused")
+    assert list(rig.step([0.2, 0.0, 0.0]).velocity) == [0.2, 0.0, 0.0]
+    assert rig.plant.state is PlantState.RUNNING

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 
@@ -13,11 +14,21 @@ from support.effort_flights import random_urdf, robot_of, thrusts, tumbling
 from support.oracles import Array, PinocchioOracle
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
-from spacerobot_ros.simulation.faults import FaultTimeline, FaultyPlant, Targets, parse_fault
+from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.simulation.faults import (
+    KINDS,
+    FaultTimeline,
+    FaultyPlant,
+    Targets,
+    parse_fault,
+)
 from spacerobot_ros.simulation.plant import Plant
+from spacerobot_ros.simulation.sensors import Sensors
 from spacerobot_ros.simulation.thrusters import thrusters_in, with_thrusters
 
 URDF = Path(__file__).parents[2] / "urdf"
@@ -85,7 +96,18 @@ def test_a_line_is_read_and_written(line: str, written: str) -> None:
         ("joint_stuck elbow", ("shoulder_yaw, shoulder_pitch, elbow_pitch",)),
         ("joint_slow elbow_pitch at 3", ("needs a value", "factor")),
         ("joint_slow elbow_pitch 1.5", ("1.5", "0 to 1")),
-        ("actuator_noise elbow_pitch -1", ("-1", "from 0 up")),
+        ("actuator_noise elbow_pitch -1", ("-1", "from 0 to 1e+06")),
+        ("sensor_noise position 1e200", ("1e+200", "from 0 to 1e+06")),
+        ("sensor_noise joints 1e155", ("from 0 to 1e+06",)),
+        ("sensor_bias attitude_x -1e300", ("from -1e+06 to 1e+06",)),
+        ("sensor_bias elbow_pitch 1e7", ("from -1e+06 to 1e+06",)),
+        ("actuator_noise elbow_pitch 1e160", ("from 0 to 1e+06",)),
+        ("actuator_bias elbow_pitch 1e308", ("from -1e+06 to 1e+06",)),
+        ("thruster_stuck force_x -1e200", ("from -1e+06 to 1e+06",)),
+        ("sensor_delay odom 61", ("from 0 to 60",)),
+        ("joint_stuck elbow_pitch at 1e300", ("its time is 1e+300 s",)),
+        ("joint_stuck elbow_pitch at -2e9", ("its time is -2e+09 s",)),
+        ("joint_stuck elbow_pitch until 1e10", ("its time is 1e+10 s",)),
         ("actuator_bias elbow_pitch much", ("'much'", "finite")),
         ("actuator_bias elbow_pitch nan", ("'nan'", "finite")),
         ("joint_stuck elbow_pitch 3", ("'at SECONDS'",)),
@@ -100,6 +122,53 @@ def test_a_bad_line_is_refused_with_a_sentence(line: str, mentions: tuple[str, .
     with pytest.raises(ParameterError) as refusal:
         parse_fault(line, TARGETS)
     assert_one_sentence(str(refusal.value), line, *mentions)
+
+
+def test_a_long_line_is_quoted_in_part() -> None:
+    for line in ("x" * 10**6 + " y", "actuator_bias elbow_pitch " + "9" * 10**6 + "x"):
+        with pytest.raises(ParameterError) as refusal:
+            parse_fault(line, TARGETS)
+        assert len(str(refusal.value)) < 500
+
+
+def test_times_of_a_long_flight_are_written_as_they_are() -> None:
+    fault = parse_fault("joint_stuck elbow_pitch at 86400.05 until 86400.1", TARGETS)
+    assert parse_fault(str(fault), TARGETS) == fault
+
+
+def test_so_many_faults_that_none_could_look_through_them_are_refused() -> None:
+    timeline = FaultTimeline(["joint_stuck elbow_pitch"] * 999, TARGETS)
+    with pytest.raises(ParameterError, match="at most 1000"):
+        timeline.read(["joint_stuck elbow_pitch"] * 2)
+    assert len(timeline.faults) == 999
+    timeline.read(["joint_stuck elbow_pitch"])
+    timeline.clear()
+    timeline.read(["joint_stuck elbow_pitch"])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("actuation", ["velocity", "effort"])
+def test_the_largest_faults_leave_numbers_finite_or_stop_the_plant_with_a_sentence(
+    kind: str, actuation: str
+) -> None:
+    robot = SpaceRobot.from_file(robot_file("sliding_masses"))
+    config = PlantConfig(actuation=actuation, tick_rate=20.0)
+    plant = build_plant(robot, config)
+    sensors = Sensors(plant, config.sensors, config.control_period)
+    targets = Targets(robot.joint_names, actuation == "effort").of(KINDS[kind])
+    extremes = {KINDS[kind].minimum, KINDS[kind].maximum} if KINDS[kind].value else {""}
+    commands = [np.full(3, 0.1), *([np.zeros(6)] if actuation == "effort" else [])]
+    for value in extremes:
+        for target in targets:
+            plant.inject("clear")
+            plant.reset()
+            plant.inject(f"{kind} {target} {value}")
+            with suppress(SpaceRobotError):
+                for _ in range(3):
+                    plant.step(*commands)
+                    sensors.measure()
+                    for numbers in (plant.pose, sensors.pose, sensors.twist, sensors.q):
+                        assert np.all(np.isfinite(numbers)), (kind, target, value)
 
 
 def test_a_plant_without_thrusters_has_no_faults_of_thrusters() -> None:

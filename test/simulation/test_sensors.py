@@ -11,9 +11,10 @@ from support.effort_flights import robot_of
 from support.oracles import Array
 
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
-from spacerobot_ros.simulation.config import SensorConfig
+from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
 from spacerobot_ros.simulation.faults import FaultyPlant
 from spacerobot_ros.simulation.sensors import Sensors
 
@@ -163,3 +164,21 @@ def test_a_late_pose_is_that_of_as_many_ticks_before() -> None:
 def test_a_bias_of_other_joints_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"'sensors.joint_bias' has 2 number.*has 3 joints"):
         Flight(SensorConfig(joint_bias=(0.1, 0.2)), ticks=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *((f"sensors.{group}_noise", 1e7) for group in ("position", "attitude", "joint_rate")),
+        ("sensors.joint_noise", 1e200),
+        ("sensors.position_bias", (0.0, -1e7, 0.0)),
+        ("sensors.joint_bias", (1e300,)),
+        ("command_timeout", 1e300),
+        ("marker_period", 1e308),
+        ("initial_position", (1e200, 0.0, 0.0)),
+        ("angular_momentum", (0.0, 1e200, 0.0)),
+    ],
+)
+def test_parameters_that_would_overflow_are_refused_by_name(name: str, value: object) -> None:
+    with pytest.raises(ParameterError, match=name):
+        configured(PlantConfig, {name: value})
