@@ -9,9 +9,11 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from multiprocessing.connection import Connection
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 
@@ -20,8 +22,9 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.session.processes import MultiProcessStack
-from spacerobot_ros.session.run import ros, stop_on_signals
+from spacerobot_ros.session.run import ros
 from spacerobot_ros.session.scenario import load_scenario
+from spacerobot_ros.termination import ended_on_request
 
 _MEMORY_PERIOD = 1.0
 """Wall s between two looks at the processes' memory."""
@@ -137,13 +140,14 @@ def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
     with (
         ros(private=False),
         tempfile.TemporaryDirectory(prefix="spacerobot_") as folder,
-        stop_on_signals() as stopped,
+        ExitStack() as closing,
     ):
         bag = Path(folder, "flight.mcap")
         stack = MultiProcessStack(scenario, bag)
         idle = _IdleProcess(1.0 / rate, duration)
         prioritised = _prioritise(stack)
         try:
+            stopped = closing.enter_context(ended_on_request())
             stack.start(_GOAL)
             began = looked = time.monotonic()
 
@@ -261,6 +265,7 @@ class _IdleProcess:
 
 
 def _wait_for_ticks(period: float, duration: float, sender: Connection) -> None:
+    Thread(target=_end_with_parent, daemon=True).start()
     began = time.perf_counter()
     late, worst = 0, 0.0
     for tick in range(1, round(duration / period)):
@@ -270,6 +275,13 @@ def _wait_for_ticks(period: float, duration: float, sender: Connection) -> None:
         late += beyond > 0
         worst = max(worst, 1e3 * beyond)
     sender.send((late, worst))
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _resident(stack: MultiProcessStack) -> float:

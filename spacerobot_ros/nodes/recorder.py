@@ -41,7 +41,7 @@ _CHUNK_SIZE = 262_144
 _SCAN_PERIOD = 0.1
 """Wall s between two looks for new topics."""
 
-_LONGEST_DRAIN = 1.5
+_LONGEST_DRAIN = 1.2
 """Wall s after a signal in which what is on its way is still recorded."""
 
 _LOSS_LOG_PERIOD = 5.0

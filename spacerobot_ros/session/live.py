@@ -12,8 +12,9 @@ from rosgraph_msgs.msg import Clock
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.session.mission_client import MissionClient, Outcome
-from spacerobot_ros.session.run import make_stack, ros, stop_on_signals
+from spacerobot_ros.session.run import make_stack, ros
 from spacerobot_ros.session.scenario import Scenario
+from spacerobot_ros.termination import ended_on_request
 
 _DISCOVERY = 10.0
 """Wall s to wait for a commander that takes goals."""
@@ -41,26 +42,27 @@ class _Sentences:
 def keep_up(
     scenario: Scenario, bag: Path | None, show: Callable[[str], None], *, processes: bool
 ) -> None:
-    """Run the nodes of a scenario in real time until SIGINT or SIGTERM; goals come by topic.
+    """Run the nodes of a scenario in real time until SIGINT, SIGTERM or SIGHUP; goals by topic.
 
     Raises
     ------
     SpaceRobotError
         A node cannot start, or has ended by itself.
     """
-    with ros(private=False), stop_on_signals() as stopped:
+    with ros(private=False):
         stack = make_stack(scenario, bag, processes=processes)
         try:
-            stack.start(None)
-            show(f"{scenario.name} is up; goals on 'goal_pose', Ctrl-C ends it.")
-            sentences = _Sentences(stack.client, show)
+            with ended_on_request(at_once=stack.interrupt) as stopped:
+                stack.start(None)
+                show(f"{scenario.name} is up; goals on 'goal_pose', Ctrl-C ends it.")
+                sentences = _Sentences(stack.client, show)
 
-            def look() -> bool:
-                sentences.show()
-                return stopped()
+                def look() -> bool:
+                    sentences.show()
+                    return stopped()
 
-            stack.spin(look)
-            stack.finish()
+                stack.spin(look)
+                stack.finish()
         finally:
             stack.close()
 
@@ -77,7 +79,7 @@ def send_goal(
     SpaceRobotError
         No commander takes goals.
     """
-    with ros(private=False), stop_on_signals() as stopped:
+    with ros(private=False):
         executor = EventsExecutor()
         clock = 0
 
@@ -100,17 +102,18 @@ def send_goal(
             for each in clients:
                 executor.add_node(each.node)
             client = _with_decider(clients, executor)
-            client.send(goal)
-            began, sentences = time.monotonic(), _Sentences(client, show)
+            with ended_on_request() as stopped:
+                client.send(goal)
+                began, sentences = time.monotonic(), _Sentences(client, show)
 
-            def look() -> bool:
+                def look() -> bool:
+                    sentences.show()
+                    late = timeout > 0 and time.monotonic() - began > timeout
+                    return stopped() or late
+
+                outcome = client.follow(executor, look, _LOOK_PERIOD)
                 sentences.show()
-                late = timeout > 0 and time.monotonic() - began > timeout
-                return stopped() or late
-
-            outcome = client.follow(executor, look, _LOOK_PERIOD)
-            sentences.show()
-            return outcome
+                return outcome
         finally:
             for each in clients:
                 each.node.destroy_node()

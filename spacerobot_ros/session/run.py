@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,6 +25,7 @@ from spacerobot_ros.session.mission_client import Outcome, Status
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.scenario import Scenario
 from spacerobot_ros.session.stack import InProcessStack, Stack
+from spacerobot_ros.termination import ended_on_request
 
 Progress = Callable[[float, float], None]
 """Called with simulated time and the time the present schedule ends, s."""
@@ -78,7 +78,8 @@ def run_scenario(
 
     ``processes`` gives each node a process of its own instead.
 
-    SIGINT and SIGTERM end the flight early; the flight until then is recorded and summed up.
+    SIGINT, SIGTERM and SIGHUP end the flight early; the flight until then is recorded and summed
+    up. Before it has begun they raise what they would without it.
 
     Raises
     ------
@@ -86,26 +87,27 @@ def run_scenario(
         A parameter, the robot or the recording is refused.
     """
     private = not processes and scenario.lockstep
-    with ros(private=private), stop_on_signals() as stopped:
+    with ros(private=private):
         stack = make_stack(scenario, bag, processes=processes)
         try:
-            began = time.perf_counter()
-            stack.start(scenario.goal)
-            time_limit = 0.0
-            if "coordinated_control" in scenario.commanders:
-                time_limit = scenario.controller.time_limit
+            with ended_on_request(at_once=stack.interrupt) as stopped:
+                began = time.perf_counter()
+                stack.start(scenario.goal)
+                time_limit = 0.0
+                if "coordinated_control" in scenario.commanders:
+                    time_limit = scenario.controller.time_limit
 
-            def look() -> bool:
-                if progress is not None:
-                    progress(stack.time_ns / 1e9, stack.client.ends_at or time_limit)
-                return stopped()
+                def look() -> bool:
+                    if progress is not None:
+                        progress(stack.time_ns / 1e9, stack.client.ends_at or time_limit)
+                    return stopped()
 
-            stack.spin(look)
-            wall_time = time.perf_counter() - began
-            if progress is not None and not stopped():
-                progress(1.0, 1.0)
-            stack.finish()
-            return RunResult(_summary(stack, wall_time))
+                stack.spin(look)
+                wall_time = time.perf_counter() - began
+                if progress is not None and not stopped():
+                    progress(1.0, 1.0)
+                stack.finish()
+                return RunResult(_summary(stack, wall_time))
         finally:
             stack.close()
 
@@ -203,18 +205,3 @@ def _last_diagnosis(bag: Bag, key: str) -> str | None:
         for status in array.status:
             value = next((pair.value for pair in status.values if pair.key == key), value)
     return value
-
-
-@contextmanager
-def stop_on_signals() -> Iterator[Callable[[], bool]]:
-    """Turn SIGINT and SIGTERM into a flag while the flight lasts."""
-    caught: list[int] = []
-    before = {
-        number: signal.signal(number, lambda number, _: caught.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield lambda: bool(caught)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

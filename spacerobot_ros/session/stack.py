@@ -95,6 +95,9 @@ class Stack(ABC):
 
         self.client.follow(self.executor, on_look)
 
+    def interrupt(self) -> None:  # noqa: B027
+        """Give up computations that take long; called from another thread when all is to end."""
+
     def _supervise(self) -> None:  # noqa: B027
         """Look after the nodes, five times a second."""
 
@@ -211,6 +214,11 @@ class InProcessStack(Stack):
 
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         timer = self.client.node.create_timer(0.001, launch, clock=steady)
+
+    def interrupt(self) -> None:
+        """Cancel the plan that is being made."""
+        if self._planner is not None:
+            self._planner.interrupt()
 
     def finish(self) -> None:
         """Stop the plant, record what is still on its way, and complete the bag."""

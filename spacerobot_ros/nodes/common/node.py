@@ -334,6 +334,12 @@ class FlightNode(LifecycleNode):
         machine = self._state_machine
         return bool(machine and machine.current_state[0] == State.PRIMARY_STATE_ACTIVE)
 
+    def finalize(self) -> None:
+        """Take the transition to the end, unless somebody has had the node take it before."""
+        machine = self._state_machine
+        if machine and machine.current_state[0] != State.PRIMARY_STATE_FINALIZED:
+            self.trigger_shutdown()
+
     def destroy_node(self) -> None:
         """Destroy the node and let go of its state machine, which would keep it in the graph."""
         super().destroy_node()
@@ -359,8 +365,11 @@ class FlightNode(LifecycleNode):
     def on_failure(self, sentence: str, error: Exception) -> None:
         """Say in the status of the node that an error stops it; it is deactivated then."""
 
+    def interrupt(self) -> None:
+        """Give up a computation that takes long; called from another thread when all is to end."""
+
     def drain(self, executor: EventsExecutor) -> None:
-        """Take in what is still on its way before the node ends."""
+        """Complete what is under way before the node ends: about a second is left."""
 
     def parameters_changed(self) -> None:
         """React to a change of live parameters; ``self.config`` has the new values."""

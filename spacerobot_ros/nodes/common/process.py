@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import os
-import signal
 import sys
 import time
 from collections.abc import Callable
@@ -16,6 +15,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes.common.node import FlightNode
+from spacerobot_ros.termination import Terminated, ended_on_request, guarded
 
 _LONGEST_DELIVERY = 1.0
 """Wall s after a signal in which readers may still confirm what they were sent."""
@@ -40,20 +40,34 @@ def use_private_discovery() -> None:
 
 
 def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = None) -> int:
-    """Run one node in its own process until SIGINT or SIGTERM.
+    """Run one node in its own process until SIGINT, SIGTERM, SIGHUP, or the end of its parent.
 
-    Returns the exit code: 0 after a signal, 2 when the node cannot start (the sentence is on
-    standard error), the node's own when it ends by itself.
+    A parent counts only if it has started this process to end with it; what a shell or ``ros2 run``
+    has started does not. Returns the exit code: 0 after a signal, 2 when the node cannot start (the
+    sentence is on standard error), the node's own when it ends by itself.
+
+    Raises
+    ------
+    Terminated
+        A signal has come before the node was there, and the caller is guarded itself.
     """
     use_loopback_discovery()
+    with guarded() as alone:
+        try:
+            return _run_node(factory, arguments)
+        except Terminated:
+            if not alone:
+                raise
+            return 0
+
+
+def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) -> int:
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # The middleware's errors: arguments, parameter files.
         print(f"ROS 2 does not start: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     stop = rclpy.task.Future()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set_result(None))
     node = None
     try:
         try:
@@ -67,10 +81,12 @@ def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = No
         gc.freeze()
         executor = EventsExecutor()
         executor.add_node(node)
-        spin_until(executor, stop)
-        node.drain(executor)
-        _deliver(node)
-        node.trigger_shutdown()
+        with ended_on_request(lambda: stop.set_result(None), node.interrupt) as requested:
+            spin_until(executor, stop)
+            requested()
+            node.drain(executor)
+            _deliver(node)
+            node.finalize()
         return stop.result() or 0
     finally:
         if node is not None:

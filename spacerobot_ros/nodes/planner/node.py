@@ -126,6 +126,11 @@ class PlannerNode(CommanderNode):
                 self._announcement.join(LONGEST_END)
         self._running, self._waiting = False, None
 
+    def interrupt(self) -> None:
+        """Cancel the plan that is being made."""
+        if self._executive is not None:
+            self._executive.cancel_plan()
+
     def _use(self, robot: SpaceRobot) -> None:
         self._executive = executive = Executive(robot, self.config, goal_file=self._goal_file)
         self._robot = robot

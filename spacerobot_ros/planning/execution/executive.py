@@ -311,6 +311,10 @@ class Executive:
         self._go(Event.PLANT_RESET, self._phase_at_rest())
         self._notice(Severity.WARNING, "The plant was reset: the motion is planned again.")
 
+    def cancel_plan(self) -> None:
+        """Have a plan that is being made end without a result; may be called in any thread."""
+        self._worker.cancel()
+
     def stop(self) -> None:
         """Give up everything at once and wait for the worker to end; the goal file stays."""
         self._tracker.stop()

@@ -139,8 +139,9 @@ class PlanningWorker:
 
     def cancel(self) -> None:
         """Have the plan that is being made end without a result."""
-        if self._job is not None:
-            self._job.cancellation.cancel()
+        job = self._job  # Another thread may take it meanwhile.
+        if job is not None:
+            job.cancellation.cancel()
 
     def close(self) -> None:
         """Cancel, and wait until nothing goes on in the background."""

@@ -1,0 +1,386 @@
+"""How a process ends: by a signal or with its parent, in seconds, and with what it has started.
+
+A process is guarded from its first import on (:func:`guarded`). SIGINT, SIGTERM and SIGHUP then
+raise :class:`Terminated` in the main thread, unless what runs has asked to be told instead
+(:func:`ended_on_request`) because it has something to complete: a flight, a bag. A thread watches
+over both. It ends the process when the main thread does not react, and at once by a second signal.
+
+Processes that are started with :func:`child_options` end when this one does, however that ends:
+the kernel closes a pipe that they read, and on Linux sends them a signal as well.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import subprocess
+
+_SENTENCES = {
+    signal.SIGINT: "Interrupted.",
+    signal.SIGTERM: "Terminated.",
+    signal.SIGHUP: "Hung up.",
+}
+
+_UNWINDING = 1.2
+"""Wall s that the main thread has to end after the exception of a signal."""
+
+_NOTICING = 5.0
+"""Wall s in which what has asked for requests must notice one: a plan may have to end first."""
+
+_WITHOUT_PARENT = 1.7
+"""Wall s that a process has to end without its parent."""
+
+_SAME = 0.5
+"""Signals so close together are one, wall s: launchers send it beside the terminal."""
+
+_LIFELINE = "SPACEROBOT_LIFELINE"
+"""Environment variable of a child: the pipe that its parent holds open, and who that is."""
+
+_ORPHANED = signal.SIGUSR2
+"""What the kernel sends to a child whose parent is gone (Linux)."""
+
+_PR_SET_PDEATHSIG = 1
+
+_END = b"\0"
+
+
+class Terminated(KeyboardInterrupt):
+    """A signal that ends what runs. As an interrupt it passes ``except Exception``.
+
+    Parameters
+    ----------
+    number
+        The signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(_SENTENCES.get(signal.Signals(number), "Terminated."))
+        self.number = number
+
+    @property
+    def exit_code(self) -> int:
+        """What shells report of a process that such a signal has ended."""
+        return 128 + self.number
+
+
+class _Request:
+    """Who wants to be told of a signal: in the main thread, and at once in the guard's."""
+
+    def __init__(self, main: Callable[[], None], at_once: Callable[[], None]) -> None:
+        self.main, self.at_once = main, at_once
+
+
+class _Guard:
+    """The signal handlers of this process and the thread that watches over its end."""
+
+    def __init__(self, *, announcing: bool) -> None:
+        self.number: int | None = None
+        """The signal that ends the process."""
+        self.request: _Request | None = None
+        self.tools: set[subprocess.Popen[str]] = set()
+        self._announcing = announcing
+        self._raised = False
+        self._since = 0.0
+        self._notice_by: float | None = None
+        self._end_by: float | None = None
+        self._lifeline, self._parent = _own_lifeline()
+        self._reader, self._writer = os.pipe()
+        os.set_blocking(self._writer, False)
+        self._handlers = {
+            number: signal.signal(number, self._on_signal)
+            for number in _SENTENCES
+            # nohup has a process ignore the end of its terminal.
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN
+        }
+        if self._lifeline is not None:
+            signal.signal(_ORPHANED, lambda *_: None)
+            _die_with_parent()
+        self._wakeup = signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
+        self._thread = threading.Thread(target=self._watch, name="termination", daemon=True)
+        self._thread.start()
+        if self._lifeline is not None and os.getppid() != self._parent:
+            self._lose_parent()
+
+    def remove(self) -> None:
+        """Give the signals back."""
+        signal.set_wakeup_fd(self._wakeup)
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        os.write(self._writer, _END)
+        self._thread.join()
+        os.close(self._reader)
+        os.close(self._writer)
+
+    def noticed(self) -> bool:
+        """Return whether a signal has come; who asks is busy with ending then."""
+        if self.number is not None:
+            self._notice_by = None
+        return self.number is not None
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        """Python's handler, in the main thread as soon as that runs Python again."""
+        self._note(number)
+        if self.request is not None:
+            self.request.main()
+        elif not self._raised:
+            self._raised = True
+            raise Terminated(number)
+
+    def _note(self, number: int) -> bool:
+        """Take note of a signal; return whether it is the first."""
+        if self.number is not None:
+            return False
+        self._since = time.monotonic()
+        self.number = number
+        grace = _UNWINDING if self.request is None else _NOTICING
+        self._notice_by = self._since + grace
+        return True
+
+    def _watch(self) -> None:
+        poll = select.poll()
+        poll.register(self._reader, select.POLLIN)
+        if self._lifeline is not None:
+            poll.register(self._lifeline, select.POLLIN | select.POLLHUP)
+        told = False
+        while True:
+            deadlines = [by for by in (self._notice_by, self._end_by) if by is not None]
+            left = min(deadlines, default=None)
+            wait = None if left is None else max(0.0, 1e3 * (left - time.monotonic()))
+            for file, _ in poll.poll(wait):
+                if file == self._lifeline:
+                    poll.unregister(file)
+                    self._lose_parent()
+                    continue
+                for number in os.read(self._reader, 64):
+                    if number == _END[0]:
+                        return
+                    if number == _ORPHANED and os.getppid() != self._parent:
+                        self._lose_parent()
+                    elif number in _SENTENCES:
+                        self._note(number)
+                        if told and time.monotonic() - self._since > _SAME:
+                            self._end()
+            if self.number is not None and not told:
+                told = True
+                self._stop_tools()
+                if self.request is not None:
+                    self.request.at_once()
+            now = time.monotonic()
+            if any(by is not None and now >= by for by in (self._notice_by, self._end_by)):
+                self._end()
+
+    def _lose_parent(self) -> None:
+        """End as by SIGTERM, and soon."""
+        if self._end_by is None:
+            self._end_by = time.monotonic() + _WITHOUT_PARENT
+            signal.raise_signal(signal.SIGTERM)
+
+    def _stop_tools(self) -> None:
+        for tool in tuple(self.tools):
+            with suppress(OSError):
+                os.killpg(tool.pid, signal.SIGKILL)
+
+    def _end(self) -> None:
+        """End the process now, whatever the main thread does."""
+        self._stop_tools()
+        error = Terminated(self.number or signal.SIGTERM)
+        if self._announcing:
+            with suppress(OSError):
+                os.write(2, f"{error}\n".encode())
+        os._exit(error.exit_code)
+
+
+_guard: _Guard | None = None
+
+
+@contextmanager
+def guarded(*, announcing: bool = False) -> Iterator[bool]:
+    """Have signals, and the end of the parent, end what runs in here.
+
+    Yields whether the guard is new: inside another one nothing changes. Outside the main thread,
+    which alone has signals, nothing is done.
+
+    Parameters
+    ----------
+    announcing
+        Whether one line on standard error says so when the main thread cannot.
+
+    Raises
+    ------
+    Terminated
+        By a signal.
+    """
+    global _guard
+    if _guard is not None or threading.current_thread() is not threading.main_thread():
+        yield False
+        return
+    _guard = _Guard(announcing=announcing)
+    try:
+        yield True
+    finally:
+        _guard.remove()
+        _guard = None
+
+
+@contextmanager
+def ended_on_request(
+    main: Callable[[], None] = lambda: None, at_once: Callable[[], None] = lambda: None
+) -> Iterator[Callable[[], bool]]:
+    """Turn signals into a request while something runs that completes its work before it ends.
+
+    Yields a function that returns whether the end was requested; it must be called now and then,
+    and what runs is left to itself from the first time that it says so. A second signal ends the
+    process at once.
+
+    Parameters
+    ----------
+    main
+        Called in the main thread, as soon as that runs Python again.
+    at_once
+        Called in another thread, also while the main one computes: may cancel a computation.
+
+    Raises
+    ------
+    Terminated
+        A signal has come before.
+    """
+    with guarded():
+        guard = _guard
+        if guard is None or threading.current_thread() is not threading.main_thread():
+            yield lambda: False
+            return
+        if guard.number is not None:
+            raise Terminated(guard.number)
+        before, guard.request = guard.request, _Request(main, at_once)
+        try:
+            yield guard.noticed
+        finally:
+            guard.request = before
+
+
+def termination() -> Terminated | None:
+    """Return what ends this process, None if nothing does."""
+    return None if _guard is None or _guard.number is None else Terminated(_guard.number)
+
+
+def child_options(environment: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Return arguments of ``subprocess.Popen`` for a process that ends with this one.
+
+    The child has to be guarded. ``environment`` is its own, else that of this process.
+    """
+    reader = _lifeline()
+    variables = os.environ if environment is None else environment
+    return {
+        "env": {**variables, _LIFELINE: f"{reader}:{os.getpid()}"},
+        "pass_fds": (reader,),
+    }
+
+
+def run_tool(words: Sequence[str], timeout: float | None = None) -> subprocess.CompletedProcess[str]:
+    """Run a program that knows nothing of us and wait for it; it ends with this process.
+
+    It gets no input and its output is captured. It and all that it starts are killed when this
+    process is asked to end, after ``timeout`` wall s, and when this process is gone.
+
+    Raises
+    ------
+    OSError
+        The program cannot be started.
+    subprocess.TimeoutExpired
+        It took too long.
+    Terminated
+        This process is to end.
+    """
+    import shutil
+    import subprocess
+
+    if shutil.which(words[0]) is None:
+        raise FileNotFoundError(f"There is no program '{words[0]}'.")
+    reader, writer = os.pipe()
+    try:
+        with subprocess.Popen(
+            [sys.executable, "-I", "-S", "-c", _KEEPER, str(reader), *words],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            pass_fds=(reader,),
+        ) as process:
+            guard = _guard
+            if guard is not None:
+                guard.tools.add(process)
+            try:
+                output, errors = process.communicate(timeout=timeout)
+            except BaseException as error:
+                with suppress(OSError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.kill()
+                if isinstance(error, subprocess.TimeoutExpired):
+                    error.cmd = list(words)
+                raise
+            finally:
+                if guard is not None:
+                    guard.tools.discard(process)
+    finally:
+        os.close(writer)
+        os.close(reader)
+    ending = termination()
+    if ending is not None and process.returncode:
+        raise ending
+    return subprocess.CompletedProcess(list(words), process.returncode, output, errors)
+
+
+_KEEPER = """
+import os, signal, sys
+lifeline, words = int(sys.argv[1]), sys.argv[2:]
+os.setsid()
+watcher = os.fork()
+if not watcher:
+    null = os.open(os.devnull, os.O_RDWR)
+    os.dup2(null, 1)
+    os.dup2(null, 2)
+    os.read(lifeline, 1)
+    os.killpg(0, signal.SIGKILL)
+code = os.spawnvp(os.P_WAIT, words[0], words)
+os.kill(watcher, signal.SIGKILL)
+os.waitpid(watcher, 0)
+os._exit(code if code >= 0 else 128 - code)
+"""
+"""Runs a program in a session of its own, which is killed when the pipe breaks."""
+
+
+@cache
+def _lifeline() -> int:
+    """Return the end of a pipe that children read; the other end is closed with this process."""
+    reader, _ = os.pipe()
+    return reader
+
+
+def _own_lifeline() -> tuple[int | None, int]:
+    """Return the pipe that a parent of ours holds open, None without one, and the parent."""
+    text = os.environ.pop(_LIFELINE, "")
+    if not text:
+        return None, 0
+    file, _, parent = text.partition(":")
+    os.set_inheritable(int(file), False)
+    return int(file), int(parent)
+
+
+def _die_with_parent() -> None:
+    """Have the kernel send a signal when the parent ends, where it can."""
+    with suppress(ImportError, OSError, AttributeError):
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(_ORPHANED), 0, 0, 0)
