@@ -67,7 +67,7 @@ setup(
         # files they are in lib/spacerobot_ros/ with pip and with colcon.
         (f"lib/{NAME}", files("scripts/*")),
     ],
-    entry_points={"console_scripts": ["spacerobot = spacerobot_ros.cli.main:main"]},
+    entry_points={"console_scripts": ["spacerobot = spacerobot_ros.cli:start"]},
     # rclpy and the messages are no requirement: where ROS 2 is installed they are the system's;
     # elsewhere the extra `jazzy` brings them.
     install_requires=[

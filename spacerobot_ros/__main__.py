@@ -1,5 +1,5 @@
 """``python -m spacerobot_ros``: the command ``spacerobot``."""
 
-from spacerobot_ros.cli.main import main
+from spacerobot_ros.cli import start
 
-main(prog_name="spacerobot")
+start()

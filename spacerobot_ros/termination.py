@@ -88,7 +88,7 @@ class _Guard:
         self.number: int | None = None
         """The signal that ends the process."""
         self.request: _Request | None = None
-        self.tools: set[subprocess.Popen[str]] = set()
+        self.tools: set[subprocess.Popen[bytes]] = set()
         self._announcing = announcing
         self._raised = False
         self._since = 0.0
@@ -287,20 +287,24 @@ def child_options(environment: Mapping[str, str] | None = None) -> dict[str, Any
     }
 
 
-def run_tool(words: Sequence[str], timeout: float | None = None) -> subprocess.CompletedProcess[str]:
-    """Run a program that knows nothing of us and wait for it; it ends with this process.
+@contextmanager
+def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[bytes]]:
+    """Start a program that knows nothing of us, and kill what is left of it at the end.
 
-    It gets no input and its output is captured. It and all that it starts are killed when this
-    process is asked to end, after ``timeout`` wall s, and when this process is gone.
+    It and all that it starts are killed as well when this process is asked to end, and when this
+    process is gone. It is in a session of its own and gets no input.
+
+    Parameters
+    ----------
+    words, options
+        As of ``subprocess.Popen``.
 
     Raises
     ------
     OSError
-        The program cannot be started.
-    subprocess.TimeoutExpired
-        It took too long.
+        There is no such program.
     Terminated
-        This process is to end.
+        This process is to end, and has ended the program.
     """
     import shutil
     import subprocess
@@ -309,37 +313,37 @@ def run_tool(words: Sequence[str], timeout: float | None = None) -> subprocess.C
         raise FileNotFoundError(f"There is no program '{words[0]}'.")
     reader, writer = os.pipe()
     try:
-        with subprocess.Popen(
+        process = subprocess.Popen(
             [sys.executable, "-I", "-S", "-c", _KEEPER, str(reader), *words],
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
             pass_fds=(reader,),
-        ) as process:
-            guard = _guard
+            **options,
+        )
+        guard = _guard
+        if guard is not None:
+            guard.tools.add(process)
+        try:
+            yield process
+        finally:
             if guard is not None:
-                guard.tools.add(process)
-            try:
-                output, errors = process.communicate(timeout=timeout)
-            except BaseException as error:
-                with suppress(OSError):
-                    os.killpg(process.pid, signal.SIGKILL)
-                process.kill()
-                if isinstance(error, subprocess.TimeoutExpired):
-                    error.cmd = list(words)
-                raise
-            finally:
-                if guard is not None:
-                    guard.tools.discard(process)
+                guard.tools.discard(process)
+            if process.poll() is None:
+                _kill(process)
     finally:
         os.close(writer)
         os.close(reader)
     ending = termination()
     if ending is not None and process.returncode:
         raise ending
-    return subprocess.CompletedProcess(list(words), process.returncode, output, errors)
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """Kill a tool and what it has started."""
+    # Its session may not be there yet; closing the pipe then does the rest.
+    with suppress(OSError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.kill()
+    process.wait()
 
 
 _KEEPER = """
@@ -356,7 +360,10 @@ if not watcher:
 code = os.spawnvp(os.P_WAIT, words[0], words)
 os.kill(watcher, signal.SIGKILL)
 os.waitpid(watcher, 0)
-os._exit(code if code >= 0 else 128 - code)
+if code < 0:
+    signal.signal(-code, signal.SIG_DFL) if -code != signal.SIGKILL else None
+    os.kill(os.getpid(), -code)
+os._exit(code)
 """
 """Runs a program in a session of its own, which is killed when the pipe breaks."""
 

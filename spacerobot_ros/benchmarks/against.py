@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.termination import child_options
 
-_OURS = "spacerobot_ros.cli.main:main"
+_OURS = "spacerobot_ros.cli:start"
 _ENTRY = re.compile(r"""["']\s*spacerobot\s*=\s*([\w.]+:\w+)\s*["']""")
 
 Figures = Mapping[str, float]
@@ -74,7 +75,7 @@ class Checkout:
             run = subprocess.run(
                 [sys.executable, "-c", call, "bench", *words, "--json", str(result)],
                 cwd=folder,
-                env={**os.environ, "PYTHONPATH": str(self.folder)},
+                **child_options({**os.environ, "PYTHONPATH": str(self.folder)}),
                 capture_output=True,
                 text=True,
                 check=False,

@@ -2,3 +2,23 @@
 
 Command modules import nothing heavy at their top: `spacerobot --help` loads all of them.
 """
+
+from __future__ import annotations
+
+import sys
+from typing import NoReturn
+
+from spacerobot_ros.termination import Terminated, guarded
+
+
+def start(prog_name: str = "spacerobot") -> NoReturn:
+    """Run the command. Signals end it with one line from here on, also while it imports."""
+    with guarded(announcing=True):
+        try:
+            from spacerobot_ros.cli.main import main
+
+            main(prog_name=prog_name)
+        except Terminated as ending:
+            sys.stderr.write(f"{ending}\n")
+            sys.exit(ending.exit_code)
+    sys.exit()

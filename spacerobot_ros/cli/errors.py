@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from enum import IntEnum
 from typing import NoReturn
 
 import click
 
 from spacerobot_ros.errors import GoalError, PlanningError, SpaceRobotError
+from spacerobot_ros.termination import Terminated, guarded, termination
 
 
 class ExitCode(IntEnum):
@@ -25,6 +26,9 @@ class ExitCode(IntEnum):
     BAD_INPUT = 2
     """The input is refused, or what the command needs is not there."""
 
+    INTERRUPTED = 130
+    """By SIGINT, that is Ctrl-C; 128 plus the number of another signal: 129 SIGHUP, 143 SIGTERM."""
+
 
 _ROS = ("rclpy", "rosidl_parser", "ament_index_python")
 
@@ -36,14 +40,38 @@ def fail(sentence: str = "") -> NoReturn:
     sys.exit(ExitCode.NOT_REACHED)
 
 
+def end(ending: Terminated) -> NoReturn:
+    """End a command that a signal has ended, with one line."""
+    with suppress(OSError):  # The terminal may be gone.
+        click.echo(str(ending), err=True)
+    sys.exit(ending.exit_code)
+
+
+def end_if_requested() -> None:
+    """End a command whose work a signal has cut short, once it has said what there is to say."""
+    ending = termination()
+    if ending is not None:
+        end(ending)
+
+
 @contextmanager
 def sentences() -> Iterator[None]:
     """End the process with one sentence and its exit code where an exception of ours is raised.
 
-    A goal that a method cannot reach is no bad input; everything else that is refused is.
+    A goal that a method cannot reach is no bad input; everything else that is refused is. A signal
+    ends it with one line and 128 plus its number, whatever has become of its exception on the way.
     """
     try:
-        yield
+        with guarded(announcing=True):
+            try:
+                yield
+            except Exception as error:
+                ending = termination()
+                if ending is None:
+                    raise
+                raise ending from error
+    except Terminated as ending:
+        end(ending)
     except SpaceRobotError as error:
         out_of_reach = isinstance(error, PlanningError) and not isinstance(error, GoalError)
         click.echo(str(error), err=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from spacerobot_ros.cli.errors import fail
+from spacerobot_ros.cli.errors import end_if_requested, fail
 
 
 @click.command("goal", context_settings={"ignore_unknown_options": True})
@@ -20,7 +20,8 @@ def command(
 ) -> None:
     """Send a goal pose to a running stack and follow it until it is reached or refused.
 
-    Exit code 0: the goal was reached; 1: it was not; 2: bad input.
+    Exit code 0: the goal was reached; 1: it was not; 2: bad input; 130: Ctrl-C has ended the
+    command, which leaves the goal to the stack.
     """
     if len(pose) not in (3, 7):
         raise click.UsageError("A goal is X Y Z, or X Y Z QX QY QZ QW.")
@@ -34,5 +35,6 @@ def command(
     from spacerobot_ros.session.mission_client import Outcome
 
     outcome = send_goal(wanted, click.echo, namespace=namespace, timeout=timeout)
+    end_if_requested()
     if outcome is not Outcome.REACHED:
         fail()

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from spacerobot_ros import __version__
+from spacerobot_ros.cli import start
 from spacerobot_ros.cli.errors import sentences
 
 COMMANDS = (
@@ -47,4 +48,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    start()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from spacerobot_ros.cli.errors import fail
+from spacerobot_ros.cli.errors import end_if_requested, fail
 from spacerobot_ros.cli.options import (
     LAWS,
     METHODS,
@@ -61,7 +61,9 @@ def command(
 ) -> None:
     """Fly SCENARIO (a name or a parameter file) to its goal and record it.
 
-    Exit code 0: the goal was reached within tolerance; 1: it was not; 2: bad input.
+    Exit code 0: the goal was reached within tolerance; 1: it was not; 2: bad input. A signal ends
+    the flight early; what was flown is recorded and summed up, and the exit code is 128 plus the
+    number of the signal: 130 after Ctrl-C.
     """
     chosen = _chosen(scenario, goal, goal_rotvec, method, settings, realtime)
     from spacerobot_ros.session.run import run_scenario
@@ -73,6 +75,7 @@ def command(
         write_json(json_file, result.summary)
     for line in (*_summary_lines(result.summary), *_published_lines(chosen, result.summary)):
         click.echo(line)
+    end_if_requested()
     if report is not None:
         from spacerobot_ros.report import write_report
 

@@ -82,6 +82,9 @@ class ControllerConfig(BelievedRobotConfig):
     resume_file: str = parameter(
         "", "file that keeps the present goals for a controller that is restarted; '': none"
     )
+    stop_when_decided: bool = parameter(
+        False, "answer no states once a goal is decided: a lockstep plant stays at that tick"
+    )
     gains: Gains = group(Gains())
     options: Mapping[str, Any] = registered(LAWS)
 

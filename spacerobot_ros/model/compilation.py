@@ -34,6 +34,7 @@ import numpy as np
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.private_files import Cache, warn_once
+from spacerobot_ros.termination import tool
 
 # Contraction into fused multiply-adds would make the numbers depend on the processor.
 _FLAGS = ("-O2", "-fPIC", "-shared", "-ffp-contract=off")
@@ -253,28 +254,18 @@ def _built(source: str, compiler: str, folder: Path, limit: float) -> Path:
 
 
 def _run(command: list[str], output: Path, limit: float) -> int | None:
-    """Run a command in a process group of its own; return its exit code, None beyond the limit."""
+    """Run a command that ends with this process; return its exit code, None beyond the limit."""
     # Into a file: what the command has started may hold a pipe open for longer than it lives.
-    with output.open("wb") as file:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            # What it leaves behind when it is ended goes with the folder.
-            env={**os.environ, "TMPDIR": str(output.parent)},
-        )
+    # What it leaves behind when it is ended goes with the folder.
+    environment = {**os.environ, "TMPDIR": str(output.parent)}
+    with (
+        output.open("wb") as file,
+        tool(command, stdout=file, stderr=subprocess.STDOUT, env=environment) as process,
+    ):
         try:
             return process.wait(limit)
         except subprocess.TimeoutExpired:
             return None
-        finally:
-            # An interrupt that comes meanwhile ends the command, too.
-            if process.poll() is None:
-                with suppress(OSError):
-                    os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
 
 
 # -- new objects ------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 
@@ -10,6 +11,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -34,6 +36,9 @@ _STATUS: Mapping[str, tuple[str, Callable[[Mapping[str, str], str], Status]]] = 
 
 _LOOK_PERIOD = 0.2
 """Wall s from one look of a follower to the next."""
+
+_LONGEST_DELIVERY = 5.0
+"""Wall s in which a goal reaches those that take it."""
 
 _SECOND = 10**9
 
@@ -148,6 +153,13 @@ class MissionClient:
         self._goal_topic.publish(self._pose(goal, stamp))
         if end_effector is not None:
             self._end_effector_topic.publish(self._pose(end_effector, stamp))
+
+    def await_delivery(self) -> None:
+        """Wait until those that take goals have received what was sent."""
+        end = time.monotonic() + _LONGEST_DELIVERY
+        for publisher in self.node.publishers:
+            if publisher.topic_name not in ("/rosout", "/parameter_events"):
+                publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
 
     def follow(
         self, executor: EventsExecutor, look: Callable[[], bool], period: float = _LOOK_PERIOD

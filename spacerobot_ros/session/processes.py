@@ -10,7 +10,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -26,11 +27,14 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.robot_source import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
+from spacerobot_ros.nodes.common.connections import Connections, unconnected
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
-from spacerobot_ros.session.mission_client import MissionClient
+from spacerobot_ros.session.mission_client import MissionClient, Outcome
 from spacerobot_ros.session.scenario import COMMANDERS, Kill, Scenario
 from spacerobot_ros.session.stack import Stack
+from spacerobot_ros.termination import child_options
+from spacerobot_ros.topics import NOT_RECORDED
 
 _START = 60.0
 """Wall s within which every node must be there."""
@@ -41,22 +45,30 @@ _END = 10.0
 _WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """Fast DDS may go on writing into what a killed node has left behind, and not to its successor."""
 
-_COMMANDS = ("joint_commands", "base_wrench", "joint_reference")
-"""What commanders publish for every state: nothing of it may be missed."""
-
 _SETTLING = 1.0
 """Wall s for the recorder to take in what was published before time stood still."""
+
+
+_SHORT_PATIENCE = 0.5
+"""Wall s that is left for an answer when all is to end soon."""
+
+_LOOK_PERIOD = 0.05
+"""Wall s from one look at what is connected to the next."""
+
+_CHILD = "spacerobot_ros.session.child"
+"""Runs the module of a node, as long as this process is there."""
 
 
 class MultiProcessStack(Stack):
     """The processes of a scenario, and in this one the client of their mission.
 
+    They end with this process, however that ends. In lockstep every run is equal: nothing begins
+    before all nodes have met, and the goal is there before the first state.
+
     Parameters
     ----------
     scenario, bag
         As of every stack.
-    plant_waits
-        Whether the plant begins only with :meth:`start`, when all nodes are connected.
 
     Raises
     ------
@@ -66,7 +78,7 @@ class MultiProcessStack(Stack):
 
     can_kill: ClassVar[bool] = True
 
-    def __init__(self, scenario: Scenario, bag: Path | None, *, plant_waits: bool = True) -> None:
+    def __init__(self, scenario: Scenario, bag: Path | None) -> None:
         super().__init__(scenario, bag)
         self._timeline = KillTimeline(scenario.kills)
         self._time_ns = 0
@@ -88,16 +100,21 @@ class MultiProcessStack(Stack):
         )
         node = self.client.node
         node.create_subscription(Clock, "/clock", self._on_clock, 10)
-        self._change_state = node.create_client(ChangeState, "plant/change_state")
+        self._change_state = {
+            name: node.create_client(ChangeState, f"{name}/change_state") for name in self.names
+        }
+        self._get_connections = {
+            name: node.create_client(Trigger, f"{name}/connections") for name in self.names
+        }
         self._get_statistics = node.create_client(Trigger, "planner/statistics")
         self._statistics = PlannerStatistics()
         self.executor = EventsExecutor()
         self.executor.add_node(node)
         try:
             for name in self.names:
-                self.launch(name, autostart=name != "plant" or not plant_waits)
-            if plant_waits:
-                self._transit(Transition.TRANSITION_CONFIGURE)
+                self.launch(name, autostart=False)
+            # All at once: models are built and compiled.
+            self._transit(Transition.TRANSITION_CONFIGURE, self.names)
             self._wait_for(self._connected, "the nodes to find each other")
         except BaseException:
             self.close()
@@ -114,6 +131,8 @@ class MultiProcessStack(Stack):
             overrides["describe"] = str(record)
         elif self.scenario.kills and name in COMMANDERS:
             overrides.setdefault("resume_file", str(Path(self._folder.name, f"{name}_goal.json")))
+        if name == self.scenario.commanders[0] and self.scenario.lockstep:
+            overrides["stop_when_decided"] = True
         overrides |= parameters
         overrides = {k: list(v) if isinstance(v, tuple) else v for k, v in overrides.items()}
         file = Path(self._folder.name, f"{name}.yaml")
@@ -121,11 +140,11 @@ class MultiProcessStack(Stack):
         with self._log_of(name).open("wb") as log:
             self.processes[name] = subprocess.Popen(
                 [
-                    *(sys.executable, "-W", "ignore::RuntimeWarning:runpy"),
-                    *("-m", NODE_TYPES[name].__module__, "--ros-args", "-r", f"__node:={name}"),
+                    *(sys.executable, "-m", _CHILD, NODE_TYPES[name].__module__),
+                    *("--ros-args", "-r", f"__node:={name}"),
                     *("--params-file", str(self.scenario.path), "--params-file", str(file)),
                 ],
-                env={**_WITHOUT_SHARED_MEMORY, **os.environ},
+                **child_options({**_WITHOUT_SHARED_MEMORY, **os.environ}),
                 stdout=log,
                 stderr=log,
                 start_new_session=True,
@@ -152,31 +171,35 @@ class MultiProcessStack(Stack):
         return self._statistics
 
     def start(self, goal: Goal | None) -> None:
-        """Send the goal, if there is one, and let time run."""
+        """Activate everything and send the goal, if there is one; the plant begins last."""
+        for name in reversed(self.names[1:]):
+            self._transit(Transition.TRANSITION_ACTIVATE, [name])
         if goal is not None:
             self.client.send(goal, self.scenario.end_effector_goal)
-        self._transit(Transition.TRANSITION_ACTIVATE)
+            self.client.await_delivery()
+        self._transit(Transition.TRANSITION_ACTIVATE, ["plant"])
 
     def finish(self) -> None:
         """Stop time, then end every node, the recorder, whose bag is completed, last.
+
+        A flight in real time that was interrupted ends with its joints at rest.
 
         Raises
         ------
         SpaceRobotError
             A node did not end well.
         """
-        if "plant" not in self._timeline.away:
-            self._transit(Transition.TRANSITION_DEACTIVATE)
-        end = time.monotonic() + _SETTLING
-        while time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=0.05)
-        if "planner" in self.names and "planner" not in self._timeline.away:
-            answer = self._call(self._get_statistics, Trigger.Request(), "planner")
-            self._statistics = PlannerStatistics.from_json(answer.message)
-        for name in self.names:
-            if name in self._timeline.away:
-                continue
-            code = self._end(name)
+        interrupted = self.client.outcome is Outcome.INTERRUPTED
+        present = [name for name in self.names if name not in self._timeline.away]
+        if "plant" in present and not (interrupted and not self.scenario.lockstep):
+            self._transit(Transition.TRANSITION_DEACTIVATE, ["plant"])
+        self._spin_for(0.0 if interrupted else _SETTLING)
+        if "planner" in present:
+            self._ask_statistics(_SHORT_PATIENCE if interrupted else _START)
+        ended: dict[str, int] = {}
+        for group in ([name for name in present if name != "recorder"], ["recorder"]):
+            ended |= self._end([name for name in group if name in present])
+        for name, code in ended.items():
             if code != 0:
                 raise SpaceRobotError(
                     f"Node '{name}' ended with code {code}: {self._last_line(name)}"
@@ -184,7 +207,13 @@ class MultiProcessStack(Stack):
 
     def close(self) -> None:
         """End what still runs."""
-        for process in self.processes.values():
+        left = [process for process in self.processes.values() if process.poll() is None]
+        for process in left:
+            process.send_signal(signal.SIGTERM)
+        end = time.monotonic() + _SHORT_PATIENCE
+        for process in left:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(max(0.0, end - time.monotonic()))
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
@@ -224,9 +253,13 @@ class MultiProcessStack(Stack):
             self.launch(name, **(again if name == "plant" else {}))
         self.require_alive()
 
-    def _end(self, name: str) -> int:
-        process = self.processes[name]
-        process.send_signal(signal.SIGINT)
+    def _end(self, names: Sequence[str]) -> dict[str, int]:
+        """End nodes together, and return their exit codes."""
+        for name in names:
+            self.processes[name].send_signal(signal.SIGINT)
+        return {name: self._await_end(self.processes[name]) for name in names}
+
+    def _await_end(self, process: subprocess.Popen[bytes]) -> int:
         try:
             return process.wait(_END)
         except subprocess.TimeoutExpired:
@@ -243,38 +276,77 @@ class MultiProcessStack(Stack):
         self._clock_seen = time.monotonic()
 
     def _connected(self) -> bool:
-        """Whether commanders and recorder receive plant and client, and the plant commands."""
-        node = self.client.node
-        listeners = 2 if self.bag is not None else 1
-        return (
-            self.client.is_connected(listeners)
-            and node.count_subscribers("odom") >= len(self.names) - 1
-            and all(
-                node.count_subscribers(topic) >= listeners
-                for topic in _COMMANDS
-                if node.count_publishers(topic)
-            )
-        )
+        """Whether everybody has met everybody, and the recorder records all that they publish."""
+        requests = {name: Trigger.Request() for name in self.names}
+        answers = self._call_all(self._get_connections, requests)
+        nodes = {name: Connections.from_json(answer.message) for name, answer in answers.items()}
+        self._spin_for(_LOOK_PERIOD)
+        if unconnected([*nodes.values(), Connections.of(self.client.node)]):
+            return False
+        if self.bag is None:
+            return True
+        wanted = set(self.scenario.config("recorder").topics.split())
+        recorded = {topic for topic, _ in nodes.pop("recorder").subscriptions}
+        published = {topic for node in nodes.values() for topic, _ in node.publishers}
+        if wanted:
+            published &= {self.client.node.resolve_topic_name(topic) for topic in wanted}
+        else:
+            published = {topic for topic in published if not topic.endswith(NOT_RECORDED)}
+        return published <= recorded
 
-    def _transit(self, transition: int) -> None:
+    def _transit(self, transition: int, names: Sequence[str]) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))
-        if not self._call(self._change_state, request, "plant").success:
-            raise SpaceRobotError(f"The plant refuses: {self._last_line('plant')}")
+        answers = self._call_all(self._change_state, dict.fromkeys(names, request))
+        for name, answer in answers.items():
+            if not answer.success:
+                raise SpaceRobotError(f"The {name} refuses: {self._last_line(name)}")
 
-    def _call(self, service: Client, request: Any, name: str) -> Any:
-        """Return what a node answers to a request."""
-        self._wait_for(service.service_is_ready, f"the {name}")
-        answer = service.call_async(request)
-        self._wait_for(answer.done, f"the {name}'s answer")
-        return answer.result()
+    def _ask_statistics(self, patience: float) -> None:
+        """Ask the planner what it has done; one that is interrupted may be busy."""
+        request = {"planner": Trigger.Request()}
+        try:
+            answer = self._call_all({"planner": self._get_statistics}, request, patience)["planner"]
+        except _LateError:
+            if patience < _START:
+                return
+            raise
+        self._statistics = PlannerStatistics.from_json(answer.message)
 
-    def _wait_for(self, condition: Callable[[], bool], what: str) -> None:
-        deadline = time.monotonic() + _START
+    def _call_all(
+        self, services: Mapping[str, Client], requests: Mapping[str, Any], patience: float = _START
+    ) -> dict[str, Any]:
+        """Return what nodes answer to requests, which are sent as soon as each is there."""
+        names = ", ".join(requests)
+        waiting = set(requests)
+        answers: dict[str, Any] = {}
+
+        def sent() -> bool:
+            for name in [name for name in waiting if services[name].service_is_ready()]:
+                answers[name] = services[name].call_async(requests[name])
+                waiting.remove(name)
+            return not waiting
+
+        self._wait_for(sent, f"the {names}", patience)
+        what = f"an answer of the {names}"
+        self._wait_for(lambda: all(each.done() for each in answers.values()), what, patience)
+        return {name: answer.result() for name, answer in answers.items()}
+
+    def _spin_for(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def _wait_for(self, condition: Callable[[], bool], what: str, patience: float = _START) -> None:
+        deadline = time.monotonic() + patience
         while not condition():
             self.require_alive()
             if time.monotonic() > deadline:
-                raise SpaceRobotError(f"Waited {_START:g} s for {what} in vain.")
-            self.executor.spin_once(timeout_sec=0.05)
+                raise _LateError(f"Waited {patience:g} s for {what} in vain.")
+            self.executor.spin_once(timeout_sec=0.02)
+
+
+class _LateError(SpaceRobotError):
+    """A node has not answered in time."""
 
 
 class KillTimeline:

@@ -25,7 +25,7 @@ from spacerobot_ros.nodes import (
 )
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
-from spacerobot_ros.session.mission_client import MissionClient
+from spacerobot_ros.session.mission_client import MissionClient, Outcome
 from spacerobot_ros.session.scenario import Scenario
 
 _DISCOVERY_TIMEOUT = 10.0
@@ -158,7 +158,8 @@ class InProcessStack(Stack):
                 lambda: self.plant.time_ns,
                 joint_names=(lambda: self.plant.plant.robot.joint_names) if shaped else None,
                 end_effector=scenario.end_effector_goal is not None,
-                on_end=self.plant.trigger_deactivate,
+                # In lockstep here and now: a run ends at the same tick every time.
+                on_end=self.plant.trigger_deactivate if scenario.lockstep else lambda: None,
                 context=context,
             )
             self._nodes.append(self.client.node)
@@ -223,6 +224,8 @@ class InProcessStack(Stack):
     def finish(self) -> None:
         """Stop the plant, record what is still on its way, and complete the bag."""
         if self.plant.is_active:
+            if self.client.outcome is Outcome.INTERRUPTED:
+                self.plant.drain(self.executor)
             self.plant.trigger_deactivate()
         for node in self._commanders:
             node.trigger_deactivate()

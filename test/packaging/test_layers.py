@@ -28,7 +28,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("control",),  # above planning, whose goals it takes
         ("planning",),
         ("model",),
-        ("events", "parameters", "private_files", "resources", "topics"),
+        ("events", "parameters", "private_files", "resources", "termination", "topics"),
         ("errors",),
         ("__init__",),
     ),

@@ -24,6 +24,7 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rclpy._rclpy_pybind11 import RCLError
+from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
@@ -36,12 +37,14 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import robot_from_text, robot_of
 from spacerobot_ros.nodes.common.cdr import raw_publish
+from spacerobot_ros.nodes.common.connections import Connections
 from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
 
@@ -66,6 +69,12 @@ AUTOSTART = Parameter(
 _LARGEST_FLOAT = sys.float_info.max
 _INTEGERS = -(2**63), 2**63 - 1
 """Bounds that descriptors can hold."""
+
+_CAN_SHUT_DOWN = (
+    State.PRIMARY_STATE_UNCONFIGURED,
+    State.PRIMARY_STATE_INACTIVE,
+    State.PRIMARY_STATE_ACTIVE,
+)
 
 Take = Callable[[bytes], None]
 
@@ -113,6 +122,8 @@ class RawOutput(RawStream):
         super().__init__(publisher.topic_name, raw_publish(publisher))
         self.readers: Callable[[], int] = publisher.get_subscription_count
         """Returns how many subscriptions it is matched with."""
+        self.await_readers: Callable[[Duration], bool] = publisher.wait_for_all_acked
+        """Waits until they have received everything; returns whether they have, in time."""
 
 
 class RawInput(RawStream):
@@ -166,6 +177,7 @@ class FlightNode(LifecycleNode):
             self.config = configured(self.Config, values)
             self.add_on_set_parameters_callback(self._on_set_parameters)
             self._event_stream = self.send_raw(DiagnosticStatus, "events", EVENTS)
+            self.create_service(Trigger, "~/connections", self._on_connections)
             self.prepare()
             self._permanent_streams = list(self.raw_streams)
             self._permanent = set(self._entities())
@@ -337,7 +349,7 @@ class FlightNode(LifecycleNode):
     def finalize(self) -> None:
         """Take the transition to the end, unless somebody has had the node take it before."""
         machine = self._state_machine
-        if machine and machine.current_state[0] != State.PRIMARY_STATE_FINALIZED:
+        if machine and machine.current_state[0] in _CAN_SHUT_DOWN:
             self.trigger_shutdown()
 
     def destroy_node(self) -> None:
@@ -411,6 +423,11 @@ class FlightNode(LifecycleNode):
             with suppress(Exception):
                 self.on_failure(self._failure, self.fault)
         return TransitionCallbackReturn.SUCCESS
+
+    def _on_connections(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Answer a supervisor that starts time when all nodes have met."""
+        response.success, response.message = True, Connections.of(self).to_json()
+        return response
 
     def _run(self, hook: Callable[[], None]) -> TransitionCallbackReturn:
         try:

@@ -179,6 +179,8 @@ class CoordinatedControlNode(CommanderNode):
     def _publish_status(self, status: ControllerStatus) -> None:
         name, level = self.get_fully_qualified_name(), bytes([status.state.level])
         self._status.publish(diagnostic_status(name, level, status.sentence, status.to_values()))
+        if status.state.decided and self.config.stop_when_decided:
+            self._running = False
         if status.state.level:
             self.get_logger().warning(status.sentence, throttle_duration_sec=5.0)
 

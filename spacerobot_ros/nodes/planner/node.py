@@ -251,6 +251,8 @@ class PlannerNode(CommanderNode):
             executive.update(measured)
             if executive.outputs:
                 self._publish_outputs(executive)
+                if not self._running:
+                    return
             self._commands.take(self._setpoint.serialised(stamp_bytes(measured.stamp_ns)))
         if measured.base_error is not None:
             self.get_logger().error(f"odom: {measured.base_error}.", throttle_duration_sec=5.0)
@@ -290,6 +292,8 @@ class PlannerNode(CommanderNode):
     def _publish_status(self, status: PlannerStatus) -> None:
         """Publish a status and log its sentence."""
         self._status_topic.publish(status_message(status, self.get_fully_qualified_name()))
+        if status.state.decided and self.config.stop_when_decided:
+            self._running = False
         if status.state.level:
             self.get_logger().warning(status.sentence)
         else:

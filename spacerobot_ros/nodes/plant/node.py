@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import sys
+import time
 from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
+from rclpy.experimental import EventsExecutor
 from rclpy.timer import Timer
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -18,7 +21,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import robot_of
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.messages import diagnostic_status
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, RawInput
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.plant.command_messages import CommandReader
 from spacerobot_ros.nodes.plant.diagnostics import PlantReport
@@ -33,6 +36,16 @@ from spacerobot_ros.simulation.time_modes import Lockstep, RealTime
 
 _LOOK_PERIOD = 0.1
 """How often a plant looks for new subscribers and commanders, wall s."""
+
+_UNCONFIRMED = STREAM.depth // 2
+"""Ticks that a lockstep plant takes at most before all readers confirm that they have their states:
+a reader that has fallen further behind than what publishers keep would lose some."""
+
+_STANDSTILL = 1e-3
+"""Joint rates of a robot at rest, m/s or rad/s."""
+
+_LONGEST_REST = 0.8
+"""Wall s in which the joints are brought to rest before the process ends."""
 
 # Looked up for every command: an enum takes its time to find a member.
 _INACTIVE, _RUNNING, _RESTING = PlantState.INACTIVE, PlantState.RUNNING, PlantState.RESTING
@@ -173,6 +186,25 @@ class PlantNode(FlightNode):
         self._commands.rest()
         self._look_at_status()
 
+    def drain(self, executor: EventsExecutor) -> None:
+        """Bring the joints to rest: the commanders end too, and nobody watches the robot."""
+        if self._active is not PlantState.RUNNING or self._real_time is None:
+            return
+        for stream in self.raw_streams:
+            if isinstance(stream, RawInput):
+                stream.take = lambda raw: None
+        self._commands.rest()
+        self._look_at_status()
+        end, began = time.monotonic() + _LONGEST_REST, self._tick
+
+        def at_rest() -> bool:
+            return self._tick > began and bool(np.all(np.abs(self.plant.qdot) <= _STANDSTILL))
+
+        while not at_rest() and time.monotonic() < end and self.is_active:
+            executor.spin_once(timeout_sec=0.02)
+        if self._tick == began and self.is_active:
+            self._step()  # Time is slow; servos stop within one tick.
+
     def cleanup(self) -> None:
         """Say that there is no plant any more."""
         self._active, self._monitor = PlantState.INACTIVE, None
@@ -236,6 +268,8 @@ class PlantNode(FlightNode):
             self._report.limited()
         self._tick += 1
         self._publish()
+        if self._lockstep is not None and self._tick % _UNCONFIRMED == 0:
+            self._publisher.await_readers()
         if self.plant.active is not self._faults_seen:
             self._look_at_status()
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 from nav_msgs.msg import Odometry
+from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
 from visualization_msgs.msg import Marker, MarkerArray
@@ -18,6 +20,9 @@ from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, RawOut
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.reported_state import ReportedState
 from spacerobot_ros.topics import TOPICS, Topic
+
+_PATIENCE = 0.5
+"""Longest wait for readers, wall s."""
 
 
 class StatePublisher:
@@ -89,6 +94,14 @@ class StatePublisher:
         new = bool(readers - self._readers) or matched > self._matched
         self._readers, self._matched = readers, matched
         return new
+
+    def await_readers(self) -> None:
+        """Wait until all readers have received the states, but not for one that has stopped."""
+        end = time.monotonic() + _PATIENCE
+        for output in self._outputs.values():
+            left = max(0.0, end - time.monotonic())
+            if not output.await_readers(Duration(seconds=left)):
+                return
 
     def _output(self, topic: Topic) -> RawOutput:
         if topic.name not in self._outputs:

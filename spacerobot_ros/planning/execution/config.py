@@ -86,6 +86,9 @@ class PlannerConfig(BelievedRobotConfig):
     resume_file: str = parameter(
         "", "file of the present goal, from which a planner that is restarted resumes; '': none"
     )
+    stop_when_decided: bool = parameter(
+        False, "answer no states once a goal is decided: a lockstep plant stays at that tick"
+    )
     options: Mapping[str, Any] = registered(METHODS)
 
     @property
