@@ -45,6 +45,24 @@ _END = 10.0
 _WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """Fast DDS may go on writing into what a killed node has left behind, and not to its successor."""
 
+_PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+"""Environment variables of Fast DDS: the file of its settings, by its new and its old name."""
+
+_PROMPT_WRITERS = """<?xml version="1.0" encoding="UTF-8"?>
+<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <profiles>
+    <data_writer profile_name="prompt" is_default_profile="true">
+      <times>
+        <initialHeartbeatDelay><sec>0</sec><nanosec>5000000</nanosec></initialHeartbeatDelay>
+        <heartbeatPeriod><sec>0</sec><nanosec>10000000</nanosec></heartbeatPeriod>
+      </times>
+    </data_writer>
+  </profiles>
+</dds>
+"""
+"""Writers ask for confirmation, and repeat what was lost, after 10 ms instead of 3 s: the plant
+would have published more than its publishers keep by then, or have waited."""
+
 _SETTLING = 1.0
 """Wall s for the recorder to take in what was published before time stood still."""
 
@@ -144,11 +162,20 @@ class MultiProcessStack(Stack):
                     *("--ros-args", "-r", f"__node:={name}"),
                     *("--params-file", str(self.scenario.path), "--params-file", str(file)),
                 ],
-                **child_options({**_WITHOUT_SHARED_MEMORY, **os.environ}),
+                **child_options(self._environment()),
                 stdout=log,
                 stderr=log,
                 start_new_session=True,
             )
+
+    def _environment(self) -> dict[str, str]:
+        """Return the environment of a node; what the user has chosen stays."""
+        environment = {**_WITHOUT_SHARED_MEMORY, **os.environ}
+        if not any(name in environment for name in _PROFILES):
+            file = Path(self._folder.name, "fastdds.xml")
+            file.write_text(_PROMPT_WRITERS, "utf-8")
+            environment |= dict.fromkeys(_PROFILES, str(file))
+        return environment
 
     def _log_of(self, name: str) -> Path:
         """Return the file of what a node writes to its standard output and error."""

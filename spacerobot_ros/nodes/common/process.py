@@ -85,8 +85,8 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
             spin_until(executor, stop)
             requested()
             node.drain(executor)
-            _deliver(node)
             node.finalize()
+            _deliver(node)
         return stop.result() or 0
     finally:
         if node is not None:
