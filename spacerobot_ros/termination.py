@@ -44,6 +44,9 @@ _WITHOUT_PARENT = 1.7
 _SAME = 0.5
 """Signals so close together are one, wall s: launchers send it beside the terminal."""
 
+_DYING = 0.3
+"""Longest wait for what was killed to be gone, wall s."""
+
 _LIFELINE = "SPACEROBOT_LIFELINE"
 """Environment variable of a child: the pipe that its parent holds open, and who that is."""
 
@@ -344,6 +347,11 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
         os.killpg(process.pid, signal.SIGKILL)
     process.kill()
     process.wait()
+    end = time.monotonic() + _DYING
+    with suppress(OSError):
+        while time.monotonic() < end:
+            os.killpg(process.pid, 0)
+            time.sleep(0.005)
 
 
 _KEEPER = """
