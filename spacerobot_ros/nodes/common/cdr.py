@@ -8,6 +8,7 @@ client, other strings) the reader deserialises it the ordinary way and learns th
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -26,7 +27,7 @@ from rosidl_parser.definition import (
 )
 from sensor_msgs.msg import JointState
 
-from spacerobot_ros.errors import CommandError
+from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model.description import Array as FloatArray
 from spacerobot_ros.simulation.commands import joint_order, require_values
 
@@ -45,6 +46,15 @@ HEADER_STAMP = slice(_ENCAPSULATION, _ENCAPSULATION + _TIME.size)
 
 NANOSECONDS = 1_000_000_000
 
+_LATEST_NS = 2**31 * NANOSECONDS - 1
+"""The last time that a stamp can carry, ns: its seconds are 32 bits."""
+
+_LONGEST = 10_000
+"""A message with a longer sequence is not taken apart: that of a million joints takes a minute."""
+
+_ROOM = 4096
+"""Bytes for the header of a message of joints, and for a writer that packs it differently."""
+
 M = TypeVar("M")
 
 Quantity = Literal["position", "velocity", "effort"]
@@ -53,6 +63,10 @@ Quantity = Literal["position", "velocity", "effort"]
 
 class UnreadableError(CommandError):
     """Bytes that are no message of their type; the clause says of which."""
+
+
+class _TooLongError(Exception):
+    """A message has a sequence that is too long to be taken apart."""
 
 
 @dataclass
@@ -72,7 +86,13 @@ class Layout:
 
     @classmethod
     def of(cls, message: Any) -> Layout:
-        """Compute the layout of a message with the strings and lengths that it has now."""
+        """Compute the layout of a message with the strings and lengths that it has now.
+
+        Raises
+        ------
+        _TooLongError
+            A sequence has more than 10000 elements.
+        """
         layout = cls()
         layout._message(message, "")
         return layout
@@ -113,6 +133,8 @@ class Layout:
             if isinstance(kind, AbstractSequence):
                 self._length()
                 self.lengths[path] = self.end - 4
+            if len(value) > _LONGEST:
+                raise _TooLongError
             for index, element in enumerate(value):
                 self._field(element, kind.value_type, f"{path}[{index}]")
             if len(value) and f"{path}[0]" in self.offsets:
@@ -157,14 +179,30 @@ class MessageTemplate:
 
 
 def stamp_bytes(time_ns: int) -> bytes:
-    """Return a time as it stands in a serialised builtin_interfaces/Time."""
-    return _TIME.pack(*divmod(time_ns, NANOSECONDS))
+    """Return a time as it stands in a serialised builtin_interfaces/Time.
+
+    Raises
+    ------
+    SpaceRobotError
+        A stamp cannot carry it.
+    """
+    try:
+        return _TIME.pack(*divmod(time_ns, NANOSECONDS))
+    except struct.error:
+        raise SpaceRobotError(
+            f"Stamps carry times up to 2^31 s (68 years), not {time_ns / NANOSECONDS:.10g} s."
+        ) from None
+
+
+def carried(time_ns: int) -> int:
+    """Return the nearest time that a stamp can carry, for times ahead in plans and paths, ns."""
+    return min(time_ns, _LATEST_NS)
 
 
 def first_time_ns(raw: bytes) -> int:
     """Return the time that a serialised message begins with, ns; 0 if it is before zero."""
     seconds, nanoseconds = _TIME.unpack_from(raw, _ENCAPSULATION)
-    return max(seconds * NANOSECONDS + nanoseconds, 0)
+    return min(max(seconds * NANOSECONDS + nanoseconds, 0), _LATEST_NS)
 
 
 def raw_publish(publisher: Publisher) -> Callable[[bytes], None]:
@@ -187,11 +225,19 @@ class TemplateReader(Generic[M]):
     spans
         Returns, for a deserialised message, the paths to read and how many float64 follow each:
         ``{"position": 3}``. Called only when the layout changes.
+    largest
+        Messages of another layout that are longer are refused unread, bytes.
     """
 
-    def __init__(self, message_type: type[M], spans: Callable[[M], dict[str, int]]) -> None:
+    def __init__(
+        self,
+        message_type: type[M],
+        spans: Callable[[M], dict[str, int]],
+        largest: float = math.inf,
+    ) -> None:
         self._type = message_type
         self._spans = spans
+        self._largest = largest
         self._size = -1
         self._fixed: list[tuple[slice, bytes]] = []
         self._stretches: list[tuple[slice, bytes]] = []
@@ -254,11 +300,19 @@ class TemplateReader(Generic[M]):
         self._stretches = [(place, raw[place]) for place in stretches]
 
     def _learn(self, raw: bytes) -> None:
+        if len(raw) > self._largest:
+            raise UnreadableError(
+                f"it has {len(raw)} bytes, of which at most {self._largest} can be meant"
+            )
         try:
             message = deserialize_message(raw, self._type)
         except RuntimeError as error:
             raise UnreadableError(f"its bytes are no {self._type.__name__}") from error
-        layout = Layout.of(message)
+        try:
+            layout = Layout.of(message)
+        except _TooLongError:
+            self._take_whole(message)
+            return
         own = bytes(serialize_message(message))
         fixed = [(0, _BYTE_ORDER), *layout.fixed]
         # Another byte order, or strings that are not what they were read as: not read in place.
@@ -274,6 +328,13 @@ class TemplateReader(Generic[M]):
             if count
         }
         self._remember_stretches(raw)
+        self.changes += 1
+
+    def _take_whole(self, message: M) -> None:
+        """Offer a message without a layout: nothing but what it is can be read of it."""
+        header = bytes(serialize_message(message.header))  # type: ignore[attr-defined]
+        self.prototype, self._raw, self._stamp = message, header, _ENCAPSULATION
+        self._size, self._fixed, self._stretches, self._reads = -1, [], [], {}
         self.changes += 1
 
 
@@ -300,7 +361,11 @@ class JointReader:
         complete: bool = False,
     ) -> None:
         self._complete, self._joints, self._quantities = complete, list(joint_names), quantities
-        self._reader = TemplateReader(JointState, self._spans)
+        largest = math.inf
+        if complete:
+            # Of each joint a name with its length and three numbers.
+            largest = _ROOM + 2 * sum(len(name.encode()) + 32 for name in joint_names)
+        self._reader = TemplateReader(JointState, self._spans, largest)
         self._changes = 0
         self._problem = ""
         self._order: npt.NDArray[np.intp] | None = None
@@ -313,7 +378,28 @@ class JointReader:
         Raises
         ------
         CommandError
-            A joint is unknown or named twice, or a length is wrong.
+            A joint is unknown or named twice, or a length is wrong; of a measured state, its
+            stamp is beyond what that of an answer can carry.
+        """
+        self.require(raw)
+        stamp = self._reader.stamp_ns
+        if stamp > _LATEST_NS and self._complete:
+            raise UnreadableError(f"no answer can carry its stamp of {stamp / NANOSECONDS:.10g} s")
+        for target, place in self._copies:
+            target[:] = raw[place]
+        if self._order is not None:
+            for name, values in self.values.items():
+                if self._reader.has(name):
+                    values[self._order] = self._reader.floats(name)
+        return stamp
+
+    def require(self, raw: bytes) -> None:
+        """Refuse a message that :meth:`accept` would refuse; ``values`` stay.
+
+        Raises
+        ------
+        CommandError
+            As :meth:`accept` does.
         """
         self._reader.accept(raw)
         if self._reader.changes != self._changes:
@@ -321,13 +407,6 @@ class JointReader:
             self._check()
         if self._problem:
             raise CommandError(self._problem)
-        for target, place in self._copies:
-            target[:] = raw[place]
-        if self._order is not None:
-            for name, values in self.values.items():
-                if self._reader.has(name):
-                    values[self._order] = self._reader.floats(name)
-        return self._reader.stamp_ns
 
     @property
     def stamp_ns(self) -> int:
@@ -343,17 +422,19 @@ class JointReader:
         assert message is not None
         names = list(message.name)
         self._problem, self._order, self._copies = "", None, []
-        for values in self.values.values():
-            values[:] = 0.0
         try:
             order = joint_order(self._joints, names, complete=self._complete)
             for i, quantity in enumerate(self._quantities):
                 count = len(getattr(message, quantity))
                 if count or i == 0:
                     require_values(names, quantity, count)
+                if count and not self._reader.has(quantity):
+                    raise CommandError(f"it has more than {_LONGEST} numbers")
         except CommandError as error:
             self._problem = str(error)
             return
+        for values in self.values.values():
+            values[:] = 0.0
         # Joints in the model's order, as the stack's own nodes send them, are copied as bytes.
         if names == self._joints:
             self._copies = [

@@ -14,7 +14,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.node import STREAM, RobotNode
@@ -148,6 +148,10 @@ class CommanderNode(RobotNode):
     # -- hooks --------------------------------------------------------------------------------
 
     @abstractmethod
+    def _require_joints(self, raw: bytes) -> None:
+        """Refuse joint states that are not of the robot, with a CommandError."""
+
+    @abstractmethod
     def _take_odom(self, raw: bytes) -> None:
         """Take up an odom message of the present time."""
 
@@ -170,6 +174,12 @@ class CommanderNode(RobotNode):
             self._take_odom(raw)
 
     def _on_joints(self, raw: bytes) -> None:
+        # Those of another robot neither tell the time nor take the place of this one's.
+        try:
+            self._require_joints(raw)
+        except CommandError as error:
+            self.get_logger().error(f"joint_states: {error}.", throttle_duration_sec=5.0)
+            return
         if self._times.admits(raw):
             self._take_joints(raw)
 

@@ -6,6 +6,12 @@ from enum import Enum
 
 from spacerobot_ros.nodes.common.cdr import HEADER_STAMP
 
+CONTRADICTION = (
+    "odom: two messages of one time differ; more than one node publishes it, and such poses are "
+    "not used."
+)
+"""What a commander logs about :meth:`StateSynchroniser.put_odom`."""
+
 
 class Pairing(str, Enum):
     """Which messages of a state a :class:`StateSynchroniser` hands over."""
@@ -62,10 +68,18 @@ class StateSynchroniser:
         else:
             self._required.setdefault(topic, b"")
 
-    def put_odom(self, raw: bytes) -> None:
-        """Accept an odom message; poses are measured (again)."""
-        self.odom = raw
+    def put_odom(self, raw: bytes) -> bool:
+        """Accept an odom message; poses are measured (again).
+
+        Return whether it contradicts the one before, of the same stamp: then another node
+        publishes odom, too, and the state has no pose.
+        """
+        before, self.odom = self.odom, raw
+        if raw[HEADER_STAMP] == before[HEADER_STAMP] and raw != before:
+            self._odom_fresh, self._without_pose = False, True
+            return True
         self._odom_fresh, self._without_pose = True, False
+        return False
 
     def put_joint_states(self, raw: bytes) -> None:
         """Accept a joint_states message; see :meth:`overdue` for the state before."""

@@ -32,7 +32,7 @@ from spacerobot_ros.nodes.common.commander import Change, CommanderNode, Stopped
 from spacerobot_ros.nodes.common.messages import diagnostic_status, goal_of
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.common.state_synchroniser import Pairing, StateSynchroniser
+from spacerobot_ros.nodes.common.state_synchroniser import CONTRADICTION, Pairing, StateSynchroniser
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
 
 JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
@@ -202,8 +202,13 @@ class CoordinatedControlNode(CommanderNode):
         if change is Change.OBEYS and self._robot is not None:
             self._executive.plant_obeys_again()
 
+    def _require_joints(self, raw: bytes) -> None:
+        if self._robot is not None:
+            self._joints.require(raw)
+
     def _take_odom(self, raw: bytes) -> None:
-        self._states.put_odom(raw)
+        if self._states.put_odom(raw):
+            self.get_logger().error(CONTRADICTION, throttle_duration_sec=5.0)
         self._on_part()
 
     def _take_joints(self, raw: bytes) -> None:

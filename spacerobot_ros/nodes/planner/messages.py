@@ -24,6 +24,7 @@ from spacerobot_ros.nodes.common.cdr import (
     Layout,
     MessageTemplate,
     TemplateReader,
+    carried,
 )
 from spacerobot_ros.nodes.common.messages import diagnostic_status, shape_marker
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
@@ -64,6 +65,16 @@ class StateReader:
         """
         self.stamp_ns = self._shape.accept(joint_states)
         self._joints_raw, self._odom_raw = joint_states, odom
+
+    def require(self, joint_states: bytes) -> None:
+        """Refuse joint states that :meth:`accept` would refuse; the state stays.
+
+        Raises
+        ------
+        CommandError
+            The joints are not those of the robot.
+        """
+        self._shape.require(joint_states)
 
     def base(self) -> BaseMeasurement | None:
         """Return pose and twist of the base and the rates of the joints, None without odom."""
@@ -127,7 +138,7 @@ def path_message(path: BasePath, start_ns: int, frame: str) -> Path:
     """Return a predicted base path that begins at ``start_ns`` as nav_msgs/Path."""
 
     def header(time_ns: int) -> Header:
-        sec, nanosec = divmod(time_ns, NANOSECONDS)
+        sec, nanosec = divmod(carried(time_ns), NANOSECONDS)
         return Header(frame_id=frame, stamp=Time(sec=sec, nanosec=nanosec))
 
     instants = (path.time * NANOSECONDS).round().astype(np.int64) + start_ns

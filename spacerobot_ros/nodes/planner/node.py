@@ -22,7 +22,7 @@ from spacerobot_ros.nodes.common.commander import Change, CommanderNode, Stopped
 from spacerobot_ros.nodes.common.messages import goal_of, shape_of
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.common.state_synchroniser import Pairing, StateSynchroniser
+from spacerobot_ros.nodes.common.state_synchroniser import CONTRADICTION, Pairing, StateSynchroniser
 from spacerobot_ros.nodes.planner.messages import (
     StateReader,
     goal_markers,
@@ -218,8 +218,13 @@ class PlannerNode(CommanderNode):
             self._executive.plant_reset()
             self._publish_outputs(self._executive)
 
+    def _require_joints(self, raw: bytes) -> None:
+        if self._executive is not None:
+            self._measured.require(raw)
+
     def _take_odom(self, raw: bytes) -> None:
-        self._states.put_odom(raw)
+        if self._states.put_odom(raw):
+            self.get_logger().error(CONTRADICTION, throttle_duration_sec=5.0)
         # With a goal to plan for or to evaluate, even a pose that comes after its joints counts.
         if self._executive is not None and self._executive.measuring:
             self._on_part()
