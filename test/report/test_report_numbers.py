@@ -1,0 +1,479 @@
+"""What a person reads in a report, word for word, of flights written by hand.
+
+No figure is drawn: tables and page are made of what the bag holds.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from sensor_msgs.msg import JointState
+from support.made_bags import array, joint_states, made_bag, odometry, pose, stamped
+
+from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.report.figures_time import (
+    attitude_group,
+    joint_unit,
+    pose_errors,
+    position_group,
+    shape_groups,
+)
+from spacerobot_ros.report.flight import Flight, read_flight
+from spacerobot_ros.report.meshcat import Player
+from spacerobot_ros.report.page import page
+from spacerobot_ros.report.style import Plate
+from spacerobot_ros.report.tables import (
+    headline,
+    joint_table,
+    published_table,
+    result_table,
+    runs_table,
+)
+
+NAMES = ["slide", "turn"]
+STILL = (0.0,) * 6
+HALF = math.sin(0.1), math.cos(0.1)
+"""Of a quaternion that turns by 0.2 rad."""
+
+URDF = """<robot name="tester">
+<link name="base"><inertial><mass value="10"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+<link name="a"><inertial><mass value="2.5"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+<link name="b"><inertial><mass value="1.25"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+<joint name="slide" type="prismatic"><parent link="base"/><child link="a"/>
+<axis xyz="1 0 0"/><limit lower="-1.5" upper="2.5" velocity="0.8" effort="5"/></joint>
+<joint name="turn" type="continuous"><parent link="a"/><child link="b"/>
+<axis xyz="0 1 0"/><limit velocity="3.2" effort="7"/></joint>
+</robot>"""
+
+GOAL = (1.0, 2.0, 3.0, 0.0, -math.sin(0.05), 0.0, math.cos(0.05))
+"""Turned by -0.1 rad about y."""
+
+
+def planner(state: PlannerState, time: float, sentence: str = "", **more: Any) -> Any:
+    more.setdefault("goal_id", "5.000000000")
+    return "planner/status", PlannerStatus(state, sentence, **more), time
+
+
+def controller(state: ControllerState, time: float, *errors: str, goal_id: str = "") -> Any:
+    command = CommandReport("a_law", False, 1.0, 0.0, 0.0, 0.0, 0.0, dict.fromkeys(errors, 0.1))
+    status = ControllerStatus(state, "A sentence.", goal_id, command if errors else None)
+    return "controller/status", status, time
+
+
+NOTES: dict[str, Any] = {"zf": [1.23456, 2.0]}
+FLOWN = (
+    planner(PlannerState.EXECUTING, 5.0, method="lie_bracket", notes=NOTES),
+    planner(PlannerState.EXECUTING, 6.0, method="lie_bracket", notes={"zf": [9.0, 9.0]}),
+    planner(PlannerState.REACHED, 6.5, "The goal is reached."),
+)
+
+
+def flight(path: Path, statuses: Any = FLOWN, **options: Any) -> Flight:
+    """Write four states 0.5 s apart from 5 s on; the base ends 0.3 rad and (0.3, 0, -0.4) m off.
+
+    Joints go from (0.125, -0.5) to (-0.625, 1.75), their largest rates are 0.2 and -0.4; momenta
+    swing by 5 and 6 times 4e-9 and come back.
+    """
+    metadata = options.pop("metadata", {})
+    urdf, name = options.pop("urdf", URDF), options.pop("name", "flight.mcap")
+    goals, more = options.pop("goals", (GOAL,)), options.pop("more", lambda say, time, k: None)
+    names = options.pop("names", NAMES)
+    assert not options
+    with made_bag(path / name) as (bag, say):
+        for key, values in metadata.items():
+            bag.add_metadata(key, values)
+        if urdf:
+            bag.add_attachment("robot_description.urdf", urdf.encode(), "application/xml", 0)
+        for n, goal in enumerate(goals):
+            say("/goal_pose", pose(5.0 + n, *goal), 5.0 + n)
+        for topic, status, time in statuses:
+            pairs = [KeyValue(key=k, value=v) for k, v in status.to_values().items()]
+            say(f"/{topic}", DiagnosticStatus(message=status.sentence, values=pairs), time)
+        for k in range(4):
+            time, last = 5.0 + 0.5 * k, k == 3
+            swing = (0.0, 3e-9, -4e-9, 0.0)[k]
+            turn = (0.0, HALF[0], 0.0, HALF[1]) if last else (0.0, 0.0, 0.0, 1.0)
+            say("/odom", odometry(time, 0.7, 2.0, 3.4 * last, *turn, *STILL), time)
+            rates = [(0.0, 0.0), (0.2, -0.4), (0.1, 0.3), (-0.1, 0.0)][k]
+            shape = [0.125 - 0.25 * k, 0.75 * k - 0.5]
+            say("/joint_states", joint_states(time, names, shape, list(rates)), time)
+            say("/momentum", array(1 + 3 * swing, 4 * swing, 0, 0, 0, 2 - 6 * swing, 0.5), time)
+            more(say, time, k)
+    return read_flight(path / name)
+
+
+def rows_of(found: Flight) -> dict[str, str]:
+    return {row[0]: row[1] for row in result_table(found).rows}
+
+
+# -- tables -----------------------------------------------------------------------------------
+
+
+def test_the_numbers_on_top(tmp_path: Path) -> None:
+    assert headline(flight(tmp_path)) == [
+        ("Position error", "0.5 m", ""),
+        ("Attitude error", "0.3 rad", "17.2°"),
+        ("Manoeuvre", "1.5 s", ""),
+        ("Method", "lie_bracket", ""),
+        ("Momentum drift", "2.0e-08 kg m/s", "angular 2.4e-08 kg m²/s"),
+        ("Recorded", "3 ticks", "1.5 s"),
+    ]
+
+
+def test_the_numbers_of_the_run(tmp_path: Path) -> None:
+    tolerances = {"position_tolerance": "0.02", "attitude_tolerance": "0.06"}
+    found = result_table(flight(tmp_path, metadata={"parameters/planner": tolerances}))
+    assert found.rows == [
+        ("Goal position", "(1.00000, 2.00000, 3.00000) m"),
+        ("Goal attitude", "rotation vector (0.00000, -0.10000, 0.00000) rad, 5.730° in all"),
+        ("Final position", "(0.70000, 2.00000, 3.40000) m"),
+        ("Final attitude", "rotation vector (0.00000, 0.20000, 0.00000) rad, 11.459° in all"),
+        ("Position error", "0.5 m (tolerance 0.02 m)"),
+        ("Attitude error", "0.3 rad = 17.19° (tolerance 0.06 rad)"),
+        ("Manoeuvre time", "1.5 s, 2 schedules in the whole flight"),
+        ("Recorded", "1.5 s, 3 ticks of 0.5 s"),
+        ("Momentum drift", "linear 2e-08 kg m/s, angular 2.4e-08 kg m²/s"),
+    ]
+
+
+def test_a_method_that_leaves_the_position_has_no_rows_of_it(tmp_path: Path) -> None:
+    statuses = [planner(PlannerState.EXECUTING, 5.0, method="area_loop")]
+    found = flight(tmp_path, statuses)
+    assert "Position error" not in [label for label, _, _ in headline(found)]
+    labels = [row[0] for row in result_table(found).rows]
+    assert "Goal position" not in labels
+    assert "Position error" not in labels
+    assert {"Goal attitude", "Final position", "Attitude error"} <= set(labels)
+    assert position_group(found).goals == []
+    assert len(attitude_group(found).goals) == 3
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_joints_beside_their_limits(tmp_path: Path, order: int) -> None:
+    names = NAMES[::order]
+    table = joint_table(flight(tmp_path, names=names))
+    assert table is not None
+    assert table.head == (
+        *("Joint", "Type", "Unit", "Start", "Final"),
+        *("Limits", "Peak velocity", "Limit", "Used"),
+    )
+    moves = [("0.12500", "-0.62500"), ("-0.50000", "1.75000")]
+    peaks = [0.2, 0.4]
+    rows = {
+        "slide": ("prismatic", "m", "-1.5 to 2.5", "0.8 m/s", 0.8),
+        "turn": ("continuous", "rad", "–", "3.2 rad/s", 3.2),
+    }
+    for row, name, move, peak in zip(table.rows, names, moves, peaks, strict=True):
+        kind, unit, limits, limit, most = rows[name]
+        share = f"{100 * peak / most:.1f} %"
+        assert row == (name, kind, unit, *move, limits, f"{peak:.5f} {unit}/s", limit, share)
+
+
+def test_joints_without_a_description_have_no_limits(tmp_path: Path) -> None:
+    found = flight(tmp_path, urdf="")
+    table = joint_table(found)
+    assert table is not None
+    assert table.rows[0] == (
+        *("slide", "–", "m or rad", "0.12500", "-0.62500"),
+        *("–", "0.20000 m or rad/s", "–", "–"),
+    )
+    assert joint_unit(found, "slide") == "m or rad"
+
+
+PRINTED: list[dict[str, Any]] = [
+    {"quantity": "zf", "printed": [1.2346], "note": "a note"},
+    {"quantity": "peak_joint_velocities", "printed": [0.25, 0.5], "note": ""},
+    {"quantity": "final_joint_positions", "printed": [1.0, 2.0], "note": ""},
+    {"quantity": "final_attitude_rotvec_rad", "printed": [0.1, 0.2, 0.3], "note": ""},
+    {"quantity": "final_position_m", "printed": [0.125, 2.0, 3.5], "note": ""},
+    {"quantity": "position_error_m", "printed": [0.51], "note": ""},
+    {"quantity": "attitude_error_rad", "printed": [0.0312], "note": ""},
+    {"quantity": "manoeuvre_time_s", "printed": [2.0], "note": ""},
+    {"quantity": "unknown", "printed": [1e-7], "note": ""},
+]
+
+
+def test_published_figures_have_as_many_decimals_as_were_printed(tmp_path: Path) -> None:
+    scenario = {"name": "test", "published": json.dumps(PRINTED)}
+    table = published_table(flight(tmp_path, metadata={"scenario": scenario}))
+    assert table is not None
+    assert table.rows == [
+        # The rest of what the first schedule has, with the most decimals.
+        ("zf", "1.2346", "1.2346, 2.0000", "planner", "a note"),
+        ("peak_joint_velocities", "0.25, 0.5", "0.20, 0.4", "flight", ""),
+        ("final_joint_positions", "1, 2", "-1, 2", "flight", ""),
+        ("final_attitude_rotvec_rad", "0.1, 0.2, 0.3", "0.0, 0.2, 0.0", "flight", ""),
+        ("final_position_m", "0.125, 2, 3.5", "0.700, 2, 3.4", "flight", ""),
+        ("position_error_m", "0.51", "0.50", "flight", ""),
+        ("attitude_error_rad", "0.0312", "0.3000", "flight", ""),
+        ("manoeuvre_time_s", "2", "2", "flight", ""),
+        ("unknown", "0", "–", "", ""),
+    ]
+    assert published_table(flight(tmp_path, name="other.mcap")) is None
+
+
+def test_flights_side_by_side(tmp_path: Path) -> None:
+    others = [
+        flight(tmp_path),
+        flight(tmp_path, (), name="bare.mcap", goals=()),
+    ]
+    table = runs_table(others)
+    assert table.head == (
+        *("Bag", "Position error", "Attitude error", "Manoeuvre"),
+        *("Method", "Momentum drift", "Recorded"),
+    )
+    drift = "2.0e-08 kg m/s"
+    assert table.rows == [
+        ("flight.mcap", "0.5 m", "0.3 rad", "1.5 s", "lie_bracket", drift, "3 ticks"),
+        ("bare.mcap", "–", "–", "–", "–", drift, "3 ticks"),
+    ]
+    assert [each.label for each in others] == ["flight (lie_bracket)", "bare.mcap"]
+
+
+def test_what_rounds_to_zero_has_no_sign(tmp_path: Path) -> None:
+    (row,) = (
+        row
+        for row in result_table(flight(tmp_path, goals=((-1e-9, 0.0, -0.0, *GOAL[3:]),))).rows
+        if row[0] == "Goal position"
+    )
+    assert row[1] == "(0.00000, 0.00000, 0.00000) m"
+
+
+# -- which goal, and how long -----------------------------------------------------------------
+
+
+def test_the_time_is_that_of_the_schedules_for_the_last_goal(tmp_path: Path) -> None:
+    first, second = (0.0, 0.0, 1.0, *GOAL[3:]), GOAL
+    statuses = [
+        planner(PlannerState.EXECUTING, 5.0, method="optimal", goal=first, goal_id="5.000000000"),
+        planner(PlannerState.EXECUTING, 5.25, method="optimal", goal=second, goal_id="6.000000000"),
+        planner(PlannerState.EXECUTING, 5.75, method="auto", goal=second, goal_id="6.000000000"),
+        planner(PlannerState.FAILED, 6.25, "Missed.", goal=second, goal_id="6.000000000"),
+    ]
+    found = flight(tmp_path, statuses, goals=(first, second))
+    assert found.manoeuvre_time == 1.0
+    assert found.method == "optimal"
+    assert found.goal is not None
+    assert found.goal.position.tolist() == [1.0, 2.0, 3.0]
+    spans = [(t.start, t.end, t.goal.position[2]) for t in found.targets]
+    assert spans == [(0.0, 0.25, 1.0), (0.25, 0.75, 3.0), (0.75, 1.5, 3.0)]
+    goals = position_group(found).goals
+    assert goals[:3] == [(0.0, 0.25, 0, 0.0), (0.0, 0.25, 1, 0.0), (0.0, 0.25, 2, 1.0)]
+    # Without its last status it lasts to the end of the recording.
+    cut = flight(tmp_path, statuses[:3], goals=(first, second), name="cut.mcap")
+    assert cut.manoeuvre_time == 1.25
+
+
+def test_a_goal_that_is_refused_in_flight_is_not_the_one_flown_to(tmp_path: Path) -> None:
+    other = (9.0, 9.0, 9.0, *GOAL[3:])
+    statuses = [
+        planner(PlannerState.EXECUTING, 5.0, method="lie_bracket"),
+        planner(PlannerState.REFUSED, 6.0, "Too far.", goal_id="6.000000000"),
+    ]
+    found = flight(tmp_path, statuses, goals=(GOAL, other))
+    assert found.goal is not None
+    assert found.goal.position.tolist() == [1.0, 2.0, 3.0]
+    assert "Goal position" in [row[0] for row in result_table(found).rows]
+    # Where nothing was flown, the goal was refused, and is said to be.
+    found = flight(tmp_path, statuses[1:], goals=(GOAL, other), name="refused.mcap")
+    rows = rows_of(found)
+    assert rows["Goal position (refused)"] == "(9.00000, 9.00000, 9.00000) m"
+    assert "Goal attitude (refused)" in rows
+
+
+def test_a_controller_and_the_components_that_it_controls(tmp_path: Path) -> None:
+    def more(say: Any, time: float, k: int) -> None:
+        say("/end_effector_pose", pose(time, 1.0 + k, 2.0, 3.0, 0.0, 0.0, *HALF), time)
+        if k == 0:
+            say("/end_effector/goal_pose", pose(time, 4.0, 2.0, 2.5, 0.0, 0.0, 0.0, 1.0), time)
+
+    labels = ("base.x", "base.rz", "end_effector.y")
+    statuses = [
+        controller(ControllerState.HOLDING, 5.0, *labels),
+        controller(ControllerState.TRACKING, 5.25, *labels, goal_id="5.000000000"),
+        controller(ControllerState.TRACKING, 5.5, *labels, goal_id="5.000000000"),
+        controller(ControllerState.REACHED, 6.25, *labels, goal_id="5.000000000"),
+    ]
+    found = flight(tmp_path, statuses, more=more)
+    assert found.method == "a_law"
+    assert found.controls("base") == [0, 5]
+    assert found.controls("end_effector") == [1]
+    assert found.manoeuvre_time == 1.0
+    rows = rows_of(found)
+    assert rows["End-effector goal"] == "(4.00000, 2.00000, 2.50000) m"
+    assert rows["End-effector, final"] == "(4.00000, 2.00000, 3.00000) m"
+    assert rows["End-effector error"] == "0.5 m"
+    assert "End-effector attitude error" not in rows
+    assert ("End-effector error", "0.5 m", "") in headline(found)
+    turned = [
+        controller(status.state, time, "end_effector.rx", goal_id=status.goal_id)
+        for _, status, time in statuses
+    ]
+    found = flight(tmp_path, turned, more=more, name="turned.mcap")
+    rows = rows_of(found)
+    assert rows["End-effector attitude error"] == "0.2 rad = 11.46°"
+    assert ("End-effector error", "0.5 m", "0.2 rad") in headline(found)
+    # The base is not under control: its goal, if there is one, is nobody's.
+    assert "Goal attitude" not in rows
+
+
+def test_momenta_that_thrusters_put_in_are_no_drift(tmp_path: Path) -> None:
+    def more(say: Any, time: float, k: int) -> None:
+        swing = (0.0, 3e-9, -4e-9, 0.0)[k]
+        expected = array(7 + 3 * swing, 4 * swing, 0, 0, 0, 5 - 6 * swing + 1e-3 * (k == 2))
+        say("/momentum_expected", expected, time)
+
+    found = flight(tmp_path, more=more)
+    assert found.drift(0) < 1e-15
+    assert found.drift(3) == pytest.approx(1e-3)
+
+
+# -- what is drawn ----------------------------------------------------------------------------
+
+
+def test_errors_are_goal_minus_measured_in_the_world(tmp_path: Path) -> None:
+    found = flight(tmp_path)
+    base = replace(found.position, values=np.hstack([found.position.values, found.quaternion]))
+    errors = pose_errors(base, found.targets)
+    np.testing.assert_allclose(errors.values[0], [0.3, 0.0, 3.0, 0.0, -0.1, 0.0], atol=1e-12)
+    np.testing.assert_allclose(errors.values[-1], [0.3, 0.0, -0.4, 0.0, -0.3, 0.0], atol=1e-12)
+    np.testing.assert_array_equal(errors.time, [0.0, 0.5, 1.0, 1.0, 1.5])
+
+
+def test_an_attitude_error_is_along_axes_of_the_world(tmp_path: Path) -> None:
+    """A base turned by 90 deg about z, whose goal is turned by 0.1 rad more about the world's x."""
+    c = math.sqrt(0.5)
+    s, k = math.sin(0.05), math.cos(0.05)
+    # (s, 0, 0, k) times (0, 0, c, c), by hand.
+    goal = (0.0, 0.0, 0.0, s * c, -s * c, k * c, k * c)
+
+    def more(say: Any, time: float, n: int) -> None:
+        say("/end_effector_pose", pose(time, 0.0, 0.0, 0.0, 0.0, 0.0, c, c), time)
+        if n == 0:
+            say("/end_effector/goal_pose", pose(time, *goal), time)
+
+    found = flight(tmp_path, more=more)
+    errors = pose_errors(found.tool, found.tool_targets)
+    np.testing.assert_allclose(errors.values[-1], [0, 0, 0, 0.1, 0, 0], atol=1e-12)
+
+
+def test_joints_of_one_unit_share_a_panel_with_their_limits(tmp_path: Path) -> None:
+    groups = shape_groups(flight(tmp_path))
+    assert [(group.unit, list(group.names)) for group in groups] == [
+        ("m", ["slide"]),
+        ("rad", ["turn"]),
+    ]
+    assert groups[0].limits == [(0, -1.5), (0, 2.5)]
+    np.testing.assert_allclose(groups[1].signal.values[:, 0], [-0.5, 0.25, 1.0, 1.75])
+
+
+def test_efforts_are_those_of_the_joints_by_their_names(tmp_path: Path) -> None:
+    def more(say: Any, time: float, k: int) -> None:
+        command = JointState(name=NAMES[::-1], position=[], velocity=[], effort=[2.0 * k, 1.0 * k])
+        say("/joint_commands", stamped(command, time), time)
+
+    found = flight(tmp_path, more=more, metadata={"parameters/plant": {"actuation": '"effort"'}})
+    np.testing.assert_array_equal(found.efforts.values[-1], [3.0, 6.0])
+    velocities = {"parameters/plant": {"actuation": '"velocity"'}}
+    found = flight(tmp_path, more=more, metadata=velocities, name="velocity.mcap")
+    assert len(found.efforts) == 0
+
+
+# -- the page ---------------------------------------------------------------------------------
+
+
+class Reader(HTMLParser):
+    """The text of a page, and the tags in it."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.text, self.tags = "", set[str]()
+        self.values: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.values += [value for _, value in attrs if value is not None]
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_what_the_page_says_of_a_flight(tmp_path: Path) -> None:
+    metadata = {
+        "scenario": {"name": "a_scenario", "description": "What it is."},
+        "spacerobot": {"version": "1.2.3"},
+        "parameters/plant": {"tick_rate": "20.0"},
+        "other": {"hidden": "nobody"},
+    }
+    found = flight(tmp_path, metadata=metadata)
+    text = page(found, Player("<p>player</p>"), [Plate("a", "Heading", "Caption.", b"<svg/>")])
+    content = Reader(text)
+    for words in (
+        "a_scenario",
+        "What it is.",
+        "method lie_bracket",
+        "robot tester: 2 joints, 13.75 kg",
+        "ReachedThe goal is reached.",
+        "Position error0.5 m",
+        "Attitude error0.3 rad17.2°",
+        "Figure 1. Heading. Caption.",
+        "tick_rate20.0",
+        f"Made from the bag flight.mcap alone: {found.message_count} messages, "
+        "recorded by spacerobot_ros 1.2.3.",
+    ):
+        assert words in content.text, words
+    assert found.message_count == 1 + 3 + 4 * 3
+    assert "nobody" not in content.text
+    assert "<title>a_scenario, lie_bracket, tester</title>" in text
+    cut = flight(tmp_path, FLOWN[:2], name="cut.mcap")
+    assert "The recording ends before that is decided." in page(cut, Player(""), [])
+
+
+def test_whatever_a_bag_holds_is_text_on_the_page(tmp_path: Path) -> None:
+    def odd(n: int) -> str:
+        return f"<i title='{n}'>&amp;\"{n}"
+
+    escaped = {"<": "&lt;", ">": "&gt;", "&": "&amp;", '"': "&quot;"}
+    urdf = URDF
+    for n, name in ((1, "tester"), (2, "slide")):
+        text = "".join(escaped.get(letter, letter) for letter in odd(n))
+        urdf = urdf.replace(f'name="{name}"', f'name="{text}"')
+    published = [{"quantity": odd(3), "printed": [1.0], "note": odd(4)}]
+    metadata = {
+        "scenario": {
+            "name": odd(5),
+            "description": odd(6),
+            "published": json.dumps(published),
+        },
+        "spacerobot": {"version": odd(7)},
+        f"parameters/{odd(8)}": {odd(9): odd(10)},
+    }
+    statuses = [
+        planner(PlannerState.EXECUTING, 5.0, method=odd(11)),
+        planner(PlannerState.REACHED, 6.0, odd(12)),
+    ]
+    found = flight(
+        tmp_path, statuses, metadata=metadata, urdf=urdf, names=[odd(2), "turn"], name="<i>13&.mcap"
+    )
+    plates: list[Plate | str] = [Plate("a", odd(14), odd(15), b"<svg/>"), odd(16)]
+    content = Reader(page(found, Player(""), plates, [found]))
+    assert "i" not in content.tags
+    read = content.text + " ".join(content.values)
+    for n in (*range(1, 13), 14, 15, 16):
+        assert odd(n) in read, n
+    assert "<i>13&.mcap" in content.text
+    assert odd(14) in content.values, "the picture's other text"
