@@ -1,0 +1,342 @@
+"""Messages for viewers and people, made without a node: shapes, paths, goals, diagnoses."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import JointState
+from support.ros_harness import nanoseconds
+from visualization_msgs.msg import Marker
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot, parse_robot
+from spacerobot_ros.model.description import Pose, Shape
+from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.nodes.common.messages import goal_of, shape_marker, shape_of
+from spacerobot_ros.nodes.planner.messages import goal_markers, path_message, status_message
+from spacerobot_ros.nodes.plant.diagnostics import PlantReport, timing_status
+from spacerobot_ros.nodes.plant.publisher import LinkMarkers
+from spacerobot_ros.planning import BasePath, Goal
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.commands import CommandValidator
+from spacerobot_ros.simulation.config import PlantConfig
+
+RED = (0.9, 0.1, 0.2, 0.7)
+
+
+def shape(kind: str, size: tuple[float, ...], resource: str = "") -> Shape:
+    return Shape(kind=kind, size=size, rgba=RED, pose=Pose(), resource=resource)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "marker", "scale"),
+    [
+        ("box", (1.0, 2.0, 3.0), Marker.CUBE, (1.0, 2.0, 3.0)),
+        # A URDF has radius and length, a marker diameters.
+        ("cylinder", (0.5, 4.0), Marker.CYLINDER, (1.0, 1.0, 4.0)),
+        ("sphere", (0.25,), Marker.SPHERE, (0.5, 0.5, 0.5)),
+        ("mesh", (0.1, 0.2, 0.3), Marker.MESH_RESOURCE, (0.1, 0.2, 0.3)),
+    ],
+)
+def test_shapes_have_their_sizes(
+    kind: str, size: tuple[float, ...], marker: int, scale: tuple[float, ...]
+) -> None:
+    found = shape_marker(shape(kind, size, "package://a/b.stl"), "map", "a_link", 7)
+    assert (found.type, found.action, found.ns, found.id) == (marker, Marker.ADD, "a_link", 7)
+    assert found.header.frame_id == "map"
+    assert (found.scale.x, found.scale.y, found.scale.z) == scale
+    assert (found.color.r, found.color.g, found.color.b, found.color.a) == pytest.approx(RED)
+    assert found.mesh_resource == "package://a/b.stl"
+
+
+TURNED = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_quat()
+GOAL = Goal.checked([1.0, -2.0, 3.0], TURNED)
+PATH = BasePath(
+    np.array([0.0, 0.5, 2.25]),
+    np.array([[0.0, 0.1, 0.2], [1.0, 1.1, 1.2], [2.0, 2.1, 2.2]]),
+    np.array([[0.0, 0.0, 0.0, 1.0], TURNED, [0.0, 0.6, 0.0, 0.8]]),
+)
+
+
+def numbers(pose: Any) -> list[float]:
+    p, o = pose.position, pose.orientation
+    return [p.x, p.y, p.z, o.x, o.y, o.z, o.w]
+
+
+def test_the_goal_is_a_ghost_and_the_path_a_line() -> None:
+    shapes = [shape("box", (1.0, 2.0, 3.0)), shape("sphere", (0.5,))]
+    first, second, line = goal_markers(GOAL, PATH, shapes, "map").markers
+    for number, ghost in enumerate((first, second)):
+        assert (ghost.ns, ghost.id, ghost.header.frame_id) == ("goal", number, "map")
+        assert ghost.color.a == 0.25
+        assert ghost.color.r == pytest.approx(RED[0])
+        assert numbers(ghost.pose) == pytest.approx([1.0, -2.0, 3.0, *TURNED])
+    assert (line.ns, line.id, line.type) == ("planned_path", 2, Marker.LINE_STRIP)
+    assert line.header.frame_id == "map"
+    assert [[p.x, p.y, p.z] for p in line.points] == PATH.position.tolist()
+    assert numbers(line.pose) == [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    assert line.scale.x > 0
+    assert line.color.a == 1.0
+
+
+def test_a_path_begins_at_its_start() -> None:
+    message = path_message(PATH, 7_900_000_000, "map")
+    assert (message.header.frame_id, nanoseconds(message.header.stamp)) == ("map", 7_900_000_000)
+    times = [nanoseconds(pose.header.stamp) for pose in message.poses]
+    assert times == [7_900_000_000, 8_400_000_000, 10_150_000_000]
+    assert {pose.header.frame_id for pose in message.poses} == {"map"}
+    for k, stamped in enumerate(message.poses):
+        expected = [*PATH.position[k], *PATH.quaternion[k]]
+        assert numbers(stamped.pose) == pytest.approx(expected)
+
+
+def test_a_status_has_its_level() -> None:
+    for state, level in (
+        (PlannerState.REACHED, b"\0"),
+        (PlannerState.ABORTED, b"\1"),
+        (PlannerState.REFUSED, b"\2"),
+    ):
+        message = status_message(PlannerStatus(state, "Words.", goal_id="1.5"), "/a/planner")
+        assert (message.level, message.message, message.name) == (level, "Words.", "/a/planner")
+        assert {"state": state.value, "goal_id": "1.5"}.items() <= {
+            pair.key: pair.value for pair in message.values
+        }.items()
+
+
+def test_a_goal_pose_is_taken_in_its_frame() -> None:
+    message = PoseStamped()
+    message.pose.position.y = -2.0
+    message.pose.orientation.x, message.pose.orientation.w = 0.6, 0.8
+    for frame in ("", "map"):
+        message.header.frame_id = frame
+        goal = goal_of(message, "map", shape=np.array([1.0, 2.0]))
+        assert goal.position.tolist() == [0.0, -2.0, 0.0]
+        assert goal.quaternion == pytest.approx([0.6, 0.0, 0.0, 0.8])
+        assert goal.joint_positions is not None
+        assert goal.joint_positions.tolist() == [1.0, 2.0]
+    message.header.frame_id = "world"
+    with pytest.raises(PlanningError, match="is in frame 'world'; goals are taken in 'map'"):
+        goal_of(message, "map")
+
+
+def test_a_goal_shape_is_taken_by_the_names_of_its_joints() -> None:
+    message = JointState(name=["c", "a", "b"], position=[3.0, 1.0, 2.0])
+    assert shape_of(message, ["a", "b", "c"]).tolist() == [1.0, 2.0, 3.0]
+    assert shape_of(message, ["b"]).tolist() == [2.0]
+    with pytest.raises(PlanningError, match="joint 'd' is missing"):
+        shape_of(message, ["a", "d"])
+    message.position[0] = math.inf
+    with pytest.raises(PlanningError, match="not finite"):
+        shape_of(message, ["a", "b", "c"])
+
+
+# -- the plant --------------------------------------------------------------------------------
+
+
+class FakeNode:
+    """Keeps what is published and logged."""
+
+    def __init__(self) -> None:
+        self.published: list[Any] = []
+        self.logged: list[str] = []
+
+    def create_publisher(self, *_: Any) -> Any:
+        return SimpleNamespace(publish=self.published.append)
+
+    def get_fully_qualified_name(self) -> str:
+        return "/a/plant"
+
+    def get_logger(self) -> Any:
+        def log(sentence: str, **_: Any) -> None:
+            self.logged.append(sentence)
+
+        return SimpleNamespace(warning=log, error=log, info=log)
+
+
+class Diagnosed:
+    """A plant of sliding masses at rest, and what its diagnostics say."""
+
+    def __init__(self, **parameters: Any) -> None:
+        self.node = FakeNode()
+        config = PlantConfig(robot="sliding_masses", time_mode="lockstep", **parameters)
+        robot = SpaceRobot.from_file(robot_file("sliding_masses"))
+        self.plant = build_plant(robot, config, None)
+        self.commands = CommandValidator(self.plant, config)
+        node: Any = self.node
+        self.report = PlantReport(node, self.plant, self.commands, None)
+
+    def status(self, part: str, time_ns: int = 0) -> tuple[bytes, str, dict[str, str]]:
+        """Publish, and return level, sentence and values of a part."""
+        self.report.publish(time_ns)
+        (found,) = (s for s in self.node.published[-1].status if s.name == f"/a/plant: {part}")
+        return found.level, found.message, {pair.key: pair.value for pair in found.values}
+
+
+OK, WARN, ERROR = b"\0", b"\1", b"\2"
+
+
+@pytest.fixture
+def diagnosed(monkeypatch: pytest.MonkeyPatch) -> Diagnosed:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    return Diagnosed()
+
+
+def test_margins_are_to_the_nearer_limit(diagnosed: Diagnosed) -> None:
+    robot = diagnosed.plant.robot
+    diagnosed.plant.q[:] = robot.lower + np.array([0.25, 1.0, 0.0])
+    diagnosed.plant.q[2] = robot.upper[2] - 0.125
+    level, _, values = diagnosed.status("strokes", 12_500_000_000)
+    assert level == OK
+    assert values == {"slider_1": "0.25", "slider_2": "1", "slider_3": "0.125"}
+    assert nanoseconds(diagnosed.node.published[-1].header.stamp) == 12_500_000_000
+
+
+def test_a_change_of_momentum_that_nothing_explains_is_an_error(diagnosed: Diagnosed) -> None:
+    plant = diagnosed.plant
+    plant.momentum[:] = [3.0, 4.0, 0.0, 0.0, 0.0, 0.0, 2.5]
+    plant.expected_momenta[:] = [3.0, 4.0, 0.0, 0.0, 0.0, 0.0]
+    level, sentence, values = diagnosed.status("momentum")
+    assert (level, sentence) == (OK, "momentum is accounted for")
+    assert values["kinetic_energy_J"] == "2.500000e+00"
+    plant.momentum[:6] += [3e-6, 0.0, -4e-6, 0.0, 2e-9, 0.0]
+    level, sentence, values = diagnosed.status("momentum")
+    assert (level, sentence) == (ERROR, "momentum changes that no thruster accounts for")
+    assert (values["linear_change"], values["angular_change"]) == ("5.000e-06", "2.000e-09")
+    # 1e-9 m/s of 16 kg only rounds; that holds for angular momentum too.
+    plant.momentum[:6] = plant.expected_momenta
+    plant.momentum[3] += 15e-9
+    assert diagnosed.status("momentum")[0] == OK
+    plant.momentum[3] += 2e-9
+    assert diagnosed.status("momentum")[0] == ERROR
+
+
+def test_limits_are_a_warning_once(diagnosed: Diagnosed) -> None:
+    what = next(iter(diagnosed.plant.limit_counts))
+    assert diagnosed.status("actuators")[:2] == (OK, "within limits")
+    diagnosed.plant.limit_counts[what][1] += 3
+    level, sentence, values = diagnosed.status("actuators")
+    assert (level, sentence) == (WARN, "limits of the URDF hold joints back")
+    assert values[f"{what}_limited.slider_2"] == "3"
+    assert values[f"{what}_limited.slider_1"] == "0"
+    assert diagnosed.status("actuators")[0] == OK
+    diagnosed.report.limited()
+    assert diagnosed.node.logged == [
+        f"Limits of the URDF held joints back so far: {what} of slider_2."
+    ]
+
+
+def test_what_thrusters_could_not_give_is_a_warning_once(diagnosed: Diagnosed) -> None:
+    thrusters: Any = SimpleNamespace(
+        missing="",
+        unmet_ticks=2,
+        unmet=np.array([3.0, 4.0, 0.0, 0.0, 0.0, -0.5]),
+        propellant=0.0123456789,
+        pulses=np.array([3, 0, 4]),
+        table=SimpleNamespace(names=["a", "b", "c"]),
+    )
+    status = diagnosed.report._thruster_status(thrusters)
+    values = {pair.key: pair.value for pair in status.values}
+    assert (status.level, status.message) == (WARN, "the wanted wrench is beyond them")
+    assert values == {
+        "propellant_kg": "0.0123456789",
+        "pulses": "7",
+        "unmet_ticks": "2",
+        "unmet_force_N": "5",
+        "unmet_torque_Nm": "0.5",
+        "pulses.a": "3",
+        "pulses.b": "0",
+        "pulses.c": "4",
+    }
+    again = diagnosed.report._thruster_status(thrusters)
+    assert (again.level, again.message) == (OK, "the wanted wrench is given")
+    thrusters.missing = "torque about z"
+    last = diagnosed.report._thruster_status(thrusters)
+    assert (last.level, last.message) == (WARN, "they cannot give torque about z")
+
+
+def test_faults_are_listed(diagnosed: Diagnosed) -> None:
+    assert diagnosed.status("faults") == (OK, "no fault is injected", {})
+    diagnosed.plant.inject("joint_stuck slider_2\njoint_stuck slider_1")
+    level, sentence, values = diagnosed.status("faults")
+    assert level == WARN
+    assert sentence == f"injected: {values['fault_1']}; {values['fault_2']}"
+    assert "slider_2" in values["fault_1"]
+
+
+def test_times_are_in_milliseconds() -> None:
+    timing = SimpleNamespace(
+        tick_rate=99.5,
+        ticks=1000,
+        ticks_late=3,
+        worst_tick=0.0125,
+        commands=999,
+        commands_late=2,
+        worst_command=0.0025,
+        command_age=0.04,
+        worse=True,
+    )
+    real_time: Any = SimpleNamespace(report=lambda: timing)
+    status = timing_status("a: timing", real_time)
+    assert (status.level, status.message) == (WARN, "deadlines were missed")
+    assert {pair.key: pair.value for pair in status.values} == {
+        "tick_rate_Hz": "99.5",
+        "ticks": "1000",
+        "ticks_late": "3",
+        "worst_tick_ms": "12.500",
+        "commands": "999",
+        "commands_late": "2",
+        "worst_command_ms": "2.500",
+        "command_age_s": "0.04",
+    }
+    timing.worse = False
+    assert timing_status("a: timing", real_time).level == OK
+
+
+URDF = """<robot name="r"><link name="base"><inertial><mass value="1"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+<visual><geometry><box size="1 1 1"/></geometry></visual></link>
+<link name="arm"><inertial><mass value="1"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+<visual><origin xyz="0.5 0 0" rpy="0 0 1.5707963267948966"/>
+<geometry><cylinder radius="0.1" length="2"/></geometry></visual></link>
+<joint name="j" type="revolute"><parent link="base"/><child link="arm"/>
+<origin xyz="0 0 2"/><axis xyz="0 0 1"/>
+<limit lower="-3" upper="3" velocity="1" effort="1"/></joint></robot>"""
+
+
+def test_shapes_are_drawn_where_they_are() -> None:
+    """Base at (1, 2, 3), turned by 90 deg about z; the joint turned by 90 deg more."""
+    from rclpy.serialization import deserialize_message
+    from visualization_msgs.msg import MarkerArray
+
+    c = math.sqrt(0.5)
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    pose = np.array([1.0, 2.0, 3.0, 0.0, 0.0, c, c])
+    np.testing.assert_allclose(matrix_from_quaternion(pose[3:]), quarter, atol=1e-15)
+    plant: Any = SimpleNamespace(
+        robot=SimpleNamespace(description=parse_robot(URDF)),
+        pose=pose,
+        link_R=np.hstack([np.eye(3), quarter]),
+        link_r=np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 2.0]]),
+    )
+    node: Any = FakeNode()
+    LinkMarkers(node, plant, "map").publish(7_250_000_000)
+    (raw,) = node.published
+    box, arm = deserialize_message(raw, MarkerArray).markers
+    assert (box.ns, arm.ns, box.id, arm.id) == ("base", "arm", 0, 1)
+    assert {m.header.frame_id for m in (box, arm)} == {"map"}
+    assert {nanoseconds(m.header.stamp) for m in (box, arm)} == {7_250_000_000}
+    assert numbers(box.pose) == pytest.approx(pose.tolist())
+    # The link is turned by 180 deg in all, its visual by 90 deg more and 0.5 along its own x.
+    found = numbers(arm.pose)
+    assert found[:3] == pytest.approx([0.5, 2.0, 5.0])
+    turn = Rotation.from_quat(found[3:]) * Rotation.from_euler("z", 90, degrees=True)
+    assert turn.magnitude() == pytest.approx(0.0, abs=1e-12)
