@@ -185,8 +185,13 @@ class PlannerNode(CommanderNode):
         if self._executive is not None:
             sentence = self._executive.abort()
             self._publish_outputs(self._executive)
-        self._waiting = None
+        waiting, self._waiting = self._waiting, None
         self._goal_file.delete()
+        if waiting is not None:
+            sentence = "Aborted on request, before the robot was known."
+            self._publish_status(
+                PlannerStatus(PlannerState.ABORTED, sentence, goal_id=waiting.goal_id)
+            )
         response.success = sentence is not None
         response.message = sentence or "There is no goal to abort."
         return response
