@@ -1,4 +1,4 @@
-"""Signals end what runs in order, and what was there before is there again."""
+"""Signals ask a flight to end, or end what asks for nothing; what was there before comes back."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from spacerobot_ros.session.run import stop_on_signals
+from spacerobot_ros.termination import Terminated, ended_on_request, guarded
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @pytest.fixture
@@ -16,23 +18,32 @@ def noted() -> Iterator[list[int]]:
     """Note signals that nothing else handles: they would end the tests."""
     found: list[int] = []
     before = {
-        number: signal.signal(number, lambda number, _: found.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
+        number: signal.signal(number, lambda number, _: found.append(number)) for number in SIGNALS
     }
     yield found
     for number, handler in before.items():
         signal.signal(number, handler)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_flight_is_stopped_by_either_signal(noted: list[int], number: signal.Signals) -> None:
-    with stop_on_signals() as stopped:
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_flight_is_asked_to_end_by_each_signal(noted: list[int], number: signal.Signals) -> None:
+    asked: list[str] = []
+    with ended_on_request(lambda: asked.append("main")) as stopped:
         assert not stopped()
         os.kill(os.getpid(), number)
         assert stopped()
+        assert asked == ["main"]
     assert noted == []
     # What was there before is there again.
     os.kill(os.getpid(), number)
     assert noted == [number]
-    with stop_on_signals() as stopped:
+    with ended_on_request() as stopped:
         assert not stopped(), "a signal of an earlier flight"
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_what_asks_for_nothing_is_ended(noted: list[int], number: signal.Signals) -> None:
+    with pytest.raises(Terminated) as end, guarded():
+        os.kill(os.getpid(), number)
+    assert end.value.exit_code == 128 + number
+    assert noted == []
