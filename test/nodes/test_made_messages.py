@@ -305,7 +305,7 @@ URDF = """<robot name="r"><link name="base"><inertial><mass value="1"/>
 <visual><geometry><box size="1 1 1"/></geometry></visual></link>
 <link name="arm"><inertial><mass value="1"/>
 <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
-<visual><origin xyz="0.5 0 0" rpy="0 0 1.5707963267948966"/>
+<visual><origin xyz="0.5 0 0" rpy="1.5707963267948966 0 0"/>
 <geometry><cylinder radius="0.1" length="2"/></geometry></visual></link>
 <joint name="j" type="revolute"><parent link="base"/><child link="arm"/>
 <origin xyz="0 0 2"/><axis xyz="0 0 1"/>
@@ -335,8 +335,9 @@ def test_shapes_are_drawn_where_they_are() -> None:
     assert {m.header.frame_id for m in (box, arm)} == {"map"}
     assert {nanoseconds(m.header.stamp) for m in (box, arm)} == {7_250_000_000}
     assert numbers(box.pose) == pytest.approx(pose.tolist())
-    # The link is turned by 180 deg in all, its visual by 90 deg more and 0.5 along its own x.
+    # The link is turned by 180 deg about z in all; its visual by 90 deg about the x of the link.
     found = numbers(arm.pose)
     assert found[:3] == pytest.approx([0.5, 2.0, 5.0])
-    turn = Rotation.from_quat(found[3:]) * Rotation.from_euler("z", 90, degrees=True)
-    assert turn.magnitude() == pytest.approx(0.0, abs=1e-12)
+    turn = Rotation.from_euler("z", 180, degrees=True) * Rotation.from_euler("x", 90, degrees=True)
+    left = Rotation.from_quat(found[3:]).inv() * turn
+    assert left.magnitude() == pytest.approx(0.0, abs=1e-12)

@@ -1,0 +1,265 @@
+"""Flights written by hand, command by command, and what their verification makes of them.
+
+Sliders go as they are commanded: where they are is added up in the test. The base follows from a
+plant that is stepped here, without what re-simulates a bag.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from support.made_bags import array, made_bag, odometry, stamped
+
+from spacerobot_ros.errors import RecordingError, SpaceRobotError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.parameters import values_of
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.verification import comparison
+from spacerobot_ros.verification.comparison import Verification, verify_bag
+
+NAMES = ["slider_1", "slider_2", "slider_3"]
+TICK = 0.1
+RATES = np.array([0.1, -0.05, 0.02])
+REST = np.zeros(3)
+
+
+@pytest.fixture(autouse=True)
+def _interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+
+
+def config_of(**more: Any) -> PlantConfig:
+    return PlantConfig(robot="sliding_masses", time_mode="lockstep", tick_rate=1 / TICK, **more)
+
+
+class Made:
+    """A bag of ten ticks.
+
+    ``moved`` are the rates of the sliders in each tick, ``commands`` what was commanded (by default
+    the same): of a tick, or of a time in ticks. ``injected`` are faults by time in ticks.
+    """
+
+    def __init__(
+        self,
+        moved: Sequence[Any],
+        commands: Mapping[Any, Any] | None = None,
+        injected: Sequence[tuple[float, str]] = (),
+        config: PlantConfig | None = None,
+        prefix: str = "",
+        without_pose: Sequence[int] = (),
+        first: int = 0,
+        error: float = 0.0,
+    ) -> None:
+        self.config = config or config_of()
+        self.prefix, self.first, self.error = prefix, first, error
+        self.moved = [np.array(rates, dtype=float) for rates in moved]
+        self.commands = dict(enumerate(self.moved)) if commands is None else dict(commands)
+        self.injected, self.without_pose = injected, without_pose
+
+    def write(self, path: Path) -> Path:
+        with made_bag(path) as (bag, say):
+            self.add(bag, say)
+        return path
+
+    def add(self, bag: Any, say: Any) -> None:
+        robot = SpaceRobot.from_file(robot_file("sliding_masses"))
+        texts = {name: json.dumps(value) for name, value in values_of(self.config).items()}
+        bag.add_metadata(f"parameters{self.prefix}/plant", texts)
+        name = f"{self.prefix}/robot_description".strip("/").replace("/", ".")
+        bag.add_attachment(f"{name}.urdf", robot.description.urdf.encode(), "application/xml", 0)
+        plant = build_plant(robot, self.config, None)
+        shape = plant.q.copy()
+        for tick in range(len(self.moved) + 1):
+            self._say_state(say, tick, plant, shape)
+            if tick == len(self.moved):
+                break
+            plant.step(self.moved[tick].copy())
+            shape = shape + TICK * self.moved[tick]
+            np.testing.assert_allclose(plant.q, shape, atol=1e-12)
+        for time, text in self.injected:
+            say(f"{self.prefix}/fault_injection", String(data=text), time * TICK)
+        for time, rates in self.commands.items():
+            message = JointState(name=NAMES, velocity=[float(x) for x in rates])
+            say(f"{self.prefix}/joint_commands", stamped(message, time * TICK), time * TICK)
+
+    def _say_state(self, say: Any, tick: int, plant: Any, shape: Any) -> None:
+        if tick < self.first:
+            return
+        time = tick * TICK
+        if tick not in self.without_pose:
+            say(f"{self.prefix}/odom", odometry(time, *plant.pose, *plant.twist), time)
+        say(f"{self.prefix}/momentum", array(*plant.momentum), time)
+        joints = JointState(name=NAMES, position=(shape + self.error).tolist(), effort=[0.0] * 3)
+        joints.velocity = plant.qdot.tolist()
+        say(f"{self.prefix}/joint_states", stamped(joints, time, "base_link"), time)
+
+
+def verified(path: Path, *args: Any, **options: Any) -> Verification:
+    return verify_bag(Made(*args, **options).write(path / "a.mcap"))
+
+
+def held(stuck: int, since: int, count: int = 10) -> list[Any]:
+    """Return rates of which one slider's is zero from a tick on."""
+    return [RATES * [float(i != stuck or k < since) for i in range(3)] for k in range(count)]
+
+
+ALL = dict.fromkeys(range(10), RATES)
+
+
+def test_a_flight_without_faults(tmp_path: Path) -> None:
+    result = verified(tmp_path, [RATES] * 10)
+    assert result.difference is None, str(result.difference)
+    assert (result.ticks, result.duration, result.messages) == (10, 1.0, 33)
+
+
+@pytest.mark.parametrize("time", [3.0, 3.4, 3.99])
+def test_a_fault_acts_in_the_tick_that_it_came_in(tmp_path: Path, time: float) -> None:
+    fault = [(time, "joint_stuck slider_2")]
+    right = verified(tmp_path, held(1, 3), ALL, fault)
+    assert right.difference is None, str(right.difference)
+    late = Made(held(1, 4), ALL, fault).write(tmp_path / "late.mcap")
+    difference = verify_bag(late).difference
+    assert difference is not None
+    assert difference.time == pytest.approx(4 * TICK)
+
+
+def test_all_faults_of_a_tick_act(tmp_path: Path) -> None:
+    moved = [RATES if k < 3 else RATES * [0.0, 0.0, 1.0] for k in range(10)]
+    faults = [(3.0, "joint_stuck slider_1"), (3.0, "joint_stuck slider_2")]
+    assert verified(tmp_path, moved, ALL, faults).difference is None
+    repaired = [RATES if k < 3 or k >= 6 else RATES * [0.0, 0.0, 1.0] for k in range(10)]
+    faults += [(6.0, "clear"), (8.0, "nonsense")]
+    made = Made(repaired, ALL, faults).write(tmp_path / "b.mcap")
+    assert verify_bag(made).difference is None
+
+
+def test_a_command_between_ticks_is_stale(tmp_path: Path) -> None:
+    moved = [RATES if k != 3 else REST for k in range(10)]
+    commands = {k if k != 3 else 3.4: RATES for k in range(10)}
+    assert verified(tmp_path, moved, commands).difference is None
+
+
+def test_a_tick_without_a_command_rests_and_the_difference_says_so(tmp_path: Path) -> None:
+    commands = {k: RATES for k in range(10) if k != 3}
+    moved = [RATES if k != 3 else REST for k in range(10)]
+    assert verified(tmp_path, moved, commands).difference is None
+    made = Made([RATES] * 10, commands).write(tmp_path / "b.mcap")
+    difference = verify_bag(made).difference
+    assert difference is not None
+    assert difference.time == pytest.approx(4 * TICK)
+    assert difference.remark == " (no message on /joint_commands is stamped 0.3 s)"
+
+
+def test_to_a_lost_pose_nobody_need_answer(tmp_path: Path) -> None:
+    """The last command is held while poses are lost; without, the joints would rest."""
+    commands = {k: RATES for k in range(10) if k not in (4, 5)}
+    lost = [(3.0, "sensor_dropout odom until 0.55")]
+    result = verified(tmp_path, [RATES] * 10, commands, lost, without_pose=(4, 5))
+    assert result.difference is None, str(result.difference)
+
+
+def test_what_follows_a_latched_fault_is_said_to(tmp_path: Path) -> None:
+    config = config_of(beyond_limits="refuse", latched_faults="beyond_limits")
+    fast = np.array([50.0, 0.0, 0.0])
+    commands = {k: RATES if k != 4 else fast for k in range(10)}
+    moved = [RATES if k < 4 else REST for k in range(10)]
+    assert verified(tmp_path, moved, commands, config=config).difference is None
+    # As if somebody had rearmed it at once.
+    moved = [RATES if k != 4 else REST for k in range(10)]
+    made = Made(moved, commands, config=config).write(tmp_path / "b.mcap")
+    difference = verify_bag(made).difference
+    assert difference is not None
+    assert difference.time == pytest.approx(6 * TICK)
+    assert difference.remark == " (a fault latched at 0.4 s; rearming is not in a bag)"
+    # In the tick after it latched that is why it rests.
+    moved = [RATES] * 10
+    made = Made(moved, commands, config=config).write(tmp_path / "c.mcap")
+    difference = verify_bag(made).difference
+    assert difference is not None
+    assert difference.time == pytest.approx(5 * TICK)
+    assert difference.remark == " (a fault latched at 0.4 s; rearming is not in a bag)"
+
+
+def test_the_refusal_of_a_command_is_named(tmp_path: Path) -> None:
+    commands = {k: RATES if k != 4 else [np.nan, 0.0, 0.0] for k in range(10)}
+    difference = verified(tmp_path, [RATES] * 10, commands).difference
+    assert difference is not None
+    assert difference.time == pytest.approx(5 * TICK)
+    assert "that on /joint_commands stamped 0.4 s is refused:" in difference.remark
+
+
+def test_states_after_the_end_of_its_plant_are_differences(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = Made([REST] * 10).write(tmp_path / "a.mcap")
+    assert verify_bag(bag).difference is None
+
+    def failing(*args: Any) -> Any:
+        plant = build_plant(*args)
+        step = plant.step
+
+        def stop(*commands: Any) -> Any:
+            if plant.tick == 5:
+                raise SpaceRobotError("It came apart.")
+            return step(*commands)
+
+        monkeypatch.setattr(plant, "step", stop)
+        return plant
+
+    monkeypatch.setattr(comparison, "build_plant", failing)
+    result = verify_bag(bag)
+    assert result.ticks == 5
+    assert result.difference is not None
+    assert result.difference.time == pytest.approx(6 * TICK)
+    assert result.difference.remark == " (its plant had stopped: It came apart)"
+
+
+def test_the_robot_of_one_plant_is_verified(tmp_path: Path) -> None:
+    with made_bag(tmp_path / "two.mcap") as (bag, say):
+        for prefix in ("/a", "/b"):
+            Made([RATES] * 4, prefix=prefix).add(bag, say)
+    with pytest.raises(RecordingError, match=r"holds the states of 2 plants \(/a, /b\)"):
+        verify_bag(tmp_path / "two.mcap")
+    alone = Made([RATES] * 4, prefix="/a").write(tmp_path / "one.mcap")
+    assert verify_bag(alone).difference is None
+
+
+def test_the_earliest_difference_is_named_wherever_it_is_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    made = Made([RATES] * 10)
+    with made_bag(path) as (bag, say):
+
+        def altered(topic: str, message: Any, time: float) -> None:
+            tick = round(time / TICK)
+            if topic == "/joint_states" and tick in (4, 6):
+                message.position[0 if tick == 4 else 1] += 1e-3
+                message.velocity[2] += 1e-3
+                # Recorded out of order.
+                time = 1.0 - time
+            say(topic, message, time)
+
+        made.add(bag, altered)
+    result = verify_bag(path)
+    assert result.difference is not None
+    assert result.difference.time == pytest.approx(4 * TICK)
+    assert result.difference.field == "position of slider_1"
+    # What is found different is not the largest deviation before it.
+    assert result.largest < 1e-12
+
+
+def test_a_flight_that_begins_at_a_limit_but_for_rounding(tmp_path: Path) -> None:
+    lower = SpaceRobot.from_file(robot_file("sliding_masses")).lower
+    config = config_of(initial_joint_positions=(float(lower[0]) + 0.04, 0.0, 0.0))
+    moved = [[-0.1, 0.0, 0.0]] * 4 + [[0.0, 0.0, 0.0]] * 6
+    result = verified(tmp_path, moved, config=config, first=5, error=-1e-10)
+    assert result.difference is None, str(result.difference)
+    assert result.ticks == 5
