@@ -1,11 +1,23 @@
 """The exceptions of this package: every one carries a sentence that a user can act on."""
 
 
+_LONGEST_SENTENCE = 2000
+
+
 class SpaceRobotError(Exception):
-    """Base of every error this package raises on purpose; line breaks in what it quotes go."""
+    """Base of every error this package raises on purpose, with one sentence for the user.
+
+    Line breaks, control characters and endless lists in what it quotes go.
+    """
 
     def __init__(self, sentence: str = "") -> None:
-        super().__init__(" ".join(str(sentence).splitlines()))
+        line = " ".join(str(sentence).splitlines())
+        if len(line) > _LONGEST_SENTENCE:
+            half = _LONGEST_SENTENCE // 2
+            line = f"{line[:half]} ... {line[-half:]}"
+        if not line.isprintable():
+            line = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
+        super().__init__(line)
 
 
 class RobotDescriptionError(SpaceRobotError):

@@ -1,88 +1,66 @@
-"""Reads messages out of an MCAP file, and says in one sentence what is wrong with it."""
+"""Reads summary and messages out of an MCAP file that is open."""
 
 from __future__ import annotations
 
 import os
 import struct
-import zlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-import lz4.frame
 import numpy as np
-import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import Chunk, ChunkIndex, DataEnd, Message
-from mcap.stream_reader import StreamReader
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    Footer,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
 
+from spacerobot_ros.bag.mcap_records import (
+    RECORD_HEADER,
+    Allowance,
+    chunk_size,
+    file_size,
+    open_bag,
+    parsed,
+    record_at,
+    records,
+    records_in,
+    unpacked,
+)
 from spacerobot_ros.errors import RecordingError
 
-# Each takes the compressed data and how large they were.
-_DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {
-    "zstd": zstandard.decompress,
-    "lz4": lambda data, _: bytes(lz4.frame.decompress(data)),
-    "": lambda data, _: data,
-}
-_RECORD_HEADER = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")
 """Opcode, length of the rest, channel, sequence, log time, publish time."""
 
-_MESSAGE_INDEX_HEADER = struct.Struct("<BQHI")
+_MESSAGE_BODY = struct.Struct("<HIQQ")
+_MESSAGE_INDEX = struct.Struct("<HI")
+_FOOTER_SIZE = RECORD_HEADER.size + struct.calcsize("<QQI")
+_END_OF_TIME = 2**63 - 1
+
+_SUMMARY: dict[int, Callable[[ReadDataStream], Any]] = {
+    Opcode.STATISTICS: Statistics.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
+    Opcode.CHUNK_INDEX: ChunkIndex.read,
+    Opcode.METADATA_INDEX: MetadataIndex.read,
+}
+"""What a summary is read for; it also has its offsets, which save no time."""
 
 RawMessage = tuple[int, int, int, bytes]
 """Channel, log time and publish time in nanoseconds, serialised message."""
 
 
-@contextmanager
-def open_bag(path: Path) -> Iterator[BinaryIO]:
-    """Open a bag that is complete, and turn what is found wrong with it into one sentence.
-
-    Raises
-    ------
-    RecordingError
-        There is no such file, it cannot be read, is not MCAP, was cut short, or a record turns out
-        damaged while the context lasts.
-    """
-    try:
-        with path.open("rb") as file:
-            _require_both_ends(path, file)
-            yield file
-    except FileNotFoundError as error:
-        raise RecordingError(f"There is no bag at {path}.") from error
-    except OSError as error:
-        raise RecordingError(f"Cannot read the bag {path}: {error.strerror or error}.") from error
-    except MemoryError as error:
-        raise RecordingError(
-            f"The bag {path} is damaged: a record claims to be larger than the memory."
-        ) from error
-    # The decompressors and the MCAP library have no error in common.
-    except (McapError, ValueError, RuntimeError, struct.error, zstandard.ZstdError) as error:
-        reason = str(error) or type(error).__name__
-        raise RecordingError(f"The bag {path} is damaged: {reason}.") from error
-
-
-def _require_both_ends(path: Path, file: BinaryIO) -> None:
-    size = len(MCAP0_MAGIC)
-    start = file.read(size)
-    if not start:
-        raise RecordingError(f"The bag {path} is empty: its writer was stopped before it began.")
-    if start != MCAP0_MAGIC[: len(start)]:
-        raise RecordingError(f"{path} is not an MCAP file.")
-    length = file.seek(0, os.SEEK_END)
-    file.seek(max(length - size, 0))
-    if length < 2 * size or file.read(size) != MCAP0_MAGIC:
-        raise RecordingError(
-            f"The bag {path} was cut short, its writer having been killed or its disk full: "
-            f"'spacerobot salvage {path}' makes a complete bag of what is in it."
-        )
-    file.seek(0)
+# -- summary ----------------------------------------------------------------------------------
 
 
 def read_summary(path: Path, file: BinaryIO) -> Summary:
@@ -92,64 +70,108 @@ def read_summary(path: Path, file: BinaryIO) -> Summary:
     ------
     RecordingError
         There is none.
+    ValueError
+        It is damaged, or contradicts the file.
     """
-    summary = SeekingReader(file).get_summary()
-    if summary is None or summary.statistics is None:
+    end = file_size(file) - len(MCAP0_MAGIC) - _FOOTER_SIZE
+    footer = parsed(Footer.read, record_at(file, max(end, 0), Opcode.FOOTER), max(end, 0))
+    if footer.summary_start > end:
+        raise ValueError(f"its summary begins at byte {footer.summary_start}, behind its end")
+    summary = Summary()
+    found = records(file, footer.summary_start, end) if footer.summary_start else ()
+    for place, opcode, body in found:
+        if opcode not in _SUMMARY:
+            continue
+        match parsed(_SUMMARY[opcode], body, place):
+            case Statistics() as statistics:
+                summary.statistics = statistics
+            case Schema() as schema:
+                summary.schemas[schema.id] = schema
+            case Channel() as channel:
+                summary.channels[channel.id] = channel
+            case AttachmentIndex() as attachment:
+                summary.attachment_indexes.append(attachment)
+            case ChunkIndex() as chunk:
+                summary.chunk_indexes.append(chunk)
+            case MetadataIndex() as metadata:
+                summary.metadata_indexes.append(metadata)
+    if summary.statistics is None:
         raise RecordingError(
             f"The bag {path} has no summary: 'spacerobot salvage {path}' makes one."
         )
+    _check_chunks(summary, end)
     return summary
 
 
-def messages_in_file_order(file: BinaryIO) -> Iterator[RawMessage]:
-    """Go through all messages of a bag, open at its start, in the order they were written.
+def _check_chunks(summary: Summary, end: int) -> None:
+    """Refuse indexes by which more would be read than there is.
 
     Raises
     ------
     ValueError
-        A chunk is damaged.
+        Two chunks overlap, or all together are too large.
     """
-    for record in StreamReader(file, emit_chunks=True).records:
-        if isinstance(record, Chunk):
-            yield from _messages_in_chunk(decompress(record))
-        elif isinstance(record, Message):
-            yield record.channel_id, record.log_time, record.publish_time, record.data
-        elif isinstance(record, DataEnd):
+    allowance = Allowance(end)
+    free = 0
+    for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+        place = index.chunk_start_offset
+        if place < free:
+            raise ValueError(f"the chunks that its index has at byte {place} overlap")
+        free = place + index.chunk_length
+        allowance.take(index.uncompressed_size, place)
+
+
+def indexed_bodies(
+    file: BinaryIO, indexes: Sequence[AttachmentIndex | MetadataIndex], wanted: Opcode
+) -> Iterator[tuple[int, bytes]]:
+    """Go through the records that an index of a summary names, each once: its place and body.
+
+    Raises
+    ------
+    ValueError
+        One is not there.
+    """
+    for place in dict.fromkeys(index.offset for index in indexes):
+        yield place, record_at(file, place, wanted)
+
+
+# -- messages ---------------------------------------------------------------------------------
+
+
+def messages_in_file_order(file: BinaryIO) -> Iterator[RawMessage]:
+    """Go through all messages of a bag in the order they were written.
+
+    Raises
+    ------
+    ValueError
+        A record is damaged.
+    """
+    size = file_size(file)
+    allowance = Allowance(size)
+    for place, opcode, body in records(file, len(MCAP0_MAGIC), size):
+        if opcode == Opcode.CHUNK:
+            allowance.take(chunk_size(body), place)
+            yield from _messages_in_chunk(unpacked(body, place), place)
+        elif opcode == Opcode.MESSAGE:
+            channel, _, log_ns, publish_ns = _MESSAGE_BODY.unpack_from(body)
+            yield channel, log_ns, publish_ns, body[_MESSAGE_BODY.size :]
+        elif opcode == Opcode.DATA_END:
             return
 
 
-def decompress(chunk: Chunk) -> bytes:
-    """Return the records of a chunk.
-
-    Raises
-    ------
-    ValueError
-        Its checksum or its compression is wrong.
-    """
-    if chunk.compression not in _DECOMPRESSORS:
-        raise ValueError(f"the compression {chunk.compression!r} is unknown")
-    data = _DECOMPRESSORS[chunk.compression](chunk.data, chunk.uncompressed_size)
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise ValueError("the checksum of a chunk is wrong")
-    return data
-
-
-def _messages_in_chunk(data: bytes) -> Iterator[RawMessage]:
-    position = 0
-    while position < len(data):
-        opcode, length = _RECORD_HEADER.unpack_from(data, position)
-        end = position + _RECORD_HEADER.size + length
+def _messages_in_chunk(data: bytes, place: int) -> Iterator[RawMessage]:
+    for opcode, position, end in records_in(data, place):
         if opcode == Opcode.MESSAGE:
             _, _, channel, _, log_ns, publish_ns = _MESSAGE.unpack_from(data, position)
             yield channel, log_ns, publish_ns, data[position + _MESSAGE.size : end]
-        position = end
 
 
 def messages_in_time_order(
     path: str | os.PathLike[str],
     channel_ids: set[int],
     start_ns: int = 0,
-    end_ns: int = 2**63 - 1,
+    end_ns: int = _END_OF_TIME,
+    summary: Summary | None = None,
 ) -> Iterator[RawMessage]:
     """Go through messages of a bag by log time, those of one time in the order they were written.
 
@@ -165,18 +187,21 @@ def messages_in_time_order(
         Earliest log time wanted, in nanoseconds.
     end_ns
         Latest log time wanted, in nanoseconds.
+    summary
+        Of the bag, where that was read before.
 
     Raises
     ------
     RecordingError
         There is no such bag, it is not MCAP, was cut short or is damaged.
     """
+    # The largest time that the columns of this package hold: the year 2262.
+    start_ns, end_ns = min(start_ns, _END_OF_TIME), min(end_ns, _END_OF_TIME)
     with open_bag(Path(path)) as file:
-        summary = read_summary(Path(path), file)
+        summary = summary or read_summary(Path(path), file)
         indexes = summary.chunk_indexes
         if not indexes or not all(index.message_index_offsets for index in indexes):
             # Written without chunks or without message indexes.
-            file.seek(0)
             wanted = [
                 message
                 for message in messages_in_file_order(file)
@@ -223,20 +248,70 @@ def _messages_of(
 ) -> Iterator[RawMessage]:
     chunks, entries = [], []
     for number, index in enumerate(sorted(cluster, key=lambda i: i.chunk_start_offset)):
-        file.seek(index.chunk_start_offset + _RECORD_HEADER.size)
-        chunks.append(decompress(Chunk.read(ReadDataStream(file))))
-        for channel, offset in index.message_index_offsets.items():
-            if channel in channel_ids:
-                file.seek(offset)
-                size = _MESSAGE_INDEX_HEADER.unpack(file.read(_MESSAGE_INDEX_HEADER.size))[3]
-                pairs = np.frombuffer(file.read(size), "<u8").reshape(-1, 2)
-                entries.append(np.column_stack([pairs, np.full(len(pairs), number, np.uint64)]))
+        chunk, pairs = _chunk_and_entries(file, index, channel_ids)
+        chunks.append(chunk)
+        entries.append(np.column_stack([pairs, np.full(len(pairs), number, np.uint64)]))
     table = np.concatenate(entries)
     table = table[(table[:, 0] >= start_ns) & (table[:, 0] <= end_ns)]
     order = np.lexsort((table[:, 1], table[:, 2], table[:, 0]))
     for _, position, number in table[order].tolist():
         chunk = chunks[number]
         _, length, channel, _, log_ns, publish_ns = _MESSAGE.unpack_from(chunk, position)
-        end = position + _RECORD_HEADER.size + length
+        end = position + RECORD_HEADER.size + length
         data = chunk[position + _MESSAGE.size : end]
         yield channel, log_ns, publish_ns, data
+
+
+def _chunk_and_entries(
+    file: BinaryIO, index: ChunkIndex, channel_ids: set[int]
+) -> tuple[bytes, NDArray[np.uint64]]:
+    """Return the records of a chunk; log time and place in it of each message wanted (N, 2).
+
+    Raises
+    ------
+    ValueError
+        The chunk is damaged, or its indexes name what are no messages, or some twice.
+    """
+    place = index.chunk_start_offset
+    body = record_at(file, place, Opcode.CHUNK)
+    if chunk_size(body) != index.uncompressed_size:
+        raise ValueError(f"the chunk at byte {place} and its index claim different sizes")
+    chunk = unpacked(body, place)
+    entries = [np.empty((0, 2), np.uint64)]
+    for channel, offset in index.message_index_offsets.items():
+        if channel not in channel_ids:
+            continue
+        listed = record_at(file, offset, Opcode.MESSAGE_INDEX)
+        named, size = _MESSAGE_INDEX.unpack_from(listed)
+        if named != channel or size % 16 or _MESSAGE_INDEX.size + size > len(listed):
+            raise ValueError(f"the message index at byte {offset} is damaged")
+        pairs = np.frombuffer(listed, "<u8", size // 8, _MESSAGE_INDEX.size)
+        entries.append(pairs.reshape(-1, 2))
+    pairs = np.concatenate(entries)
+    _check_entries(chunk, pairs[:, 1], place)
+    return chunk, pairs
+
+
+def _check_entries(chunk: bytes, positions: NDArray[np.uint64], place: int) -> None:
+    """Refuse positions in a chunk (N,) that are not those of messages, each once.
+
+    Raises
+    ------
+    ValueError
+        They are not.
+    """
+    if not len(positions):
+        return
+    wrong = f"the message indexes of the chunk at byte {place} do not fit it"
+    if int(positions.max()) > len(chunk) - _MESSAGE.size:
+        raise ValueError(wrong)
+    starts = positions.astype(np.int64)
+    content = np.frombuffer(chunk, np.uint8)
+    lengths = content[starts[:, np.newaxis] + np.arange(1, 9)].copy().view("<u8")[:, 0]
+    if (content[starts] != Opcode.MESSAGE).any() or int(lengths.max()) > len(chunk):
+        raise ValueError(wrong)
+    ends = starts + RECORD_HEADER.size + lengths.astype(np.int64)
+    order = np.argsort(starts)
+    apart = bool((starts[order][1:] >= ends[order][:-1]).all())
+    if not apart or int(ends.max()) > len(chunk) or (ends - starts < _MESSAGE.size).any():
+        raise ValueError(wrong)

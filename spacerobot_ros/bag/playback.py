@@ -6,13 +6,14 @@ import math
 from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from spacerobot_ros.bag.mcap_reading import messages_in_time_order
 from spacerobot_ros.bag.reader import Bag
 from spacerobot_ros.bag.rosbag2 import QosProfile
 from spacerobot_ros.errors import ParameterError, RecordingError
 
 _SECOND = 10**9
 _END_OF_TIME = 2**63 - 1
+_MOST_TOPICS = 1000
+"""Each takes a publisher, which takes memory and discovery."""
 
 
 @dataclass(frozen=True)
@@ -177,10 +178,16 @@ class Playback:
     ) -> None:
         if not bag.message_count():
             raise RecordingError(f"The bag {bag.path} has no messages to replay.")
+        if len(topics or bag.topics) > _MOST_TOPICS:
+            raise RecordingError(
+                f"The bag {bag.path} has {len(bag.topics)} topics, and {_MOST_TOPICS} can be "
+                "replayed at once: name those that are wanted."
+            )
         self._bag = bag
         self._loop = loop
-        self._start_ns = bag.start_time_ns + round(start * _SECOND)
-        self._end_ns = self._start_ns + round(duration * _SECOND) if duration else _END_OF_TIME
+        self._start_ns = min(bag.start_time_ns + round(start * _SECOND), _END_OF_TIME)
+        end_ns = self._start_ns + round(duration * _SECOND) if duration else _END_OF_TIME
+        self._end_ns = min(end_ns, _END_OF_TIME)
         self.topics = [_topic(bag, name) for name in topics or bag.topics]
         self._names = {
             number: topic.name for topic in self.topics for number in bag.channel_ids(topic.name)
@@ -281,7 +288,7 @@ class Playback:
     def _between(
         self, channel_ids: set[int], start_ns: int, end_ns: int
     ) -> Iterator[ReplayMessage]:
-        found = messages_in_time_order(self._bag.path, channel_ids, start_ns, end_ns)
+        found = self._bag.raw_messages(channel_ids, start_ns, end_ns)
         for channel_id, log_time_ns, _, data in found:
             yield ReplayMessage(self._names[channel_id], log_time_ns, data)
 

@@ -9,20 +9,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.reader import SeekingReader
-from mcap.records import Channel
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
+from spacerobot_ros.bag.definitions import MessageTypes
 from spacerobot_ros.bag.mcap_reading import (
+    RawMessage,
+    indexed_bodies,
     messages_in_file_order,
     messages_in_time_order,
-    open_bag,
     read_summary,
 )
+from spacerobot_ros.bag.mcap_records import file_size, open_bag, parsed
 from spacerobot_ros.bag.rosbag2 import QosProfile
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.errors import RecordingError
+
+_DECODABLE, _DECODABLE_TIMES = 16_000_000, 50
+"""Bytes of a topic that may become objects, which take ten times as much: so many, or so many times
+the size of the file."""
 
 
 def read_bag(path: str | os.PathLike[str]) -> Bag:
@@ -57,7 +63,6 @@ def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, i
             channel.id: (channel.topic, _type_name(summary.schemas, channel))
             for channel in summary.channels.values()
         }
-        file.seek(0)
         for channel_id, log_time_ns, publish_time_ns, data in messages_in_file_order(file):
             if channel_id not in names:
                 raise ValueError(f"its summary lacks channel {channel_id}")
@@ -76,8 +81,16 @@ class Bag:
         self.path = path
         with open_bag(path) as file:
             self._summary = read_summary(path, file)
-        self._typestore = get_typestore(Stores.EMPTY)
+            self._decodable = max(_DECODABLE, _DECODABLE_TIMES * file_size(file))
+        self._types = MessageTypes()
         self._series: dict[str, TopicSeries] = {}
+
+    @cached_property
+    def _channels_by_topic(self) -> dict[str, list[Channel]]:
+        found: dict[str, list[Channel]] = {}
+        for channel in self._summary.channels.values():
+            found.setdefault(channel.topic, []).append(channel)
+        return found
 
     @cached_property
     def topics(self) -> dict[str, str]:
@@ -89,13 +102,17 @@ class Bag:
     def metadata(self) -> dict[str, dict[str, str]]:
         """Keys and values of every metadata record by its name; the last of several of one name."""
         with open_bag(self.path) as file:
-            return {m.name: m.metadata for m in SeekingReader(file).iter_metadata()}
+            found = indexed_bodies(file, self._summary.metadata_indexes, Opcode.METADATA)
+            read = (parsed(Metadata.read, body, place) for place, body in found)
+            return {metadata.name: metadata.metadata for metadata in read}
 
     @cached_property
     def attachments(self) -> dict[str, bytes]:
         """Content of every attachment by its name; the last of several of one name."""
         with open_bag(self.path) as file:
-            return {a.name: a.data for a in SeekingReader(file).iter_attachments()}
+            found = indexed_bodies(file, self._summary.attachment_indexes, Opcode.ATTACHMENT)
+            read = (parsed(Attachment.read, body, place) for place, body in found)
+            return {attachment.name: attachment.data for attachment in read}
 
     @property
     def start_time(self) -> float:
@@ -140,6 +157,22 @@ class Bag:
         """
         return {channel.id for channel in self._channels(topic)}
 
+    def raw_messages(
+        self, channel_ids: set[int], start_ns: int = 0, end_ns: int = 2**63 - 1
+    ) -> Iterator[RawMessage]:
+        """Go through the messages of some channels, still serialised, by log time.
+
+        Yields
+        ------
+        Channel, log time and publish time in nanoseconds, serialised message.
+
+        Raises
+        ------
+        RecordingError
+            The bag is damaged.
+        """
+        return messages_in_time_order(self.path, channel_ids, start_ns, end_ns, self._summary)
+
     def qos(self, topic: str) -> list[QosProfile]:
         """Return what the publishers of a topic offered, as far as the bag says it.
 
@@ -181,7 +214,7 @@ class Bag:
             decode = self._decoder(channels[0])
             times, data = self._read(self.channel_ids(topic))
             self._series[topic] = TopicSeries(
-                topic, self.topics[topic], times, data, self._typestore.fielddefs, decode
+                topic, self.topics[topic], times, data, self._types.fields, decode, self._decodable
             )
         return self._series[topic]
 
@@ -190,10 +223,10 @@ class Bag:
         return self._summary.statistics
 
     def _channels(self, topic: str) -> list[Channel]:
-        channels = [c for c in self._summary.channels.values() if c.topic == topic]
+        channels = self._channels_by_topic.get(topic, [])
         if not channels:
             raise RecordingError(
-                f"The bag {self.path} has no topic {topic}: it has {', '.join(self.topics)}."
+                f"The bag {self.path} has no topic {topic}: it has {_listed(list(self.topics))}."
             )
         if len({channel.schema_id for channel in channels}) > 1:
             raise RecordingError(f"The topic {topic} of the bag {self.path} has several types.")
@@ -208,27 +241,17 @@ class Bag:
                 "('cdr' defined by 'ros2msg')."
             )
         try:
-            self._typestore.register(get_types_from_msg(schema.data.decode(), type_name))
-        except (TypesysError, UnicodeDecodeError) as error:
+            return self._types.decoder(type_name, schema.data)
+        except ValueError as error:
             raise RecordingError(
                 f"The definition of {type_name} in the bag {self.path} cannot be read: {error}."
             ) from error
-        definition = self._typestore.get_msgdef(type_name)
-        little, big = definition.deserialize_cdr_le, definition.deserialize_cdr_be
-
-        def decode(data: bytes) -> Any:
-            # Not `Typestore.deserialize_cdr`: that one refuses what rclpy serialises with an empty
-            # list of float64, which has some meaningless bytes at its end.
-            deserialise = little if data[1] & 1 else big
-            return deserialise(data[4:], 0, definition.cls, self._typestore)[0]
-
-        return decode
 
     def _read(self, channel_ids: set[int]) -> tuple[NDArray[np.int64], list[bytes]]:
         """Read some channels: log times in nanoseconds in order, serialised messages."""
         times: list[int] = []
         data: list[bytes] = []
-        for _, log_time_ns, _, message in messages_in_time_order(self.path, channel_ids):
+        for _, log_time_ns, _, message in self.raw_messages(channel_ids):
             times.append(log_time_ns)
             data.append(message)
         return np.array(times, np.int64), data
@@ -237,6 +260,11 @@ class Bag:
 def _type_name(schemas: dict[int, Any], channel: Channel) -> str:
     schema = schemas.get(channel.schema_id)
     return "" if schema is None else schema.name
+
+
+def _listed(names: list[str], most: int = 40) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def _bag_file(path: str | os.PathLike[str]) -> Path:

@@ -46,7 +46,8 @@ class RecordedRobot:
         topic = f"{self.namespace}/{name}"
         if self.bag.topics.get(topic) != TOPICS[name].type or not self.bag.message_count(topic):
             return None
-        return self.bag[topic]
+        # What the summary counts need not be there.
+        return self.bag[topic] if len(self.bag[topic]) else None
 
     def __getitem__(self, name: str) -> TopicSeries:
         """Return a topic of the stack.
@@ -167,12 +168,21 @@ def _last_state(robot: RecordedRobot) -> LastState:
         )
     k, j = (int(np.flatnonzero(series.stamp_ns == common[-1])[-1]) for series in (odom, joints))
     pose = odom.table(columns("odom", "pose.pose"))[k]
+    names = robot.joint_names
+    positions, rates = (np.asarray(joints.field(name)[j]) for name in ("position", "velocity"))
+    momenta = np.asarray(momentum.field("data")[min(k, len(momentum) - 1)])[:6]
+    numbers = np.concatenate([pose, positions, rates, momenta])
+    whole = len(positions) == len(rates) == len(names) and len(momenta) == 6
+    if not (whole and np.isfinite(numbers).all()):
+        raise RecordingError(
+            f"The last state in the bag {robot.bag.path} lacks numbers, or they are not finite."
+        )
     return LastState(
         time_ns=int(common[-1]),
         position=pose[:3],
         quaternion=pose[3:],
-        joint_names=robot.joint_names,
-        joints=np.asarray(joints.field("position"))[j],
-        rates=np.asarray(joints.field("velocity"))[j],
-        momenta=np.asarray(momentum.field("data"))[min(k, len(momentum) - 1), :6],
+        joint_names=names,
+        joints=positions,
+        rates=rates,
+        momenta=momenta,
     )

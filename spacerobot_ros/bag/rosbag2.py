@@ -178,7 +178,7 @@ class QosProfile:
     Raises
     ------
     RecordingError
-        A policy is not one of its words.
+        A policy is not one of its words, or a number is none.
     """
 
     history: str = "keep_last"
@@ -196,6 +196,12 @@ class QosProfile:
             word = getattr(self, policy)
             if word not in words:
                 raise RecordingError(f"The QoS {policy} {word!r} is not one of {', '.join(words)}.")
+        numbers = (self.depth, self.deadline_ns, self.lifespan_ns, self.liveliness_lease_duration_ns)
+        for number in numbers:
+            if type(number) is not int or not 0 <= number <= INFINITE_NS:
+                raise RecordingError(
+                    f"A depth or duration of QoS is {number!r}, no whole number from 0 to 2^63 - 1."
+                )
 
     @classmethod
     def from_yaml(cls, text: str) -> list[QosProfile]:
@@ -210,9 +216,13 @@ class QosProfile:
             The text is not such a list.
         """
         try:
+            _require_plain(text)
             entries = yaml.safe_load(text) or []
             return [cls(**_arguments(entry)) for entry in entries]
-        except (yaml.YAMLError, TypeError, ValueError, AttributeError) as error:
+        except (
+            *(yaml.YAMLError, TypeError, ValueError, AttributeError),
+            *(KeyError, OverflowError, RecursionError),
+        ) as error:
             reason = " ".join(str(error).split())
             raise RecordingError(f"A QoS profile of the bag cannot be read: {reason}.") from error
 
@@ -241,6 +251,34 @@ LATCHED = QosProfile(depth=1, durability="transient_local")
 def _duration(name: str, nanoseconds: int) -> tuple[str, str, str]:
     seconds, rest = divmod(nanoseconds, 10**9)
     return f"  {name}:", f"    sec: {seconds}", f"    nsec: {rest}"
+
+
+_LONGEST_TEXT = 65_536
+_DEEPEST = 8
+"""Levels of lists and mappings: a list of profiles, each with durations, has three."""
+
+
+def _require_plain(text: str) -> None:
+    """Refuse YAML that is nested, or multiplies itself by references.
+
+    Raises
+    ------
+    ValueError
+        It does.
+    """
+    if len(text) > _LONGEST_TEXT:
+        raise ValueError(f"it is longer than {_LONGEST_TEXT} characters")
+    depth = 0
+    # Events are read without recursion.
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError("it has references")
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if depth > _DEEPEST:
+            raise ValueError(f"it is nested more than {_DEEPEST} deep")
 
 
 def _arguments(entry: dict[str, Any]) -> dict[str, Any]:

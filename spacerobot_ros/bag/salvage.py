@@ -7,34 +7,34 @@ import struct
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
+from mcap.records import Attachment, Channel, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from spacerobot_ros.bag.mcap_file import McapFile, encode
-from spacerobot_ros.bag.mcap_reading import (
-    decompress,
-    messages_in_file_order,
+from spacerobot_ros.bag.mcap_reading import messages_in_file_order, read_summary
+from spacerobot_ros.bag.mcap_records import (
+    DAMAGE,
+    RECORD_HEADER,
+    Allowance,
+    chunk_size,
+    file_size,
     open_bag,
-    read_summary,
+    open_file,
+    parsed,
+    records,
+    records_in,
+    unpacked,
 )
 from spacerobot_ros.bag.rosbag2 import METADATA_NAME, QosProfile, RecordedTopic, metadata_record
 from spacerobot_ros.errors import RecordingError
 
 _CHUNK_SIZE = 65536
-_RECORD = struct.Struct("<BQ")
 _CHANNEL_AND_TIME = struct.Struct("<H4xQ")
 """What a message begins with; between them is its sequence number."""
-
-_BROKEN = (McapError, ValueError, RuntimeError, struct.error, zstandard.ZstdError)
-"""What reading a damaged record raises."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,8 @@ class Salvaged:
         Messages in it, and the time in s that they span.
     lost_chunks
         Chunks that could not be read.
+    lost_because
+        Why the first of them could not; empty without any.
     lost_bytes
         Bytes behind the last whole record, which remain in the old bag alone.
     """
@@ -58,6 +60,7 @@ class Salvaged:
     duration: float
     lost_chunks: int
     lost_bytes: int
+    lost_because: str = ""
 
 
 def salvage_bag(
@@ -101,6 +104,7 @@ def salvage_bag(
         span / 1e9,
         found.lost_chunks,
         found.lost_bytes,
+        found.reason,
     )
 
 
@@ -109,23 +113,17 @@ def is_complete(path: Path) -> bool:
     try:
         with open_bag(path) as file:
             summary = read_summary(path, file)
-            file.seek(0)
             count = sum(1 for _ in messages_in_file_order(file))
             return summary.statistics is not None and summary.statistics.message_count == count
     except RecordingError:
         return False
 
 
-def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, bytes]]:
-    """Go through opcode and body of the whole records of a stream."""
-    while True:
-        head = stream.read(_RECORD.size)
-        if len(head) < _RECORD.size:
-            return
-        opcode, length = _RECORD.unpack(head)
-        if length > size - stream.tell():
-            return
-        yield opcode, stream.read(length)
+def _whole_records(file: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
+    """Go through the records between two places, up to the first that is not whole."""
+    # What a consumer raises does not pass through here.
+    with suppress(ValueError):
+        yield from records(file, start, end)
 
 
 class _Found:
@@ -134,50 +132,47 @@ class _Found:
     def __init__(self, path: Path) -> None:
         self.profile = "ros2"
         self.lost_chunks = self.lost_bytes = 0
+        self.reason = ""
+        """Why the first of the lost chunks cannot be read."""
         self._path = path
         self.records = self._read()
 
     def _read(self) -> Iterator[tuple[int, bytes]]:
-        try:
-            with self._path.open("rb") as file:
-                size = file.seek(0, os.SEEK_END)
-                file.seek(0)
-                start = file.read(len(MCAP0_MAGIC))
-                if start != MCAP0_MAGIC:
-                    empty = start == MCAP0_MAGIC[: len(start)]
-                    what = "holds nothing yet" if empty else "is not an MCAP file"
-                    raise RecordingError(f"{self._path} {what}: there is nothing to salvage.")
-                whole = file.tell()
-                for opcode, body in _records(file, size):
-                    whole = file.tell()
-                    if opcode == Opcode.HEADER:
-                        with suppress(*_BROKEN):
-                            self.profile = Header.read(_stream(body)).profile
-                    elif opcode == Opcode.CHUNK:
-                        yield from self._chunk(body)
-                    elif opcode == Opcode.DATA_END:
-                        # The summary says nothing new.
-                        return
-                    else:
-                        yield opcode, body
-                self.lost_bytes = size - whole
-        except FileNotFoundError as error:
-            raise RecordingError(f"There is no bag at {self._path}.") from error
-        except OSError as error:
-            reason = error.strerror or error
-            raise RecordingError(f"Cannot read the bag {self._path}: {reason}.") from error
+        with open_file(self._path) as file:
+            size = file_size(file)
+            start = file.read(len(MCAP0_MAGIC))
+            if start != MCAP0_MAGIC:
+                empty = start == MCAP0_MAGIC[: len(start)]
+                what = "holds nothing yet" if empty else "is not an MCAP file"
+                raise RecordingError(f"{self._path} {what}: there is nothing to salvage.")
+            whole, allowance = len(start), Allowance(size)
+            for place, opcode, body in _whole_records(file, len(start), size):
+                whole = place + RECORD_HEADER.size + len(body)
+                if opcode == Opcode.HEADER:
+                    with suppress(*DAMAGE):
+                        self.profile = parsed(Header.read, body, place).profile
+                elif opcode == Opcode.CHUNK:
+                    yield from self._chunk(body, place, allowance)
+                elif opcode == Opcode.DATA_END:
+                    # The summary says nothing new.
+                    return
+                else:
+                    yield opcode, body
+            self.lost_bytes = size - whole
 
-    def _chunk(self, body: bytes) -> Iterator[tuple[int, bytes]]:
+    def _chunk(
+        self, body: bytes, place: int, allowance: Allowance
+    ) -> Iterator[tuple[int, bytes]]:
         try:
-            data = decompress(Chunk.read(_stream(body)))
-        except _BROKEN:
+            allowance.take(chunk_size(body), place)
+            data = unpacked(body, place)
+        except DAMAGE as error:
             self.lost_chunks += 1
+            self.reason = self.reason or str(error) or type(error).__name__
             return
-        yield from _records(BytesIO(data), len(data))
-
-
-def _stream(body: bytes) -> ReadDataStream:
-    return ReadDataStream(BytesIO(body))
+        with suppress(ValueError):
+            for opcode, start, end in records_in(data, place):
+                yield opcode, data[start + RECORD_HEADER.size : end]
 
 
 class _Copy:
@@ -192,19 +187,19 @@ class _Copy:
 
     def add(self, opcode: int, body: bytes) -> None:
         """Take a record; one that cannot be read is left out."""
-        with suppress(*_BROKEN):
+        with suppress(*DAMAGE):
             if opcode == Opcode.MESSAGE:
                 self._add_message(body)
             elif opcode == Opcode.SCHEMA:
-                schema = Schema.read(_stream(body))
+                schema = parsed(Schema.read, body, 0)
                 self._schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
-                channel = Channel.read(_stream(body))
+                channel = parsed(Channel.read, body, 0)
                 self._channels[channel.id] = channel
             elif opcode == Opcode.ATTACHMENT:
-                self._file.append_attachment(Attachment.read(_stream(body)))
+                self._file.append_attachment(parsed(Attachment.read, body, 0))
             elif opcode == Opcode.METADATA:
-                metadata = Metadata.read(_stream(body))
+                metadata = parsed(Metadata.read, body, 0)
                 if metadata.name != METADATA_NAME:
                     self._file.append_metadata(metadata)
 
@@ -229,7 +224,7 @@ class _Copy:
                 self._chunk += encode(self._schemas[channel.schema_id])
             self._chunk += encode(channel)
         self._entries[channel_id] += log_time_ns, len(self._chunk)
-        self._chunk += _RECORD.pack(Opcode.MESSAGE, len(body)) + body
+        self._chunk += RECORD_HEADER.pack(Opcode.MESSAGE, len(body)) + body
         if len(self._chunk) >= _CHUNK_SIZE:
             self._flush()
 

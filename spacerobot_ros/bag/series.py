@@ -7,6 +7,7 @@ hundred times faster than decoding every message to pick one number from each.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Iterator, KeysView, Sequence
 from dataclasses import dataclass
@@ -45,6 +46,9 @@ _HEADER = (Nodetype.NAME, "std_msgs/msg/Header")
 _HEADER_SIZE = 4
 _LITTLE_ENDIAN_CDR = b"\x00\x01"
 
+_DAMAGE = (SerdeError, ValueError, IndexError, OverflowError, TypeError, struct.error)
+"""What decoding a damaged message raises."""
+
 
 class TopicSeries:
     """The messages of one topic, by log time; ``bag[topic]`` makes it.
@@ -65,6 +69,7 @@ class TopicSeries:
         data: Sequence[bytes],
         fields: Fields,
         decode: Callable[[bytes], Any],
+        decodable: float = math.inf,
     ) -> None:
         self.topic = topic
         self.type_name = type_name
@@ -72,6 +77,7 @@ class TopicSeries:
         self._data = data
         self._fields = fields
         self._decode = decode
+        self._decodable = decodable
 
     def __len__(self) -> int:
         return len(self._data)
@@ -121,7 +127,10 @@ class TopicSeries:
         """
         dtype, is_array, in_list = self._resolve(path)
         if self._columns is not None and path in self._columns.paths:
-            return self._columns[path]
+            try:
+                return self._columns[path]
+            except UnicodeDecodeError as error:
+                raise self._damaged(error) from error
         messages = self._messages
         if in_list:
             return [_values(message, path.split(".")) for message in messages]
@@ -168,24 +177,37 @@ class TopicSeries:
         RecordingError
             A message is damaged.
         """
+        self._require_decodable()
         for time_ns, data in zip(self.time_ns.tolist(), self._data, strict=True):
             yield time_ns, self._decoded(data)
 
     @cached_property
     def _messages(self) -> list[Any]:
+        self._require_decodable()
         return [self._decoded(data) for data in self._data]
 
     @cached_property
     def _columns(self) -> Columns | None:
         return columns(self._data, self.type_name, self._fields)
 
+    def _require_decodable(self) -> None:
+        """Refuse to make objects of much more than the file is large."""
+        size = sum(map(len, self._data))
+        if size > self._decodable:
+            raise RecordingError(
+                f"The messages on {self.topic} have {size} bytes, and {self._decodable:.0f} can be "
+                "decoded of a bag of this size."
+            )
+
     def _decoded(self, data: bytes) -> Any:
         try:
             return self._decode(data)
-        except (SerdeError, ValueError, IndexError, struct.error) as error:
-            raise RecordingError(
-                f"A message on {self.topic} is no {self.type_name}: {error}."
-            ) from error
+        except _DAMAGE as error:
+            raise self._damaged(error) from error
+
+    def _damaged(self, error: Exception) -> RecordingError:
+        reason = str(error) or type(error).__name__
+        return RecordingError(f"A message on {self.topic} is no {self.type_name}: {reason}.")
 
     def _resolve(self, path: str) -> tuple[np.dtype[Any] | None, bool, bool]:
         """Follow a path: type of its numbers if any, whether an array, whether inside of a list."""
@@ -328,15 +350,21 @@ class _Layout:
         if path is not None:
             # The serialised string ends with a zero.
             self.leaves[path] = _Leaf(self.position, max(length - 1, 0), None, ())
-        self.position += length
+        self._advance(length)
 
     def _numbers(self, dtype: np.dtype[Any], path: str | None, shape: tuple[int, ...]) -> None:
-        size = dtype.itemsize * int(np.prod(shape))
+        size = dtype.itemsize * math.prod(shape)
         if size:
             self._align(dtype.itemsize)
         if path is not None:
             self.leaves[path] = _Leaf(self.position, size, dtype, shape)
+        self._advance(size)
+
+    def _advance(self, size: int) -> None:
         self.position += size
+        if self.position > len(self._message):
+            # Or a count of 4e9 messages in a list would be believed.
+            raise IndexError("the message ends before its fields")
 
     def _length(self) -> int:
         self._align(4)

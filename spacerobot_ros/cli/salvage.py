@@ -21,5 +21,6 @@ def command(bag: Path, output: Path | None) -> None:
     click.echo(
         f"lost        {saved.lost_bytes} bytes behind the last whole record, "
         f"{saved.lost_chunks} damaged chunk(s)"
+        + (f"; the first: {saved.lost_because}" if saved.lost_because else "")
     )
     click.echo(f"bag         {saved.path}")

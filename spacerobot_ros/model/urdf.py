@@ -29,6 +29,8 @@ from spacerobot_ros.model.rotations import matrix_from_rpy
 _LARGEST = 1e12
 """Larger numbers (kg, m, kg m^2) are slips, and their squares soon overflow."""
 
+_MOST_LINKS = 200
+
 
 def load_robot(path: str | Path) -> RobotDescription:
     """Read the robot of a URDF file.
@@ -57,6 +59,11 @@ def parse_robot(text: str) -> RobotDescription:
         The text is not URDF, or does not describe a free-floating tree of prismatic, revolute,
         continuous and fixed joints with positive definite inertia.
     """
+    if text.count("<link") > _MOST_LINKS:
+        raise RobotDescriptionError(
+            f"The robot description has more than {_MOST_LINKS} links: its equations would take "
+            "hours to derive."
+        )
     tree = _parse_xml(text)
     colours = {
         material.name: tuple(material.color.rgba)

@@ -33,6 +33,15 @@ _BURST = 500
 _ACKNOWLEDGED = Duration(seconds=2)
 """How long a reader may take for the last messages."""
 
+_LONGEST_WAIT_NS = 3600 * NANOSECONDS
+"""What a timer holds is less than the times that a bag may have."""
+
+_LAST_CLOCK_NS = 2**31 * NANOSECONDS - 1
+"""The last time that a clock message holds: in the year 2038."""
+
+_DEEPEST_QUEUE = 10_000
+"""The middleware takes memory for queues: what a bag says may be anything."""
+
 _CLOCK = "/clock"
 _BAD_BAG = 2
 
@@ -159,7 +168,8 @@ class ReplayNode(FlightNode):
         if due is None:
             self._timer.cancel()
             return
-        self._timer.timer_period_ns = max(due - self._now(), 1)
+        # A later look finds nothing due and sets the timer anew.
+        self._timer.timer_period_ns = min(max(due - self._now(), 1), _LONGEST_WAIT_NS)
         self._timer.reset()
 
     def _play(self) -> None:
@@ -176,7 +186,19 @@ class ReplayNode(FlightNode):
         self._end_if_done()
 
     def _send(self, message: ReplayMessage) -> None:
+        """Publish one message.
+
+        Raises
+        ------
+        RecordingError
+            It is of a time that a clock cannot show.
+        """
         if self.config.clock:
+            if message.log_time_ns > _LAST_CLOCK_NS:
+                raise RecordingError(
+                    f"a message on {message.topic} is of {message.log_time_ns / NANOSECONDS:.9g} "
+                    "s, and a clock ends at 2^31 s."
+                )
             self._publish_clock(message.log_time_ns)
         send = self._sends.get(message.topic)
         if send is not None:
@@ -188,6 +210,7 @@ class ReplayNode(FlightNode):
             self._publish_clock(self._playback.bag_time(self._now()))
 
     def _publish_clock(self, time_ns: int) -> None:
+        time_ns = min(time_ns, _LAST_CLOCK_NS)
         if time_ns == self._last_clock:
             return
         self._last_clock = time_ns
@@ -230,13 +253,14 @@ class ReplayNode(FlightNode):
             return response
         try:
             message = self._playback.step(self._now())
+            if message is not None:
+                self._send(message)
         except RecordingError as error:
             response.message = str(error)
             return response
         if message is None:
             response.message = "The replay has ended."
             return response
-        self._send(message)
         response.success = True
         response.message = f"{message.topic} at {message.log_time_ns / NANOSECONDS:.9f} s"
         self._end_if_done()
@@ -248,7 +272,7 @@ def _profile(qos: QosProfile) -> QoSProfile:
     latched = qos.durability == "transient_local"
     best_effort = qos.reliability == "best_effort"
     return QoSProfile(
-        depth=qos.depth or (1 if latched else STREAM.depth),
+        depth=min(qos.depth, _DEEPEST_QUEUE) or (1 if latched else STREAM.depth),
         reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

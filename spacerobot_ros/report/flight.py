@@ -192,7 +192,7 @@ class Flight:
         """Return a parameter of a node; None if the bag does not hold it."""
         try:
             return json.loads(self.metadata.get(f"parameters/{node}", {})[name])
-        except (KeyError, ValueError):
+        except (KeyError, ValueError, RecursionError):
             return None
 
     @cached_property
@@ -204,7 +204,7 @@ class Flight:
                 Published(str(r["quantity"]), [float(x) for x in r["printed"]], str(r["note"]))
                 for r in rows
             ]
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, RecursionError):
             return []
 
     # -- what happened ------------------------------------------------------------------------

@@ -23,6 +23,9 @@ TOLERANCE = 1e-9
 
 _SECOND = 1e9
 
+_MOST_TICKS_A_STATE, _MOST_SILENT_TICKS = 10, 20_000
+"""A recorder that was paused for a while leaves a gap; stamps of no flight leave a larger one."""
+
 _EXPLAINING = ("joint_states", "odom")
 """Topics in which a difference is looked for first, because it explains those in the others."""
 
@@ -105,6 +108,13 @@ def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Ve
     published = _published(flight)
     first = min(int(p.ticks.min()) for p in published)
     last = max(int(p.ticks.max()) for p in published)
+    states = sum(len(p.ticks) for p in published)
+    if first < 0 or last - first > _MOST_SILENT_TICKS + _MOST_TICKS_A_STATE * states:
+        raise RecordingError(
+            f"The states in the bag {flight.path} are stamped {first * flight.config.period_ns}"
+            f" to {last * flight.config.period_ns} ns, and there are {states} of them: a flight "
+            "has a state in every tick."
+        )
     resimulation = _resimulate(flight, _initial(first, published, flight), first, last)
     published = [p for p in published if p.topic in resimulation.topics]
     if first > 0:

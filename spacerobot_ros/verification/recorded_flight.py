@@ -146,7 +146,7 @@ def _config(bag: Bag, namespace: str) -> PlantConfig:
         )
     try:
         values = {name: json.loads(text) for name, text in texts.items()}
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise RecordingError(
             f"The plant's parameters in the bag {bag.path} cannot be read: {error}."
         ) from error
