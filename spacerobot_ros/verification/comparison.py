@@ -161,11 +161,6 @@ class _Published:
 def _published(flight: RecordedFlight) -> list[_Published]:
     """Read the state topics; the plant stamps those without a header like its odometry."""
     recorded, period, names = flight.recorded, flight.config.period_ns, flight.robot.joint_names
-    if recorded.joint_names != list(names):
-        raise RecordingError(
-            f"The joint states in the bag {flight.path} are of "
-            f"{', '.join(recorded.joint_names)}; its robot has {', '.join(names)}."
-        )
     published: list[_Published] = []
     clock = recorded["odom"].stamp_ns
     for topic in sorted(state_topics(), key=_rank):

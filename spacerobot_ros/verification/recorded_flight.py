@@ -14,7 +14,7 @@ from spacerobot_ros.bag.reader import Bag
 from spacerobot_ros.bag.recorded_robot import RecordedRobot
 from spacerobot_ros.errors import CommandError, ParameterError, RecordingError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.robot_source import robot_from_text
+from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.simulation.commands import (
     CommandSource,
@@ -115,7 +115,15 @@ def read_flight(bag: Bag) -> RecordedFlight:
     series = recorded.get("fault_injection")
     for time_ns, message in series.messages() if series is not None else ():
         injections.setdefault(time_ns // config.period_ns, []).append(message.data)
-    robot = robot_from_text(urdf.decode(errors="replace"), config)
+    description = parse_robot(urdf.decode(errors="replace"))
+    names = recorded.joint_names
+    if names != list(description.joint_names):
+        # Before equations are derived of whatever robot there is.
+        raise RecordingError(
+            f"The joint states in the bag {bag.path} are of {', '.join(names)}; its robot has "
+            f"{', '.join(description.joint_names)}."
+        )
+    robot = SpaceRobot(config.believed(description))
     return RecordedFlight(recorded, config, robot, injections)
 
 
