@@ -1,6 +1,5 @@
 """The exceptions of this package: every one carries a sentence that a user can act on."""
 
-
 _LONGEST_SENTENCE = 2000
 
 

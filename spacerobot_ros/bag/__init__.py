@@ -6,7 +6,7 @@ from spacerobot_ros.bag.recorded_robot import RecordedRobot
 from spacerobot_ros.bag.recording import Recording, RecordingState
 from spacerobot_ros.bag.rosbag2 import LATCHED, QosProfile, message_definition, type_hash
 from spacerobot_ros.bag.series import TopicSeries
-from spacerobot_ros.bag.writer import BagWriter
+from spacerobot_ros.bag.writer import BagWriter, free_name
 from spacerobot_ros.errors import RecordingError
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "ReplayTopic",
     "Timeline",
     "TopicSeries",
+    "free_name",
     "iterate_raw",
     "message_definition",
     "read_bag",

@@ -12,6 +12,12 @@ class RecorderConfig:
     """What is recorded, and how the file is written."""
 
     bag: str = parameter("", "file to write; '': spacerobot-<date>-<time>.mcap here")
+    when_exists: str = parameter(
+        "next",
+        "where a bag of that name is there: take the next free name (NAME-1, NAME-2, ...), or "
+        "refuse to start; it is never written over",
+        choices=("next", "refuse"),
+    )
     topics: str = parameter("", "names to record, separated by spaces; '': all of the stack")
     compression: str = parameter("zstd", "of the bag's chunks", choices=("zstd", "lz4", "none"))
     clock_wait: float = parameter(

@@ -7,6 +7,9 @@ recorder would slow a simulation down.
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import io
 import os
 import struct
 import zlib
@@ -37,6 +40,7 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
+from spacerobot_ros.bag.mcap_records import require_regular
 from spacerobot_ros.errors import RecordingError
 
 _COMPRESSIONS = {"zstd": "zstd", "lz4": "lz4", "none": ""}
@@ -53,6 +57,49 @@ def _compressor(compression: str) -> Callable[[bytes | bytearray], bytes]:
     return lz4.frame.compress if compression == "lz4" else bytes
 
 
+class BagExistsError(RecordingError):
+    """A bag that is there, and is not to be written over."""
+
+
+def _created(path: Path, overwrite: bool) -> io.FileIO:
+    """Open a file of our own for writing: regular, empty and locked.
+
+    Raises
+    ------
+    RecordingError
+        There is something that is not to be written over.
+    OSError
+        It cannot be opened.
+    """
+    with suppress(FileNotFoundError):
+        require_regular(os.stat(path).st_mode, path, "make")
+    flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        descriptor = os.open(path, flags if overwrite else flags | os.O_EXCL, 0o666)
+    except FileExistsError as error:
+        raise BagExistsError(
+            f"Cannot make the bag {path}: File exists; name another one, or remove it."
+        ) from error
+    # Unbuffered: what was appended survives a kill.
+    raw = open(descriptor, "wb", buffering=0)  # noqa: SIM115
+    try:
+        require_regular(os.fstat(descriptor).st_mode, path, "make")
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raw.close()
+        raise BagExistsError(f"The bag {path} is being written by another recorder.") from error
+    except OSError as error:
+        # Some file systems of networks have no locks; a file that was there is refused there.
+        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
+            raw.close()
+            raise
+    except RecordingError:
+        raw.close()
+        raise
+    raw.truncate(0)
+    return raw
+
+
 def encode(record: McapRecord) -> bytes:
     """Return the bytes of one record."""
     builder = RecordBuilder()
@@ -64,14 +111,16 @@ class McapFile:
     """An MCAP file that grows by whole records.
 
     Every append goes to the operating system at once, and one that fails is undone, so that the
-    file of a process that dies is whole but for the record that it was appending. ``compression``
-    and ``overwrite`` are as of :class:`~spacerobot_ros.bag.BagWriter`; ``profile`` says what the
-    messages are.
+    file of a process that dies is whole but for the record that it was appending. While it is open
+    it is locked: no second one can be opened on the same path. ``compression`` and ``overwrite``
+    are as of :class:`~spacerobot_ros.bag.BagWriter`; ``profile`` says what the messages are.
 
     Raises
     ------
+    BagExistsError
+        The file is there and is not to be replaced, or is being written.
     RecordingError
-        The file cannot be made, or is there and is not to be replaced.
+        The file cannot be made.
     """
 
     def __init__(
@@ -95,12 +144,10 @@ class McapFile:
         self._size = 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            # Unbuffered: what was appended survives a kill.
-            self._raw = open(path, "wb" if overwrite else "xb", buffering=0)  # noqa: SIM115
-        except OSError as error:
-            raise RecordingError(
-                f"Cannot make the bag {path}: {error.strerror or error}."
-            ) from error
+            self._raw = _created(path, overwrite)
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise RecordingError(f"Cannot make the bag {path}: {reason}.") from error
         try:
             self._append(MCAP0_MAGIC + encode(Header(profile=profile, library="spacerobot_ros")))
         except RecordingError:
@@ -111,6 +158,29 @@ class McapFile:
     def size(self) -> int:
         """How many bytes the file has."""
         return self._size
+
+    def check(self) -> None:
+        """Find out whether the path still names this file, and it has all that was written.
+
+        Raises
+        ------
+        RecordingError
+            It was removed, replaced, moved or cut: whoever looks for it will not find what is
+            written.
+        """
+        what = ""
+        try:
+            ours, theirs = os.fstat(self._raw.fileno()), os.stat(self.path)
+            if (ours.st_dev, ours.st_ino) != (theirs.st_dev, theirs.st_ino):
+                what = "another file is in its place"
+            elif ours.st_size != self._size:
+                what = f"it has {ours.st_size} bytes, and {self._size} were written"
+        except FileNotFoundError:
+            what = "it was removed or moved"
+        except (OSError, ValueError) as error:
+            what = str(getattr(error, "strerror", None) or error)
+        if what:
+            raise RecordingError(f"The bag {self.path} is lost while it is written: {what}.")
 
     def append_chunk(self, records: bytearray, entries: dict[int, list[int]]) -> None:
         """Append a chunk of encoded records and the indexes of its messages.

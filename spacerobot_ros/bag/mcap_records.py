@@ -68,7 +68,7 @@ _KINDS = (
 )
 
 
-def require_regular(mode: int, path: Path) -> None:
+def require_regular(mode: int, path: Path, act: str = "read") -> None:
     """Refuse what is no file: to open a pipe waits for ever, to write to a device does harm.
 
     Raises
@@ -77,8 +77,8 @@ def require_regular(mode: int, path: Path) -> None:
         ``mode``, of the inode at ``path``, is not that of a regular file.
     """
     if not stat.S_ISREG(mode):
-        kind = next((words for test, words in _KINDS if test(mode)), "something else")
-        raise RecordingError(f"A bag is a file, and {path} is {kind}.")
+        kind = next((words for test, words in _KINDS if test(mode)), "no file")
+        raise RecordingError(f"Cannot {act} the bag {path}: it is {kind}.")
 
 
 @contextmanager

@@ -149,6 +149,10 @@ class Recording:
                 self._decide(_ON_WALL_TIME)
         self._guarded(self.writer.flush)
 
+    def check(self) -> None:
+        """Find out whether the file is still there, with all that was written."""
+        self._guarded(self.writer.check)
+
     def describe(self, name: str, values: dict[str, str]) -> None:
         """Put named values into the bag."""
         self._guarded(lambda: self.writer.add_metadata(name, values))
@@ -171,8 +175,13 @@ class Recording:
         self._decide(_ON_WALL_TIME)
         counts = {"messages": self.messages, "messages_lost": self.lost.total()}
         self.describe("recorder", {name: str(count) for name, count in counts.items()})
+        self.check()
         self.state = RecordingState.CLOSED
-        self.writer.close()
+        try:
+            self.writer.close()
+        except RecordingError as error:
+            self.failure = error
+            raise
 
     def _decide(self, state: RecordingState) -> None:
         """Settle which time the bag has, unless it is settled, and write the early messages."""

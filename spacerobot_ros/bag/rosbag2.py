@@ -196,8 +196,8 @@ class QosProfile:
             word = getattr(self, policy)
             if word not in words:
                 raise RecordingError(f"The QoS {policy} {word!r} is not one of {', '.join(words)}.")
-        numbers = (self.depth, self.deadline_ns, self.lifespan_ns, self.liveliness_lease_duration_ns)
-        for number in numbers:
+        durations = self.deadline_ns, self.lifespan_ns, self.liveliness_lease_duration_ns
+        for number in (self.depth, *durations):
             if type(number) is not int or not 0 <= number <= INFINITE_NS:
                 raise RecordingError(
                     f"A depth or duration of QoS is {number!r}, no whole number from 0 to 2^63 - 1."

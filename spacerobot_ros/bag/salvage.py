@@ -160,9 +160,7 @@ class _Found:
                     yield opcode, body
             self.lost_bytes = size - whole
 
-    def _chunk(
-        self, body: bytes, place: int, allowance: Allowance
-    ) -> Iterator[tuple[int, bytes]]:
+    def _chunk(self, body: bytes, place: int, allowance: Allowance) -> Iterator[tuple[int, bytes]]:
         try:
             allowance.take(chunk_size(body), place)
             data = unpacked(body, place)

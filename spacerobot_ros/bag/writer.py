@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from spacerobot_ros.bag.mcap_file import McapFile, encode
+from spacerobot_ros.bag.mcap_file import BagExistsError, McapFile, encode
 from spacerobot_ros.bag.rosbag2 import (
     QosProfile,
     RecordedTopic,
@@ -29,6 +30,16 @@ _MESSAGE_HEADER = struct.Struct("<BQHIQQ")
 _pack_header = _MESSAGE_HEADER.pack
 _LENGTH_WITHOUT_DATA = _MESSAGE_HEADER.size - 9
 _MESSAGE = int(Opcode.MESSAGE)
+
+
+def free_name(path: Path, first: int = 0) -> Path:
+    """Return a path, or the first of ``NAME-1``, ``NAME-2``, ... at which nothing is."""
+    number = first
+    while True:
+        name = path.with_name(f"{path.stem}-{number}{path.suffix}") if number else path
+        if not os.path.lexists(name):
+            return name
+        number += 1
 
 
 class BagWriter:
@@ -52,7 +63,10 @@ class BagWriter:
     chunk_size
         How large a chunk grows, in bytes before compression.
     overwrite
-        Whether a file that is there is replaced.
+        Whether a file that is there is replaced; not one that is being written.
+    next_free
+        Whether the bag takes the next name that is free where one is there: ``NAME-1.mcap``,
+        ``NAME-2.mcap``, ...
     max_size
         How large a file grows, in bytes, before the next one is begun; 0: without bound. The files
         of a bag that may be split are ``NAME_0.mcap``, ``NAME_1.mcap``, ..., each complete, with
@@ -74,16 +88,20 @@ class BagWriter:
         compression: str = "zstd",
         chunk_size: int = 65536,
         overwrite: bool = True,
+        next_free: bool = False,
         max_size: int = 0,
         max_duration_ns: int = 0,
     ) -> None:
         self._whole_path = Path(path)
         self._limits = max_size, max_duration_ns
         self._number = 0
-        self._compression, self._overwrite = compression, overwrite
+        self._compression, self._overwrite = compression, overwrite and not next_free
+        self._next_free = next_free
+        self.splits = 0
+        """How many files were begun after the first."""
         self._earlier: Counter[str] = Counter()
         self._context: list[Attachment | Metadata] = []
-        self._file = self._new_file()
+        self._file = self._first_file()
         self._chunk_size = chunk_size
         self._chunk = bytearray()
         # Of each channel, log time and offset in the chunk of each message. Empty as soon as
@@ -322,6 +340,50 @@ class BagWriter:
         span = (self._file.end_ns or 0) - (self._file.start_ns or 0)
         return 0 < max_size <= self._file.size or 0 < max_duration_ns <= span
 
+    def _first_file(self) -> McapFile:
+        """Make the file, or the first of several; names of one bag are not mixed with another's."""
+        asked, number = self._whole_path, 0
+        while True:
+            try:
+                if any(self._limits) and not self._overwrite:
+                    self._require_no_parts()
+                return self._new_file()
+            except BagExistsError:
+                if not self._next_free:
+                    raise
+            number += 1
+            self._whole_path = asked.with_name(f"{asked.stem}-{number}{asked.suffix}")
+
+    def _require_no_parts(self) -> None:
+        """Refuse a name of which there are files of a bag that was split.
+
+        Raises
+        ------
+        BagExistsError
+            There are some.
+        """
+        whole = self._whole_path
+        pattern = re.compile(rf"{re.escape(whole.stem)}_\d+{re.escape(whole.suffix)}")
+        with suppress(OSError):
+            for name in sorted(os.listdir(whole.parent)):
+                if pattern.fullmatch(name):
+                    raise BagExistsError(
+                        f"Cannot make the bag {whole.with_name(name)}: File exists; name another "
+                        "one, or remove it."
+                    )
+
+    def check(self) -> None:
+        """Find out whether the file is still there, under its name, with all that was written.
+
+        Raises
+        ------
+        RecordingError
+            It is not; nothing more is written.
+        """
+        self._require_open()
+        with self._refusing_after_failure():
+            self._file.check()
+
     def _new_file(self) -> McapFile:
         path = self._whole_path
         if any(self._limits):
@@ -335,9 +397,9 @@ class BagWriter:
         self._file.close()
         for name, (channel, _, _) in self._topics.items():
             self._earlier[name] += self._count(channel)
-        self._number += 1
         schemas, channels = self._file.schemas, self._file.channels
-        self._file = self._new_file()
+        self._file = self._next_file()
+        self.splits += 1
         self._append_rosbag2_metadata()
         for record in self._context:
             if isinstance(record, Attachment):
@@ -348,6 +410,16 @@ class BagWriter:
         self._file.channels += channels
         for known in (*schemas, *channels):
             self._chunk += encode(known)
+
+    def _next_file(self) -> McapFile:
+        while True:
+            self._number += 1
+            try:
+                return self._new_file()
+            except BagExistsError:
+                # Not ours. Refused at the start, it is stepped over in flight.
+                if self._overwrite:
+                    raise
 
     def _append_rosbag2_metadata(self) -> None:
         topics = [

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 @rotvec_option
 @click.option("--method", type=Registered(METHODS, LAWS), help="Gait method, or control law.")
 @settings_option
-@click.option("--bag", type=PATH, help="Bag to write [out/SCENARIO.mcap].")
+@click.option("--bag", type=PATH, help="New bag to write [out/SCENARIO.mcap, or the next free].")
 @json_option("Write the result.")
 @click.option("--report", type=PATH, help="Write a picture report (HTML).")
 @click.option(
@@ -66,11 +66,13 @@ def command(
     number of the signal: 130 after Ctrl-C.
     """
     chosen = _chosen(scenario, goal, goal_rotvec, method, settings, realtime)
+    from spacerobot_ros.bag import free_name
     from spacerobot_ros.session.run import run_scenario
 
-    path = bag or Path("out") / f"{chosen.name}.mcap"
+    path = bag or free_name(Path("out") / f"{chosen.name}.mcap")
     with _progress(chosen.name) as progress:
         result = run_scenario(chosen, path, progress, processes=processes)
+    path = Path(result.summary["bag"])
     if json_file is not None:
         write_json(json_file, result.summary)
     for line in (*_summary_lines(result.summary), *_published_lines(chosen, result.summary)):

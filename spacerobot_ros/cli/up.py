@@ -30,6 +30,6 @@ def command(
     chosen = load_scenario(scenario).in_real_time(rate).with_settings(settings)
     from spacerobot_ros.session.live import keep_up
 
-    keep_up(chosen, bag, click.echo, processes=processes)
-    if bag is not None:
-        click.echo(f"bag         {bag}")
+    recorded = keep_up(chosen, bag, click.echo, processes=processes)
+    if recorded is not None:
+        click.echo(f"bag         {recorded}")

@@ -24,6 +24,7 @@ from spacerobot_ros import __version__
 from spacerobot_ros.bag import BagWriter, QosProfile, Recording, RecordingState
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.nodes.common.cdr import HEADER_STAMP, NANOSECONDS, first_time_ns
 from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode, RawInput, RawStream, Take
@@ -40,6 +41,9 @@ _CHUNK_SIZE = 262_144
 
 _SCAN_PERIOD = 0.1
 """Wall s between two looks for new topics."""
+
+_CHECK_PERIOD = 0.4
+"""Wall s between two looks whether the file is still there: a failure is seen within a second."""
 
 _LONGEST_DRAIN = 1.2
 """Wall s after a signal in which what is on its way is still recorded."""
@@ -69,6 +73,8 @@ class RecorderNode(FlightNode):
         writer = BagWriter(
             config.bag or time.strftime("spacerobot-%Y%m%d-%H%M%S.mcap"),
             compression=config.compression,
+            overwrite=False,
+            next_free=config.when_exists == "next",
             chunk_size=_CHUNK_SIZE,
             max_size=round(config.max_size * 1e6),
             max_duration_ns=round(config.max_duration * NANOSECONDS),
@@ -81,6 +87,13 @@ class RecorderNode(FlightNode):
         steady = RosClock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_SCAN_PERIOD, self.scan, clock=steady)
         self.create_timer(config.flush_period, self.flush, clock=steady)
+        self.create_timer(_CHECK_PERIOD, self._check, clock=steady)
+        self._splits = 0
+        asked = Path(config.bag).name
+        if asked and not writer.path.name.startswith((f"{Path(asked).stem}_", asked)):
+            self.get_logger().warning(
+                f"The bag {config.bag} is there already: this flight goes into {writer.path}."
+            )
         if config.diagnostics_period:
             self.create_timer(config.diagnostics_period, self._publish_state, clock=steady)
         self.describe("spacerobot", {"version": __version__})
@@ -94,11 +107,16 @@ class RecorderNode(FlightNode):
         """Record from now on."""
         if self.recording is not None:
             self.recording.start()
+            # Without the name: what two equal flights record is equal.
+            self.report_event(Event(EventKind.RECORDING, "Recording has begun."))
 
     def deactivate(self) -> None:
         """Pause: what arrives is not recorded."""
         if self.recording is not None:
+            paused = self.recording.running
             self.recording.pause()
+            if paused:
+                self.report_event(Event(EventKind.RECORDING_PAUSED, "Recording is paused."))
 
     def drain(self, executor: EventsExecutor, quiet: float = 0.3) -> None:
         """Record what is still on its way, until nothing has come for ``quiet`` wall s."""
@@ -214,8 +232,27 @@ class RecorderNode(FlightNode):
     # -- what the recorder reports ------------------------------------------------------------
 
     def _on_failure(self, error: RecordingError) -> None:
-        """Log once why nothing is recorded any more; the other nodes go on."""
-        self.get_logger().error(f"Recording has ended: {error}")
+        """Report why nothing is recorded any more; the other nodes go on."""
+        sentence = f"Recording has ended: {error}"
+        self.get_logger().error(sentence)
+        self._report(EventKind.RECORDING_FAILED, sentence, level=2)
+        self._publish_state()
+
+    def _check(self) -> None:
+        """Look after the file; a failure is published again, for who subscribes to it late."""
+        recording = self.recording
+        if recording is None or recording.state is RecordingState.CLOSED:
+            return
+        recording.check()
+        if recording.failure is not None:
+            self._publish_state()
+        elif recording.writer.splits != self._splits:
+            self._splits = recording.writer.splits
+            self._report(EventKind.FILE_SPLIT, f"Recording goes on in {recording.writer.path}.")
+
+    def _report(self, kind: EventKind, sentence: str, level: int = 0) -> None:
+        bag = str(self.recording.writer.path) if self.recording is not None else ""
+        self.report_event(Event(kind, sentence, level, about={"bag": bag}))
 
     def _publish_losses(self, recording: Recording) -> None:
         if not recording.lost:
@@ -390,8 +427,19 @@ def _descriptions(path: str) -> list[tuple[str, dict[str, str]]]:
 
 
 def main() -> None:
-    """Record until SIGINT or SIGTERM."""
-    sys.exit(run_node(RecorderNode))
+    """Record until SIGINT or SIGTERM; the exit code is 1 where the recording has failed."""
+    made: list[RecorderNode] = []
+
+    def make() -> RecorderNode:
+        made.append(RecorderNode())
+        return made[0]
+
+    code = run_node(make)
+    failure = made[0].failure if made else None
+    if failure is not None and not code:
+        print(f"{failure}", file=sys.stderr)
+        code = 1
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -41,8 +41,10 @@ class _Sentences:
 
 def keep_up(
     scenario: Scenario, bag: Path | None, show: Callable[[str], None], *, processes: bool
-) -> None:
+) -> Path | None:
     """Run the nodes of a scenario in real time until SIGINT, SIGTERM or SIGHUP; goals by topic.
+
+    Returns the bag, whose name is another one where that was taken and ``when_exists`` is next.
 
     Raises
     ------
@@ -63,6 +65,7 @@ def keep_up(
 
                 stack.spin(look)
                 stack.finish()
+                return stack.bag
         finally:
             stack.close()
 

@@ -142,7 +142,7 @@ class MultiProcessStack(Stack):
         """Start one node of the scenario, for the first time or again, with more parameters."""
         overrides: dict[str, Any] = self.scenario.checked_overrides(name)
         if name == "recorder":
-            overrides["bag"] = str(self.bag)
+            overrides |= {"bag": str(self.bag), "when_exists": self.when_exists}
             record = Path(self._folder.name, "scenario.json")
             records = self.scenario.records([other for other in self.names if other != name])
             record.write_text(json.dumps(records), "utf-8")

@@ -15,6 +15,7 @@ from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from spacerobot_ros.bag import free_name
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.nodes import (
     NODE_TYPES,
@@ -59,7 +60,10 @@ class Stack(ABC):
                 f"The scenario '{scenario.name}' kills nodes on the way: fly it with --processes "
                 "and --realtime."
             )
-        self.scenario, self.bag = scenario, bag
+        self.scenario = scenario
+        self.when_exists = scenario.checked_overrides("recorder").get("when_exists", "refuse")
+        """Somebody who names a bag wants that one: by default it is refused where it is there."""
+        self.bag = free_name(bag) if bag is not None and self.when_exists == "next" else bag
         recorder = () if bag is None else ("recorder",)
         self.names = ("plant", *scenario.commanders, *recorder)
         """The nodes, in the order of their start."""
@@ -250,7 +254,7 @@ class InProcessStack(Stack):
     def _make(self, name: str, context: rclpy.Context | None) -> FlightNode:
         overrides = self.scenario.checked_overrides(name)
         if name == "recorder":
-            overrides["bag"] = str(self.bag)
+            overrides |= {"bag": str(self.bag), "when_exists": self.when_exists}
         try:
             node = NODE_TYPES[name](
                 name,

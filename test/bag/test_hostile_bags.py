@@ -110,10 +110,10 @@ def make_device(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (make_pipe, "is a pipe"),
-        (make_socket, "is a socket"),
-        (make_device, "is a device"),
-        (make_folder, "is a folder|holds 0 MCAP files"),
+        (make_pipe, "it is a pipe"),
+        (make_socket, "it is a socket"),
+        (make_device, "it is a device"),
+        (make_folder, "it is a folder|holds 0 MCAP files"),
     ],
 )
 def test_what_is_no_file_is_neither_read_nor_written(

@@ -136,8 +136,16 @@ def test_a_disk_that_fills_up_on_closing_is_reported_once(
     assert salvaged(tmp_path / "a.mcap") == [string("kept")]
 
 
-def test_a_device_that_is_always_full() -> None:
-    with pytest.raises(RecordingError, match="/dev/full: No space left on device"):
+def test_a_disk_that_is_full_from_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Disk(monkeypatch, 10)
+    with pytest.raises(RecordingError, match=r"a\.mcap: No space left on device"):
+        BagWriter(tmp_path / "a.mcap")
+
+
+def test_a_device_is_not_written_to() -> None:
+    with pytest.raises(RecordingError, match="Cannot make the bag /dev/full: it is a device"):
         BagWriter("/dev/full")
 
 

@@ -35,6 +35,7 @@ def test_a_recording_is_split_by_size(harness: Harness, tmp_path: Path) -> None:
         RecorderNode,
         {
             "bag": str(tmp_path / "flight.mcap"),
+            "topics": "/talk",
             "max_size": 0.05,
             "clock_wait": 0.0,
             "compression": "none",

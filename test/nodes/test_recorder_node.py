@@ -193,6 +193,9 @@ def test_a_bag_is_whole_while_the_flight_goes_on(stack: Stack, tmp_path: Path) -
     assert BagContent(stack.bag).count == before
     # Configured again, it writes a new one.
     assert stack.recorder.trigger_configure() is TransitionCallbackReturn.SUCCESS
+    assert stack.recorder.recording is not None
+    first, stack.bag = stack.bag, stack.recorder.recording.writer.path
+    assert stack.bag == first.with_name("flight-1.mcap")
     stack.await_topics(*STREAMS)
     stack.harness.connect()
     stack.recorder.trigger_activate()
@@ -200,6 +203,7 @@ def test_a_bag_is_whole_while_the_flight_goes_on(stack: Stack, tmp_path: Path) -
     stack.fly(0.02)
     stack.stop()
     again = stack.close_bag()
+    assert BagContent(first).count == before
     assert len(again["/odom"]) <= stack.probe.count("/odom") - heard
     assert len(again["/odom"]) > 40
 

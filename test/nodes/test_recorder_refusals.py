@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.lifecycle import TransitionCallbackReturn
 from support.recorded_stack import LATCHED_TOPICS, STREAMS, BagContent, Stack, message_class
 from support.ros_harness import Harness, Probe, construction
@@ -50,10 +56,10 @@ def test_a_full_disk_ends_the_recording_with_one_sentence_and_not_the_flight(
     assert BagContent(stack.bag).count == 100
 
 
-def test_a_device_without_room_is_refused_in_a_sentence(harness: Harness) -> None:
+def test_a_device_is_refused_in_a_sentence(harness: Harness) -> None:
     stack = Stack(harness, Path("/dev/full"))
     assert stack.recorder.trigger_configure() is not TransitionCallbackReturn.SUCCESS
-    assert_one_sentence(str(stack.recorder.fault), "/dev/full", "space")
+    assert_one_sentence(str(stack.recorder.fault), "/dev/full", "it is a device")
     stack.probe.watch("/planner/status", message_class("diagnostic_msgs/msg/DiagnosticStatus"))
     harness.connect()
     stack.fly()
@@ -81,3 +87,63 @@ def test_a_bad_parameter_is_refused_with_a_sentence_that_names_it(
         RecorderNode(**construction(ros_context, parameters))
     assert_one_sentence(str(refusal.value), f"'{name}'", str(value))
     assert not (tmp_path / "flight.mcap").exists()
+
+
+def test_a_recorder_that_is_to_refuse_a_bag_that_is_there_does(
+    ros_context: rclpy.Context, tmp_path: Path
+) -> None:
+    bag = tmp_path / "flight.mcap"
+    bag.write_bytes(b"the record of the crash")
+    parameters = {"bag": str(bag), "when_exists": "refuse"}
+    with pytest.raises(SpaceRobotError) as refusal:
+        RecorderNode(**construction(ros_context, parameters))
+    assert_one_sentence(str(refusal.value), str(bag), "File exists")
+    assert bag.read_bytes() == b"the record of the crash"
+
+
+def test_a_bag_that_goes_is_reported_within_a_second(
+    harness: Harness, ros_domain: int, tmp_path: Path
+) -> None:
+    kinds = {"/diagnostics": DiagnosticArray, "/events": DiagnosticStatus}
+    probe = harness.probe(kinds)
+    bag = tmp_path / "folder" / "flight.mcap"
+    with subprocess.Popen(
+        [
+            *(sys.executable, "-m", "spacerobot_ros.nodes.recorder", "--ros-args"),
+            *("-p", f"bag:={bag}", "-p", "flush_period:=60.0"),
+        ],
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, "ROS_DOMAIN_ID": str(ros_domain)},
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            harness.spin_until(
+                lambda: (
+                    any("Recording has begun" in e.message for e in probe.messages["/events"])
+                    or (bag.exists() and probe.count_publishers("/events") > 0)
+                ),
+                "it records",
+            )
+            bag.unlink()
+            bag.parent.rmdir()
+            gone = time.monotonic()
+            harness.spin_until(lambda: probe.messages["/diagnostics"], "it is reported")
+            seconds = time.monotonic() - gone
+            harness.spin_until(
+                lambda: any(
+                    "recording_failed" in [pair.value for pair in event.values]
+                    for event in probe.messages["/events"]
+                ),
+                "the event",
+            )
+        finally:
+            process.send_signal(signal.SIGINT)
+            errors = process.communicate(timeout=20)[1]
+    (status,) = probe.last("/diagnostics").status
+    assert status.level == DiagnosticStatus.ERROR
+    assert "is lost while it is written: it was removed or moved" in status.message
+    assert seconds < 1.0
+    assert process.returncode == 1
+    assert "is lost while it is written" in errors.splitlines()[-1]
+    assert "Traceback" not in errors

@@ -16,7 +16,6 @@ import struct
 import sys
 import time
 import traceback
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -40,7 +39,6 @@ from mcap.records import (
     McapRecord,
     Message,
     MessageIndex,
-    Metadata,
     MetadataIndex,
     Schema,
     Statistics,
@@ -627,11 +625,15 @@ NUMBERS = {
 }
 for _title, _number in NUMBERS.items():
     # The last numbers of a pose lie before its covariance.
-    CASES[f"flight: every number of joint_states is {_title}"] = lambda number=_number: flight(  # type: ignore[misc]
-        on("/joint_states", lambda n, data: data[:-56] + number * 7)
+    CASES[f"flight: every number of joint_states is {_title}"] = (
+        lambda number=_number: flight(  # type: ignore[misc]
+            on("/joint_states", lambda n, data: data[:-56] + number * 7)
+        )
     )
-    CASES[f"flight: poses of {_title}"] = lambda number=_number: flight(  # type: ignore[misc]
-        on("/odom", lambda n, data: data[:-700] + number * 7 + data[-644:])
+    CASES[f"flight: poses of {_title}"] = (
+        lambda number=_number: flight(  # type: ignore[misc]
+            on("/odom", lambda n, data: data[:-700] + number * 7 + data[-644:])
+        )
     )
 
 
@@ -657,9 +659,7 @@ def _() -> bytes:
 
 @case("flight: a state in 2038")
 def _() -> bytes:
-    return flight(
-        on("/joint_states", lambda n, data: stamped(data, 2**31 - 1) if n == 9 else data)
-    )
+    return flight(on("/joint_states", lambda n, data: stamped(data, 2**31 - 1) if n == 9 else data))
 
 
 @case("flight: a state in 1901")
@@ -952,11 +952,9 @@ def outcomes(folder: Path, operations: list[str], words: str = "") -> Iterator[O
 def main() -> None:
     folder, operations, *words = sys.argv[1:]
     # What every case would import is there before the processes part.
-    import spacerobot_ros.bag.recorded_robot  # noqa: F401
+    import spacerobot_ros.bag.recorded_robot
 
     if operations != "everything":
-        import matplotlib.figure
-
         import spacerobot_ros.cli.main
         import spacerobot_ros.report
         import spacerobot_ros.verification.comparison  # noqa: F401

@@ -1,0 +1,254 @@
+"""The file of a bag: never written over, never shared, missed at once, whole after any kill."""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from spacerobot_ros.bag import BagWriter, Recording, RecordingError, free_name, iterate_raw
+from spacerobot_ros.bag.mcap_file import McapFile
+from spacerobot_ros.bag.salvage import is_complete, salvage_bag
+
+STRING = "std_msgs/msg/String"
+
+
+def string(text: str) -> bytes:
+    """Serialise a std_msgs/String by hand."""
+    data = text.encode() + b"\0"
+    return b"\0\1\0\0" + struct.pack("<I", len(data)) + data
+
+
+def numbers(path: Path) -> list[int]:
+    return [int(data[8:14]) for *_, data in iterate_raw(path)]
+
+
+def make_bag(path: Path, count: int = 3) -> bytes:
+    with BagWriter(path) as writer:
+        channel = writer.add_topic("/a", STRING)
+        for n in range(count):
+            writer.write(channel, string(f"{n:06d}"), n, n)
+    return path.read_bytes()
+
+
+# -- names ------------------------------------------------------------------------------------
+
+
+def test_a_bag_that_is_there_is_kept_and_the_next_name_taken(tmp_path: Path) -> None:
+    path = tmp_path / "crash.mcap"
+    before = make_bag(path)
+    for number in (1, 2):
+        with BagWriter(path, overwrite=False, next_free=True) as writer:
+            assert writer.path == tmp_path / f"crash-{number}.mcap"
+    assert path.read_bytes() == before
+    assert free_name(path) == tmp_path / "crash-3.mcap"
+    with pytest.raises(RecordingError, match=r"crash\.mcap: File exists; name another one"):
+        BagWriter(path, overwrite=False)
+    assert path.read_bytes() == before
+
+
+def test_a_dangling_link_is_a_name_that_is_taken(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.symlink_to(tmp_path / "elsewhere.mcap")
+    with pytest.raises(RecordingError, match="File exists"):
+        BagWriter(path, overwrite=False)
+    assert not (tmp_path / "elsewhere.mcap").exists()
+    assert free_name(path) == tmp_path / "a-1.mcap"
+
+
+@pytest.mark.parametrize("limits", [{}, {"max_size": 10_000}])
+@pytest.mark.parametrize("overwrite", [True, False])
+def test_two_recorders_do_not_share_a_file(
+    tmp_path: Path, limits: dict[str, Any], overwrite: bool
+) -> None:
+    path = tmp_path / "a.mcap"
+    with BagWriter(path, overwrite=overwrite, **limits) as first:
+        channel = first.add_topic("/a", STRING)
+        first.write(channel, string("000007"), 1, 1)
+        with pytest.raises(RecordingError, match=r"is being written by another|File exists"):
+            BagWriter(path, overwrite=overwrite, **limits)
+        with BagWriter(path, overwrite=overwrite, next_free=True, **limits) as second:
+            assert second.path.name.startswith("a-1")
+            assert second.path != first.path
+    assert numbers(first.path) == [7]
+
+
+def test_a_split_bag_is_not_mixed_with_another(tmp_path: Path) -> None:
+    old = make_bag(tmp_path / "a_2.mcap")
+    with pytest.raises(RecordingError, match=r"a_2\.mcap: File exists"):
+        BagWriter(tmp_path / "a.mcap", overwrite=False, max_size=1000)
+    with BagWriter(tmp_path / "a.mcap", next_free=True, max_size=1000) as writer:
+        assert writer.path == tmp_path / "a-1_0.mcap"
+    assert (tmp_path / "a_2.mcap").read_bytes() == old
+
+
+def test_a_file_in_the_way_of_a_split_is_stepped_over(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.mcap", overwrite=False, chunk_size=500, max_size=1500) as writer:
+        channel = writer.add_topic("/a", STRING)
+        old = make_bag(tmp_path / "a_1.mcap")
+        for n in range(60):
+            writer.write(channel, string(f"{n:06d}" + "x" * 90), n, n)
+    assert (tmp_path / "a_1.mcap").read_bytes() == old
+    parts = sorted(tmp_path.glob("a_*.mcap"), key=lambda path: int(path.stem[2:]))
+    assert len(parts) > 3
+    found = [n for path in parts if path.name != "a_1.mcap" for n in numbers(path)]
+    assert found == list(range(60))
+
+
+# -- a file that goes while it is written -----------------------------------------------------
+
+
+def unlink(path: Path) -> None:
+    path.unlink()
+
+
+def replace(path: Path) -> None:
+    other = path.with_suffix(".other")
+    other.write_bytes(path.read_bytes())
+    other.replace(path)
+
+
+def move(path: Path) -> None:
+    path.rename(path.with_suffix(".moved"))
+
+
+def remove_folder(path: Path) -> None:
+    path.unlink()
+    path.parent.rmdir()
+
+
+def replace_folder(path: Path) -> None:
+    path.parent.rename(path.parent.with_name("other"))
+    path.parent.mkdir()
+
+
+def cut(path: Path) -> None:
+    os.truncate(path, 20)
+
+
+def lengthen(path: Path) -> None:
+    with path.open("ab") as file:
+        file.write(b"x")
+
+
+@pytest.mark.parametrize(
+    "harm", [unlink, replace, move, remove_folder, replace_folder, cut, lengthen]
+)
+def test_a_file_that_goes_while_it_is_written_is_missed(
+    tmp_path: Path, harm: Callable[[Path], None]
+) -> None:
+    path = tmp_path / "folder" / "a.mcap"
+    failures: list[RecordingError] = []
+    recording = Recording(BagWriter(path), 0.0, failures.append)
+    channel = recording.writer.add_topic("/a", STRING)
+    recording.start()
+    recording.set_clock(5)
+    recording.record(channel, string("000001"))
+    recording.flush(True)
+    recording.check()
+    assert not failures
+    harm(path)
+    recording.check()
+    recording.check()
+    (failure,) = failures
+    assert f"The bag {path} is lost while it is written: " in str(failure)
+    assert recording.failure is failure
+    assert not recording.running
+    recording.close()
+
+
+def test_a_file_that_goes_just_before_the_end_is_missed(tmp_path: Path) -> None:
+    recording = Recording(BagWriter(tmp_path / "a.mcap"), 0.0)
+    recording.start()
+    (tmp_path / "a.mcap").unlink()
+    recording.close()
+    assert recording.failure is not None
+
+
+def test_a_disk_that_is_full_at_the_very_end_is_a_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def finish(self: McapFile) -> None:
+        raise RecordingError(f"Cannot write the bag {self.path}: no space.")
+
+    recording = Recording(BagWriter(tmp_path / "a.mcap"), 0.0)
+    recording.start()
+    monkeypatch.setattr(McapFile, "finish", finish)
+    with pytest.raises(RecordingError, match="no space"):
+        recording.close()
+    assert recording.failure is not None
+
+
+# -- kills ------------------------------------------------------------------------------------
+
+
+def record_until_killed(path: Path, step: int, share: float) -> None:
+    """Write to the end, or be killed in a step of it, when a share of its bytes is on the disk.
+
+    Every message that was handed to the operating system is counted in a file beside the bag.
+    """
+    whole = McapFile._append
+    left = step
+
+    def append(self: McapFile, data: bytes) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            os.write(self._raw.fileno(), data[: int(share * len(data))])
+            os.kill(os.getpid(), signal.SIGKILL)
+        whole(self, data)
+
+    McapFile._append = append  # type: ignore[method-assign]
+    with BagWriter(path, overwrite=False, compression="none", max_size=3_000) as writer:
+        writer.add_attachment("robot.urdf", b"<robot/>", "application/xml", 5)
+        channel = writer.add_topic("/a", STRING)
+        for n in range(40):
+            writer.write(channel, string(f"{n:06d}" + "x" * 90), n, n)
+            if n % 4 == 3:
+                writer.flush()
+                path.with_suffix(".count").write_text(f"{n + 1}")
+
+
+def saved(part: Path) -> list[int]:
+    if is_complete(part):
+        return numbers(part)
+    with suppress(RecordingError):  # Nothing is in a file that was just begun.
+        return numbers(salvage_bag(part).path)
+    return []
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_kill_in_any_step_of_a_split_loses_nothing_that_was_written(
+    tmp_path: Path, share: float
+) -> None:
+    steps = 0
+    while True:
+        folder = tmp_path / f"{steps}"
+        folder.mkdir()
+        path = folder / "a.mcap"
+        child = os.fork()
+        if not child:
+            record_until_killed(path, steps, share)
+            os._exit(0)
+        status = os.waitpid(child, 0)[1]
+        count = path.with_suffix(".count")
+        written = int(count.read_text()) if count.exists() else 0
+        found: list[int] = []
+        parts = sorted(folder.glob("a_*.mcap"), key=lambda path: int(path.stem[2:]))
+        for part in parts:
+            found += saved(part)
+        assert found == list(range(len(found)))
+        assert len(found) >= written, f"step {steps}"
+        if not status:
+            break
+        assert os.waitstatus_to_exitcode(status) == -signal.SIGKILL
+        steps += 1
+    assert len(parts) >= 3
+    assert found == list(range(40))
+    assert steps > 20
