@@ -21,6 +21,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
+from difflib import SequenceMatcher
 from pathlib import Path
 
 from coverage import CoverageData
@@ -41,6 +42,10 @@ _FIRST = 40
 
 _REPEATED = ("test/nodes/", "test/session/", "test/cli/", "test/benchmarks/", "test/examples/")
 """Tests whose failure is tried again: on a loaded machine one may fail by itself."""
+
+
+_READ_SOURCES = "test/packaging/test_layers.py"
+"""Tests of the text of the package, which reach no line."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,8 @@ class Reach:
 
     seconds: dict[str, float]
     lines: dict[str, dict[int, list[str]]] = field(default_factory=lambda: defaultdict(dict))
+    new: list[str] = field(default_factory=list)
+    """Files of tests that have changed since: whatever else is in them may reach anything."""
 
     @classmethod
     def read(cls, folder: Path) -> Reach:
@@ -98,6 +105,29 @@ class Reach:
                     here[line] = [*here.get(line, []), *names]
         return found
 
+    def moved_to(self, old: Path, new: Path) -> Reach:
+        """Return the same for a project that has changed a little since it was measured."""
+        files = {str(path.relative_to(new)) for path in (new / "test").rglob("test_*.py")}
+        moved = Reach({n: s for n, s in self.seconds.items() if n.split("::")[0] in files})
+        moved.new = sorted(f for f in files if _text(old / f) != _text(new / f))
+        for file, lines in self.lines.items():
+            before, after = _text(old / file), _text(new / file)
+            if before == after:
+                moved.lines[file] = lines
+                continue
+            matcher = SequenceMatcher(None, before.splitlines(), after.splitlines(), False)
+            for tag, a, b, c, d in matcher.get_opcodes():
+                around = [name for k in range(a, b + 2) for name in lines.get(k, ())]
+                for k in range(c, d):
+                    there = lines.get(a + k - c + 1, []) if tag == "equal" else around
+                    moved.lines[file][k + 1] = there
+        return moved
+
+    def new_tests(self, mutant: Mutant) -> list[str]:
+        """Return the files whose tests may reach a change, as far as they are not known."""
+        folder = "test/" + mutant.path.split("/")[1] + "/"
+        return [f for f in self.new if f.startswith((folder, "test/test_", "test/packaging/"))]
+
     def tests_for(self, mutant: Mutant, source: str, limit: float) -> list[str]:
         """Return the tests that reach a change, fastest first, as many as fit into a time (s)."""
         lines = self.lines.get(mutant.path, {})
@@ -109,8 +139,8 @@ class Reach:
             # Constants and defaults: whoever uses anything of the file may see them.
             reaching |= {name for names in lines.values() for name in names}
             folder = "test/" + mutant.path.split("/")[1] + "/"
-            reaching |= {name for name in self.seconds if name.startswith(folder)}
-        known = sorted((n for n in reaching if n in self.seconds), key=lambda n: self.seconds[n])
+            reaching |= {name for name in self.seconds if name.startswith((folder, _READ_SOURCES))}
+        known = sorted((n for n in reaching if n in self.seconds), key=self.seconds.__getitem__)
         chosen, total = [], 0.0
         for name in known:
             total += self.seconds[name]
@@ -160,19 +190,19 @@ class Worker:
         assert changed is not None
         try:
             _write(file, changed)
-            noticed, by, run = self._run(tests)
+            noticed, by, run = self._run(tests, self._reach.new_tests(mutant))
         finally:
             _write(file, source)
         return Verdict(mutant, noticed, by, run, len(tests), time.monotonic() - begin)
 
-    def _run(self, tests: list[str]) -> tuple[bool, str, int]:
+    def _run(self, tests: list[str], new: list[str]) -> tuple[bool, str, int]:
         """Return whether a test failed, which one, and how many were run."""
         count = 0
         until = time.monotonic() + 60 + 4 * self._limit
-        for stage in (tests[:_FIRST], tests[_FIRST:]):
-            if not stage:
+        for stage, files in ((tests[:_FIRST], new), (tests[_FIRST:], [])):
+            if not (stage or files):
                 continue
-            code, ran = self._pytest(stage, until - time.monotonic())
+            code, ran = self._pytest(stage, until - time.monotonic(), files)
             count += len(ran)
             if code is None:
                 return False, "the time was over", count
@@ -184,9 +214,7 @@ class Worker:
             if last.startswith(_REPEATED):
                 code, _ = self._pytest([last], 300)
                 if code == 0:
-                    rest = stage[stage.index(last) + 1 :] + (
-                        tests[_FIRST:] if stage is not tests[_FIRST:] else []
-                    )
+                    rest = tests[tests.index(last) + 1 :] if last in tests else tests
                     code, ran = self._pytest(rest, until - time.monotonic()) if rest else (0, [])
                     if code in (0, 5, None):
                         return False, "", count + len(ran)
@@ -194,11 +222,22 @@ class Worker:
             return True, last, count
         return False, "" if tests else "no test reaches it", count
 
-    def _pytest(self, tests: list[str], timeout: float) -> tuple[int | None, list[str]]:
+    def _pytest(
+        self, tests: list[str], timeout: float, new: Sequence[str] = ()
+    ) -> tuple[int | None, list[str]]:
         """Return pytest's exit code (None: time over) and the tests that were begun."""
         log, limits, cache = (self._folder / n for n in ("log", "limits.json", "cache"))
         log.write_text("")
-        limits.write_text(json.dumps({n: 20 + 8 * self._reach.seconds[n] for n in tests}))
+        seconds = self._reach.seconds
+        limits.write_text(
+            json.dumps(
+                {
+                    "limits": {n: 20 + 8 * seconds.get(n, 0.0) for n in tests},
+                    "new": [*new],
+                    "known": [n for n in seconds if n.split("::")[0] in new],
+                }
+            )
+        )
         # What a mutant compiles or plans must not be found by the next one.
         shutil.rmtree(cache, ignore_errors=True)
         shutil.copytree(self._filled_cache, cache)
@@ -208,7 +247,7 @@ class Worker:
             "SPACEROBOT_MUTANT_LOG": str(log),
             "SPACEROBOT_MUTANT": mark,
         }
-        files = list(dict.fromkeys(name.split("::")[0] for name in tests))
+        files = list(dict.fromkeys([*new, *(name.split("::")[0] for name in tests)]))
         temporary = f"--basetemp={self._folder / 'tmp'}"
         process = subprocess.Popen(
             [*_PYTEST, "-x", "-p", "mutation.one_mutant", temporary, *files],
@@ -230,6 +269,10 @@ class Worker:
 
 
 _PYTEST = [sys.executable, "-m", "pytest", "-q", "--no-header", "-p", "no:cacheprovider"]
+
+
+def _text(path: Path) -> str:
+    return path.read_text("utf-8") if path.exists() else ""
 
 
 def _environment(project: Path, cache: Path) -> dict[str, str]:
@@ -355,7 +398,9 @@ def main() -> int:
     parser.add_argument("--mutate", nargs="+", default=MUTATED, help="folders of the package")
     parser.add_argument("--tests", nargs="*", default=[], help="fewer than all quick tests")
     parser.add_argument("--again", type=Path, help="results whose survivors are judged again")
-    parser.add_argument("--keep-reach", action="store_true", help="although the code has changed")
+    parser.add_argument(
+        "--keep-reach", action="store_true", help="although the code has changed a little"
+    )
     chosen = parser.parse_args()
 
     out = chosen.out.resolve()
@@ -369,7 +414,7 @@ def main() -> int:
         cache.mkdir(parents=True, exist_ok=True, mode=0o700)
         measure(base, reached, cache, chosen.tests, chosen.workers)
         mark.write_text(fingerprint)
-    reach = Reach.read(reached)
+    reach = Reach.read(reached).moved_to(base, PROJECT)
 
     population = list(mutants_of(PROJECT, chosen.mutate, NOT_MUTATED))
     if chosen.again is not None:

@@ -709,3 +709,29 @@ def test_the_documentation_explains_every_phase_event_and_reason() -> None:
     text = PAGE.read_text("utf-8")
     for each in (*Phase, *Event, *PlanReason):
         assert f"`{each.name}`" in text
+
+
+# -- measurements that are none ---------------------------------------------------------------
+
+
+def test_a_goal_whose_result_cannot_be_measured_has_failed_with_the_reason() -> None:
+    loop = evaluating()
+    loop.measured.broken = True
+    loop.tick()
+    status = loop.statuses[-1]
+    assert (status.state, status.goal_id) == (PlannerState.FAILED, "goal-1")
+    assert status.sentence == "The measured state is not finite; see odom and joint_states."
+    assert loop.executive.phase is Phase.IDLE
+    loop.measured.broken = False
+    assert loop.decide(OTHER).state is PlannerState.REACHED
+
+
+def test_a_tracking_error_that_cannot_be_measured_is_none() -> None:
+    loop = executing(ticks=40, wrong_path=0.0, drift_position=1e-3)
+    loop.measured.broken = True
+    loop.tick(3)
+    assert any("The path is not known: The measured state" in n for n in loop.notices)
+    assert loop.executive.phase is Phase.EXECUTING
+    assert not any(loop.speeds[-3:]), "nor is anything commanded"
+    loop.measured.broken = False
+    loop.until(PlannerState.REACHED)

@@ -13,13 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatistics,
     PlannerStatus,
     goal_values,
+    remaining_error,
 )
 
 GOAL = Goal(np.array([0.1, -2.0, 3.5]), np.array([0.0, 0.6, 0.0, 0.8]), np.array([0.25, -0.5]))
@@ -218,3 +219,31 @@ def test_a_goal_file_is_replaced_as_a_whole(
     file.save({BASE: IdentifiedGoal(GOAL, "2.0")})
     assert file.load()[BASE].goal_id == "2.0"
     assert {each.name for each in tmp_path.iterdir()} == {"goal.json", "goal.json.new"}
+
+
+def test_a_remaining_error_names_what_is_controlled() -> None:
+    error = PoseError(
+        np.array([0.03, 0.04, 0.0]), np.array([0.0, 0.0, -0.2]), np.array([0.5, -0.75])
+    )
+    for controls, words in (
+        ({"position"}, "0.05 m from the goal"),
+        ({"attitude"}, "0.2 rad from the goal"),
+        ({"position", "attitude"}, "0.05 m and 0.2 rad from the goal"),
+        ({"attitude", "shape"}, "0.2 rad and 0.75 at the joints from the goal"),
+    ):
+        assert remaining_error(error, frozenset(controls)) == words  # type: ignore[arg-type]
+    unshaped = PoseError(error.position, error.rotvec)
+    assert remaining_error(unshaped, frozenset({"attitude", "shape"})) == "0.2 rad from the goal"
+    assert PoseError(error.position, error.rotvec, np.zeros(0)).farthest_joint == 0.0
+
+
+def test_numbers_and_texts_of_notes_are_read_as_what_they_were() -> None:
+    notes: dict[str, list[float] | float | str] = {
+        "one": 0.123456789123,
+        "many": [1.0, -2.5],
+        "words": "clockwise",
+    }
+    status = PlannerStatus(PlannerState.EXECUTING, method="stub", notes=notes)
+    values = status.to_values()
+    assert [values[key] for key in notes] == ["0.123456789", "1 -2.5", "clockwise"]
+    assert PlannerStatus.from_values(values).notes == {**notes, "one": 0.123456789}

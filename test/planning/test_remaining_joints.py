@@ -14,7 +14,19 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
-from spacerobot_ros.planning import Goal, RobotState, Tolerance, method_options
+from spacerobot_ros.parameters import configured
+from spacerobot_ros.planning import (
+    GaitSchedule,
+    Goal,
+    PlanRequest,
+    RobotState,
+    Tolerance,
+    method_options,
+)
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
+from spacerobot_ros.planning.execution import worker as worker_module
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
@@ -172,3 +184,37 @@ def test_a_method_that_leaves_the_position_does_not_stand_in_for_one_that_does_n
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(2))
     with pytest.raises(PlanningError, match="optimal would leave the position as it comes"):
         method.plan(state, goal)
+
+
+def test_a_worker_builds_the_method_without_some_joints_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robot = robot_of(SERVICER)
+    built: list[dict[str, Any]] = []
+
+    class Counted(RemainingJointsGait):
+        def __init__(self, *args: Any, **options: Any) -> None:
+            built.append(options)
+            super().__init__(*args, **options)
+
+        def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
+            raise PlanningError("It is only counted.")
+
+    monkeypatch.setattr(worker_module, "RemainingJointsGait", Counted)
+    worker = PlanningWorker(robot, configured(PlannerConfig, {"method": "area_loop"}))
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), SHAPE)
+    request = PlanRequest(state, Goal(np.zeros(3), state.quaternion), Tolerance(1e-3, 1e-3))
+    attitude = frozenset({"attitude"})
+    for stuck, required, count in (
+        ({"elbow_pitch": 2.0}, frozenset(), 1),
+        ({"elbow_pitch": 2.0}, frozenset(), 1),
+        ({"elbow_pitch": 2.5}, frozenset(), 2),
+        ({"elbow_pitch": 2.5}, attitude, 3),
+        ({"elbow_pitch": 2.5}, attitude, 3),
+        ({"elbow_pitch": 2.5, "wrist_pitch": 0.8}, attitude, 4),
+    ):
+        with pytest.raises(PlanningError, match="only counted"):
+            worker.plan(PlanningTask(request, stuck, required), Cancellation())  # type: ignore[arg-type]
+        assert len(built) == count
+        assert (built[-1]["stuck"], built[-1]["required"]) == (stuck, required)
+        assert built[-1]["method"] == "area_loop"

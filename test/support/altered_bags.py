@@ -10,6 +10,7 @@ from typing import Any
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from rclpy.serialization import deserialize_message, serialize_message
+from std_msgs.msg import String
 
 Change = Callable[[Any], Any]
 """Takes a message and gives the one in its place, or None to leave it out."""
@@ -28,11 +29,12 @@ def altered(
     change: Change | None = None,
     parameters: dict[str, str] | None = None,
     urdf: tuple[bytes, bytes] = (b"", b""),
+    injected: dict[int, str] | None = None,
 ) -> Path:
     """Copy a bag with something changed.
 
     The message of that number on a topic, some of the plant's parameters, or one text in its URDF
-    that another takes the place of.
+    that another takes the place of. ``injected`` adds messages on /fault_injection, by log time.
     """
     count = 0
     with bag.open("rb") as source, out.open("wb") as target:
@@ -69,6 +71,12 @@ def altered(
             writer.add_message(
                 channels[channel.id], message.log_time, data, message.publish_time, message.sequence
             )
+        if injected:
+            text = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+            channel_id = writer.register_channel("/fault_injection", "cdr", text)
+            for time, line in injected.items():
+                data = bytes(serialize_message(String(data=line)))
+                writer.add_message(channel_id, time, data, time)
         writer.finish()
     assert not topic or count > number
     return out

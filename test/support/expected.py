@@ -8,16 +8,26 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from support.planar_trees import random_tree
 
 from spacerobot_ros.bag.config import RecorderConfig, ReplayConfig
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import Parameter, declared
-from spacerobot_ros.planning import GaitSchedule, Goal, PlanRequest, RobotState, Tolerance, plan
+from spacerobot_ros.planning import (
+    GaitSchedule,
+    Goal,
+    PlanRequest,
+    RobotState,
+    Tolerance,
+    method_options,
+    plan,
+)
 from spacerobot_ros.planning.analysis import analyze
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
@@ -90,6 +100,36 @@ _PLANS: dict[str, dict[str, Any]] = {
         "cycles_per_plan": 3,
         "k": 0.5,
     },
+    "to the shape alone": {
+        "robot": "three_joint_arm",
+        "method": "area_loop",
+        "start": ARM,
+        "joint_positions": (0.3, -0.4, 1.0),
+        "tolerance": Tolerance(1.0, 0.9, 1e-6),
+    },
+    "few large loops": {
+        "robot": "three_joint_arm",
+        "method": "area_loop",
+        "rotvec": (0.3, 0.2, -0.1),
+        "start": ARM,
+        "tolerance": Tolerance(1.0, 0.35),
+        "largest_edge": 0.4,
+        "nominal": (0.2, -0.9, 1.2),
+        "k": 1.0,
+    },
+    "squares round a centre": {
+        "robot": "planar_chain",
+        "method": "square_path",
+        "rotvec": (0.0, 0.0, 0.8),
+        "start": (0.1, -0.2),
+        "given_centre": 1,
+        "centre_1": 0.4,
+        "centre_2": -0.9,
+        "t1": 2.0,
+        "t2": 5.0,
+        "t3": 13.0,
+        "t4": 17.0,
+    },
     "three of six joints": {
         "robot": "servicer",
         "method": "area_loop",
@@ -117,7 +157,11 @@ def plans() -> dict[str, dict[str, Any]]:
         0.01,
         stuck={servicer.joint_names[2]: 1.9, servicer.joint_names[5]: 0.1},
         method="area_loop",
-        options={},
+        options={
+            "area_loop": method_options(
+                "area_loop", {"joints": " ".join(servicer.joint_names[i] for i in (0, 1, 4))}
+            )
+        },
     )
     shape = np.array(SERVICER)
     shape[[2, 5]] = 1.9, 0.1
@@ -125,6 +169,13 @@ def plans() -> dict[str, dict[str, Any]]:
     goal = Goal.checked([0, 0, 0], [0.01, 0.0, -0.02, 1.0])
     request = PlanRequest(state, goal, Tolerance(1.0, 1e-4))
     found["without two joints"] = _numbers(stuck.plan(request))
+    tree = replace(random_tree(np.random.default_rng(3), 4, branched=True), plane=np.eye(3))
+    planar = SpaceRobot.from_urdf(tree.urdf)
+    for turn in (0.3, -1.2):
+        schedule = plan(
+            planar, rotvec=(0.0, 0.0, turn), method="square_path", start=(0.2, -0.4, 0.5)
+        )
+        found[f"planar tree by {turn}"] = _numbers(schedule)
     for robot in ("sliding_masses", "planar_chain", "three_joint_arm", "servicer"):
         result = analyze(SpaceRobot.from_file(robot_file(robot)))
         conditions = result.conditions[np.isfinite(result.conditions)]
