@@ -72,6 +72,12 @@ real-time: $(STAMP)/demo ## fly ten minutes in real time in separate processes, 
 	$(BIN)/spacerobot bench --real-time 600 --rate 100
 	$(BIN)/spacerobot bench --real-time 60 --rate 200 --rate 500
 
+SOAK ?= 1800
+.PHONY: soak
+soak: $(STAMP)/demo ## fly half an hour (SOAK=SECONDS) in separate processes: memory, descriptors, threads; out/soak.png
+	@mkdir -p out
+	$(BIN)/spacerobot bench --soak $(SOAK) --json out/soak.json
+
 # Short flights, so that the bags of all scenarios stay small. A goal not met in time is no failure.
 REFERENCE := --set plant.marker_period=5 --set plant.diagnostics_period=5
 FLY = @fly() { echo "bags/$$1.mcap"; $(BIN)/spacerobot run "$$@" --bag "bags/$$1.mcap" $(REFERENCE) \

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from spacerobot_ros.cli.errors import fail
 from spacerobot_ros.cli.options import PATH, json_option, write_json
 
 
@@ -28,6 +29,13 @@ from spacerobot_ros.cli.options import PATH, json_option, write_json
     metavar="HZ",
     help="... with so many commands a second. May be repeated.  [default: 100]",
 )
+@click.option(
+    "--soak",
+    type=click.FloatRange(min=10.0),
+    metavar="S",
+    help="Instead: fly for S s in real time with a goal every 12 s; whether memory, descriptors "
+    "and threads of all processes stay flat. With --json also a picture beside it.",
+)
 @json_option("Write the figures.")
 @click.option(
     "--against",
@@ -46,12 +54,26 @@ def command(
     ticks: int,
     seconds: float | None,
     rates: tuple[float, ...],
+    soak: float | None,
     json_file: Path | None,
     against: Path | None,
     rounds: int,
 ) -> None:
-    """Measure the speed of the stack against a bare ping-pong in the same run."""
+    """Measure the speed of the stack against a bare ping-pong in the same run.
+
+    Exit code 1: something grows (--soak).
+    """
     figures: Mapping[str, Any]
+    if soak is not None:
+        from spacerobot_ros.benchmarks.soak import run_soak
+
+        picture = None if json_file is None else json_file.with_suffix(".png")
+        figures = run_soak(soak, click.echo, picture)
+        if json_file is not None:
+            write_json(json_file, figures, indent=None)
+        if not figures["flat"]:
+            fail()
+        return
     if against is not None:
         from spacerobot_ros.benchmarks.against import compare_checkouts
 

@@ -96,7 +96,7 @@ class Supervisor:
             # Killed before anything was recorded.
             assert "no message" in refusal or "nothing" in refusal, refusal
             return np.zeros(0)
-        if "/joint_states" not in bag.topics:
+        if "/joint_states" not in bag.topics or not bag.message_count("/joint_states"):
             return np.zeros(0)
         return np.abs(np.asarray(bag["/joint_states"].field("velocity"))).max(axis=1)
 
