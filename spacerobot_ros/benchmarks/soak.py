@@ -34,7 +34,7 @@ _MOST_SAMPLES = 400
 """A trend is the median over all pairs: of more samples every second, third, ... is enough."""
 
 _SEED = 13
-_FARTHEST, _WIDEST = 0.05, 0.0005
+_FARTHEST, _WIDEST = 0.05, 0.0001
 """Of goals in each coordinate, m and rad."""
 
 _MIB = 1024.0
