@@ -121,7 +121,12 @@ class PlantConfig(RobotConfig):
         0.5, "simulated time between markers; 0: none", unit="s", minimum=0.0, maximum=_FAR
     )
     diagnostics_period: float = parameter(
-        1.0, "simulated time between diagnostics; 0: none", unit="s", minimum=0.0, maximum=_FAR
+        1.0,
+        "simulated time between diagnostics; 0: none. Realtime: at least once a second of wall "
+        "time; a paused plant: once a second of wall time",
+        unit="s",
+        minimum=0.0,
+        maximum=_FAR,
     )
     resume_bag: str = parameter(
         "", "bag from whose last state and time to go on; '': the initial state"

@@ -170,3 +170,35 @@ def test_a_busy_machine_misses_deadlines_and_no_tick(harness: Harness) -> None:
     )
     stamps = [nanoseconds(m.header.stamp) for m in rig.probe.messages["joint_states"]]
     assert set(np.diff(stamps)) == {TICK_NS}
+
+
+@pytest.mark.parametrize("period", [20.0, 0.0])
+def test_diagnostics_come_once_a_second_whatever_simulated_time_says(
+    harness: Harness, period: float
+) -> None:
+    rig = Rig(harness, {**REALTIME, "real_time_factor": 1.0, "diagnostics_period": period})
+    before = rig.probe.count("/diagnostics")
+    rig.wait("/diagnostics", before + 3)
+    gaps = np.diff(rig.probe.arrivals["/diagnostics"][before:])
+    # On a busy machine a timer may be late, and no diagnostics come early.
+    assert gaps.min() > 0.9
+    assert gaps.max() < 2.5
+
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+def test_a_paused_plant_goes_on_to_report(harness: Harness, mode: str) -> None:
+    rig = Rig(harness, {**REALTIME, "time_mode": mode, "diagnostics_period": 1000.0})
+    status = harness.probe({"plant/status": DiagnosticStatus}, latched=("plant/status",), name="s")
+    rig.pause(True)
+    harness.settle(rig.probe, status)
+    before, states = rig.probe.count("/diagnostics"), rig.probe.count("joint_states")
+    assert rig.trigger("plant/abort").success
+    harness.spin_until(
+        lambda: "aborted on request" in status.last("plant/status").message, "the abort"
+    )
+    assert status.last("plant/status").level == DiagnosticStatus.ERROR
+    rig.wait("/diagnostics", before + 2)
+    shown = rig.probe.last("/diagnostics").status[0]
+    assert shown.level == DiagnosticStatus.ERROR
+    assert "aborted on request" in shown.message
+    assert rig.probe.count("joint_states") == states, "time stands still"

@@ -222,7 +222,11 @@ class FlightNode(LifecycleNode):
         return stream
 
     def take_raw(
-        self, kind: type[Any], topic: str, callback: Take, number: Callable[[int], None]
+        self,
+        kind: type[Any],
+        topic: str,
+        callback: Take,
+        number: Callable[[int], None] | None = None,
     ) -> None:
         """Subscribe to serialised messages; a listener of the stream is shown them as well.
 
@@ -233,23 +237,28 @@ class FlightNode(LifecycleNode):
         callback
             What is done with each.
         number
-            Called before with the number that its publisher has given to the message.
+            Called before with the number that its publisher has given to the message, if wanted.
         """
         stream = RawInput(self.resolve_topic_name(topic), callback)
 
-        def take(*given: Any) -> None:
-            # rclpy's events executor hands over message and information as one tuple (7.1).
-            raw, info = given[0] if len(given) == 1 else given
+        def take(raw: bytes) -> None:
             try:
-                number(info["publication_sequence_number"])
                 stream.take(raw)  # Looked up for every message: a listener may come and go.
             except Exception as error:
                 self._fail(f"a message on '{topic}'", error)
 
+        def take_numbered(*given: Any) -> None:
+            # rclpy's events executor hands over message and information as one tuple (7.1).
+            raw, information = given[0] if len(given) == 1 else given
+            assert number is not None
+            number(information.get("publication_sequence_number") or 0)  # 0: it has none.
+            take(raw)
+
         # By the number of parameters rclpy finds out that the information is wanted.
-        take.__signature__ = _TWO_PARAMETERS  # type: ignore[attr-defined]
+        take_numbered.__signature__ = _TWO_PARAMETERS  # type: ignore[attr-defined]
+        chosen = take if number is None else take_numbered
         # Guarded already: one call less for each message.
-        super().create_subscription(kind, topic, take, STREAM, raw=True)
+        super().create_subscription(kind, topic, chosen, STREAM, raw=True)
         self.raw_streams.append(stream)
 
     def report_event(self, event: Event) -> None:

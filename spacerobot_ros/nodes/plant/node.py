@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
 
@@ -47,8 +48,11 @@ _STANDSTILL = 1e-3
 _LONGEST_REST = 0.8
 """Wall s in which the joints are brought to rest before the process ends."""
 
+_REPORT_PERIOD_NS = 950_000_000
+"""Wall time without diagnostics after which they are due: with the look's, one a second."""
+
 # Looked up for every command: an enum takes its time to find a member.
-_INACTIVE, _RUNNING, _RESTING = PlantState.INACTIVE, PlantState.RUNNING, PlantState.RESTING
+_RUNNING, _PAUSED, _RESTING = PlantState.RUNNING, PlantState.PAUSED, PlantState.RESTING
 
 
 class PlantNode(FlightNode):
@@ -91,6 +95,10 @@ class PlantNode(FlightNode):
     def state(self) -> PlantState:
         """What the plant does with time and with commands."""
         return self.status.state
+
+    @property
+    def _steps_or_pauses(self) -> bool:
+        return self._active in (PlantState.RUNNING, PlantState.PAUSED)
 
     # -- life ---------------------------------------------------------------------------------
 
@@ -135,7 +143,8 @@ class PlantNode(FlightNode):
                 reader.message_type,
                 source.topic,
                 partial(self._on_command, reader),
-                partial(self._on_number, source.senders),
+                # In lockstep the first command of a tick counts, whoever sends it.
+                None if self._real_time is None else self._number_taker(source.senders),
             )
         self.create_subscription(String, "fault_injection", self._on_fault, STREAM)
         self.create_service(Trigger, "~/reset", self._on_reset)
@@ -151,6 +160,7 @@ class PlantNode(FlightNode):
         self._commands.begin(self.time_ns)
         self._publisher.publish_description()
         self._steady = steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._reported_ns = steady.now().nanoseconds
         if self._real_time is None:
             self._publisher.has_new_readers()
             self._look_for_commanders()
@@ -159,16 +169,14 @@ class PlantNode(FlightNode):
             self._real_time.start(steady.now().nanoseconds, self._tick)
             self._wall_timers = [
                 self.create_timer(self._real_time.period, self._on_wall_tick, clock=steady),
-                self.create_timer(_LOOK_PERIOD, self._count_commanders, clock=steady),
+                self.create_timer(_LOOK_PERIOD, self._on_real_time_look, clock=steady),
             ]
         self._look_at_status()
         self._publish()
 
     def deactivate(self) -> None:
         """Stop time; nothing is commanded when it goes on."""
-        for timer in self._wall_timers:
-            self.destroy_timer(timer)
-        self._wall_timers = []
+        self._stop_timers()
         if self._active in (PlantState.INACTIVE, PlantState.FAILED):
             return
         self._active = PlantState.INACTIVE
@@ -177,6 +185,7 @@ class PlantNode(FlightNode):
 
     def on_failure(self, sentence: str, error: Exception) -> None:
         """Report the failure, and command nothing when the plant is started again."""
+        self._stop_timers()
         self._active = PlantState.FAILED
         reason = "model" if isinstance(error, SpaceRobotError) else "exception"
         if self._monitor is None:
@@ -204,6 +213,11 @@ class PlantNode(FlightNode):
             executor.spin_once(timeout_sec=0.02)
         if self._tick == began and self.is_active:
             self._step()  # Time is slow; servos stop within one tick.
+
+    def _stop_timers(self) -> None:
+        for timer in self._wall_timers:
+            self.destroy_timer(timer)
+        self._wall_timers = []
 
     def cleanup(self) -> None:
         """Say that there is no plant any more."""
@@ -281,7 +295,16 @@ class PlantNode(FlightNode):
         if self._marker_ticks and self._tick % self._marker_ticks == 0:
             self._markers.publish(now)
         if self._report_ticks and self._tick % self._report_ticks == 0:
-            self._report.publish(now)
+            self._publish_report()
+
+    def _publish_report(self) -> None:
+        self._reported_ns = self._steady.now().nanoseconds
+        self._report.publish(self.time_ns)
+
+    def _report_by_wall(self) -> None:
+        """Publish diagnostics where simulated time has not led to any for a second."""
+        if self._steady.now().nanoseconds - self._reported_ns >= _REPORT_PERIOD_NS:
+            self._publish_report()
 
     def _ticks(self, seconds: float) -> int:
         return max(1, round(seconds * NANOSECONDS / self._period_ns)) if seconds else 0
@@ -303,6 +326,8 @@ class PlantNode(FlightNode):
     def _on_look_round(self) -> None:
         """A lockstep plant waits for ever if nobody saw its last state: show it to newcomers."""
         if self._active is not PlantState.RUNNING:
+            if self._report_ticks:
+                self._report_by_wall()
             return  # A subscriber that comes now is shown the state after the pause.
         self._look_for_commanders()
         assert self._lockstep is not None
@@ -310,6 +335,10 @@ class PlantNode(FlightNode):
             self._step()
         elif self._lockstep.waits and self._publisher.has_new_readers():
             self._publisher.publish(self.time_ns, all_topics=True)
+
+    def _on_real_time_look(self) -> None:
+        self._count_commanders()
+        self._report_by_wall()
 
     def _look_for_commanders(self) -> None:
         self._count_commanders()
@@ -321,11 +350,12 @@ class PlantNode(FlightNode):
 
     # -- commands -----------------------------------------------------------------------------
 
-    def _on_number(self, senders: Senders, number: int) -> None:
-        senders.note(number, self._tick * self._period_ns)
+    def _number_taker(self, senders: Senders) -> Callable[[int], None]:
+        note = senders.note
+        return lambda number: note(number, self._tick * self._period_ns)
 
     def _on_command(self, reader: CommandReader, raw: bytes) -> None:
-        if self._active is _INACTIVE:
+        if self._active is not _RUNNING and self._active is not _PAUSED:
             return
         refusal = reader.offer(self._commands, raw, self._tick * self._period_ns)
         if refusal is not None:
@@ -364,7 +394,7 @@ class PlantNode(FlightNode):
         response.message = "The robot is back in its initial state; time goes on."
         # A commander is to know of the reset before it answers a state of it.
         self._look_at_status()
-        if self._active is not PlantState.INACTIVE:
+        if self._steps_or_pauses:
             self._publish()
         return response
 
@@ -391,7 +421,7 @@ class PlantNode(FlightNode):
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._when_active = PlantState.PAUSED if request.data else PlantState.RUNNING
         before = self._active
-        if before is not PlantState.INACTIVE:
+        if self._steps_or_pauses:
             self._active = self._when_active
         self._look_at_status()
         if (before, self._active) == (PlantState.PAUSED, PlantState.RUNNING):
