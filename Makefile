@@ -34,6 +34,7 @@ help: ## show this list
 .PHONY: demo
 demo: $(STAMP)/demo ## fly sliding_masses, the paper's way and the fast way; see out/
 	@mkdir -p out
+	@rm -f out/sliding_masses_paper.mcap out/sliding_masses.mcap
 	$(BIN)/spacerobot run sliding_masses --method lie_bracket --bag out/sliding_masses_paper.mcap
 	$(BIN)/spacerobot run sliding_masses --bag out/sliding_masses.mcap
 	$(BIN)/spacerobot report out/sliding_masses.mcap --beside out/sliding_masses_paper.mcap
@@ -67,6 +68,10 @@ SEED := 1
 mutants: $(STAMP)/mutants ## put random errors into the package; see out/mutants; MUTANTS=400 SEED=1
 	PYTHONPATH=.:test nice $(BIN)/python3 test/mutation/run.py --sample $(MUTANTS) --seed $(SEED)
 
+.PHONY: hostile-bags
+hostile-bags: $(STAMP)/test ## read bags that were made to harm their reader, each in a process of its own
+	$(BIN)/python3 -m pytest -m 'slow or not slow' -rP test/bag/test_hostile_bags.py
+
 .PHONY: real-time
 real-time: $(STAMP)/demo ## fly ten minutes in real time in separate processes, at 100, then 200 and 500 Hz
 	$(BIN)/spacerobot bench --real-time 600 --rate 100
@@ -80,7 +85,7 @@ soak: $(STAMP)/demo ## fly half an hour (SOAK=SECONDS) in separate processes: me
 
 # Short flights, so that the bags of all scenarios stay small. A goal not met in time is no failure.
 REFERENCE := --set plant.marker_period=5 --set plant.diagnostics_period=5
-FLY = @fly() { echo "bags/$$1.mcap"; $(BIN)/spacerobot run "$$@" --bag "bags/$$1.mcap" $(REFERENCE) \
+FLY = @fly() { echo "bags/$$1.mcap"; rm -f "bags/$$1.mcap"; $(BIN)/spacerobot run "$$@" --bag "bags/$$1.mcap" $(REFERENCE) \
     >/dev/null || [ $$? -eq 1 ]; }; fly
 
 .PHONY: bags

@@ -18,6 +18,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     rotvecs_from_quaternions,
 )
+from spacerobot_ros.report.events import LANE, draw_events
 from spacerobot_ros.report.flight import Flight, Target
 from spacerobot_ros.report.signals import Cycles, Signal
 from spacerobot_ros.report.style import (
@@ -54,6 +55,9 @@ _SMALLEST = 1e-9
 BAND = (
     "Where a trace has more samples than the picture has columns, the band spans the smallest and "
     "the largest value in each slice of time."
+)
+EVENTS = (
+    "Below the time axis, what happened: goals and plans above, the robot and its faults below."
 )
 NO_STATES = "The bag holds no base poses (odom), so there is no picture of them."
 NO_JOINTS = "The robot has no joints in this bag."
@@ -196,7 +200,9 @@ def rates_plate(flight: Flight) -> Plate | str:
     names, cycles = flight.joint_names, flight.cycles
     height = 1.0 if len(names) <= 4 else 0.75
     widths = [1.0] if cycles is None else [2.2, 1.0]
-    figure, panels = sheet([widths] * len(names), [height] * len(names), gap=0.36)
+    lane = LANE if flight.events else 0.0
+    bottom = 0.5 + lane
+    figure, panels = sheet([widths] * len(names), [height] * len(names), gap=0.36, bottom=bottom)
     dense = []
     for i, (row, name) in enumerate(zip(panels, names, strict=True)):
         signal = Signal(flight.rates.time, flight.rates.values[:, i : i + 1])
@@ -227,10 +233,14 @@ def rates_plate(flight: Flight) -> Plate | str:
         row[0].set_ylabel(unit)
     if cycles is not None:
         panels[0][1].set_title(f"last {SHOWN_CYCLES} cycles")
+    if flight.events:
+        for axes in panels[-1]:
+            draw_events(axes, flight.events)
     caption = "Velocity of each joint; dotted, its limit in the URDF, where that is in range."
     if cycles is not None:
         caption += f" Right: the last {SHOWN_CYCLES} of {cycles.count} cycles, to the same scale."
     caption += f" {BAND}" if any(dense) else ""
+    caption += f" {EVENTS}" if flight.events else ""
     return Plate("velocities", "Joint velocities", caption, svg_of(figure))
 
 
@@ -275,7 +285,8 @@ def time_plate(flight: Flight, name: str, heading: str, what: str, groups: list[
     if cycles is not None:
         rows, heights = [[1.0], [1.0, 1.0]], [2.0, 1.35]
     right = room_for([name for group in groups for name in group.names])
-    figure, panels = sheet(rows * len(groups), heights * len(groups), right=right)
+    lane = LANE if flight.events else 0.0
+    figure, panels = sheet(rows * len(groups), heights * len(groups), right=right, lane=lane)
     share = min(1.0, 4 / len(groups))
     dense = []
     for number, group in enumerate(groups):
@@ -285,6 +296,9 @@ def time_plate(flight: Flight, name: str, heading: str, what: str, groups: list[
             whole[0].set_title("whole flight")
             dense.append(_first_part(below[0][0], group, cycles))
             _last_cycles(below[0][1], group, cycles)
+    if flight.events:
+        for axes in (each for row in panels for each in row):
+            draw_events(axes, flight.events)
     caption = f"{what}"
     if any(group.goals for group in groups):
         caption += "; dashed, the goal"
@@ -296,7 +310,9 @@ def time_plate(flight: Flight, name: str, heading: str, what: str, groups: list[
             f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
             f"what comes before them, and {_close_up(cycles)}."
         )
-    return Plate(name, heading, caption + (f" {BAND}" if any(dense) else ""), svg_of(figure))
+    caption += f" {BAND}" if any(dense) else ""
+    caption += f" {EVENTS}" if flight.events else ""
+    return Plate(name, heading, caption, svg_of(figure))
 
 
 def _close_up(cycles: Cycles) -> str:
@@ -421,7 +437,8 @@ def momentum_plate(flight: Flight) -> Plate | str:
     changes = np.column_stack(
         [np.linalg.norm(balance[:, k : k + 3] - balance[0, k : k + 3], axis=1) for k in (0, 3)]
     )
-    figure, ((above,), (below,)) = sheet([[1.0], [1.0]], [1.6, 1.1])
+    bottom = 0.5 + (LANE if flight.events else 0.0)
+    figure, ((above,), (below,)) = sheet([[1.0], [1.0]], [1.6, 1.1], bottom=bottom)
     largest = float(changes.max())
     top = np.ceil(np.log10(largest)) if largest > 0 else -15.0
     above.set_yscale("log")
@@ -449,6 +466,8 @@ def momentum_plate(flight: Flight) -> Plate | str:
     below.set_title("kinetic energy")
     below.set_ylabel("J")
     set_time(below, 0.0, flight.end)
+    if flight.events:
+        draw_events(below, flight.events)
     largest_of = ", the largest in each slice of time" if len(time) > 2 * SLICES else ""
     caption = (
         "The momentum balance of the whole system. Top: how far the linear momentum p "
@@ -457,6 +476,7 @@ def momentum_plate(flight: Flight) -> Plate | str:
         "shows, and zero, lies on its lower edge. Bottom: kinetic energy."
     )
     caption += f" {BAND}" if dense else ""
+    caption += f" {EVENTS}" if flight.events else ""
     return Plate("momentum", "Momentum balance", caption, svg_of(figure))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_q
 from spacerobot_ros.planning import METHODS, Goal, PoseError
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.report.events import FlightEvent, read_events
 from spacerobot_ros.report.signals import Cycles, Signal, find_cycles, nearest_rotvec, rotvecs
 from spacerobot_ros.report.solids import SolidRobot
 from spacerobot_ros.session.scenario import Published
@@ -138,6 +139,8 @@ class Flight:
         The goals of base and end-effector.
     planned
         Planned positions of the base (K, 3), one array a schedule.
+    events
+        Changes of state of the nodes; none in bags of earlier versions.
     """
 
     file_name: str
@@ -159,6 +162,7 @@ class Flight:
     sent: list[SentGoal]
     tool_goals: list[SentGoal]
     planned: list[Array]
+    events: list[FlightEvent] = field(default_factory=list)
 
     # -- what it is called --------------------------------------------------------------------
 
@@ -437,6 +441,7 @@ def read_flight(path: Path) -> Flight:
             )
             for _, message in robot.messages("planned_path")
         ],
+        events=robot.events(),
     )
 
 
@@ -470,6 +475,10 @@ class _Recorded(RecordedRobot):
         time = (self._times(series) - self._began)[whole]
         order = np.argsort(time, kind="stable")
         return Signal(time[order], values[whole][order])
+
+    def events(self) -> list[FlightEvent]:
+        """Return the events that figures show."""
+        return read_events(self, self._began, stamped=self._stamped)
 
     def _times(self, series: TopicSeries) -> Array:
         return series.stamp if self._stamped else series.time

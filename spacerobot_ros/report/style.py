@@ -107,13 +107,15 @@ def sheet(
     right: float = 0.25,
     bottom: float = 0.5,
     gap: float = 0.62,
+    lane: float = 0.0,
 ) -> tuple[Figure, list[list[Axes]]]:
     """Return a figure of panels, row by row.
 
     Each row gives the relative widths of its panels, ``heights`` those of the rows in inches;
     there is room for labels ``left`` and ``right`` of the panels, at the ``bottom``, and for titles
-    in the ``gap`` between the rows.
+    in the ``gap`` between the rows, and for a ``lane`` below every row.
     """
+    bottom, gap = bottom + lane, gap + lane
     top, between = 0.3, right + left - 0.1
     height = top + sum(heights) + gap * (len(heights) - 1) + bottom
     figure = new_figure(height)

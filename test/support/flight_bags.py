@@ -59,6 +59,7 @@ class Story:
     prefix: str = ""
     name: str = "joint_"
     topics: Sequence[str] = ("odom", "joint_states", "momentum")
+    events: Sequence[tuple[float, dict[str, str]]] = ()
 
 
 def cyclic_shapes(slide: int = 40, cycles: int = 20, period: int = 30) -> Array:
@@ -104,6 +105,9 @@ def tell(path: Path, story: Story) -> Path:
         for time, sentence, values in story.statuses:
             pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
             say("planner/status", DiagnosticStatus(message=sentence, values=pairs), time)
+        for time, values in story.events:
+            pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+            say("events", DiagnosticStatus(name="/node", message="It is so.", values=pairs), time)
         for k in range(count):
             time = k * TICK
             pose = pose_message(time, share[k] * np.array(FINAL[0]), share[k] * np.array(FINAL[1]))

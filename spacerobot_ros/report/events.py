@@ -1,0 +1,154 @@
+"""Events of a flight below the time axes of its figures: goals, plans, faults, latches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from spacerobot_ros.bag import RecordedRobot
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.report.style import INK, MUTED, PALETTE, panel
+
+LANE = 0.62
+"""Room that a lane with its key takes below a time axis, inches."""
+
+_MOST = 2000
+"""Marks in a lane: more are a band anyway."""
+
+_BELOW = 0.44
+"""Of the lane's upper edge below the axis, inches: labels are between."""
+
+_HEIGHT = 0.24
+_GOOD, _BAD, _WARN, _PLAIN = PALETTE[2], "#c62f2f", PALETTE[1], PALETTE[0]
+
+
+@dataclass(frozen=True)
+class FlightEvent:
+    """An event of a recorded flight, ``time`` in s since its first state."""
+
+    time: float
+    node: str
+    event: Event
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """How events of a kind are drawn: ``row`` 0 is for goals and plans, 1 for the robot."""
+
+    label: str
+    marker: str
+    colour: str
+    row: int
+    hollow: bool = False
+
+
+_MARKS = {
+    EventKind.GOAL_ACCEPTED: _Mark("goal", "v", _PLAIN, 0),
+    EventKind.GOAL_REFUSED: _Mark("goal refused", "v", _BAD, 0, hollow=True),
+    EventKind.PLAN_STARTED: _Mark("plan begun", "o", _PLAIN, 0, hollow=True),
+    EventKind.PLAN_READY: _Mark("plan", "o", _PLAIN, 0),
+    EventKind.CORRECTION: _Mark("correction", "s", _PLAIN, 0, hollow=True),
+    EventKind.GOAL_REACHED: _Mark("goal reached", "*", _GOOD, 0),
+    EventKind.GOAL_FAILED: _Mark("goal failed", "X", _BAD, 0),
+    EventKind.GOAL_ABORTED: _Mark("aborted", "X", _WARN, 0),
+    EventKind.FAULT_INJECTED: _Mark("fault on", "^", _WARN, 1),
+    EventKind.FAULT_ENDED: _Mark("fault off", "^", _WARN, 1, hollow=True),
+    EventKind.FAULTS_CLEARED: _Mark("faults off", "^", _WARN, 1, hollow=True),
+    EventKind.LATCHED: _Mark("latched", "s", _BAD, 1),
+    EventKind.REARMED: _Mark("rearmed", "s", _GOOD, 1, hollow=True),
+    EventKind.STUCK_JOINT: _Mark("stuck joint", "D", _BAD, 1),
+    EventKind.FAILED: _Mark("node failed", "X", _BAD, 1),
+    EventKind.RESTING: _Mark("at rest", "|", MUTED, 1),
+    EventKind.RUNNING: _Mark("running", "|", _GOOD, 1),
+    EventKind.PAUSED: _Mark("paused", "|", INK, 1),
+    EventKind.RESUMED: _Mark("resumed", "|", _PLAIN, 1),
+    EventKind.RESET: _Mark("reset", "P", INK, 1),
+    EventKind.RECORDING_FAILED: _Mark("recording failed", "d", _BAD, 1),
+    EventKind.FILE_SPLIT: _Mark("next file", "d", MUTED, 1, hollow=True),
+    EventKind.NODE_SILENT: _Mark("node silent", "h", _BAD, 1),
+    EventKind.NODE_BACK: _Mark("node back", "h", _GOOD, 1, hollow=True),
+}
+"""Kinds that are drawn; the others are about the life of nodes."""
+
+
+def read_events(robot: RecordedRobot, began: float, *, stamped: bool) -> list[FlightEvent]:
+    """Return the events of a bag that are drawn; none of a bag without them.
+
+    Parameters
+    ----------
+    robot
+        The topics of the robot.
+    began
+        Time of the first state, s.
+    stamped
+        Whether that is a simulated time, as the events' own is; otherwise log times count.
+    """
+    series = robot.get("events")
+    found = []
+    for time_ns, message in series.messages() if series is not None else ():
+        values = {pair.key: pair.value for pair in message.values}
+        try:
+            event = Event.from_values(values, message.message)
+        except SpaceRobotError:
+            continue
+        time = event.time_s if stamped and event.time_s is not None else time_ns / 1e9
+        # Not true of nan either.
+        if event.kind in _MARKS and abs(time - began) < 1e12:
+            found.append(FlightEvent(time - began, message.name, event))
+    return found
+
+
+def draw_events(axes: Axes, events: Sequence[FlightEvent]) -> None:
+    """Draw a lane below a time axis with the events in its span, and a key of their marks."""
+    start, end = axes.get_xlim()
+    shown = [each for each in events if start <= each.time <= end][:_MOST]
+    figure = axes.figure
+    assert isinstance(figure, Figure)
+    across, up = figure.get_size_inches()
+    box = axes.get_position()
+    x, width = box.x0 * across, box.width * across
+    lane = panel(figure, x, box.y0 * up - _BELOW - _HEIGHT, width, _HEIGHT)
+    lane.set_xlim(start, end)
+    lane.set_ylim(-0.6, 1.6)
+    lane.grid(False)
+    lane.spines[:].set_visible(False)
+    lane.set_facecolor("#f4f5f7")
+    lane.tick_params(left=False, bottom=False, labelleft=False, labelbottom=False)
+    lane.set_label("events")
+    for kind, mark in _MARKS.items():
+        times = [each.time for each in shown if each.event.kind is kind]
+        if times:
+            lane.plot(times, [1 - mark.row] * len(times), clip_on=False, **_style(mark))
+    kinds = {each.event.kind for each in shown}
+    keys = [
+        Line2D([], [], label=mark.label, **_style(mark))
+        for kind, mark in _MARKS.items()
+        if kind in kinds
+    ]
+    if keys:
+        lane.legend(
+            handles=keys,
+            loc="upper left",
+            bbox_to_anchor=(0.0, 0.02),
+            ncols=len(keys) if width > 4 else 4,
+            borderaxespad=0.0,
+            handletextpad=0.2,
+            columnspacing=0.9,
+            fontsize=7.0 if len(keys) <= 8 else 5.5,
+        )
+
+
+def _style(mark: _Mark) -> dict[str, Any]:
+    return {
+        "linestyle": "none",
+        "marker": mark.marker,
+        "markersize": 5.0,
+        "markeredgecolor": mark.colour,
+        "markerfacecolor": "none" if mark.hollow else mark.colour,
+    }

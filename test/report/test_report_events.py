@@ -1,0 +1,131 @@
+"""Events of a bag below the time axes of its report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from matplotlib.figure import Figure
+from support.flight_bags import GOAL, TICK, Story, goal_value, still, tell
+
+from spacerobot_ros.events import EventKind
+from spacerobot_ros.report import figures_time
+from spacerobot_ros.report.events import _MARKS
+from spacerobot_ros.report.flight import Flight, read_flight
+
+EVENTS = [
+    (0.05, {"event": "goal_accepted", "time": "0.05"}),
+    (0.10, {"event": "plan_ready", "time": "0.1", "wall_time": "1.7e9"}),
+    # The recorder was late: the node knows when it was.
+    (0.90, {"event": "fault_injected", "time": "0.4"}),
+    (0.60, {"event": "latched"}),
+    (0.70, {"event": "rearmed", "time": "0.7"}),
+    (0.75, {"event": "goal_aborted", "time": "0.75"}),
+    (0.80, {"event": "activated", "time": "0.8"}),
+    (0.80, {"event": "of another version", "time": "0.8"}),
+    (0.80, {"event": "latched", "time": "nan"}),
+    (0.80, {"event": "latched", "time": "1e300"}),
+    (0.80, {}),
+]
+TIMES = {
+    "goal_accepted": 0.05,
+    "plan_ready": 0.1,
+    "fault_injected": 0.4,
+    "latched": 0.6,
+    "rearmed": 0.7,
+    "goal_aborted": 0.75,
+}
+
+
+def story(tmp_path: Path, events: Any = EVENTS, **options: Any) -> Path:
+    executing = {"state": "executing", "method": "lie_bracket", **goal_value()}
+    shapes = still(count=21)
+    shapes[:, 0] = [0.01 * k for k in range(21)]
+    return tell(
+        tmp_path / "a.mcap",
+        Story(
+            shapes,
+            statuses=[(0.1, "Executing.", executing)],
+            goals=[(0.05, *GOAL)],
+            events=events,
+            **options,
+        ),
+    )
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Return the figures that are drawn in this test."""
+    drawn: list[Figure] = []
+
+    def keep(figure: Figure) -> bytes:
+        drawn.append(figure)
+        return b"<svg/>"
+
+    monkeypatch.setattr(figures_time, "svg_of", keep)
+    return drawn
+
+
+def lanes(figure: Figure) -> list[Any]:
+    return [axes for axes in figure.axes if axes.get_label() == "events"]
+
+
+def test_events_have_the_time_that_their_node_gave(tmp_path: Path) -> None:
+    flight = read_flight(story(tmp_path))
+    found = {each.event.kind.value: each.time for each in flight.events}
+    assert found == pytest.approx(TIMES)
+    assert {each.node for each in flight.events} == {"/node"}
+
+
+@pytest.mark.parametrize(
+    "plate",
+    [
+        figures_time.position_plate,
+        figures_time.attitude_plate,
+        figures_time.shape_plate,
+        figures_time.rates_plate,
+        figures_time.momentum_plate,
+    ],
+)
+def test_a_lane_below_every_time_axis_has_every_event(
+    tmp_path: Path, figures: list[Figure], plate: Callable[[Flight], Any]
+) -> None:
+    made = plate(read_flight(story(tmp_path)))
+    assert "Below the time axis" in made.caption
+    (figure,) = figures
+    timed = [axes for axes in figure.axes if axes.get_xlabel() == "time (s)"]
+    below = lanes(figure)
+    assert len(below) == len(timed) >= 1
+    for lane, axes in zip(below, timed, strict=True):
+        assert lane.get_xlim() == axes.get_xlim() == pytest.approx((0.0, 20 * TICK))
+        assert lane.get_position().y1 < axes.get_position().y0
+        assert lane.get_position().y0 > 0
+        drawn = sorted(x for line in lane.lines for x in line.get_xdata())
+        assert drawn == pytest.approx(sorted(TIMES.values()))
+        labels = {text.get_text() for text in lane.get_legend().get_texts()}
+        assert labels == {_MARKS[EventKind(kind)].label for kind in TIMES}
+
+
+@pytest.mark.parametrize("events", [[], EVENTS[6:]])
+def test_a_bag_without_events_has_no_lane(
+    tmp_path: Path, figures: list[Figure], events: list[Any]
+) -> None:
+    made = figures_time.position_plate(read_flight(story(tmp_path, events)))
+    assert not isinstance(made, str)
+    assert "Below the time axis" not in made.caption
+    assert not lanes(figures[0])
+
+
+def test_every_kind_is_a_mark_of_its_own() -> None:
+    looks = [(m.marker, m.colour, m.hollow, m.row) for m in _MARKS.values()]
+    different = set(looks)
+    # Faults that end and faults that are cleared are one thing to the eye.
+    assert len(different) == len(looks) - 1
+    wanted = {
+        *(EventKind.GOAL_ACCEPTED, EventKind.PLAN_READY, EventKind.FAULT_INJECTED),
+        *(EventKind.FAULT_ENDED, EventKind.FAULTS_CLEARED, EventKind.LATCHED, EventKind.REARMED),
+        *(EventKind.STUCK_JOINT, EventKind.GOAL_ABORTED),
+    }
+    assert wanted <= _MARKS.keys()
