@@ -48,6 +48,7 @@ def test_true_model_follows_the_plant(seed: int) -> None:
     start = random_state(rng, robot.n)
     plant = plant_of(robot, start, longest_step=1e-3)
     estimator = DeadReckoning(robot, 0.01, integration_step=1e-3)
+    assert estimator.elapsed == 0.0
     estimator.reset(start)
     assert difference(estimator.state, start) < 1e-12
     for _ in range(50):

@@ -168,6 +168,17 @@ def test_which_methods_suit_the_robots_of_the_papers(name: str, suits: set[str])
         assert sentence.endswith(".")
 
 
+@pytest.mark.parametrize("robot", ["planar_chain", "sliding_masses"])
+def test_with_one_joint_none_of_the_three_axes_is_spanned(robot: str) -> None:
+    found = brackets_anywhere(robot_named(robot), among=[1])
+    assert (found.rank, found.needed, found.joints) == (0, 3, ())
+    assert not found.controllable
+    assert found.singular_values.tolist() == [0.0, 0.0, 0.0]
+    assert found.condition == np.inf
+    with pytest.raises(PlanningError, match=r"has 1 joint\(s\): no loop encloses an area"):
+        found.require()
+
+
 def test_slots_count_by_their_directions_and_not_by_their_size() -> None:
     robot = robot_named("sliding_masses")
     require_three_slots(robot, 1e-11 * np.eye(3))
