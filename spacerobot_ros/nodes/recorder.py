@@ -27,8 +27,9 @@ from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotErro
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.nodes.common.cdr import HEADER_STAMP, NANOSECONDS, first_time_ns
 from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
-from spacerobot_ros.nodes.common.node import STREAM, FlightNode, RawInput, RawStream, Take
+from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
+from spacerobot_ros.nodes.common.streams import RawInput, RawStream, Take
 from spacerobot_ros.topics import NOT_RECORDED
 
 _CLOCK = "/clock"

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import inspect
-import math
-import sys
 import time
 import traceback
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -18,17 +15,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
     SetParametersResult,
 )
 from rclpy._rclpy_pybind11 import RCLError
-from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
-from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -43,9 +35,10 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import robot_from_text, robot_of
-from spacerobot_ros.nodes.common.cdr import raw_publish
 from spacerobot_ros.nodes.common.connections import Connections
 from spacerobot_ros.nodes.common.messages import diagnostic_status
+from spacerobot_ros.nodes.common.ros_parameters import declare
+from spacerobot_ros.nodes.common.streams import RawInput, RawOutput, RawStream, Take
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
@@ -66,68 +59,11 @@ AUTOSTART = Parameter(
 )
 """A parameter of every node."""
 
-_LARGEST_FLOAT = sys.float_info.max
-_INTEGERS = -(2**63), 2**63 - 1
-"""Bounds that descriptors can hold."""
-
 _CAN_SHUT_DOWN = (
     State.PRIMARY_STATE_UNCONFIGURED,
     State.PRIMARY_STATE_INACTIVE,
     State.PRIMARY_STATE_ACTIVE,
 )
-
-Take = Callable[[bytes], None]
-
-_TWO_PARAMETERS = inspect.signature(lambda message, information: None)
-
-
-class RawStream:
-    """The messages of one topic that pass through a node.
-
-    A subscription of its own is dear for a component of the same process that wants every
-    message: the middleware copies each one, queues it, and wakes the executor for it.
-
-    Parameters
-    ----------
-    topic
-        Its full name.
-    take
-        What is done with each message.
-    """
-
-    def __init__(self, topic: str, take: Take) -> None:
-        self.topic = topic
-        self.take = self._take = take
-        """``take`` is what the owner calls with each message; look it up every time."""
-
-    def listen(self, listener: Take) -> None:
-        """Have every message shown to a listener, before it is taken; one listener at a time."""
-        act = self._take
-
-        def take(raw: bytes) -> None:
-            listener(raw)
-            act(raw)
-
-        self.take = take
-
-    def unlisten(self) -> None:
-        """Show messages to nobody any more."""
-        self.take = self._take
-
-
-class RawOutput(RawStream):
-    """What one publisher publishes: ``take`` sends a message on its way."""
-
-    def __init__(self, publisher: Publisher) -> None:
-        super().__init__(publisher.topic_name, raw_publish(publisher))
-        self.readers: Callable[[], int] = publisher.get_subscription_count
-        """Returns how many subscriptions it is matched with."""
-        self.await_readers: Callable[[Duration], bool] = publisher.wait_for_all_acked
-        """Waits until they have received everything; returns whether they have, in time."""
-
-
-class RawInput(RawStream):
-    """What a node receives on a topic, from any publisher: ``take`` is the node's callback."""
 
 
 class FlightNode(LifecycleNode):
@@ -172,7 +108,7 @@ class FlightNode(LifecycleNode):
         self._raising = False
         self._guard_transitions()
         try:
-            values = _declare(self, (AUTOSTART, *declared(self.Config)))
+            values = declare(self, (AUTOSTART, *declared(self.Config)))
             self._autostart = bool(values[AUTOSTART.name])
             self.config = configured(self.Config, values)
             self.add_on_set_parameters_callback(self._on_set_parameters)
@@ -241,24 +177,12 @@ class FlightNode(LifecycleNode):
         """
         stream = RawInput(self.resolve_topic_name(topic), callback)
 
-        def take(raw: bytes) -> None:
-            try:
-                stream.take(raw)  # Looked up for every message: a listener may come and go.
-            except Exception as error:
-                self._fail(f"a message on '{topic}'", error)
+        def on_error(error: Exception) -> None:
+            self._fail(f"a message on '{topic}'", error)
 
-        def take_numbered(*given: Any) -> None:
-            # rclpy's events executor hands over message and information as one tuple (7.1).
-            raw, information = given[0] if len(given) == 1 else given
-            assert number is not None
-            number(information.get("publication_sequence_number") or 0)  # 0: it has none.
-            take(raw)
-
-        # By the number of parameters rclpy finds out that the information is wanted.
-        take_numbered.__signature__ = _TWO_PARAMETERS  # type: ignore[attr-defined]
-        chosen = take if number is None else take_numbered
         # Guarded already: one call less for each message.
-        super().create_subscription(kind, topic, chosen, STREAM, raw=True)
+        callback_of_stream = stream.callback(number, on_error)
+        super().create_subscription(kind, topic, callback_of_stream, STREAM, raw=True)
         self.raw_streams.append(stream)
 
     def report_event(self, event: Event) -> None:
@@ -556,55 +480,3 @@ def _described(error: BaseException) -> str:
     place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     text = " ".join(str(error).split()).rstrip(".")
     return f"{type(error).__name__}{': ' if text else ''}{text}{place}"
-
-
-def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    """Return what ``ros2 param describe`` shows."""
-    unit = f" [{parameter.unit}]" if parameter.unit else ""
-    choices = ", ".join(parameter.choices)
-    described = ParameterDescriptor(
-        name=parameter.name,
-        description=f"{parameter.description}{unit}",
-        read_only=parameter.read_only,
-        additional_constraints=f"one of: {choices}" if choices else "",
-    )
-    low = max(parameter.minimum, -_LARGEST_FLOAT)
-    high = min(parameter.maximum, _LARGEST_FLOAT)
-    if math.isinf(parameter.minimum) and math.isinf(parameter.maximum):
-        return described
-    if isinstance(parameter.default, float):
-        described.floating_point_range = [
-            FloatingPointRange(from_value=float(low), to_value=float(high))
-        ]
-    elif isinstance(parameter.default, int) and not isinstance(parameter.default, bool):
-        least, most = (int(min(max(b, _INTEGERS[0]), _INTEGERS[1])) for b in (low, high))
-        described.integer_range = [IntegerRange(from_value=least, to_value=most)]
-    return described
-
-
-def _declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
-    """Declare parameters on a node and return their checked values.
-
-    A whole number is accepted where a real one is wanted (``rate: 20``).
-
-    Raises
-    ------
-    ParameterError
-        A given value is refused; the sentence names the parameter.
-    """
-    values = {}
-    for parameter in parameters:
-        name = parameter.name
-        # First without a type, to see what was given whatever its type; then as it should be.
-        node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True))
-        given = node.get_parameter(name).value
-        node.undeclare_parameter(name)
-        value = parameter.default if given is None else parameter.checked(given)
-        stored = list(value) if isinstance(value, tuple) else value
-        if value == ():
-            # rclpy cannot tell the type of an empty list: declare the type and leave it unset.
-            kind = RosParameter.Type
-            stored = kind.STRING_ARRAY if parameter.texts else kind.DOUBLE_ARRAY
-        node.declare_parameter(name, stored, _descriptor(parameter), ignore_override=True)
-        values[name] = value
-    return values

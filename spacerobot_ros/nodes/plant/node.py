@@ -22,16 +22,18 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import robot_of
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.messages import diagnostic_status
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, RawInput
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
+from spacerobot_ros.nodes.common.streams import RawInput
 from spacerobot_ros.nodes.plant.command_messages import CommandReader
 from spacerobot_ros.nodes.plant.diagnostics import PlantReport
 from spacerobot_ros.nodes.plant.publisher import LinkMarkers, StatePublisher
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.building import build_plant
-from spacerobot_ros.simulation.commands import CommandValidator, Senders
+from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.reported_state import ReportedState
+from spacerobot_ros.simulation.senders import Senders
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
 from spacerobot_ros.simulation.time_modes import Lockstep, RealTime
 

@@ -16,7 +16,8 @@ from spacerobot_ros.model.description import Pose
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.nodes.common.cdr import MessageTemplate, stamp_bytes
 from spacerobot_ros.nodes.common.messages import message_class, shape_marker
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, RawOutput
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
+from spacerobot_ros.nodes.common.streams import RawOutput
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.reported_state import ReportedState
 from spacerobot_ros.topics import TOPICS, Topic

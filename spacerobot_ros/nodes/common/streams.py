@@ -1,0 +1,97 @@
+"""Serialised messages on their way through a node, which others in the process may listen to."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+
+from spacerobot_ros.nodes.common.cdr import raw_publish
+
+Take = Callable[[bytes], None]
+
+_TWO_PARAMETERS = inspect.signature(lambda message, information: None)
+
+
+class RawStream:
+    """The messages of one topic that pass through a node.
+
+    A subscription of its own is dear for a component of the same process that wants every
+    message: the middleware copies each one, queues it, and wakes the executor for it.
+
+    Parameters
+    ----------
+    topic
+        Its full name.
+    take
+        What is done with each message.
+    """
+
+    def __init__(self, topic: str, take: Take) -> None:
+        self.topic = topic
+        self.take = self._take = take
+        """``take`` is what the owner calls with each message; look it up every time."""
+
+    def listen(self, listener: Take) -> None:
+        """Have every message shown to a listener, before it is taken; one listener at a time."""
+        act = self._take
+
+        def take(raw: bytes) -> None:
+            listener(raw)
+            act(raw)
+
+        self.take = take
+
+    def unlisten(self) -> None:
+        """Show messages to nobody any more."""
+        self.take = self._take
+
+
+class RawOutput(RawStream):
+    """What one publisher publishes: ``take`` sends a message on its way."""
+
+    def __init__(self, publisher: Publisher) -> None:
+        super().__init__(publisher.topic_name, raw_publish(publisher))
+        self.readers: Callable[[], int] = publisher.get_subscription_count
+        """Returns how many subscriptions it is matched with."""
+        self.await_readers: Callable[[Duration], bool] = publisher.wait_for_all_acked
+        """Waits until they have received everything; returns whether they have, in time."""
+
+
+class RawInput(RawStream):
+    """What a node receives on a topic, from any publisher: ``take`` is the node's callback."""
+
+    def callback(
+        self, number: Callable[[int], None] | None, on_error: Callable[[Exception], None]
+    ) -> Callable[..., None]:
+        """Return what a subscription calls with each message.
+
+        Parameters
+        ----------
+        number
+            Called before with the number that its publisher has given to the message, if wanted.
+        on_error
+            Called with an exception of a callback: none leaves the executor.
+        """
+
+        def take(raw: bytes) -> None:
+            try:
+                self.take(raw)  # Looked up for every message: a listener may come and go.
+            except Exception as error:
+                on_error(error)
+
+        if number is None:
+            return take
+
+        def take_numbered(*given: Any) -> None:
+            # rclpy's events executor hands over message and information as one tuple (7.1).
+            raw, information = given[0] if len(given) == 1 else given
+            number(information.get("publication_sequence_number") or 0)  # 0: it has none.
+            take(raw)
+
+        # By the number of parameters rclpy finds out that the information is wanted.
+        take_numbered.__signature__ = _TWO_PARAMETERS  # type: ignore[attr-defined]
+        return take_numbered
