@@ -24,7 +24,7 @@ from spacerobot_ros.cli.options import PATH, settings_option
 def command(
     scenario: str, settings: tuple[str, ...], bag: Path | None, rate: float, processes: bool
 ) -> None:
-    """Run the nodes of SCENARIO in real time until Ctrl-C; send goals by topic."""
+    """Run the nodes of SCENARIO in real time until Ctrl-C, SIGTERM or SIGHUP; goals by topic."""
     from spacerobot_ros.session.scenario import load_scenario
 
     chosen = load_scenario(scenario).in_real_time(rate).with_settings(settings)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from rclpy.experimental import EventsExecutor
@@ -36,7 +37,8 @@ class _Sentences:
         """Show the sentence of the last status if it is new."""
         if self._client.sentence != self._shown:
             self._shown = self._client.sentence
-            self._show(self._shown)
+            with suppress(OSError):  # A closed terminal is no reason to drop the robot.
+                self._show(self._shown)
 
 
 def keep_up(
@@ -56,7 +58,8 @@ def keep_up(
         try:
             with ended_on_request(at_once=stack.interrupt) as stopped:
                 stack.start(None)
-                show(f"{scenario.name} is up; goals on 'goal_pose', Ctrl-C ends it.")
+                with suppress(OSError):
+                    show(f"{scenario.name} is up; goals on 'goal_pose', Ctrl-C ends it.")
                 sentences = _Sentences(stack.client, show)
 
                 def look() -> bool:

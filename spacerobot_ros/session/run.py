@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,7 +99,8 @@ def run_scenario(
 
                 def look() -> bool:
                     if progress is not None:
-                        progress(stack.time_ns / 1e9, stack.client.ends_at or time_limit)
+                        with suppress(OSError):  # A closed terminal ends no flight.
+                            progress(stack.time_ns / 1e9, stack.client.ends_at or time_limit)
                     return stopped()
 
                 stack.spin(look)
