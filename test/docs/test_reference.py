@@ -87,7 +87,7 @@ def test_every_service_is_documented_with_its_type() -> None:
     for path in nodes.rglob("*.py"):
         relative = path.relative_to(nodes)
         folder = relative.parts[0] if len(relative.parts) > 1 else path.stem
-        node = {"controller": "coordinated_control"}.get(folder, folder)
+        node = {"controller": "coordinated_control", "common": "NODE"}.get(folder, folder)
         source = path.read_text(encoding="utf-8")
         for kind, name in re.findall(r'create_service\((\w+), "~/(\w+)"', source):
             found.add((f"{node}/{name}", f"std_srvs/{kind}"))
