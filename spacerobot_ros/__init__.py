@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -11,6 +13,26 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 
 __all__ = ["__version__", "plan", "read_bag"]
+
+
+_TOO_LITTLE = 16 * 2**10
+"""Bytes of shared memory without which libraries of ROS end the process that loads them."""
+
+
+def _warn_of_full_shared_memory() -> None:
+    """Say beforehand what SIGBUS would not: tracing in ROS takes a page of shared memory."""
+    try:
+        facts = os.statvfs("/dev/shm")
+    except OSError:
+        return
+    if facts.f_blocks and facts.f_bavail * facts.f_frsize < _TOO_LITTLE:
+        logging.getLogger(__name__).warning(
+            "/dev/shm is full: ROS may end here with SIGBUS (bus error). Free it; what killed "
+            "processes have left, fastrtps_*, may be deleted while nothing runs."
+        )
+
+
+_warn_of_full_shared_memory()
 
 
 def __getattr__(name: str) -> Any:

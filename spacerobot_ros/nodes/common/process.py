@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import gc
+import logging
 import os
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import rclpy
 from rclpy.duration import Duration
@@ -17,16 +19,55 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes.common.node import FlightNode
 from spacerobot_ros.termination import Terminated, ended_on_request, guarded
 
+_LOG = logging.getLogger(__name__)
+
 _LONGEST_DELIVERY = 1.0
 """Wall s after a signal in which readers may still confirm what they were sent."""
 
 _DISCOVERY_CHOICES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
 
 
+_TRANSPORT_CHOICES = (
+    "FASTDDS_BUILTIN_TRANSPORTS",
+    "FASTDDS_DEFAULT_PROFILES_FILE",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+)
+
+_SHARED_MEMORY = Path("/dev/shm")
+
+_ENOUGH_MEMORY = 2 * 2**20
+"""Free bytes of shared memory that a process starts with; the middleware takes about one MiB."""
+
+
 def use_loopback_discovery() -> None:
-    """Keep discovery on this machine unless the user chose otherwise."""
+    """Keep discovery on this machine unless the user chose otherwise; find a way for messages."""
     if not any(os.environ.get(name) for name in _DISCOVERY_CHOICES):
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    _use_sockets_without_shared_memory()
+
+
+def _use_sockets_without_shared_memory() -> None:
+    """Send messages through sockets where shared memory is missing or full, and say why.
+
+    The middleware does so by itself, after errors that nobody understands.
+    """
+    if any(os.environ.get(name) for name in _TRANSPORT_CHOICES):
+        return
+    try:
+        facts = os.statvfs(_SHARED_MEMORY)
+    except OSError:
+        free = 0
+    else:
+        free = facts.f_bavail * facts.f_frsize if os.access(_SHARED_MEMORY, os.W_OK) else 0
+    if free < _ENOUGH_MEMORY:
+        os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
+        _LOG.warning(
+            "%s has %d kB that can be used: messages go through sockets "
+            "(FASTDDS_BUILTIN_TRANSPORTS=UDPv4). What killed processes have left there, "
+            "fastrtps_*, may be deleted while nothing runs.",
+            _SHARED_MEMORY,
+            free // 1024,
+        )
 
 
 def use_private_discovery() -> None:
