@@ -239,8 +239,9 @@ _TABLE = (
     Topic(
         "/diagnostics",
         "diagnostic_msgs/msg/DiagnosticArray",
-        ("plant", "recorder"),
-        "refused commands, limits, momentum, faults, deadlines; what was recorded and lost",
+        ("plant", "planner", "coordinated_control", "recorder"),
+        "refused commands, limits, momentum, faults, deadlines; ignored states; silent nodes; what "
+        "was recorded and lost",
     ),
     Topic(
         "fault_injection",
@@ -325,13 +326,20 @@ _TABLE = (
         "one record for each change of state: `event` is its kind, `time` simulated, `wall_time` "
         "since the epoch (not in a lockstep run in one process), both in s",
     ),
+    Topic(
+        "heartbeat",
+        _STATUS,
+        ("plant", "planner", "coordinated_control", "recorder", "replay"),
+        "five times a second of wall time from every active node: `name`, `hardware_id` (what "
+        "others depend on it for), `message` (active, busy or inactive); in bags only on request",
+    ),
 )
 
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 """Every topic of the stack by its name; those of the plant in the order of publication."""
 
-NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event")
-"""Ends of topics with the middleware's own messages: recorded only where they are asked for."""
+NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event", "/heartbeat")
+"""Ends of topics that tell nothing of a flight: recorded only where they are asked for."""
 
 
 def state_topics() -> list[Topic]:

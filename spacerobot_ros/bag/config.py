@@ -36,6 +36,13 @@ class RecorderConfig:
     max_duration: float = parameter(
         0.0, "bag time in a file, likewise; 0: never", unit="s", minimum=0.0
     )
+    watchdog_timeout: float = parameter(
+        0.8,
+        "wall time without a heartbeat after which a node that this one depends on is silent; 0: "
+        "never",
+        unit="s",
+        minimum=0.0,
+    )
 
 
 @dataclass(frozen=True)

@@ -86,6 +86,16 @@ class ControllerConfig(BelievedRobotConfig):
         False, "answer no states once a goal is decided: a lockstep plant stays at that tick"
     )
     gains: Gains = group(Gains())
+    watchdog_timeout: float = parameter(
+        0.8,
+        "wall time without a heartbeat after which a node that this one depends on is silent; 0: "
+        "never",
+        unit="s",
+        minimum=0.0,
+    )
+    watchdog_action: str = parameter(
+        "report", "what a silent plant leads to beside a report", choices=("report", "abort")
+    )
     options: Mapping[str, Any] = registered(LAWS)
 
     @property

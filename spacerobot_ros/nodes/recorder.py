@@ -30,6 +30,7 @@ from spacerobot_ros.nodes.common.messages import diagnostic_status, message_clas
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.streams import RawInput, RawStream, Take
+from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.topics import NOT_RECORDED
 
 _CLOCK = "/clock"
@@ -57,6 +58,8 @@ class RecorderNode(FlightNode):
     """Records topics as raw bytes, as rosbag2 would; :class:`Recording` says with which time."""
 
     Config: ClassVar = RecorderConfig
+    role = Role.RECORDER
+    depends_on = (Role.PLANT,)
     config: RecorderConfig
     recording: Recording | None = None
     """What is being recorded, or was last."""

@@ -23,6 +23,7 @@ from spacerobot_ros.nodes.common.cdr import NANOSECONDS, raw_publish
 from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
+from spacerobot_ros.nodes.common.watchdog import Role
 
 _READER_CHECK = 0.05
 """Wall s between two looks for readers."""
@@ -55,6 +56,7 @@ class ReplayNode(FlightNode):
     """
 
     Config: ClassVar = ReplayConfig
+    role = Role.REPLAY
     config: ReplayConfig
 
     def __init__(self, name: str = "replay", **kwargs: Any) -> None:

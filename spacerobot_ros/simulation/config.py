@@ -105,6 +105,16 @@ class PlantConfig(RobotConfig):
         "spaces: malformed not_finite stale early unknown_state out_of_order beyond_limits "
         "second_commander",
     )
+    watchdog_timeout: float = parameter(
+        0.8,
+        "wall time without a heartbeat after which a node that this one depends on is silent; 0: "
+        "never",
+        unit="s",
+        minimum=0.0,
+    )
+    watchdog_action: str = parameter(
+        "report", "what a silent commander leads to beside a report", choices=("report", "latch")
+    )
     integration_step: float = parameter(
         0.0, "longest step; 0: 0.01 (velocity), 0.001 (effort)", unit="s", minimum=0.0, maximum=_FAR
     )

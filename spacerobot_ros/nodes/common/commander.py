@@ -14,11 +14,14 @@ from rclpy.clock import Clock, ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
+from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.node import STREAM, RobotNode
 from spacerobot_ros.nodes.common.state_times import StateTimes
+from spacerobot_ros.nodes.common.watchdog import Role, Silence
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
 _LOOK_PERIOD = 0.1
@@ -133,13 +136,20 @@ class CommanderNode(RobotNode):
     when the plant reports that it does not obey (:class:`PlantListener`).
     """
 
+    role = Role.COMMANDER
+    depends_on = (Role.PLANT,)
+
+    config: PlannerConfig | ControllerConfig
+
     def listen(self, control_period: float) -> None:
         """Subscribe to what the plant publishes; to be called while the node is configured."""
         self._times = StateTimes(control_period)
         self._plant = PlantListener()
         self._ignored_reported, self._next_report = 0, 0.0
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
-        self.create_subscription(DiagnosticStatus, "plant/status", self._on_plant_status, _STATUSES)
+        self._statuses = self.create_subscription(
+            DiagnosticStatus, "plant/status", self._on_plant_status, _STATUSES
+        )
         self.create_subscription(Odometry, "odom", self._on_odom, STREAM, raw=True)
         self.create_subscription(JointState, "joint_states", self._on_joints, STREAM, raw=True)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -167,6 +177,18 @@ class CommanderNode(RobotNode):
     def _plant_changed(self, change: Change) -> None:
         """Do what the change asks for."""
 
+    @property
+    def simulated_time_s(self) -> float | None:
+        """Time of the last state, s; None before the first."""
+        times = getattr(self, "_times", None)
+        return None if times is None or not times.now_ns else times.now_ns / NANOSECONDS
+
+    def on_silence(self, silence: Silence) -> None:
+        """Give up the goals for a silent plant, where that is asked for."""
+        super().on_silence(silence)
+        if self.config.watchdog_action == "abort" and not silence.over:
+            self._plant_stopped(Stopped(silence.sentence))
+
     # -- what the plant publishes -------------------------------------------------------------
 
     def _on_odom(self, raw: bytes) -> None:
@@ -184,7 +206,8 @@ class CommanderNode(RobotNode):
             self._take_joints(raw)
 
     def _look_at_times(self) -> None:
-        """Take up a state that was set aside once it is believed, and report those ignored."""
+        """Take up what waits: statuses, and a state that was set aside once it is believed."""
+        self._take_waiting_statuses()
         times = self._times
         # A plant that is paused publishes nothing that could contradict it.
         believed = None if self._plant.paused else times.believed()
@@ -198,6 +221,13 @@ class CommanderNode(RobotNode):
             self._next_report = time.monotonic() + _REPORT_PERIOD
             self.get_logger().warning(times.last_ignored)
             self._publish_diagnostics(times)
+
+    def _take_waiting_statuses(self) -> None:
+        """Take up statuses that no callback came for: an executor that is busy may lose one."""
+        handle = self._statuses.handle
+        with handle:
+            while (taken := handle.take_message(DiagnosticStatus, False)) is not None:
+                self._on_plant_status(taken[0])
 
     def _publish_diagnostics(self, times: StateTimes) -> None:
         """Publish how many states were ignored, and why the last one was."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 import traceback
 from abc import abstractmethod
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -39,6 +39,7 @@ from spacerobot_ros.nodes.common.connections import Connections
 from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.ros_parameters import declare
 from spacerobot_ros.nodes.common.streams import RawInput, RawOutput, RawStream, Take
+from spacerobot_ros.nodes.common.watchdog import Liveness, Pulse, Role, Silence
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
@@ -94,6 +95,12 @@ class FlightNode(LifecycleNode):
     Config: ClassVar[type[Any]]
     """The frozen dataclass that declares the node's parameters."""
 
+    role: ClassVar[Role | None] = None
+    """What other nodes depend on this one for."""
+
+    depends_on: ClassVar[tuple[Role, ...]] = ()
+    """The roles of the nodes that are noticed when they are silent."""
+
     def __init__(self, name: str, *, autostart: bool | None = None, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
         self.fault: SpaceRobotError | None = None
@@ -102,6 +109,7 @@ class FlightNode(LifecycleNode):
         self.raw_streams: list[RawStream] = []
         """What passes through the node as bytes, from its configuration to its cleanup."""
         self._failure = ""
+        self._liveness: Liveness | None = None
         self._event_stream: RawOutput | None = None
         self.events_have_wall_time = True
         """Off in a run that is to be repeatable to the last message."""
@@ -114,6 +122,8 @@ class FlightNode(LifecycleNode):
             self.add_on_set_parameters_callback(self._on_set_parameters)
             self._event_stream = self.send_raw(DiagnosticStatus, "events", EVENTS)
             self.create_service(Trigger, "~/connections", self._on_connections)
+            timeout = float(getattr(self.config, "watchdog_timeout", 0.0))
+            self._liveness = Liveness(self, self.role, self.depends_on, timeout)
             self.prepare()
             self._permanent_streams = list(self.raw_streams)
             self._permanent = set(self._entities())
@@ -287,6 +297,7 @@ class FlightNode(LifecycleNode):
 
     def destroy_node(self) -> None:
         """Destroy the node and let go of its state machine, which would keep it in the graph."""
+        self._end_heartbeats()
         super().destroy_node()
         self._state_machine = None
 
@@ -313,6 +324,29 @@ class FlightNode(LifecycleNode):
     def interrupt(self) -> None:
         """Give up a computation that takes long; called from another thread when all is to end."""
 
+    def on_silence(self, silence: Silence) -> None:
+        """React to a node that has become silent, or is back; it is reported everywhere."""
+        kind = EventKind.NODE_BACK if silence.over else EventKind.NODE_SILENT
+        level, logger = (0 if silence.over else 2), self.get_logger()
+        if silence.over:
+            logger.info(silence.sentence)
+        else:
+            logger.error(silence.sentence)
+        about = {"node": silence.name, "silent_s": f"{silence.seconds:.3f}"}
+        self.report_event(Event(kind, silence.sentence, level, about=about))
+
+    @contextmanager
+    def long_work(self) -> Iterator[None]:
+        """Tell those that depend on this node that it works on something that may take long."""
+        if self._liveness is None:
+            yield
+            return
+        self._liveness.beat(Pulse.BUSY)
+        try:
+            yield
+        finally:
+            self._liveness.beat()
+
     def drain(self, executor: EventsExecutor) -> None:
         """Complete what is under way before the node ends: about a second is left."""
 
@@ -329,11 +363,15 @@ class FlightNode(LifecycleNode):
         return self._report_transition(result, EventKind.CONFIGURED)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run the hook."""
-        return self._report_transition(self._run(self.activate), EventKind.ACTIVATED)
+        """Run the hook; the heart of the node beats from then on."""
+        result = self._run(self.activate)
+        if result is TransitionCallbackReturn.SUCCESS and self._liveness is not None:
+            self._liveness.begin()
+        return self._report_transition(result, EventKind.ACTIVATED)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run the hook."""
+        self._end_heartbeats()
         return self._report_transition(self._run(self.deactivate), EventKind.DEACTIVATED)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -344,11 +382,13 @@ class FlightNode(LifecycleNode):
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop working and give everything up."""
+        self._end_heartbeats()
         self._run(self.deactivate)
         return self._report_transition(self._run(self.cleanup), EventKind.SHUT_DOWN)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Give everything up after a transition that failed; the node may be configured again."""
+        self._end_heartbeats()
         with suppress(Exception):  # What failed may have left anything.
             self.cleanup()
         self._destroy_configured()
@@ -389,6 +429,10 @@ class FlightNode(LifecycleNode):
             words = kind.value.replace("_", " ")
             self.report_event(Event(kind, f"Node '{self.get_name()}' is {words}."))
         return result
+
+    def _end_heartbeats(self) -> None:
+        if self._liveness is not None:
+            self._liveness.end()
 
     def _guard_transitions(self) -> None:
         """Have a request for an impossible transition answered instead of ending the process."""
@@ -467,7 +511,8 @@ class RobotNode(FlightNode):
     def _on_description(self, message: String) -> None:
         if self._robot is None:
             try:
-                self._use(robot_from_text(message.data, self.config))
+                with self.long_work():
+                    self._use(robot_from_text(message.data, self.config))
             except SpaceRobotError as error:
                 self.get_logger().error(f"robot_description: {error}")
                 return

@@ -46,7 +46,7 @@ from spacerobot_ros.planning.execution.status import (
     PlannerStatus,
     goal_values,
 )
-from spacerobot_ros.planning.execution.worker import LONGEST_END
+from spacerobot_ros.planning.execution.worker import LONGEST_END, PlanningWorker
 
 # Python looks up the member of an enum as slowly as it calls a function; these are for every state.
 _WITHOUT_POSE, _LATE_POSE = Pairing.WITHOUT_POSE, Pairing.LATE_POSE
@@ -132,7 +132,8 @@ class PlannerNode(CommanderNode):
             self._executive.cancel_plan()
 
     def _use(self, robot: SpaceRobot) -> None:
-        self._executive = executive = Executive(robot, self.config, goal_file=self._goal_file)
+        worker = PlanningWorker(robot, self.config, long_work=self.long_work)
+        self._executive = executive = Executive(robot, self.config, worker, self._goal_file)
         self._robot = robot
         self._measured = StateReader(robot.joint_names)
         self._setpoint = setpoint_template(robot.joint_names, executive.setpoint)

@@ -25,6 +25,7 @@ from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.streams import RawInput
+from spacerobot_ros.nodes.common.watchdog import Role, Silence
 from spacerobot_ros.nodes.plant.command_messages import CommandReader
 from spacerobot_ros.nodes.plant.diagnostics import PlantReport
 from spacerobot_ros.nodes.plant.publisher import LinkMarkers, StatePublisher
@@ -66,6 +67,8 @@ class PlantNode(FlightNode):
     """
 
     Config: ClassVar = PlantConfig
+    role = Role.PLANT
+    depends_on = (Role.COMMANDER,)
     config: PlantConfig
 
     def __init__(self, name: str = "plant", **kwargs: Any) -> None:
@@ -384,6 +387,14 @@ class PlantNode(FlightNode):
             self.get_logger().warning(str(error))
             return
         self._look_at_status()
+
+    def on_silence(self, silence: Silence) -> None:
+        """Bring everything to rest for a silent commander, where that is asked for."""
+        super().on_silence(silence)
+        if self.config.watchdog_action == "latch" and not silence.over:
+            self._commands.latch("watchdog", f"node '{silence.name}' is silent", self.time_ns)
+            self._report.latched()
+            self._look_at_status()
 
     # -- services -----------------------------------------------------------------------------
 

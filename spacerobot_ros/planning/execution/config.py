@@ -89,6 +89,16 @@ class PlannerConfig(BelievedRobotConfig):
     stop_when_decided: bool = parameter(
         False, "answer no states once a goal is decided: a lockstep plant stays at that tick"
     )
+    watchdog_timeout: float = parameter(
+        0.8,
+        "wall time without a heartbeat after which a node that this one depends on is silent; 0: "
+        "never",
+        unit="s",
+        minimum=0.0,
+    )
+    watchdog_action: str = parameter(
+        "report", "what a silent plant leads to beside a report", choices=("report", "abort")
+    )
     options: Mapping[str, Any] = registered(METHODS)
 
     @property

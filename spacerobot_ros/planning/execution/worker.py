@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from threading import Thread
 
@@ -87,6 +88,8 @@ class PlanningWorker:
         Of the planner.
     method
         What plans with all joints; None: the method that the configuration names.
+    long_work
+        Returns the context in which a plan is made at once.
 
     Raises
     ------
@@ -95,9 +98,13 @@ class PlanningWorker:
     """
 
     def __init__(
-        self, robot: SpaceRobot, config: PlannerConfig, method: GaitMethod | None = None
+        self,
+        robot: SpaceRobot,
+        config: PlannerConfig,
+        method: GaitMethod | None = None,
+        long_work: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
-        self._robot, self._config = robot, config
+        self._robot, self._config, self._long_work = robot, config, long_work
         self._method = method or build_method(
             config.method, robot, config.control_period, config.integration_step, config.options
         )
@@ -122,7 +129,8 @@ class PlanningWorker:
         if self.background:
             job.start()
         else:
-            job.run()
+            with self._long_work():
+                job.run()
 
     def poll(self) -> Planned | Refused | None:
         """Return the result once it is there, None before and for a plan that was cancelled.

@@ -1,0 +1,244 @@
+"""Which of the nodes that a node depends on are alive: their heartbeats, and the lack of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.clock import Clock, ClockType
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.timer import Timer
+
+from spacerobot_ros.nodes.common.cdr import NANOSECONDS
+from spacerobot_ros.nodes.common.messages import diagnostic_status
+
+if TYPE_CHECKING:
+    from spacerobot_ros.nodes.common.node import FlightNode
+
+TOPIC = "heartbeat"
+
+HEARTBEAT_PERIOD = 0.2
+"""Wall s between two heartbeats of an active node."""
+
+_LOOK_PERIOD = 0.1
+"""Wall s between two looks for nodes that are silent."""
+
+_STANDSTILL = 0.3
+"""Wall s between two looks beyond which this node itself stood still."""
+
+_REPORT_PERIOD = 1.0
+"""Wall s between two diagnostics while a node is silent."""
+
+_HEARTBEATS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
+
+
+class Role(str, Enum):
+    """What others depend on a node for; the value is the ``hardware_id`` of its heartbeats."""
+
+    PLANT = "plant"
+    COMMANDER = "commander"
+    RECORDER = "recorder"
+    REPLAY = "replay"
+
+
+class Pulse(str, Enum):
+    """The state of a node; the value is the ``message`` of its heartbeats."""
+
+    ACTIVE = "active"
+    BUSY = "busy"
+    """It plans or compiles, and gives no heartbeat until that is done."""
+    INACTIVE = "inactive"
+    """It was deactivated or shut down in order, and gives no heartbeat."""
+
+
+@dataclass(frozen=True)
+class Silence:
+    """A node has become silent, or is back.
+
+    Attributes
+    ----------
+    name
+        Its full name.
+    seconds
+        For how long nothing came from it, wall s.
+    over
+        Whether it is back.
+    """
+
+    name: str
+    seconds: float
+    over: bool = False
+
+    @property
+    def sentence(self) -> str:
+        """The same for people."""
+        if self.over:
+            return f"Node '{self.name}' is back after {self.seconds:.2g} s."
+        return f"Node '{self.name}' is silent for {self.seconds:.2g} s."
+
+
+class Watchdog:
+    """Finds nodes whose heartbeats cease.
+
+    A node is watched from its first heartbeat on until it says that it is inactive. While it is
+    busy nothing is expected of it. Where this node itself stood still, all are given their time
+    again.
+
+    Parameters
+    ----------
+    timeout
+        Wall s without a heartbeat after which a node is silent.
+    clock
+        Returns the wall time, s.
+    """
+
+    def __init__(self, timeout: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._timeout, self._clock = timeout, clock
+        self._heard: dict[str, float] = {}
+        """When a node was heard last, or should have been."""
+        self._busy: set[str] = set()
+        self.silent: dict[str, float] = {}
+        """The nodes that are silent, and when each was heard last."""
+        self._looked = clock()
+
+    def hear(self, name: str, pulse: str) -> Silence | None:
+        """Take up a heartbeat; return that a node is back."""
+        now = self._clock()
+        back = None
+        if name in self.silent:
+            back = Silence(name, now - self.silent.pop(name), over=True)
+        self._busy.discard(name)
+        if pulse == Pulse.BUSY.value:
+            self._busy.add(name)
+        if pulse in (Pulse.ACTIVE.value, Pulse.BUSY.value):
+            self._heard[name] = now
+        else:
+            self._heard.pop(name, None)
+        return back
+
+    def look(self) -> list[Silence]:
+        """Return which nodes have become silent since the last look."""
+        now = self._clock()
+        if now - self._looked > _STANDSTILL:
+            for name in self._heard:
+                self._heard[name] = now
+        self._looked = now
+        lost = [
+            Silence(name, now - heard)
+            for name, heard in self._heard.items()
+            if name not in self.silent and name not in self._busy and now - heard > self._timeout
+        ]
+        for silence in lost:
+            self.silent[silence.name] = self._heard[silence.name]
+        return lost
+
+
+class Liveness:
+    """The heartbeats of a node, and its watch over those of others.
+
+    Parameters
+    ----------
+    node
+        Whose they are.
+    role
+        Its own.
+    depends_on
+        The roles that it watches.
+    timeout
+        See :class:`Watchdog`; 0: nothing is watched.
+    """
+
+    def __init__(
+        self, node: FlightNode, role: Role | None, depends_on: Iterable[Role], timeout: float
+    ) -> None:
+        self._node, self._role = node, role
+        self._publisher = node.create_publisher(DiagnosticStatus, TOPIC, _HEARTBEATS)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timers: list[Timer] = []
+        self._watched = {each.value for each in depends_on}
+        self._timeout = timeout
+        self._watchdog: Watchdog | None = None
+        if self._watched and timeout:
+            node.create_subscription(DiagnosticStatus, TOPIC, self._on_heartbeat, _HEARTBEATS)
+            self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", _HEARTBEATS)
+
+    def begin(self) -> None:
+        """Give heartbeats, and watch, from now on."""
+        self._end_timers()
+        node = self._node
+        beat = node.create_timer(HEARTBEAT_PERIOD, self.beat, clock=self._steady)
+        self._timers.append(beat)
+        if self._watched and self._timeout:
+            self._watchdog = Watchdog(self._timeout)
+            self._timers.append(node.create_timer(_LOOK_PERIOD, self._look, clock=self._steady))
+            self._next_report = 0.0
+        self.beat()
+
+    def end(self) -> None:
+        """Say that no heartbeat is to be expected any more."""
+        if self._timers:
+            self._end_timers()
+            self._watchdog = None
+            with suppress(Exception):  # The context may be gone.
+                self._publish(Pulse.INACTIVE)
+
+    def beat(self, pulse: Pulse = Pulse.ACTIVE) -> None:
+        """Give a heartbeat, if the node is active."""
+        if self._timers:
+            self._publish(pulse)
+
+    def _publish(self, pulse: Pulse) -> None:
+        name, role = self._node.get_fully_qualified_name(), self._role
+        self._publisher.publish(
+            DiagnosticStatus(
+                name=name, message=pulse.value, hardware_id="" if role is None else role.value
+            )
+        )
+
+    def _end_timers(self) -> None:
+        for timer in self._timers:
+            self._node.destroy_timer(timer)
+        self._timers.clear()
+
+    def _on_heartbeat(self, message: DiagnosticStatus) -> None:
+        watchdog = self._watchdog
+        if watchdog is None or message.hardware_id not in self._watched:
+            return
+        if message.name == self._node.get_fully_qualified_name():
+            return
+        back = watchdog.hear(message.name, message.message)
+        if back is not None:
+            self._report([back])
+
+    def _look(self) -> None:
+        assert self._watchdog is not None
+        lost = self._watchdog.look()
+        if lost or (self._watchdog.silent and time.monotonic() >= self._next_report):
+            self._report(lost)
+
+    def _report(self, news: list[Silence]) -> None:
+        """Have the node react to what is new, and publish who is silent."""
+        for silence in news:
+            self._node.on_silence(silence)
+        watchdog, node = self._watchdog, self._node
+        if watchdog is None:
+            return  # The reaction was to stop.
+        self._next_report = time.monotonic() + _REPORT_PERIOD
+        silent = sorted(watchdog.silent)
+        values = dict.fromkeys(silent, "silent")
+        values.update({each.name: "back" for each in news if each.over})
+        status = diagnostic_status(
+            f"{node.get_fully_qualified_name()}: watchdog",
+            DiagnosticStatus.ERROR if silent else DiagnosticStatus.OK,
+            f"silent: {', '.join(silent)}" if silent else "all nodes are heard",
+            values,
+        )
+        array = DiagnosticArray(status=[status])
+        now_ns = round((node.simulated_time_s or 0.0) * NANOSECONDS)
+        array.header.stamp.sec, array.header.stamp.nanosec = divmod(now_ns, NANOSECONDS)
+        self._diagnostics.publish(array)

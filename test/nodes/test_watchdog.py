@@ -1,0 +1,233 @@
+"""Nodes that become silent are noticed and named; those that are busy or inactive are not."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from support.planner_flight import NEAR, PLANNER, Flight, values_of
+from support.ros_harness import Harness
+
+from spacerobot_ros.nodes import RecorderNode
+from spacerobot_ros.nodes.common.watchdog import Pulse, Silence, Watchdog
+from spacerobot_ros.simulation.status import PlantState
+
+REAL_TIME = {"time_mode": "realtime", "real_time_factor": 1.0, "command_timeout": 5.0}
+
+
+class Watch:
+    """A watchdog, its clock, and what it finds."""
+
+    def __init__(self, timeout: float = 0.8) -> None:
+        self.now = 50.0
+        self.watchdog = Watchdog(timeout, clock=lambda: self.now)
+        self.found: list[Silence] = []
+
+    def spend(self, seconds: float, *beating: str, every: float = 0.2) -> None:
+        """Let time pass; these nodes give their heartbeats."""
+        for step in range(round(seconds / 0.1)):
+            self.now += 0.1
+            if step % round(every / 0.1) == 0:
+                for name in beating:
+                    self.hear(name)
+            self.found += self.watchdog.look()
+
+    def hear(self, name: str, pulse: str = "active") -> None:
+        back = self.watchdog.hear(name, pulse)
+        if back is not None:
+            self.found.append(back)
+
+
+def test_a_node_that_is_silent_is_named_once_within_a_second() -> None:
+    watch = Watch()
+    watch.spend(5.0, "/plant", "/planner")
+    watch.spend(1.0, "/plant")
+    (silence,) = watch.found
+    assert (silence.name, silence.over) == ("/planner", False)
+    assert 0.8 < silence.seconds <= 1.0
+    watch.spend(5.0, "/plant")
+    assert len(watch.found) == 1
+    assert list(watch.watchdog.silent) == ["/planner"]
+    watch.hear("/planner")
+    back = watch.found[-1]
+    assert (back.name, back.over) == ("/planner", True)
+    assert back.seconds == pytest.approx(6.1, abs=0.2)
+    watch.spend(5.0, "/plant", "/planner")
+    assert len(watch.found) == 2
+    assert not watch.watchdog.silent
+
+
+@pytest.mark.parametrize("pulse", [Pulse.INACTIVE, Pulse.BUSY])
+def test_nothing_is_expected_of_nodes_that_say_so(pulse: Pulse) -> None:
+    watch = Watch()
+    watch.spend(1.0, "/planner")
+    watch.hear("/planner", pulse.value)
+    watch.spend(100.0)
+    assert watch.found == []
+    # It is watched again from its next heartbeat on.
+    watch.hear("/planner")
+    watch.spend(1.0)
+    assert [silence.name for silence in watch.found] == ["/planner"]
+
+
+def test_a_node_that_was_never_heard_is_not_missed() -> None:
+    watch = Watch()
+    watch.spend(100.0)
+    assert watch.found == []
+
+
+def test_a_node_that_stood_still_itself_blames_no_other() -> None:
+    watch = Watch()
+    watch.spend(1.0, "/plant")
+    for _ in range(5):
+        watch.now += 30.0
+        watch.found += watch.watchdog.look()
+    assert watch.found == []
+    watch.spend(1.0)
+    assert [silence.name for silence in watch.found] == ["/plant"]
+
+
+class Watched(Flight):
+    """A flight whose heartbeats, events and diagnostics are heard."""
+
+    def __init__(self, harness: Harness, **options: Any) -> None:
+        super().__init__(harness, options.get("planner"), {**REAL_TIME, **options.get("plant", {})})
+        self.doctor = harness.probe(
+            {
+                "/diagnostics": DiagnosticArray,
+                "events": DiagnosticStatus,
+                "heartbeat": DiagnosticStatus,
+            },
+            name="doctor",
+        )
+        harness.connect()
+        self.start()
+
+    def events(self, *kinds: str) -> list[tuple[str, str]]:
+        """Return node and subject of the events of these kinds."""
+        return [
+            (message.name, values_of(message)["node"])
+            for message in self.doctor.messages["events"]
+            if values_of(message)["event"] in kinds
+        ]
+
+    def diagnosed(self, name: str) -> list[DiagnosticStatus]:
+        return [
+            status
+            for array in self.doctor.messages["/diagnostics"]
+            for status in array.status
+            if status.name == name
+        ]
+
+    def silence(self, node: Any) -> float:
+        """Have nobody run a node's callbacks; return after how long that is noticed, wall s."""
+        self.harness.executor.remove_node(node)
+        began = time.monotonic()
+        self.harness.spin_until(lambda: self.events("node_silent"), "the silence", timeout=5.0)
+        return time.monotonic() - began
+
+
+def test_a_silent_planner_is_noticed_by_the_plant_and_is_back(harness: Harness) -> None:
+    flight = Watched(harness)
+    flight.send(NEAR)
+    flight.wait("executing")
+    assert flight.silence(flight.planner) < 1.0
+    assert flight.events("node_silent") == [("/plant", "/planner")]
+    harness.spin_until(lambda: flight.diagnosed("/plant: watchdog"), "the diagnostics")
+    status = flight.diagnosed("/plant: watchdog")[-1]
+    assert status.level == DiagnosticStatus.ERROR
+    assert "/planner" in status.message
+    assert flight.plant.state is PlantState.RUNNING  # It is reported, and no more.
+    harness.executor.add_node(flight.planner)
+    harness.spin_until(lambda: flight.events("node_back"), "the planner")
+    assert flight.events("node_back") == [("/plant", "/planner")]
+    harness.spin_until(
+        lambda: flight.diagnosed("/plant: watchdog")[-1].level == DiagnosticStatus.OK, "an OK"
+    )
+
+
+def test_a_silent_commander_latches_a_plant_that_is_asked_to(harness: Harness) -> None:
+    flight = Watched(harness, plant={"watchdog_action": "latch"})
+    flight.send(NEAR)
+    flight.wait("executing")
+    flight.silence(flight.planner)
+    harness.spin_until(lambda: flight.plant.state is PlantState.LATCHED, "the latch")
+    assert flight.plant.status.reason == "watchdog"
+    assert "/planner" in flight.plant.status.sentence
+    # The planner learns why when it is back.
+    harness.executor.add_node(flight.planner)
+    assert "'/planner' is silent" in flight.wait("aborted").message
+
+
+def test_a_silent_plant_is_noticed_by_commander_and_recorder(
+    harness: Harness, tmp_path: Any
+) -> None:
+    flight = Watched(harness, planner={**PLANNER, "watchdog_action": "abort"})
+    harness.make(RecorderNode, {"bag": str(tmp_path / "flight.mcap")})
+    harness.connect()
+
+    def beats(name: str) -> int:
+        return sum(m.name == name for m in flight.doctor.messages["heartbeat"])
+
+    before = beats("/plant")
+    harness.spin_until(lambda: beats("/plant") > before + 1 and beats("/recorder"), "all beat")
+    flight.send(NEAR)
+    flight.wait("executing")
+    assert flight.silence(flight.plant) < 1.0
+    harness.spin_until(lambda: len(flight.events("node_silent")) == 2, "both notice")
+    assert sorted(flight.events("node_silent")) == [
+        ("/planner", "/plant"),
+        ("/recorder", "/plant"),
+    ]
+    assert "'/plant' is silent" in flight.wait("aborted").message
+
+
+def test_nodes_that_end_or_rest_in_order_are_not_missed(harness: Harness) -> None:
+    flight = Watched(harness)
+    harness.spin_until(lambda: flight.doctor.count("heartbeat") > 4, "heartbeats")
+    flight.planner.trigger_deactivate()
+    harness.spin_for(1.2)
+    assert flight.doctor.messages["heartbeat"][-1].name == "/plant"
+    flight.planner.trigger_activate()
+    harness.spin_for(0.3)
+    harness.remove(flight.planner)
+    flight.plant.trigger_deactivate()
+    harness.spin_for(1.2)
+    assert flight.events("node_silent") == []
+    states = [(m.name, m.message) for m in flight.doctor.messages["heartbeat"]]
+    assert ("/planner", "inactive") in states
+    assert states[-1] == ("/plant", "inactive")
+
+
+def test_a_planner_that_plans_is_busy_and_not_silent(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A plan that is made at once keeps the planner from its heartbeats, and here nobody else."""
+    flight = Watched(harness)
+    plan = flight.planner._executive._worker.plan  # type: ignore[union-attr]
+
+    def slow(*given: Any) -> Any:
+        end = time.monotonic() + 1.2
+        flight.plant._liveness._watchdog._looked = time.monotonic()  # type: ignore[union-attr]
+        while time.monotonic() < end:
+            # Another process would look meanwhile.
+            flight.plant._liveness._look()  # type: ignore[union-attr]
+            flight.plant._liveness._watchdog.hear("/planner", heard[-1])  # type: ignore[union-attr]
+        return plan(*given)
+
+    heard = ["active"]
+    beat = flight.planner._liveness._publish  # type: ignore[union-attr]
+
+    def publish(pulse: Pulse) -> None:
+        heard.append(pulse.value)
+        beat(pulse)
+
+    monkeypatch.setattr(flight.planner._liveness, "_publish", publish)
+    monkeypatch.setattr(flight.planner._executive._worker, "plan", slow)  # type: ignore[union-attr]
+    flight.send(NEAR)
+    flight.wait("executing")
+    at = heard.index("busy")
+    assert heard[at : at + 2] == ["busy", "active"]
+    assert flight.events("node_silent") == []
