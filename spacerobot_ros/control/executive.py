@@ -12,6 +12,7 @@ from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.state import ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import Goal
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
@@ -51,6 +52,8 @@ class ControlExecutive:
         Where the present goals are saved for a controller that is restarted.
     warn
         Called with a sentence where the goals cannot be saved.
+    report_event
+        Called with every event of a goal.
     """
 
     def __init__(
@@ -60,10 +63,11 @@ class ControlExecutive:
         report: Callable[[ControllerStatus], None],
         goal_file: GoalFile | None = None,
         warn: Callable[[str], None] = lambda sentence: None,
+        report_event: Callable[[Event], None] = lambda event: None,
     ) -> None:
         self.controller = controller
         self._config = config
-        self._report, self._warn = report, warn
+        self._report, self._warn, self._report_event = report, warn, report_event
         self._file = goal_file if goal_file is not None else GoalFile("", GOAL_KEYS)
         self._longest_gap = max(_GAP, _GAP_PERIODS * config.control_period)
         self.reset()
@@ -136,6 +140,7 @@ class ControlExecutive:
     def refuse(self, sentence: str, goal_id: str = "") -> None:
         """Report that a goal is refused; an earlier one is still pursued."""
         self._publish(ControllerState.REFUSED, sentence, goal_id)
+        self._decided(EventKind.GOAL_REFUSED, sentence, ControllerState.REFUSED, goal_id)
 
     def resume(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         """Accept the goals that an earlier controller saved.
@@ -191,6 +196,7 @@ class ControlExecutive:
         # At once: the next measured state may be long in coming.
         self._goal_state = self._reported_state = ControllerState.ABORTED
         self._publish(ControllerState.ABORTED, self._abort_sentence)
+        self._decided(EventKind.GOAL_ABORTED, self._abort_sentence, ControllerState.ABORTED)
         return True
 
     def plant_obeys_again(self) -> None:
@@ -241,6 +247,9 @@ class ControlExecutive:
             self._goal_state = self._outcome(time)
             if self._goal_state.decided:
                 self._file.delete()
+                reached = self._goal_state is ControllerState.REACHED
+                kind = EventKind.GOAL_REACHED if reached else EventKind.GOAL_FAILED
+                self._decided(kind, self._sentence(self._goal_state), self._goal_state)
         state = self.state
         if (
             state is self._reported_state
@@ -270,6 +279,7 @@ class ControlExecutive:
         if self._abort_requested:
             self._goal_state = self._reported_state = ControllerState.ABORTED
             self._publish(ControllerState.ABORTED, self._sentence(ControllerState.ABORTED))
+            self._decided(EventKind.GOAL_ABORTED, self._abort_sentence, ControllerState.ABORTED)
         elif self._goal_state is not ControllerState.ABORTED:
             self._goal_state, self._goal_id = ControllerState.HOLDING, ""
         self._abort_requested = self._hold_here = False
@@ -288,6 +298,8 @@ class ControlExecutive:
             end_effector=poses.get(END_EFFECTOR),
             joints=shapes[0] if shapes else None,
         )
+        sentence, goal_id = "The goal is accepted.", self._goal_id
+        self._report_event(Event(EventKind.GOAL_ACCEPTED, sentence, goal_id=goal_id))
         self._goal_state = ControllerState.TRACKING
         self._started = self._next_report = time
         self._within_since = None
@@ -335,6 +347,13 @@ class ControlExecutive:
     def _publish(self, state: ControllerState, sentence: str, goal_id: str | None = None) -> None:
         about = self._goal_id if goal_id is None else goal_id
         self._report(ControllerStatus(state, sentence, about, self._command_report))
+
+    def _decided(
+        self, kind: EventKind, sentence: str, state: ControllerState, goal_id: str | None = None
+    ) -> None:
+        """Report the event of a goal that is decided; by default of the present one."""
+        about = self._goal_id if goal_id is None else goal_id
+        self._report_event(Event(kind, sentence, state.level, goal_id=about))
 
     def _sentence(self, state: ControllerState) -> str:
         errors = self.controller.errors()

@@ -654,3 +654,96 @@ def test_the_estimate_begins_at_the_last_measured_state_whatever_becomes_of_its_
             result = controller.command(PERIOD * tick, state if tick < 2 else None, q, qdot)
         commands.append(np.concatenate([result.realised.wrench_B, result.realised.tau]))
     np.testing.assert_array_equal(commands[0], commands[1])
+
+
+# -- events, and a plant that does not obey ---------------------------------------------------
+
+
+def kinds(loop: ExecutiveLoop) -> list[tuple[str, str]]:
+    return [(event.kind.value, event.goal_id) for event in loop.events]
+
+
+def test_each_change_of_a_goal_is_one_event() -> None:
+    loop = ExecutiveLoop(settle_time=0.02, time_limit=0.2)
+    loop.answer(3)
+    assert loop.events == []
+    loop.aim(base=goal_at([0.0, 0.0, 0.0], "here"))
+    loop.answer(5)
+    loop.aim(base=goal_at([1.0, 0.0, 0.0], "there"))
+    loop.answer(30)
+    loop.aim(base=goal_at([2.0, 0.0, 0.0], "beyond"))
+    loop.answer(3)
+    loop.executive.abort()
+    loop.answer(30)
+    loop.executive.refuse("It is too far.", "far")
+    assert kinds(loop) == [
+        ("goal_accepted", "here"),
+        ("goal_reached", "here"),
+        ("goal_accepted", "there"),
+        ("goal_failed", "there"),
+        ("goal_accepted", "beyond"),
+        ("goal_aborted", "beyond"),
+        ("goal_refused", "far"),
+    ]
+
+
+def test_a_plant_that_stops_ends_the_goal_at_once_and_once(tmp_path: Path) -> None:
+    file = tmp_path / "goals.json"
+    loop = ExecutiveLoop(file)
+    loop.aim(base=goal_at([1.0, 0.0, 0.0], "there"))
+    loop.answer(3)
+    assert file.exists()
+    assert loop.executive.plant_stopped("The plant is latched.")
+    assert (loop.state, loop.status.goal_id) == ("aborted", "there")
+    assert loop.status.sentence == "Aborted by the plant: The plant is latched."
+    assert not file.exists()
+    loop.place = np.array([0.4, 0.0, 0.0])
+    wrench, _ = loop.answer()
+    np.testing.assert_allclose(wrench, 0.0, atol=1e-12)
+    loop.answer(5)
+    assert loop.status.sentence == "Aborted by the plant: The plant is latched."
+    assert not loop.executive.plant_stopped("The plant is latched.")
+    assert kinds(loop) == [("goal_accepted", "there"), ("goal_aborted", "there")]
+    # A goal that waits for its first state is given up as well.
+    loop.aim(base=goal_at([2.0, 0.0, 0.0], "beyond"))
+    assert loop.executive.plant_stopped("The plant has failed.")
+    assert loop.status.goal_id == "beyond"
+    wrench, _ = loop.answer()
+    np.testing.assert_allclose(wrench, 0.0, atol=1e-12)
+
+
+def test_a_plant_that_rested_before_a_goal_ends_only_older_ones() -> None:
+    loop = ExecutiveLoop()
+    loop.answer(3)
+    loop.aim(base=goal_at([1.0, 0.0, 0.0], "there"))
+    loop.answer(3)
+    assert not loop.executive.plant_stopped("It is too old.", 30_000_000)
+    assert loop.executive.plant_stopped("It is too old.", 40_000_000)
+
+
+def test_a_held_pose_is_not_flown_back_to_after_a_latch() -> None:
+    loop = ExecutiveLoop(settle_time=0.02)
+    loop.aim(base=goal_at([0.0, 0.0, 0.0], "here"))
+    loop.answer(5)
+    assert loop.state == "reached"
+    assert not loop.executive.plant_stopped("The plant is latched.")
+    loop.place = np.array([0.4, 0.0, 0.0])
+    loop.executive.plant_obeys_again()
+    wrench, _ = loop.answer()
+    np.testing.assert_allclose(wrench, 0.0, atol=1e-12)
+    assert (loop.state, loop.status.goal_id) == ("holding", "")
+
+
+@pytest.mark.parametrize("ticks", [10**8, -3 * 10**5])
+def test_a_jump_of_time_is_no_progress_of_a_goal(ticks: int) -> None:
+    loop = ExecutiveLoop(settle_time=0.05, time_limit=0.1)
+    loop.tick = 4 * 10**5
+    loop.aim(base=goal_at([0.0, 0.0, 0.0], "here"))
+    loop.answer(3)
+    loop.tick += ticks
+    loop.answer()
+    assert loop.state == "tracking"
+    loop.answer(3)
+    assert loop.state == "tracking"
+    loop.answer(3)
+    assert loop.state == "reached"

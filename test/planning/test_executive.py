@@ -16,6 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.planner_loop import HERE, NEAR, TICK_NS, Loop, Place, StubMethod, goal_at
 
+from spacerobot_ros.events import Event as FlightEvent
+from spacerobot_ros.events import EventKind
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
 from spacerobot_ros.planning.execution.state_machine import (
     TRANSITIONS,
@@ -735,3 +737,43 @@ def test_a_tracking_error_that_cannot_be_measured_is_none() -> None:
     assert not any(loop.speeds[-3:]), "nor is anything commanded"
     loop.measured.broken = False
     loop.until(PlannerState.REACHED)
+
+
+# -- events -----------------------------------------------------------------------------------
+
+
+def events_of(loop: Loop) -> list[tuple[str, str]]:
+    """Return kind and goal of every event of an executive, in order."""
+    events = [output for output in loop.outputs if isinstance(output, FlightEvent)]
+    return [(event.kind.value, event.goal_id) for event in events]
+
+
+def test_each_change_of_a_goal_is_one_event() -> None:
+    loop = resting()
+    stub_of(loop).overshoot = 0.1
+    assert loop.decide(NEAR).corrections == 1
+    planned = [("plan_started", "goal-1"), ("plan_ready", "goal-1")]
+    assert events_of(loop) == [
+        *planned,
+        ("goal_accepted", "goal-1"),
+        ("correction", "goal-1"),
+        *planned,
+    ]
+    first = next(output for output in loop.outputs if isinstance(output, FlightEvent))
+    assert first.time_s == 0.0
+    assert dict(first.about) == {"reason": "new goal"}
+    loop.outputs.clear()
+    loop.decide(FAR)
+    assert events_of(loop) == [("plan_started", "goal-2")]
+
+
+def test_stuck_joints_are_an_event_that_names_them() -> None:
+    loop = long_flight()
+    quick_without_joints(loop)
+    stuck(loop)
+    (event,) = [
+        output
+        for output in loop.outputs
+        if isinstance(output, FlightEvent) and output.kind is EventKind.STUCK_JOINT
+    ]
+    assert (event.level, event.goal_id, dict(event.about)) == (1, "goal-1", {"joints": "slider_1"})

@@ -16,6 +16,7 @@ from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
 from spacerobot_ros.control.status import ControllerStatus
+from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import Goal
@@ -55,6 +56,7 @@ class ExecutiveLoop:
         self.config = configured(ControllerConfig, {**defaults, **settings})
         self.statuses: list[ControllerStatus] = []
         self.warnings: list[str] = []
+        self.events: list[Event] = []
         self.file = GoalFile(str(goal_file or ""), GOAL_KEYS)
         self.executive = ControlExecutive(
             build_controller(planar_manipulator(), self.config),
@@ -62,6 +64,7 @@ class ExecutiveLoop:
             self.statuses.append,
             self.file,
             self.warnings.append,
+            self.events.append,
         )
         self.tick = 0
         self.place, self.velocity, self.rates = np.zeros(3), np.zeros(3), np.zeros(2)

@@ -19,6 +19,7 @@ from spacerobot_ros.control.executive import END_EFFECTOR, GOAL_KEYS, ControlExe
 from spacerobot_ros.control.reference import HeldVelocityReference
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import CommandError, PlanningError
+from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import (
@@ -111,6 +112,7 @@ class CoordinatedControlNode(CommanderNode):
             self._publish_status,
             self._goal_file,
             self.get_logger().error,
+            self.report_event,
         )
         self._joints = JointReader(robot.joint_names, ["position", "velocity"], complete=True)
         self._references = JointReader(robot.joint_names, ["position", "velocity"])
@@ -166,6 +168,8 @@ class CoordinatedControlNode(CommanderNode):
     def _refuse(self, error: PlanningError, goal_id: str) -> None:
         if self._robot is None:
             self._publish_status(ControllerStatus(ControllerState.REFUSED, str(error), goal_id))
+            event = Event(EventKind.GOAL_REFUSED, str(error), level=2, goal_id=goal_id)
+            self.report_event(event)
         else:
             self._executive.refuse(str(error), goal_id)
 

@@ -15,6 +15,7 @@ from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.errors import CommandError, PlanningError
+from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import stamp_bytes
@@ -50,6 +51,15 @@ from spacerobot_ros.planning.execution.worker import LONGEST_END, PlanningWorker
 
 # Python looks up the member of an enum as slowly as it calls a function; these are for every state.
 _WITHOUT_POSE, _LATE_POSE = Pairing.WITHOUT_POSE, Pairing.LATE_POSE
+
+
+_DECISIONS = {
+    PlannerState.REACHED: EventKind.GOAL_REACHED,
+    PlannerState.FAILED: EventKind.GOAL_FAILED,
+    PlannerState.REFUSED: EventKind.GOAL_REFUSED,
+    PlannerState.ABORTED: EventKind.GOAL_ABORTED,
+}
+"""The event of each status that decides a goal."""
 
 
 class PlannerNode(CommanderNode):
@@ -280,6 +290,8 @@ class PlannerNode(CommanderNode):
                     self._publish_status(output)
                 case ScheduleStart():
                     self._announce(output)
+                case Event():
+                    self.report_event(output)
                 # Three calls: rclpy refuses one that changes its severity.
                 case Notice(Severity.INFO, sentence):
                     logger.info(sentence)
@@ -301,8 +313,12 @@ class PlannerNode(CommanderNode):
         )
 
     def _publish_status(self, status: PlannerStatus) -> None:
-        """Publish a status and log its sentence."""
+        """Publish a status, and an event where it decides a goal, and log its sentence."""
         self._status_topic.publish(status_message(status, self.get_fully_qualified_name()))
+        kind = _DECISIONS.get(status.state)
+        if kind is not None:
+            level, goal_id = status.state.level, status.goal_id
+            self.report_event(Event(kind, status.sentence, level, goal_id=goal_id))
         if status.state.decided and self.config.stop_when_decided:
             self._running = False
         if status.state.level:

@@ -13,6 +13,8 @@ from enum import Enum
 from typing import NamedTuple, Protocol
 
 from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.events import Event as FlightEvent
+from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import POSE, Controlled, PoseError, RobotState
@@ -76,7 +78,7 @@ class ScheduleStart:
     stamp_ns: int
 
 
-Output = PlannerStatus | ScheduleStart | Notice | Transition
+Output = PlannerStatus | ScheduleStart | Notice | Transition | FlightEvent
 """What an executive hands out beside setpoints, in order."""
 
 
@@ -426,8 +428,13 @@ class Executive:
             self._request(ticket, state)
 
     def _correct_tracking(self, pursuit: _Pursuit, error: TrackingError) -> None:
-        pursuit.corrections += 1
+        self._count_correction(pursuit, f"{error}: the remaining motion is planned again.")
         self._notice(Severity.WARNING, f"{error}: the remaining motion is planned again.")
+
+    def _count_correction(self, pursuit: _Pursuit, sentence: str) -> None:
+        pursuit.corrections += 1
+        about = {"corrections": str(pursuit.corrections)}
+        self._happened(EventKind.CORRECTION, sentence, pursuit.identified, 1, **about)
 
     # -- planning -----------------------------------------------------------------------------
 
@@ -461,6 +468,9 @@ class Executive:
         )
         self._ticket, self._commanded_from_ns = ticket, self._stamp_ns
         self._go(Event.PLAN_REQUESTED, Phase.PLANNING)
+        reason = ticket.reason.value
+        sentence = f"A plan is made: {reason}."
+        self._happened(EventKind.PLAN_STARTED, sentence, ticket.identified, reason=reason)
         self._worker.submit(
             PlanningTask(
                 request,
@@ -490,6 +500,15 @@ class Executive:
         self._plan_time += result.wall_time
         self._plans += 1
         self._notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
+        if isinstance(result, Planned):
+            method, duration = result.schedule.method, f"{result.schedule.duration:.9g}"
+            self._happened(
+                EventKind.PLAN_READY,
+                f"The plan is a {method} gait of {result.schedule.duration:.6g} s.",
+                ticket.identified,
+                method=method,
+                duration_s=duration,
+            )
         self._conclude_plan(ticket, result)
 
     def _conclude_plan(self, ticket: _Ticket, result: Planned | Refused) -> None:
@@ -539,6 +558,7 @@ class Executive:
     def _accept(self, pursuit: _Pursuit) -> None:
         """Pursue a new goal, with all joints."""
         self._pursuit, self._tracker.stuck = pursuit, []
+        self._happened(EventKind.GOAL_ACCEPTED, "The goal is accepted.", pursuit.identified)
         try:
             self._file.save({BASE: pursuit.identified})
         except ParameterError as error:
@@ -608,7 +628,10 @@ class Executive:
         self._average.restart()
         self._go(Event.JOINTS_STUCK, self._phase_at_rest())
         names = ", ".join(self._robot.joint_names[i] for i in tracker.stuck)
-        self._notice(Severity.WARNING, f"Stuck: {names}. The remaining motion is planned without.")
+        sentence = f"Stuck: {names}. The remaining motion is planned without."
+        self._notice(Severity.WARNING, sentence)
+        joints = {"joints": names}
+        self._happened(EventKind.STUCK_JOINT, sentence, pursuit.identified, 1, **joints)
 
     # -- evaluating ---------------------------------------------------------------------------
 
@@ -633,7 +656,8 @@ class Executive:
             if pursuit.corrections >= self.config.max_corrections:
                 self._fail(error, f" after {pursuit.corrections} correction(s).", Event.FAILED)
                 return
-            pursuit.corrections += 1
+            left = remaining_error(error, controls)
+            self._count_correction(pursuit, f"The remaining motion is planned: {left}.")
         self._request(_Ticket(pursuit.identified, pursuit.next_plan, remaining=error), state)
 
     def _fail(self, remaining: PoseError, why: str, event: Event) -> None:
@@ -659,6 +683,17 @@ class Executive:
 
     def _notice(self, severity: Severity, sentence: str) -> None:
         self.outputs.append(Notice(severity, sentence))
+
+    def _happened(
+        self,
+        kind: EventKind,
+        sentence: str,
+        identified: IdentifiedGoal,
+        level: int = 0,
+        **about: str,
+    ) -> None:
+        now = self._stamp_ns / 1e9
+        self.outputs.append(FlightEvent(kind, sentence, level, now, identified.goal_id, about))
 
     def _report(
         self,
