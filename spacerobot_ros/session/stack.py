@@ -28,6 +28,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.session.mission_client import MissionClient, Outcome
 from spacerobot_ros.session.scenario import Scenario
+from spacerobot_ros.topics import NOT_RECORDED
 
 _DISCOVERY_TIMEOUT = 10.0
 
@@ -294,7 +295,8 @@ class InProcessStack(Stack):
     def _connected(self) -> bool:
         ours = [p for node in self._nodes for p in node.publishers if node is not self._recorder]
         topics = {p.topic_name for p in ours} - {"/rosout", "/parameter_events"}
-        if self._recorder is not None and not topics <= self._recorder.topics:
+        recorded = {topic for topic in topics if not topic.endswith(NOT_RECORDED)}
+        if self._recorder is not None and not recorded <= self._recorder.topics:
             return False
         expected: dict[str, int] = {}
         for node in self._nodes:

@@ -130,7 +130,7 @@ def test_a_restarted_plant_is_believed_when_nothing_contradicts_it(at: float) ->
     assert listener.times.ignored == 0
 
 
-def test_a_node_that_stood_still_itself_believes_no_other_time_for_it() -> None:
+def test_a_node_that_stood_still_itself_believes_no_other_time() -> None:
     listener = Listener()
     listener.states(20)
     assert not listener.joints(1e6)

@@ -123,7 +123,7 @@ class FlightNode(LifecycleNode):
             self._event_stream = self.send_raw(DiagnosticStatus, "events", EVENTS)
             self.create_service(Trigger, "~/connections", self._on_connections)
             timeout = float(getattr(self.config, "watchdog_timeout", 0.0))
-            self._liveness = Liveness(self, self.role, self.depends_on, timeout)
+            self._liveness = Liveness(self, self.role, self.depends_on, timeout, self._on_silence)
             self.prepare()
             self._permanent_streams = list(self.raw_streams)
             self._permanent = set(self._entities())
@@ -430,6 +430,9 @@ class FlightNode(LifecycleNode):
             self.report_event(Event(kind, f"Node '{self.get_name()}' is {words}."))
         return result
 
+    def _on_silence(self, silence: Silence) -> None:
+        self.on_silence(silence)
+
     def _end_heartbeats(self) -> None:
         if self._liveness is not None:
             self._liveness.end()
@@ -458,6 +461,8 @@ class FlightNode(LifecycleNode):
     def _destroy_configured(self) -> None:
         """Destroy what configure made; the services of every ROS node stay for the next start."""
         self.raw_streams[:] = self._permanent_streams
+        if self._liveness is not None:
+            self._liveness.forget_configured()
         destroy = {
             Timer: self.destroy_timer,
             Subscription: self.destroy_subscription,

@@ -7,18 +7,15 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.messages import diagnostic_status
-
-if TYPE_CHECKING:
-    from spacerobot_ros.nodes.common.node import FlightNode
 
 TOPIC = "heartbeat"
 
@@ -151,12 +148,20 @@ class Liveness:
         The roles that it watches.
     timeout
         See :class:`Watchdog`; 0: nothing is watched.
+    on_silence
+        Called when a node has become silent, or is back.
     """
 
     def __init__(
-        self, node: FlightNode, role: Role | None, depends_on: Iterable[Role], timeout: float
+        self,
+        node: Node,
+        role: Role | None,
+        depends_on: Iterable[Role],
+        timeout: float,
+        on_silence: Callable[[Silence], None],
     ) -> None:
-        self._node, self._role = node, role
+        self._node, self._role, self._on_silence = node, role, on_silence
+        self._diagnostics: Publisher | None = None
         self._publisher = node.create_publisher(DiagnosticStatus, TOPIC, _HEARTBEATS)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers: list[Timer] = []
@@ -165,7 +170,6 @@ class Liveness:
         self._watchdog: Watchdog | None = None
         if self._watched and timeout:
             node.create_subscription(DiagnosticStatus, TOPIC, self._on_heartbeat, _HEARTBEATS)
-            self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", _HEARTBEATS)
 
     def begin(self) -> None:
         """Give heartbeats, and watch, from now on."""
@@ -175,6 +179,10 @@ class Liveness:
         self._timers.append(beat)
         if self._watched and self._timeout:
             self._watchdog = Watchdog(self._timeout)
+            if self._diagnostics is None:
+                self._diagnostics = node.create_publisher(
+                    DiagnosticArray, "/diagnostics", _HEARTBEATS
+                )
             self._timers.append(node.create_timer(_LOOK_PERIOD, self._look, clock=self._steady))
             self._next_report = 0.0
         self.beat()
@@ -186,6 +194,10 @@ class Liveness:
             self._watchdog = None
             with suppress(Exception):  # The context may be gone.
                 self._publish(Pulse.INACTIVE)
+
+    def forget_configured(self) -> None:
+        """Take note that what was created since the construction is destroyed."""
+        self._diagnostics = None
 
     def beat(self, pulse: Pulse = Pulse.ACTIVE) -> None:
         """Give a heartbeat, if the node is active."""
@@ -224,9 +236,9 @@ class Liveness:
     def _report(self, news: list[Silence]) -> None:
         """Have the node react to what is new, and publish who is silent."""
         for silence in news:
-            self._node.on_silence(silence)
+            self._on_silence(silence)
         watchdog, node = self._watchdog, self._node
-        if watchdog is None:
+        if watchdog is None or self._diagnostics is None:
             return  # The reaction was to stop.
         self._next_report = time.monotonic() + _REPORT_PERIOD
         silent = sorted(watchdog.silent)
@@ -238,7 +250,4 @@ class Liveness:
             f"silent: {', '.join(silent)}" if silent else "all nodes are heard",
             values,
         )
-        array = DiagnosticArray(status=[status])
-        now_ns = round((node.simulated_time_s or 0.0) * NANOSECONDS)
-        array.header.stamp.sec, array.header.stamp.nanosec = divmod(now_ns, NANOSECONDS)
-        self._diagnostics.publish(array)
+        self._diagnostics.publish(DiagnosticArray(status=[status]))
