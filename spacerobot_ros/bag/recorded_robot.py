@@ -169,7 +169,8 @@ def _last_state(robot: RecordedRobot) -> LastState:
     k, j = (int(np.flatnonzero(series.stamp_ns == common[-1])[-1]) for series in (odom, joints))
     pose = odom.table(columns("odom", "pose.pose"))[k]
     names = robot.joint_names
-    positions, rates = (np.asarray(joints.field(name)[j]) for name in ("position", "velocity"))
+    positions = np.asarray(joints.field("position")[j])
+    rates = np.asarray(joints.field("velocity")[j])
     momenta = np.asarray(momentum.field("data")[min(k, len(momentum) - 1)])[:6]
     numbers = np.concatenate([pose, positions, rates, momenta])
     whole = len(positions) == len(rates) == len(names) and len(momenta) == 6

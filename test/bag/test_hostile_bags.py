@@ -76,6 +76,17 @@ def test_what_inflates_much_is_read_where_the_user_says_so(
     assert read_bag(path).message_count() == 1
 
 
+def test_all_chunks_together_are_bounded(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    size = 20 * 2**20
+    part = Part("zstd", zstd_zeros(size, claims=size), size)
+    path.write_bytes(bag(part))
+    assert read_bag(path).message_count() == 1
+    path.write_bytes(bag(part, part))
+    with pytest.raises(RecordingError, match=f"inflates to {2 * size} bytes"):
+        read_bag(path)
+
+
 def test_a_sentence_names_the_place(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     content = bag(Part("", message(string("x")), 2**63))
