@@ -15,6 +15,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 from support.control_loop import SHAPE, STATUS, TIP, URDF, Loop, pose
 from support.ros_harness import LATCHED, Harness, Probe, construction, nanoseconds
 from support.sentences import assert_one_sentence
@@ -203,6 +204,24 @@ def test_a_robot_that_comes_later_and_cannot_go_on_says_so_and_holds(
     harness.connect()
     description.publish(String(data=URDF.read_text("utf-8")))
     assert_one_sentence(loop.wait_for("refused").message, "computed_torque", "end-effector")
+    np.testing.assert_allclose(loop.answer()[0], 0.0, atol=1e-12)
+
+
+def test_a_goal_that_is_aborted_before_the_robot_is_known_is_not_flown_to(
+    harness: Harness, file: Path
+) -> None:
+    file.write_text(written("base", position=[0.5, 0.25, 0.0]))
+    loop = Loop(harness, robot="", resume_file=str(file))
+    description = loop.probe.create_publisher(String, "robot_description", LATCHED)
+    harness.connect()
+    client = loop.probe.create_client(Trigger, "control/abort")
+    answer = harness.call(client, Trigger.Request())
+    assert answer.success
+    assert loop.wait_for("aborted").message == answer.message
+    assert not file.exists()
+    assert not harness.call(client, Trigger.Request()).success, "nothing waits any more"
+    description.publish(String(data=URDF.read_text("utf-8")))
+    harness.spin_until(lambda: loop.node._robot is not None, "the robot is known")
     np.testing.assert_allclose(loop.answer()[0], 0.0, atol=1e-12)
 
 

@@ -235,3 +235,18 @@ def test_the_messages_themselves_are_kept_as_they_came() -> None:
     states.put_odom(odom(1))
     states.put_joint_states(joints(2))
     assert (states.odom, states.joint_states) == (odom(1), joints(2))
+
+
+def test_a_topic_that_is_required_again_keeps_its_message() -> None:
+    states = StateSynchroniser(pose_required=True)
+    states.require("joint_reference")
+    assert states.latest("joint_reference") == b""
+    states.put_odom(odom(3))
+    states.put_joint_states(joints(3))
+    assert states.ready() is None, "it waits for its reference"
+    states.put_required("joint_reference", joints(3))
+    states.require("joint_reference")
+    assert states.latest("joint_reference") == joints(3)
+    assert states.ready() is WHOLE
+    states.require("joint_reference", required=False)
+    assert states.latest("joint_reference") == b""

@@ -174,11 +174,23 @@ class CoordinatedControlNode(CommanderNode):
             self._executive.refuse(str(error), goal_id)
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._running and self._robot is not None
+        response.success = self._running and (self._robot is not None or bool(self._waiting))
         response.message = "The robot holds where it is."
-        if response.success:
+        if not response.success:
+            response.message = "There is no goal to abort."
+        elif self._robot is not None:
             self._executive.abort()
+        else:
+            response.message = "Aborted on request, before the robot was known."
+            self._abort_waiting(response.message)
         return response
+
+    def _abort_waiting(self, sentence: str) -> None:
+        """Give up the goals that wait for the robot."""
+        *_, goal = self._waiting.values()
+        self._waiting = {}
+        self._goal_file.delete()
+        self._publish_status(ControllerStatus(ControllerState.ABORTED, sentence, goal.goal_id))
 
     def _publish_status(self, status: ControllerStatus) -> None:
         name, level = self.get_fully_qualified_name(), bytes([status.state.level])
@@ -196,11 +208,7 @@ class CoordinatedControlNode(CommanderNode):
                 stopped.why, stopped.commanded_until_ns, stopped.rests_since_ns
             )
         elif self._waiting and stopped.commanded_until_ns is None:
-            *_, goal = self._waiting.values()
-            self._waiting = {}
-            self._goal_file.delete()
-            sentence = f"Aborted by the plant: {stopped.why}"
-            self._publish_status(ControllerStatus(ControllerState.ABORTED, sentence, goal.goal_id))
+            self._abort_waiting(f"Aborted by the plant: {stopped.why}")
 
     def _plant_changed(self, change: Change) -> None:
         if change is Change.OBEYS and self._robot is not None:
