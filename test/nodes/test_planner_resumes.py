@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from support.planner_flight import NEAR, TURNED, Flight, goal_at, values_of
 from support.ros_harness import Harness
@@ -58,3 +59,19 @@ def test_a_goal_that_is_aborted_before_is_not_flown_to(harness: Harness, tmp_pat
     # A new goal is.
     assert values_of(flight.decide(NEAR))["state"] == "reached"
     assert max(flight.error_to(NEAR)) <= 1e-3
+
+
+def test_a_goal_has_the_shape_that_was_wanted_before_it(harness: Harness, tmp_path: Path) -> None:
+    path = tmp_path / "goal.json"
+    flight = Flight(harness, {"resume_file": str(path)})
+    shapes = flight.probe.create_publisher(JointState, "goal_joint_states", 10)
+    harness.connect()
+    names = ["slider_3", "slider_1", "slider_2"]
+    shapes.publish(JointState(name=names, position=[0.3, 0.1, 0.2]))
+    harness.spin_until(lambda: flight.planner._goal_shape is not None, "the shape is received")
+    flight.send(NEAR)
+    flight.start()
+    harness.spin_until(path.exists, "the goal is pursued")
+    goal = GoalFile(str(path)).load()[BASE].goal
+    assert goal.joint_positions is not None
+    assert goal.joint_positions.tolist() == [0.1, 0.2, 0.3]

@@ -27,6 +27,7 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import ReplayNode
+from spacerobot_ros.nodes.replay import _profile
 
 ROOT = Path(__file__).parents[2]
 STRING = "std_msgs/msg/String"
@@ -105,6 +106,54 @@ def test_publishers_offer_what_was_recorded(harness: Harness, bag: Path) -> None
     assert offers["/stream"].durability == DurabilityPolicy.VOLATILE
     assert offers["/stream"].reliability == ReliabilityPolicy.RELIABLE
     assert offers["/loose"].reliability == ReliabilityPolicy.BEST_EFFORT
+
+
+@pytest.mark.parametrize(
+    ("profile", "depth"),
+    [
+        # Humble's bags say no depth: like the streams of the stack, or the one latched message.
+        (QosProfile(depth=0), 100),
+        (QosProfile(depth=0, durability="transient_local"), 1),
+        (QosProfile(depth=7), 7),
+    ],
+)
+def test_depths_that_are_not_in_a_bag(profile: QosProfile, depth: int) -> None:
+    assert _profile(profile).depth == depth
+
+
+def test_a_bag_that_turns_out_damaged_is_exit_2(harness: Harness, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with BagWriter(path, chunk_size=100, compression="none") as writer:
+        channel = writer.add_topic("/stream", STRING)
+        for k in range(COUNT):
+            writer.write(channel, string(f"{k:04d}"), BEGAN + k * SPACING, BEGAN)
+    content = path.read_bytes()
+    assert content.count(b"0050") == 1
+    path.write_bytes(content.replace(b"0050", b"0051"))
+    played = Played(harness, path, rate=50.0)
+    played.finish()
+    assert played.codes == [2]
+    assert 0 < played.node.messages_replayed < COUNT
+
+
+def test_a_clock_of_its_own_takes_the_place_of_the_recorded_one(
+    harness: Harness, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.mcap"
+    with BagWriter(path) as writer:
+        clock = writer.add_topic("/clock", "rosgraph_msgs/msg/Clock")
+        stream = writer.add_topic("/stream", STRING)
+        for k in range(5):
+            now = BEGAN + k * SPACING
+            # Of another time, so that the two can be told apart.
+            writer.write(clock, b"\0\1\0\0" + struct.pack("<iI", 99, k), now, now)
+            writer.write(stream, string(f"{k}"), now, now)
+    played = Played(harness, path, clock=50.0)
+    played.finish()
+    harness.spin_until(lambda: played.probe.count("/stream") == 5, "all are heard")
+    assert played.node.count_publishers("/clock") == 1
+    assert {message.clock.sec for message in played.probe.messages["/clock"]} == {5}
+    assert played.node.messages_replayed == 5
 
 
 def test_a_late_reader_gets_what_is_latched(harness: Harness, bag: Path) -> None:

@@ -189,12 +189,13 @@ def test_what_follows_a_latched_fault_is_said_to(tmp_path: Path) -> None:
     assert difference.remark == " (a fault latched at 0.4 s; rearming is not in a bag)"
 
 
-def test_the_refusal_of_a_command_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("prefix", ["", "/a"])
+def test_the_refusal_of_a_command_is_named(tmp_path: Path, prefix: str) -> None:
     commands = {k: RATES if k != 4 else [np.nan, 0.0, 0.0] for k in range(10)}
-    difference = verified(tmp_path, [RATES] * 10, commands).difference
+    difference = verified(tmp_path, [RATES] * 10, commands, prefix=prefix).difference
     assert difference is not None
     assert difference.time == pytest.approx(5 * TICK)
-    assert "that on /joint_commands stamped 0.4 s is refused:" in difference.remark
+    assert f"that on {prefix}/joint_commands stamped 0.4 s is refused:" in difference.remark
 
 
 def test_states_after_the_end_of_its_plant_are_differences(
