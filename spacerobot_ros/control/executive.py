@@ -205,7 +205,9 @@ class ControlExecutive:
 
     def _give_up(self, sentence: str) -> None:
         """Drop every goal and its file; the sentence is the status from now on."""
-        self._goal_id = self._latest_id()
+        pursued = self._pending or self._goal_state is ControllerState.TRACKING
+        # A goal that is decided stays so: without another one the abort is about none.
+        self._goal_id = self._latest_id() if pursued else ""
         self._pending.clear()
         self._abort_sentence = sentence
         self._file.delete()

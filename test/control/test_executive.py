@@ -292,6 +292,19 @@ def test_an_abort_is_about_the_goal_that_still_waits() -> None:
     assert (loop.state, loop.status.goal_id) == ("aborted", "waiting")
 
 
+def test_an_abort_after_a_goal_was_reached_does_not_decide_it_again() -> None:
+    loop = ExecutiveLoop(settle_time=0.0)
+    loop.aim(base=goal_at(np.zeros(3), "4"))
+    loop.answer(3)
+    assert (loop.state, loop.status.goal_id) == ("reached", "4")
+    loop.executive.abort()
+    loop.answer(3)
+    assert (loop.state, loop.status.goal_id) == ("aborted", "")
+    loop.aim(base=goal_at(AIM, "5"))
+    loop.answer()
+    assert (loop.state, loop.status.goal_id) == ("tracking", "5")
+
+
 def test_a_goal_before_an_abort_is_dropped_and_one_after_it_is_flown(file: Path) -> None:
     loop = ExecutiveLoop(file)
     loop.answer()
