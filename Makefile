@@ -72,6 +72,15 @@ mutants: $(STAMP)/mutants ## put random errors into the package; see out/mutants
 hostile-bags: $(STAMP)/test ## read bags that were made to harm their reader, each in a process of its own
 	$(BIN)/python3 -m pytest -m 'slow or not slow' -rP test/bag/test_hostile_bags.py
 
+COUNT ?= 2000
+SEED ?= 1
+ONLY ?= many
+
+.PHONY: actions
+actions: $(STAMP)/test ## do COUNT random actions in lockstep and as many in real time, from SEED
+	SPACEROBOT_ACTIONS=$(COUNT) SPACEROBOT_ACTIONS_SEED=$(SEED) \
+	    $(BIN)/python3 -m pytest -q -s -m slow -k "$(ONLY)" test/nodes/test_random_actions.py
+
 .PHONY: real-time
 real-time: $(STAMP)/demo ## fly ten minutes in real time in separate processes, at 100, then 200 and 500 Hz
 	$(BIN)/spacerobot bench --real-time 600 --rate 100

@@ -1,0 +1,45 @@
+"""Random actions of operators on stacks; what they publish is checked state by state.
+
+`make actions` does many. A violation names the seed, the last actions and the last messages;
+`make actions SEED=... ONLY=...` does the same actions again (in lockstep with the same states).
+"""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+from support.random_actions import SETUPS, RandomFlight
+from support.ros_harness import Harness
+
+SEED = int(os.environ.get("SPACEROBOT_ACTIONS_SEED", "1"))
+COUNT = int(os.environ.get("SPACEROBOT_ACTIONS", "2000"))
+
+MODES = pytest.mark.parametrize("real_time", [False, True], ids=["lockstep", "real_time"])
+
+
+@pytest.mark.parametrize(
+    ("setup", "real_time", "count"),
+    [("planar_manipulator", False, 20), ("sliding_masses", True, 20)],
+    ids=["lockstep", "real_time"],
+)
+def test_some_random_actions_leave_every_state_as_specified(
+    harness: Harness, setup: str, real_time: bool, count: int
+) -> None:
+    flight = RandomFlight(harness, SETUPS[setup], seed=3, real_time=real_time)
+    flight.run(count)
+    assert not flight.figures.violations, flight.figures.violations[0]
+    assert flight.figures.states > 100
+    assert flight.figures.samples > 3
+
+
+@pytest.mark.slow
+@MODES
+@pytest.mark.parametrize("setup", list(SETUPS))
+def test_many_random_actions_leave_every_state_as_specified(
+    harness: Harness, setup: str, real_time: bool
+) -> None:
+    flight = RandomFlight(harness, SETUPS[setup], SEED, real_time=real_time)
+    flight.run(-(-COUNT // len(SETUPS)))
+    print(f"\n{flight.name}: {flight.figures}")
+    assert not flight.figures.violations, flight.figures.violations[0]

@@ -1,0 +1,653 @@
+"""A stack to which random actions are done, and everything it publishes being checked."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import SetBool, Trigger
+from support.oracles import Array
+from support.random_actions.actions import PLANT, Action, Draw, Kind
+from support.random_actions.expectations import (
+    SECOND,
+    Check,
+    Disturbance,
+    EventBook,
+    GoalCheck,
+    LimitCheck,
+    MomentumCheck,
+    RestCheck,
+    Situation,
+    StandstillCheck,
+    State,
+    StatusCheck,
+    TimeCheck,
+    commanders,
+)
+from support.random_actions.setups import CONTROLLER, PLANNER, Setup
+from support.ros_harness import DEEP, DEEP_LATCHED, Harness, nanoseconds
+
+from spacerobot_ros.events import Event
+from spacerobot_ros.nodes import CoordinatedControlNode, PlannerNode, PlantNode
+from spacerobot_ros.simulation.status import PlantStatus
+
+_WALL_LIMIT = 20.0
+"""Wall s without a state after which time is taken to stand: far beyond any plan."""
+
+_IDLE_SPINS = 25
+
+_LAST = 15
+"""Actions that are named with a violation."""
+
+_HEARD = 40
+"""Messages that are named with it."""
+
+_CLASSES: dict[str, Any] = {
+    PLANT: PlantNode,
+    PLANNER: PlannerNode,
+    CONTROLLER: CoordinatedControlNode,
+}
+
+_TRANSITIONS = {
+    "configure": (Transition.TRANSITION_CONFIGURE, "unconfigured", "inactive"),
+    "activate": (Transition.TRANSITION_ACTIVATE, "inactive", "active"),
+    "deactivate": (Transition.TRANSITION_DEACTIVATE, "active", "inactive"),
+    "cleanup": (Transition.TRANSITION_CLEANUP, "inactive", "unconfigured"),
+}
+
+
+@dataclass
+class Figures:
+    """What was done and seen."""
+
+    actions: int = 0
+    states: int = 0
+    samples: int = 0
+    goals: int = 0
+    recoveries: int = 0
+    second_attempts: int = 0
+    decisions: Counter[str] = field(default_factory=Counter)
+    kinds: Counter[str] = field(default_factory=Counter)
+    violations: list[str] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        decided = ", ".join(f"{count} {word}" for word, count in sorted(self.decisions.items()))
+        return (
+            f"{self.actions} actions, {self.goals} goals ({decided}), {self.states} states, "
+            f"{self.samples} compared with Pinocchio, {self.recoveries} recoveries "
+            f"({self.second_attempts} at the second attempt), {len(self.violations)} violations"
+        )
+
+
+class RandomFlight:
+    """Does random actions to a stack, and checks every state that is published.
+
+    Parameters
+    ----------
+    harness
+        Where the nodes run.
+    setup
+        Which nodes.
+    seed
+        Of all randomness.
+    real_time
+        Whether the plant runs on the wall clock.
+    """
+
+    def __init__(self, harness: Harness, setup: Setup, seed: int, *, real_time: bool) -> None:
+        self._harness, self._setup, self._real_time = harness, setup, real_time
+        self.name = f"{setup.robot}, {'real time' if real_time else 'lockstep'}, seed {seed}"
+        self._rng = np.random.default_rng(seed)
+        self._draw = Draw(setup, self._rng)
+        self.figures = Figures()
+        self._last: deque[str] = deque(maxlen=_LAST)
+        self._heard: deque[str] = deque(maxlen=_HEARD)
+        self._names = list(setup.model.joint_names)
+        self._nodes: dict[str, Node] = {}
+        self._start_nodes()
+        node = self._node = harness.add(Node("operator", context=harness.context))
+        self._goals = node.create_publisher(PoseStamped, "goal_pose", 100)
+        self._tip_goals = node.create_publisher(PoseStamped, "end_effector/goal_pose", 100)
+        self._shapes = node.create_publisher(JointState, "goal_joint_states", 100)
+        self._faults = node.create_publisher(String, "fault_injection", 100)
+        self._clients: dict[str, Any] = {}
+        self._goal_count = 0
+        self._begin()
+        self._situation.may_repeat = not real_time
+        self._subscribe()
+        for name in self._nodes:
+            self._transit(name, "configure")
+        harness.connect()
+        for name in reversed(self._nodes):
+            self._transit(name, "activate")
+        self._pass_ticks(2)
+
+    # -- the stack ----------------------------------------------------------------------------
+
+    def _start_nodes(self) -> None:
+        setup = self._setup
+        plant = dict(setup.plant) | {"time_mode": "lockstep"}
+        planner = dict(setup.planner)
+        if self._real_time:
+            plant |= setup.real_time
+            planner |= {"plan_in_background": True}
+        parameters = {PLANT: plant, PLANNER: planner, CONTROLLER: dict(setup.controller)}
+        for name in (PLANT, *setup.commanders):
+            self._nodes[name] = self._harness.make(
+                _CLASSES[name], parameters[name], name=name, autostart=False
+            )
+
+    def _begin(self) -> None:
+        setup = self._setup
+        self._situation = situation = Situation(dict.fromkeys(self._nodes, "unconfigured"))
+        self._books = commanders(setup, self._violate)
+        lockstep = not self._real_time
+        self._momentum = MomentumCheck(setup, situation, lockstep=lockstep)
+        self._plant_status = StatusCheck(setup, situation, lockstep=lockstep, report=self._violate)
+        self._events = EventBook(self._violate)
+        self._checks: list[Check] = [
+            TimeCheck(setup, situation),
+            StandstillCheck(setup, situation),
+            self._plant_status,
+            LimitCheck(setup, situation),
+            self._momentum,
+            GoalCheck(self._books, situation),
+            RestCheck(setup, situation, self._books[setup.decider]),
+        ]
+        self._state: State | None = None
+        self._first: State | None = None
+        self._parts: dict[str, Any] = {}
+
+    def _subscribe(self) -> None:
+        def hear(kind: Any, topic: str, act: Callable[[Any], None], latched: bool = False) -> None:
+            qos = DEEP_LATCHED if latched else DEEP
+            self._node.create_subscription(kind, topic, act, qos)
+
+        def part(topic: str) -> Callable[[Any], None]:
+            def keep(message: Any) -> None:
+                self._parts[topic] = message
+
+            return keep
+
+        hear(Clock, "/clock", lambda message: self._parts.clear())
+        for topic in ("odom", "odom_true"):
+            hear(Odometry, topic, part(topic))
+        hear(JointState, "joint_states_true", part("joint_states_true"))
+        hear(PoseStamped, "base_pose", part("base_pose"))
+        hear(PoseStamped, "end_effector_pose", part("end_effector_pose"))
+        for topic in ("momentum", "momentum_expected"):
+            hear(Float64MultiArray, topic, part(topic))
+        hear(JointState, "joint_states", self._on_joints)
+        hear(JointState, "joint_commands", self._on_command)
+        if not self._setup.servos:
+            hear(WrenchStamped, "base_wrench", self._on_wrench)
+        hear(DiagnosticStatus, "plant/status", self._on_plant_status, True)
+        hear(DiagnosticStatus, "events", self._on_event)
+        for name, topic in ((PLANNER, "planner/status"), (CONTROLLER, "controller/status")):
+            if name in self._nodes:
+                hear(DiagnosticStatus, topic, partial(self._on_status, name), True)
+
+    # -- what is published --------------------------------------------------------------------
+
+    def _on_joints(self, message: JointState) -> None:
+        parts = self._parts
+        joints = parts.get("joint_states_true", message)
+        odom = parts.get("odom_true", parts.get("odom"))
+        pose = parts.get("base_pose")
+        if odom is None or pose is None or "momentum" not in parts:
+            self._violate(f"a state lacks topics: only {', '.join(parts)} are there")
+            return
+        expected = parts.get("momentum_expected")
+        p, o = pose.pose.position, pose.pose.orientation
+        v, w = odom.twist.twist.linear, odom.twist.twist.angular
+        state = State(
+            nanoseconds(message.header.stamp),
+            np.array(joints.position),
+            np.array(joints.velocity),
+            np.array(message.effort),
+            np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w]),
+            np.array([v.x, v.y, v.z, w.x, w.y, w.z]),
+            np.array(parts["momentum"].data),
+            None if expected is None else np.array(expected.data),
+        )
+        self.figures.states += 1
+        rates = " ".join(f"{rate:.3g}" for rate in state.qdot)
+        self._heard.append(f"{state.time_ns / SECOND:.9g} s: joints at {rates}")
+        before, self._state = self._state, state
+        self._first = self._first or state
+        for check in self._checks:
+            wrong = check.look(state, before)
+            if wrong is not None:
+                self._violate(wrong)
+
+    def _on_command(self, message: JointState) -> None:
+        values = message.velocity if self._setup.servos else message.effort
+        words = " ".join(f"{value:.3g}" for value in values)
+        stamp = nanoseconds(message.header.stamp) / SECOND
+        self._heard.append(f"command for {stamp:.9g} s: {words}")
+
+    def _on_wrench(self, message: WrenchStamped) -> None:
+        f, t = message.wrench.force, message.wrench.torque
+        stamp = nanoseconds(message.header.stamp)
+        self._heard.append(f"wrench for {stamp / SECOND:.9g} s")
+        self._momentum.wrenches.setdefault(stamp, np.array([f.x, f.y, f.z, t.x, t.y, t.z]))
+
+    def _on_status(self, name: str, message: DiagnosticStatus) -> None:
+        values = {pair.key: pair.value for pair in message.values}
+        state, goal_id = values["state"], values.get("goal_id", "")
+        book = self._books[name]
+        self._heard.append(f"{name}: {state} {goal_id}: {message.message}")
+        if state in ("reached", "failed", "refused", "aborted") and goal_id not in book.decided:
+            self.figures.decisions[state] += 1
+        pursued = book.pursued
+        book.on_status(state, goal_id, message.message)
+        if pursued and not book.pursued and state == "aborted":
+            self._allow_stop(1.0)
+
+    def _on_plant_status(self, message: DiagnosticStatus) -> None:
+        values = {pair.key: pair.value for pair in message.values}
+        self._heard.append(f"plant: {values['state']}: {message.message}")
+        self._plant_status.on_status(PlantStatus.from_values(values, message.message))
+
+    def _on_event(self, message: DiagnosticStatus) -> None:
+        values = {pair.key: pair.value for pair in message.values}
+        self._heard.append(f"event of {message.name}: {values['event']}: {message.message}")
+        self._events.on_event(message.name, Event.from_values(values, message.message))
+
+    def _allow_stop(self, seconds: float) -> None:
+        ticks = 3 * self._setup.period_ns
+        end = self._now_ns + round(seconds * SECOND) + ticks
+        self._situation.stopping_until = max(end, self._situation.stopping_until)
+
+    @property
+    def _now_ns(self) -> int:
+        return 0 if self._state is None else self._state.time_ns
+
+    def _violate(self, sentence: str) -> None:
+        done = "\n".join(f"  {line}" for line in self._last)
+        self.figures.violations.append(
+            f"{self.name}, action {self.figures.actions}, {self._now_ns / SECOND:.6g} s: {sentence}"
+            f"\nthe last actions:\n{done}\nthe last messages:\n  " + "\n  ".join(self._heard)
+        )
+
+    # -- services -----------------------------------------------------------------------------
+
+    def _call(self, kind: Any, service: str, request: Any) -> Any:
+        client = self._clients.get(service)
+        if client is None:
+            client = self._clients[service] = self._node.create_client(kind, service)
+        return self._harness.call(client, request)
+
+    def _transit(self, name: str, word: str) -> bool:
+        """Ask for a transition, and note what has become of the node."""
+        number, before, after = _TRANSITIONS[word]
+        situation, lifecycle = self._situation, self._situation.lifecycle
+        possible = lifecycle[name] == before
+        if name == PLANT and possible and word == "activate":
+            # Its state is published before the answer of the service.
+            lifecycle[name] = after
+            situation.may_repeat = True
+        if name != PLANT and possible and word == "deactivate":
+            self._books[name].drop()
+            self._allow_stop(self._timeout)
+        request = ChangeState.Request(transition=Transition(id=number))
+        answer = self._call(ChangeState, f"{name}/change_state", request)
+        if answer.success is not possible:
+            self._violate(f"{name}, {lifecycle[name]}: {word} answers {answer.success}")
+        if possible:
+            lifecycle[name] = after
+        if name == PLANT and possible and word == "activate":
+            situation.may_jump = situation.may_restart = False
+            situation.may_repeat = not self._real_time
+        if name == PLANT and possible and word == "configure":
+            situation.latched, situation.rearmed = False, True
+            situation.may_jump = situation.may_restart = True
+            situation.disturbances.clear()
+        return bool(answer.success)
+
+    @property
+    def _timeout(self) -> float:
+        return float(self._setup.real_time["command_timeout"]) if self._real_time else 0.0
+
+    # -- time ---------------------------------------------------------------------------------
+
+    @property
+    def _time_runs(self) -> bool:
+        situation = self._situation
+        if situation.paused or situation.lifecycle[PLANT] != "active":
+            return False
+        return self._real_time or situation.active
+
+    def _pass_ticks(self, count: int) -> None:
+        """Let ticks pass; where time stands, look that it does."""
+        if not self._time_runs:
+            self._idle()
+            return
+        wanted = self.figures.states + count
+        self._spin_until(lambda: self.figures.states >= wanted, f"{count} ticks pass")
+
+    def _idle(self) -> None:
+        quiet, before = 0, -1
+        while quiet < _IDLE_SPINS:
+            self._harness.executor.spin_once(timeout_sec=0.001)
+            quiet = quiet + 1 if self.figures.states == before else 0
+            before = self.figures.states
+
+    def _spin_until(self, predicate: Callable[[], bool], what: str) -> bool:
+        """Spin until something is so; a violation if it is not in time."""
+        states, deadline = self.figures.states, monotonic() + _WALL_LIMIT
+        violations = len(self.figures.violations)
+        while not predicate():
+            if self.figures.states > states:
+                states, deadline = self.figures.states, monotonic() + _WALL_LIMIT
+            if monotonic() > deadline:
+                self._violate(f"nothing for {_WALL_LIMIT:g} s of wall time: {what}")
+                return False
+            if len(self.figures.violations) > violations:
+                return False
+            self._harness.executor.spin_once(timeout_sec=0.05)
+        return True
+
+    # -- actions ------------------------------------------------------------------------------
+
+    def run(self, count: int, *, between_recoveries: int = 40) -> None:
+        """Do this many actions, or as many as there are before a violation.
+
+        After every so many the stack is brought back into order and must reach a goal.
+        """
+        for _ in range(count):
+            self.perform(self._possible_action())
+            if self.figures.violations:
+                return
+            if self.figures.actions % between_recoveries == 0:
+                self.recover()
+            if self.figures.violations:
+                return
+        self.recover()
+        self.figures.samples = self._momentum.samples
+
+    def _possible_action(self) -> Action:
+        """Draw until there is something to do: unconfigured nodes have no services."""
+        lifecycle = self._situation.lifecycle
+        while True:
+            action = self._draw.action()
+            of_plant = action.kind in (Kind.REARM, Kind.PAUSE, Kind.RESUME, Kind.RESET)
+            node = PLANT if of_plant else action.node
+            if node not in lifecycle or action.kind is Kind.ACTIVATE:
+                return action
+            if lifecycle[node] != "unconfigured":
+                return action
+
+    def perform(self, action: Action) -> None:
+        """Do one action, and let time pass."""
+        self.figures.actions += 1
+        self.figures.kinds[action.kind.value] += 1
+        self._last.append(f"{self.figures.actions}: {action}  [{self._now_ns / SECOND:.6g} s]")
+        self._do(action)
+        self._pass_ticks(action.ticks)
+        self._compare()
+
+    def _compare(self) -> None:
+        """Compare statuses and events with what was done."""
+        for wrong in (
+            self._plant_status.agrees(),
+            self._events.compare(self._plant_status.changes),
+        ):
+            if wrong is not None:
+                self._violate(wrong)
+
+    def _do(self, action: Action) -> None:
+        situation = self._situation
+        match action.kind:
+            case Kind.GOAL | Kind.BURST | Kind.UNREACHABLE:
+                for aim in action.aims:
+                    self._send(self._pose(aim.offset, aim.turn))
+            case Kind.TIP_GOAL:
+                for aim in action.aims:
+                    tip = self._parts.get("end_effector_pose")
+                    if tip is not None:
+                        self._send(_moved(tip, aim.offset, aim.turn), tip=True)
+            case Kind.SHAPE_GOAL:
+                self._shapes.publish(JointState(name=self._names, position=list(action.shape)))
+                self._send(self._pose(action.aims[0].offset, action.aims[0].turn))
+            case Kind.BAD_GOAL:
+                self._send(_spoilt(self._pose(action.aims[0].offset, (0.0, 0.0, 0.0)), action.text))
+            case Kind.BAD_SHAPE:
+                self._shapes.publish(_bad_shape(self._names, action.text))
+            case Kind.ABORT if action.node == PLANT:
+                situation.rearmed = False
+                self._trigger("plant/abort")
+                situation.latched, situation.latched_at = True, self._now_ns
+                situation.goal_since_stop = False
+            case Kind.ABORT:
+                self._trigger(f"{action.node}/abort", may_refuse=True)
+            case Kind.REARM:
+                self._rearm()
+            case Kind.PAUSE:
+                self._pause(True)
+            case Kind.RESUME:
+                self._pause(False)
+            case Kind.RESET:
+                self._reset()
+            case Kind.DEACTIVATE | Kind.ACTIVATE:
+                if situation.lifecycle[action.node] == "unconfigured":
+                    self._transit(action.node, "configure")
+                self._transit(action.node, action.kind.value)
+                self._harness.connect()
+            case Kind.RECONFIGURE:
+                self._reconfigure(action.node)
+            case Kind.FAULT:
+                self._inject(action.text)
+            case Kind.BAD_FAULT:
+                self._faults.publish(String(data=action.text))
+            case Kind.CLEAR:
+                self._clear()
+            case Kind.WAIT:
+                pass
+
+    def _reconfigure(self, name: str) -> None:
+        was = self._situation.lifecycle[name]
+        if was == "active":
+            self._transit(name, "deactivate")
+        self._transit(name, "cleanup")
+        self._transit(name, "configure")
+        self._harness.connect()
+        if was == "active":
+            self._transit(name, "activate")
+
+    def _trigger(self, service: str, *, may_refuse: bool = False) -> None:
+        answer = self._call(Trigger, service, Trigger.Request())
+        if not answer.message or not (answer.success or may_refuse):
+            self._violate(f"{service} answers {answer.success}: '{answer.message}'")
+
+    def _pause(self, on: bool) -> None:
+        situation = self._situation
+        situation.paused = situation.resumed = False
+        self._call(SetBool, "plant/pause", SetBool.Request(data=on))
+        situation.paused, situation.resumed = on, not on
+
+    def _rearm(self) -> None:
+        situation = self._situation
+        situation.latched = False
+        self._trigger("plant/rearm")
+        situation.rearmed = True
+
+    def _reset(self) -> None:
+        situation = self._situation
+        situation.may_jump = True
+        self._trigger("plant/reset")
+        # An answer to the state before the reset has the stamp of the one after it.
+        self._allow_stop(0.0)
+        if situation.lifecycle[PLANT] == "active":
+            situation.may_jump = False
+            self._compare_start()
+
+    def _inject(self, text: str) -> None:
+        now = self._now_ns / SECOND
+        words = text.split()
+        times = {"at": now, "until": np.inf}
+        line = []
+        for before, word in zip(["", *words], words, strict=False):
+            if word.startswith("NOW+"):
+                times[before] = now + float(word.removeprefix("NOW+"))
+                word = f"{times[before]:.9g}"
+            line.append(word)
+        found = Disturbance(words[0], words[1], times["at"], times["until"])
+        self._situation.disturbances.append(found)
+        self._faults.publish(String(data=" ".join(line)))
+
+    def _clear(self) -> None:
+        self._faults.publish(String(data="clear"))
+        now = self._now_ns / SECOND
+        slack = 5 * self._setup.period_ns / SECOND
+        for fault in self._situation.disturbances:
+            fault.end = min(fault.end, now + slack)
+
+    def _compare_start(self) -> None:
+        """Look that a plant that was reset is where it began."""
+        state, first = self._state, self._first
+        assert state is not None
+        assert first is not None
+        if not (np.array_equal(state.q, first.q) and np.array_equal(state.pose, first.pose)):
+            self._violate(f"after a reset the robot is at {state.pose}, {state.q}")
+
+    # -- goals --------------------------------------------------------------------------------
+
+    def _pose(self, offset: tuple[float, ...], turn: tuple[float, ...]) -> PoseStamped:
+        """Return a pose relative to where the base is."""
+        message = PoseStamped()
+        message.header.frame_id = "world"
+        state = self._state
+        pose = np.array([0, 0, 0, 0, 0, 0, 1.0]) if state is None else state.pose
+        _fill(message, pose[:3], pose[3:])
+        return _moved(message, offset, turn)
+
+    def _send(self, goal: PoseStamped, *, tip: bool = False) -> str:
+        self._goal_count += 1
+        self.figures.goals += 1
+        goal.header.stamp.sec, goal.header.stamp.nanosec = 1, self._goal_count
+        goal_id = f"1.{self._goal_count:09d}"
+        for book in self._books.values():
+            book.sent.add(goal_id)
+        self._situation.goal_since_stop = True
+        (self._tip_goals if tip else self._goals).publish(goal)
+        return goal_id
+
+    # -- liveness -----------------------------------------------------------------------------
+
+    def recover(self) -> None:
+        """Bring everything back into order; a fresh goal must be reached."""
+        self.figures.recoveries += 1
+        self._last.append(f"recovery  [{self._now_ns / SECOND:.6g} s]")
+        for name, state in self._situation.lifecycle.items():
+            if state == "unconfigured":
+                self._transit(name, "configure")
+        self._harness.connect()
+        for name, state in self._situation.lifecycle.items():
+            if state != "active":
+                self._transit(name, "activate")
+        self._clear()
+        self._pause(False)
+        self._rearm()
+        self._pass_ticks(10)
+        if self.figures.violations or self._reaches():
+            return
+        first = self._books[self._setup.decider].sentence
+        self.figures.second_attempts += 1
+        self._last.append(f"second attempt after: {first}")
+        self._reset()
+        self._pass_ticks(10)
+        if not self.figures.violations and not self._reaches():
+            book = self._books[self._setup.decider]
+            self._violate(f"a fresh goal is {book.last}: {book.sentence}")
+
+    def _reaches(self) -> bool:
+        """Send a goal that can be reached, and return whether it is."""
+        setup, book = self._setup, self._books[self._setup.decider]
+        if setup.shapes:
+            self._shapes.publish(JointState(name=self._names, position=setup.home.tolist()))
+        step = self._homeward()
+        tip = self._parts.get("end_effector_pose") if setup.tip else None
+        turn = (0.0,) * 3 if setup.tip else tuple(0.1 * x for x in setup.turn)
+        goal_id = self._send(self._pose(step, turn))
+        if tip is not None:
+            # Otherwise the end-effector stays where it is held.
+            goal_id = self._send(_moved(tip, step, turn), tip=True)
+        end = self._now_ns + round(setup.patience * SECOND)
+        self._spin_until(
+            lambda: goal_id in book.decided or self._now_ns > end, f"goal {goal_id} is decided"
+        )
+        if goal_id not in book.decided and not self.figures.violations:
+            late = f"goal {goal_id} is not decided within {setup.patience:g} s"
+            self._violate(f"{late}: {book.sentence}")
+        return book.decided.get(goal_id) == "reached"
+
+    def _homeward(self) -> tuple[float, ...]:
+        """Return a step (3,) of the base that brings sliders back: a part of the way home, m."""
+        setup, state = self._setup, self._state
+        if not any(setup.reach) or state is None:
+            return (0.0, 0.0, 0.0)
+        if not setup.servos:
+            return tuple(0.2 * x for x in setup.reach)
+        robot = setup.model
+        center = robot.function("center_of_mass")
+        moved = np.asarray(center(state.q) - center(setup.home)).ravel()
+        return tuple((0.2 * Rotation.from_quat(state.pose[3:]).apply(moved)).tolist())
+
+
+def _fill(message: PoseStamped, position: Array, quaternion: Array) -> None:
+    p, o = message.pose.position, message.pose.orientation
+    p.x, p.y, p.z = (float(x) for x in position)
+    o.x, o.y, o.z, o.w = (float(x) for x in quaternion)
+
+
+def _moved(pose: PoseStamped, offset: tuple[float, ...], turn: tuple[float, ...]) -> PoseStamped:
+    """Return a pose moved by an offset in the world, and turned about its own axes."""
+    message = PoseStamped()
+    message.header.frame_id = "world"
+    p, o = pose.pose.position, pose.pose.orientation
+    attitude = Rotation.from_quat([o.x, o.y, o.z, o.w]) * Rotation.from_rotvec(turn)
+    _fill(message, np.array([p.x, p.y, p.z]) + offset, attitude.as_quat())
+    return message
+
+
+def _spoilt(goal: PoseStamped, how: str) -> PoseStamped:
+    o = goal.pose.orientation
+    match how:
+        case "frame":
+            goal.header.frame_id = "moon"
+        case "quaternion":
+            o.x = o.y = o.z = o.w = 0.0
+        case "nan":
+            goal.pose.position.y = float("nan")
+        case _:
+            goal.pose.position.z = float("inf")
+    return goal
+
+
+def _bad_shape(names: list[str], how: str) -> JointState:
+    zeros = [0.0] * len(names)
+    match how:
+        case "unknown":
+            return JointState(name=["nobody", *names[1:]], position=zeros)
+        case "short":
+            return JointState(name=names, position=zeros[1:])
+        case "nan":
+            return JointState(name=names, position=[float("nan"), *zeros[1:]])
+        case _:
+            return JointState(name=[names[0]] * 2, position=[0.0, 0.0])
