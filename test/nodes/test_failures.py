@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,6 +74,25 @@ def test_an_exception_of_a_callback_deactivates_the_node_which_says_why(
     assert (failed, deactivated) == ("failed", "deactivated")
     assert probe.messages["events"][0].level == DiagnosticStatus.ERROR
     assert node.trigger_activate() is TransitionCallbackReturn.SUCCESS
+    assert node.is_active
+
+
+def test_a_timer_that_is_destroyed_fires_no_more_though_it_is_due(harness: Harness) -> None:
+    node = harness.add(Fragile("fragile", context=harness.context))
+    fired: list[str] = []
+
+    def first() -> None:
+        fired.append("first")
+        for timer in timers:
+            node.destroy_timer(timer)
+
+    # Both are due when the executor looks: whichever comes first destroys the other.
+    timers = [node.create_timer(0.001, first) for _ in range(2)]
+    due = time.monotonic() + 0.01
+    while time.monotonic() < due:
+        pass
+    harness.spin_for(0.05)
+    assert fired == ["first"]
     assert node.is_active
 
 

@@ -102,6 +102,7 @@ class FlightNode(LifecycleNode):
     """The roles of the nodes that are noticed when they are silent."""
 
     def __init__(self, name: str, *, autostart: bool | None = None, **kwargs: Any) -> None:
+        self._timers_alive: dict[int, list[bool]] = {}
         super().__init__(name, **kwargs)
         self.fault: SpaceRobotError | None = None
         self.on_end: Callable[[int], None] = lambda code: None
@@ -224,8 +225,21 @@ class FlightNode(LifecycleNode):
         self, timer_period_sec: float, callback: Callable[[], Any], *args: Any, **kwargs: Any
     ) -> Timer:
         """Create a timer with a callback whose exceptions end in :meth:`on_failure`."""
-        guarded = self._guarded(callback, "a timer")
-        return super().create_timer(timer_period_sec, guarded, *args, **kwargs)
+        guarded, alive = self._guarded(callback, "a timer"), [True]
+
+        def fire() -> None:
+            # The executor may have a timer in its queue that has been destroyed since.
+            if alive[0]:
+                guarded()
+
+        timer = super().create_timer(timer_period_sec, fire, *args, **kwargs)
+        self._timers_alive[id(timer)] = alive
+        return timer
+
+    def destroy_timer(self, timer: Timer) -> bool:
+        """Destroy a timer: its callback runs no more."""
+        self._timers_alive.pop(id(timer), [True])[0] = False
+        return bool(super().destroy_timer(timer))
 
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
