@@ -81,6 +81,9 @@ def test_an_entry_without_a_key_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.yaml").write_text("- {file: x.py, before: a, after: b}\n", "utf-8")
     with pytest.raises(ValueError, match="has not the keys"):
         known_errors(tmp_path)
+    (tmp_path / "x.yaml").write_text("- {file: x.py, before: a, before: b}\n", "utf-8")
+    with pytest.raises(ValueError, match="a key twice"):
+        known_errors(tmp_path)
 
 
 @pytest.mark.slow

@@ -102,18 +102,28 @@ def _pattern(before: str) -> re.Pattern[str]:
     return re.compile(rf"^(?P<indent>[ ]*){re.escape(first)}" + "".join(lines) + "$", re.MULTILINE)
 
 
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that is there twice, as a merge may leave it."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [key.value for key, _ in node.value]
+        if len(set(keys)) < len(keys):
+            raise ValueError(f"There is a key twice{node.start_mark}.")
+        return super().construct_mapping(node, deep)
+
+
 def known_errors(folder: Path = FOLDER) -> list[KnownError]:
     """Read the list.
 
     Raises
     ------
     ValueError
-        An entry lacks a key or has one too many.
+        An entry lacks a key, has one too many, or one twice.
     """
     return [
         _entry(path.name, entry)
         for path in sorted(folder.glob("*.yaml"))
-        for entry in yaml.safe_load(path.read_text("utf-8")) or ()
+        for entry in yaml.load(path.read_text("utf-8"), _Loader) or ()
     ]
 
 
