@@ -11,6 +11,7 @@ the kernel closes a pipe that they read, and on Linux sends them a signal as wel
 
 from __future__ import annotations
 
+import io
 import os
 import select
 import signal
@@ -21,7 +22,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
     import subprocess
@@ -94,6 +95,7 @@ class _Guard:
         self.tools: set[subprocess.Popen[bytes]] = set()
         self._announcing = announcing
         self._raised = False
+        self._errors: TextIO | None = None
         self._since = 0.0
         self._notice_by: float | None = None
         self._end_by: float | None = None
@@ -117,6 +119,7 @@ class _Guard:
 
     def remove(self) -> None:
         """Give the signals back."""
+        self.speak()
         signal.set_wakeup_fd(self._wakeup)
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
@@ -138,7 +141,15 @@ class _Guard:
             self.request.main()
         elif not self._raised:
             self._raised = True
+            if self._announcing:
+                # What the exception passes, such as a solver, writes warnings about it.
+                self._errors, sys.stderr = sys.stderr, io.StringIO()
             raise Terminated(number)
+
+    def speak(self) -> None:
+        """Have standard error back."""
+        if self._errors is not None:
+            self._errors, sys.stderr = None, self._errors
 
     def _note(self, number: int) -> bool:
         """Take note of a signal; return whether it is the first."""
@@ -275,6 +286,15 @@ def ended_on_request(
 def termination() -> Terminated | None:
     """Return what ends this process, None if nothing does."""
     return None if _guard is None or _guard.number is None else Terminated(_guard.number)
+
+
+def announce(ending: Terminated) -> None:
+    """Say on standard error, where there still is one, what ends this process."""
+    if _guard is not None:
+        _guard.speak()
+    with suppress(OSError):  # The terminal may be gone.
+        sys.stderr.write(f"{ending}\n")
+        sys.stderr.flush()
 
 
 def child_options(environment: Mapping[str, str] | None = None) -> dict[str, Any]:

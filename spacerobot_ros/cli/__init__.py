@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from typing import NoReturn
 
-from spacerobot_ros.termination import Terminated, guarded
+from spacerobot_ros.termination import Terminated, announce, guarded
 
 
 def start(prog_name: str = "spacerobot") -> NoReturn:
@@ -19,6 +19,6 @@ def start(prog_name: str = "spacerobot") -> NoReturn:
 
             main(prog_name=prog_name)
         except Terminated as ending:
-            sys.stderr.write(f"{ending}\n")
+            announce(ending)
             sys.exit(ending.exit_code)
     sys.exit()

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from enum import IntEnum
 from typing import NoReturn
 
 import click
 
 from spacerobot_ros.errors import GoalError, PlanningError, SpaceRobotError
-from spacerobot_ros.termination import Terminated, guarded, termination
+from spacerobot_ros.termination import Terminated, announce, guarded, termination
 
 
 class ExitCode(IntEnum):
@@ -42,8 +42,7 @@ def fail(sentence: str = "") -> NoReturn:
 
 def end(ending: Terminated) -> NoReturn:
     """End a command that a signal has ended, with one line."""
-    with suppress(OSError):  # The terminal may be gone.
-        click.echo(str(ending), err=True)
+    announce(ending)
     sys.exit(ending.exit_code)
 
 
