@@ -23,6 +23,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from difflib import SequenceMatcher
 from pathlib import Path
+from typing import ClassVar
 
 from coverage import CoverageData
 from mutation.mutants import Mutant, described, mutants_of, sample, statement_lines
@@ -86,8 +87,6 @@ class Reach:
 
     seconds: dict[str, float]
     lines: dict[str, dict[int, list[str]]] = field(default_factory=lambda: defaultdict(dict))
-    new: list[str] = field(default_factory=list)
-    """Files of tests that have changed since: whatever else is in them may reach anything."""
 
     @classmethod
     def read(cls, folder: Path) -> Reach:
@@ -106,15 +105,10 @@ class Reach:
         return found
 
     def moved_to(self, old: Path, new: Path) -> Reach:
-        """Return the same for a project that has changed a little since it was measured."""
-        files = {str(path.relative_to(new)) for path in (new / "test").rglob("test_*.py")}
-        moved = Reach({n: s for n, s in self.seconds.items() if n.split("::")[0] in files})
-        moved.new = sorted(f for f in files if _text(old / f) != _text(new / f))
+        """Return the same for a project whose code has changed a little since it was measured."""
+        moved = Reach(dict(self.seconds))
         for file, lines in self.lines.items():
             before, after = _text(old / file), _text(new / file)
-            if before == after:
-                moved.lines[file] = lines
-                continue
             matcher = SequenceMatcher(None, before.splitlines(), after.splitlines(), False)
             for tag, a, b, c, d in matcher.get_opcodes():
                 around = [name for k in range(a, b + 2) for name in lines.get(k, ())]
@@ -123,10 +117,19 @@ class Reach:
                     moved.lines[file][k + 1] = there
         return moved
 
-    def new_tests(self, mutant: Mutant) -> list[str]:
-        """Return the files whose tests may reach a change, as far as they are not known."""
-        folder = "test/" + mutant.path.split("/")[1] + "/"
-        return [f for f in self.new if f.startswith((folder, "test/test_", "test/packaging/"))]
+    def with_changed(self, changed: Reach, files: Sequence[str]) -> Reach:
+        """Return the same, where what the tests of some files reach was measured again."""
+
+        def kept(name: str) -> bool:
+            return name.split("::")[0] not in files
+
+        both = Reach({n: s for n, s in self.seconds.items() if kept(n)} | changed.seconds)
+        for file in self.lines.keys() | changed.lines.keys():
+            here, more = self.lines.get(file, {}), changed.lines.get(file, {})
+            for line in here.keys() | more.keys():
+                names = [name for name in here.get(line, ()) if kept(name)]
+                both.lines[file][line] = [*names, *more.get(line, ())]
+        return both
 
     def tests_for(self, mutant: Mutant, source: str, limit: float) -> list[str]:
         """Return the tests that reach a change, fastest first, as many as fit into a time (s)."""
@@ -169,10 +172,14 @@ def measure(project: Path, folder: Path, cache: Path, tests: Sequence[str], work
 class Worker:
     """A copy of the project in which mutants are judged, one after the other."""
 
+    _sound: ClassVar[dict[str, bool]] = {}
+    """Whether a test passes without any error, as far as that was asked."""
+    _sound_lock = threading.Lock()
+
     def __init__(
         self, folder: Path, project: Path, cache: Path, reach: Reach, limit: float
     ) -> None:
-        self._project = folder / "project"
+        self._project, self._original = folder / "project", project
         self._folder = folder
         self._filled_cache = cache
         self._reach = reach
@@ -190,54 +197,52 @@ class Worker:
         assert changed is not None
         try:
             _write(file, changed)
-            noticed, by, run = self._run(tests, self._reach.new_tests(mutant))
+            noticed, by, run = self._run(tests)
         finally:
             _write(file, source)
         return Verdict(mutant, noticed, by, run, len(tests), time.monotonic() - begin)
 
-    def _run(self, tests: list[str], new: list[str]) -> tuple[bool, str, int]:
+    def _run(self, tests: list[str]) -> tuple[bool, str, int]:
         """Return whether a test failed, which one, and how many were run."""
-        count = 0
+        done: list[str] = []
         until = time.monotonic() + 60 + 4 * self._limit
-        for stage, files in ((tests[:_FIRST], new), (tests[_FIRST:], [])):
-            if not (stage or files):
+        stages = [tests[:_FIRST], tests[_FIRST:]]
+        while stages:
+            stage = stages.pop(0)
+            if not stage:
                 continue
-            code, ran = self._pytest(stage, until - time.monotonic(), files)
-            count += len(ran)
+            code, ran = self._pytest(stage, until - time.monotonic())
+            done += ran
             if code is None:
-                return False, "the time was over", count
+                return False, "the time was over", len(done)
             if code in (0, 5):
                 continue
             if not ran:
-                return True, "collection", count
-            last = ran[-1]
-            if last.startswith(_REPEATED):
-                code, _ = self._pytest([last], 300)
-                if code == 0:
-                    rest = tests[tests.index(last) + 1 :] if last in tests else tests
-                    code, ran = self._pytest(rest, until - time.monotonic()) if rest else (0, [])
-                    if code in (0, 5, None):
-                        return False, "", count + len(ran)
-                    return True, ran[-1] if ran else "collection", count + len(ran)
-            return True, last, count
-        return False, "" if tests else "no test reaches it", count
+                return True, "collection", len(done)
+            if self._notices(ran[-1]):
+                return True, ran[-1], len(done)
+            stages.insert(0, [name for name in stage if name not in done])
+        return False, "" if tests else "no test reaches it", len(done)
 
-    def _pytest(
-        self, tests: list[str], timeout: float, new: Sequence[str] = ()
-    ) -> tuple[int | None, list[str]]:
+    def _notices(self, test: str) -> bool:
+        """Whether a test that failed fails by the error and not by itself."""
+        if test.startswith(_REPEATED) and self._pytest([test], 300)[0] == 0:
+            return False
+        with self._sound_lock:
+            if test not in self._sound:
+                mutated, self._project = self._project, self._original
+                try:
+                    self._sound[test] = self._pytest([test], 300)[0] == 0
+                finally:
+                    self._project = mutated
+            return self._sound[test]
+
+    def _pytest(self, tests: list[str], timeout: float) -> tuple[int | None, list[str]]:
         """Return pytest's exit code (None: time over) and the tests that were begun."""
         log, limits, cache = (self._folder / n for n in ("log", "limits.json", "cache"))
         log.write_text("")
         seconds = self._reach.seconds
-        limits.write_text(
-            json.dumps(
-                {
-                    "limits": {n: 20 + 8 * seconds.get(n, 0.0) for n in tests},
-                    "new": [*new],
-                    "known": [n for n in seconds if n.split("::")[0] in new],
-                }
-            )
-        )
+        limits.write_text(json.dumps({n: 20 + 8 * seconds[n] for n in tests}))
         # What a mutant compiles or plans must not be found by the next one.
         shutil.rmtree(cache, ignore_errors=True)
         shutil.copytree(self._filled_cache, cache)
@@ -247,7 +252,7 @@ class Worker:
             "SPACEROBOT_MUTANT_LOG": str(log),
             "SPACEROBOT_MUTANT": mark,
         }
-        files = list(dict.fromkeys([*new, *(name.split("::")[0] for name in tests)]))
+        files = list(dict.fromkeys(name.split("::")[0] for name in tests))
         temporary = f"--basetemp={self._folder / 'tmp'}"
         process = subprocess.Popen(
             [*_PYTEST, "-x", "-p", "mutation.one_mutant", temporary, *files],
@@ -366,6 +371,13 @@ def table(verdicts: Iterable[Verdict]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _changed_tests(old: Path, new: Path, folders: Sequence[str]) -> list[str]:
+    """Return the files with tests of some folders that have changed."""
+    files = [path for folder in folders for path in (new / "test" / folder).rglob("test_*.py")]
+    names = [str(path.relative_to(new)) for path in (*files, new / "test" / "test_expected.py")]
+    return sorted(name for name in names if _text(old / name) != _text(new / name))
+
+
 def _fingerprint(project: Path, tests: Sequence[str]) -> str:
     digest = hashlib.sha256(json.dumps(list(tests)).encode())
     for folder in ("spacerobot_ros", "test"):
@@ -414,7 +426,14 @@ def main() -> int:
         cache.mkdir(parents=True, exist_ok=True, mode=0o700)
         measure(base, reached, cache, chosen.tests, chosen.workers)
         mark.write_text(fingerprint)
-    reach = Reach.read(reached).moved_to(base, PROJECT)
+    reach = Reach.read(reached)
+    if chosen.keep_reach:
+        changed = _changed_tests(base, PROJECT, chosen.mutate)
+        print(f"{len(changed)} files of tests have changed: they are run once.", flush=True)
+        reach = reach.moved_to(base, PROJECT)
+        if changed:
+            measure(PROJECT, out / "changed", cache, changed, chosen.workers)
+            reach = reach.with_changed(Reach.read(out / "changed"), changed)
 
     population = list(mutants_of(PROJECT, chosen.mutate, NOT_MUTATED))
     if chosen.again is not None:
