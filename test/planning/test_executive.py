@@ -480,6 +480,7 @@ def test_a_plant_that_rested_before_the_goal_was_commanded_ends_nothing() -> Non
     loop.tick()
     (start,) = loop.starts
     assert not loop.executive.plant_stopped("Too late.", start.stamp_ns - TICK_NS, 10**12)
+    assert not loop.executive.plant_stopped("Too late.", start.stamp_ns - TICK_NS, 0)
     assert loop.executive.plant_stopped("Too late.", start.stamp_ns, 10**12)
     # A goal that nothing was commanded for is not touched.
     loop.propose(OTHER)
