@@ -237,7 +237,7 @@ class InProcessStack(Stack):
         if self._recorder is None:
             return
         # In one process what is published is there.
-        self._recorder.drain(self.executor, quiet=0.02)
+        self._recorder.drain(self.executor, quiet=0.1)
         self._recorder.trigger_deactivate()
         self._recorder.trigger_cleanup()
         if self._recorder.failure or self._recorder.fault:
