@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.node import Node
 from support.planner_flight import NEAR, PLANNER, Flight, values_of
 from support.ros_harness import Harness
 
 from spacerobot_ros.nodes import RecorderNode
-from spacerobot_ros.nodes.common.watchdog import Pulse, Silence, Watchdog
+from spacerobot_ros.nodes.common.watchdog import Liveness, Pulse, Role, Silence, Watchdog
 from spacerobot_ros.simulation.status import PlantState
 
 REAL_TIME = {"time_mode": "realtime", "real_time_factor": 1.0, "command_timeout": 5.0}
@@ -127,6 +129,23 @@ class Watched(Flight):
         began = time.monotonic()
         self.harness.spin_until(lambda: self.events("node_silent"), "the silence", timeout=5.0)
         return time.monotonic() - began
+
+
+def test_a_look_that_is_due_when_the_node_is_stopped_is_no_failure(harness: Harness) -> None:
+    node = harness.add(Node("watching", context=harness.context))
+    due: list[Callable[[], None]] = []
+    create = node.create_timer
+
+    def create_timer(period: float, act: Callable[[], None], **clock: Any) -> Any:
+        due.append(act)
+        return create(period, act, **clock)
+
+    node.create_timer = create_timer
+    liveness = Liveness(node, Role.PLANT, [Role.COMMANDER], 1.0, lambda silence: None)
+    liveness.begin()
+    liveness.end()
+    for act in due:  # The executor had taken them up before they were destroyed.
+        act()
 
 
 def test_a_silent_planner_is_noticed_by_the_plant_and_is_back(harness: Harness) -> None:

@@ -228,7 +228,8 @@ class Liveness:
             self._report([back])
 
     def _look(self) -> None:
-        assert self._watchdog is not None
+        if self._watchdog is None:
+            return  # The executor still calls a timer that is destroyed when it is due.
         lost = self._watchdog.look()
         if lost or (self._watchdog.silent and time.monotonic() >= self._next_report):
             self._report(lost)

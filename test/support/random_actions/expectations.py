@@ -315,6 +315,8 @@ class MomentumCheck:
             error = np.abs(np.concatenate([p, L, [energy]]) - now.momentum).max()
             if error > scale:
                 return f"Pinocchio has momenta {p}, {L}, {energy}: published {now.momentum}"
+        if before is not None and now.time_ns < before.time_ns:
+            self.wrenches.clear()
         if before is None or now.expected is None or before.expected is None:
             return None
         return self._impulse(now, before)

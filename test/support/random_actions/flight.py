@@ -256,8 +256,9 @@ class RandomFlight:
             self.figures.decisions[state] += 1
         pursued = book.pursued
         book.on_status(state, goal_id, message.message)
-        if pursued and not book.pursued and state == "aborted":
-            self._allow_stop(1.0)
+        if pursued and not book.pursued and (state == "aborted" or self._real_time):
+            # The joints brake; in real time commands are some ticks on their way.
+            self._allow_stop(1.0 if state == "aborted" else 0.0)
 
     def _on_plant_status(self, message: DiagnosticStatus) -> None:
         values = {pair.key: pair.value for pair in message.values}
