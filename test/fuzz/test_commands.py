@@ -180,6 +180,8 @@ def assert_judged_alike(message: object, kind: type, number: int, beyond_limits:
     decoded = deserialize_message(raw, kind)
     stamp = decoded.header.stamp.sec * 10**9 + decoded.header.stamp.nanosec
     source, again = by_node.sources[number], by_bag.sources[number]
+    for commands in (by_node, by_bag):
+        commands.begin(stamp)  # So that no stamp is of a state before the start.
     refusal = CommandReader(source, robot()).offer(by_node, raw, stamp)
     assert by_bag.offer(again, stamp, read_command(decoded, again, robot()), stamp) == refusal
     assert by_bag.counts == by_node.counts
