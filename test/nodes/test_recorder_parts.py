@@ -1,0 +1,159 @@
+"""Parts of the recorder without a node: quality of service, streams, stamps, descriptions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from support.made_bags import joint_states
+
+from spacerobot_ros.bag import BagWriter, QosProfile, Recording
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.nodes import recorder
+from spacerobot_ros.nodes.common.streams import RawInput, RawStream
+
+RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+LATCHED, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
+S = 10**9
+
+
+def offer(reliability: ReliabilityPolicy, durability: DurabilityPolicy) -> QoSProfile:
+    return QoSProfile(depth=3, reliability=reliability, durability=durability)
+
+
+@pytest.mark.parametrize(
+    ("offered", "reliability", "durability"),
+    [
+        ([(RELIABLE, LATCHED)], RELIABLE, LATCHED),
+        ([(BEST_EFFORT, VOLATILE)], BEST_EFFORT, VOLATILE),
+        # A reader that asks for more than a publisher offers hears nothing of that one.
+        ([(RELIABLE, LATCHED), (BEST_EFFORT, LATCHED)], BEST_EFFORT, LATCHED),
+        ([(RELIABLE, VOLATILE), (RELIABLE, LATCHED)], RELIABLE, VOLATILE),
+    ],
+)
+def test_a_topic_is_subscribed_with_what_all_of_its_publishers_offer(
+    offered: list[Any], reliability: ReliabilityPolicy, durability: DurabilityPolicy
+) -> None:
+    qos = recorder._subscribed_qos([offer(*each) for each in offered])
+    assert (qos.reliability, qos.durability) == (reliability, durability)
+
+
+def test_a_bag_says_what_was_offered() -> None:
+    qos = QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=7, reliability=BEST_EFFORT, durability=LATCHED
+    )
+    found = recorder._recorded_qos(qos)
+    assert (found.history, found.depth) == ("keep_last", 7)
+    assert (found.reliability, found.durability) == ("best_effort", "transient_local")
+
+
+class Heard:
+    """A stream of a node, and what a listener hears of it."""
+
+    def __init__(self, kind: type[RawStream] = RawStream) -> None:
+        self.taken: list[bytes] = []
+        self.stream = RawStream("/a", self.taken.append)
+        self.stream.__class__ = kind
+
+
+def taps_of(*streams: RawStream) -> Any:
+    taps = recorder._StreamTaps()
+    taps.nodes = [SimpleNamespace(raw_streams=[stream]) for stream in streams]  # type: ignore[misc]
+    return taps
+
+
+def test_streams_are_tapped_where_nothing_can_escape() -> None:
+    first, second, input_ = Heard(), Heard(), Heard(RawInput)
+    listened: list[bytes] = []
+    # A third publisher is in no node of this process.
+    assert not taps_of(first.stream, second.stream).tap("/a", listened.append, 3)
+    assert not taps_of(first.stream).tap("/b", listened.append, 1)
+    taps = taps_of(first.stream, second.stream)
+    assert taps.tap("/a", listened.append, 2)
+    first.stream.take(b"1")
+    second.stream.take(b"2")
+    assert (listened, first.taken, second.taken) == ([b"1", b"2"], [b"1"], [b"2"])
+    # One more publisher: from now on some may escape.
+    assert taps.release_incomplete(lambda topic: 2) == []
+    assert taps.release_incomplete(lambda topic: 3) == ["/a"]
+    first.stream.take(b"3")
+    assert listened == [b"1", b"2"]
+    # What a node receives has every publisher's.
+    taps = taps_of(first.stream, input_.stream)
+    assert taps.tap("/a", listened.append, 5)
+    first.stream.take(b"4")
+    input_.stream.take(b"5")
+    assert listened == [b"1", b"2", b"5"]
+    taps.release()
+    input_.stream.take(b"6")
+    assert listened == [b"1", b"2", b"5"]
+
+
+def test_messages_carry_the_clock_and_their_stamps(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    writer = BagWriter(path)
+    recording = Recording(writer, 2.0)
+    recording.start()
+    stamps = recorder._Stamps()
+
+    def take(topic: str, message: Any) -> Any:
+        kind = type(message)
+        package = kind.__module__.split(".")[0]
+        channel = writer.add_topic(topic, f"{package}/msg/{kind.__name__}", QosProfile())
+        return recorder._take(recording, stamps, topic, kind, channel)
+
+    clock, joints = take("/clock", Clock()), take("/joint_states", JointState())
+    text, urdf = take("/talk", String()), take("/a/robot_description", String())
+    for second in (1, 2, 2):
+        message = Clock()
+        message.clock.sec = second
+        clock(bytes(serialize_message(message)))
+        joints(bytes(serialize_message(joint_states(second - 0.5, ["a"], [1.0], [2.0]))))
+        text(bytes(serialize_message(String(data=f"at {second}"))))
+        urdf(bytes(serialize_message(String(data=f"<robot name='{second}'/>"))))
+    recording.close()
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        found: dict[str, list[tuple[float, float]]] = {}
+        for _, channel, record in reader.iter_messages(log_time_order=False):
+            times = record.log_time / S, record.publish_time / S
+            found.setdefault(channel.topic, []).append(times)
+        attachments = [(a.name, a.data) for a in reader.iter_attachments()]
+    assert found == {
+        "/clock": [(1.0, 1.0), (2.0, 2.0), (2.0, 2.0)],
+        "/joint_states": [(1.0, 0.5), (2.0, 1.5), (2.0, 1.5)],
+        "/talk": [(1.0, 1.0), (2.0, 2.0), (2.0, 2.0)],
+        "/a/robot_description": [(1.0, 1.0), (2.0, 2.0), (2.0, 2.0)],
+    }
+    # The first one only; the others are messages like all.
+    assert attachments == [("a.robot_description.urdf", b"<robot name='1'/>")]
+
+
+def test_losses_add_up(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        recording = Recording(writer, 2.0)
+        events = recorder.loss_events(recording, "/a")
+        for count in (3, 4):
+            events.message_lost(SimpleNamespace(total_count_change=count))
+        recorder.loss_events(recording, "/b").message_lost(SimpleNamespace(total_count_change=1))
+        assert recording.lost == {"/a": 7, "/b": 1}
+
+
+def test_descriptions_are_texts(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps({"one": {"a": 1, "b": "x"}, "two": {}}))
+    assert recorder._descriptions(str(path)) == [("one", {"a": "1", "b": "x"}), ("two", {})]
+    assert recorder._descriptions("") == []
+    for text in ("[1]", "{", '{"one": 5}'):
+        path.write_text(text)
+        with pytest.raises(ParameterError, match="'describe'"):
+            recorder._descriptions(str(path))
