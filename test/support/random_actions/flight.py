@@ -10,6 +10,7 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
+import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from lifecycle_msgs.msg import Transition
@@ -54,6 +55,9 @@ _IDLE_SPINS = 25
 _LAST = 15
 """Actions that are named with a violation."""
 
+_MOST_STATES = 4000
+"""States after which a stack is replaced: see :func:`random_flights`."""
+
 _HEARD = 40
 """Messages that are named with it."""
 
@@ -84,6 +88,17 @@ class Figures:
     decisions: Counter[str] = field(default_factory=Counter)
     kinds: Counter[str] = field(default_factory=Counter)
     violations: list[str] = field(default_factory=list)
+
+    stacks: int = 0
+
+    def add(self, other: Figures) -> None:
+        """Add the figures of one more stack."""
+        self.stacks += 1
+        for name in ("actions", "states", "samples", "goals", "recoveries", "second_attempts"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.decisions.update(other.decisions)
+        self.kinds.update(other.kinds)
+        self.violations += other.violations
 
     def __str__(self) -> str:
         decided = ", ".join(f"{count} {word}" for word, count in sorted(self.decisions.items()))
@@ -226,6 +241,7 @@ class RandomFlight:
             None if expected is None else np.array(expected.data),
         )
         self.figures.states += 1
+        self.figures.samples = self._momentum.samples
         rates = " ".join(f"{rate:.3g}" for rate in state.qdot)
         self._heard.append(f"{state.time_ns / SECOND:.9g} s: joints at {rates}")
         before, self._state = self._state, state
@@ -367,7 +383,7 @@ class RandomFlight:
     # -- actions ------------------------------------------------------------------------------
 
     def run(self, count: int, *, between_recoveries: int = 40) -> None:
-        """Do this many actions, or as many as there are before a violation.
+        """Do this many actions, or as many as there are before a violation or 4000 states.
 
         After every so many the stack is brought back into order and must reach a goal.
         """
@@ -379,8 +395,9 @@ class RandomFlight:
                 self.recover()
             if self.figures.violations:
                 return
+            if self.figures.states > _MOST_STATES:
+                break
         self.recover()
-        self.figures.samples = self._momentum.samples
 
     def _possible_action(self) -> Action:
         """Draw until there is something to do: unconfigured nodes have no services."""
@@ -609,6 +626,24 @@ class RandomFlight:
         center = robot.function("center_of_mass")
         moved = np.asarray(center(state.q) - center(setup.home)).ravel()
         return tuple((0.2 * Rotation.from_quat(state.pose[3:]).apply(moved)).tolist())
+
+
+def random_flights(
+    context: rclpy.Context, setup: Setup, seed: int, count: int, *, real_time: bool
+) -> Figures:
+    """Do this many actions to one stack after the other, up to the first violation.
+
+    Within one process, Fast DDS delivers nothing to a subscription that is created after 5000
+    messages of a reliable publisher: nodes of an older stack cannot be configured again.
+    """
+    total = Figures()
+    while total.actions < count and not total.violations:
+        harness = Harness(context)
+        flight = RandomFlight(harness, setup, seed + total.stacks, real_time=real_time)
+        flight.run(count - total.actions)
+        harness.close()
+        total.add(flight.figures)
+    return total
 
 
 def _fill(message: PoseStamped, position: Array, quaternion: Array) -> None:
