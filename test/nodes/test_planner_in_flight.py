@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import SetParameters
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -74,10 +75,14 @@ def test_a_reset_of_the_plant_does_not_keep_the_goal_from_being_met(harness: Har
     flight.start()
     flight.wait("executing")
     flight.ticks(15)
+    flight.probe.watch("/rosout", Log)
+    harness.connect()
     harness.call(flight.probe.create_client(Trigger, "plant/reset"), Trigger.Request())
     flight.wait("reached", "failed")
     assert flight.states[-1] == "reached"
     assert max(flight.error_to(NEAR)) <= 1e-3
+    # The state of the same time that the plant then shows is no other plant's.
+    assert not [log.msg for log in flight.probe.messages["/rosout"] if "more than one" in log.msg]
 
 
 # -- corrections ------------------------------------------------------------------------------

@@ -237,6 +237,19 @@ def test_the_messages_themselves_are_kept_as_they_came() -> None:
     assert (states.odom, states.joint_states) == (odom(1), joints(2))
 
 
+def test_another_pose_of_one_time_is_a_contradiction_unless_the_plant_was_reset() -> None:
+    states = StateSynchroniser(pose_required=True)
+    moved = Odometry()
+    moved.header.stamp.nanosec, moved.pose.pose.position.x = 1, 0.5
+    here = Odometry()
+    here.header.stamp.nanosec = 1
+    assert not states.put_odom(serialize_message(moved))
+    assert states.put_odom(serialize_message(here))
+    assert states.put_odom(serialize_message(moved))
+    states.forget_pose()
+    assert not states.put_odom(serialize_message(here))
+
+
 def test_a_topic_that_is_required_again_keeps_its_message() -> None:
     states = StateSynchroniser(pose_required=True)
     states.require("joint_reference")

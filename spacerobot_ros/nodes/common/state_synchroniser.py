@@ -81,6 +81,10 @@ class StateSynchroniser:
         self._odom_fresh, self._without_pose = True, False
         return False
 
+    def forget_pose(self) -> None:
+        """Take no later odom for a contradiction: the plant shows another state of one time."""
+        self.odom, self._odom_fresh = b"", False
+
     def put_joint_states(self, raw: bytes) -> None:
         """Accept a joint_states message; see :meth:`overdue` for the state before."""
         self.joint_states = raw

@@ -211,6 +211,8 @@ class CoordinatedControlNode(CommanderNode):
             self._abort_waiting(f"Aborted by the plant: {stopped.why}")
 
     def _plant_changed(self, change: Change) -> None:
+        if change is Change.RESET:
+            self._states.forget_pose()
         if change is Change.OBEYS and self._robot is not None:
             self._executive.plant_obeys_again()
 

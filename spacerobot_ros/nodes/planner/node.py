@@ -230,7 +230,10 @@ class PlannerNode(CommanderNode):
             self._waiting = waiting
 
     def _plant_changed(self, change: Change) -> None:
-        if change is Change.RESET and self._executive is not None:
+        if change is not Change.RESET:
+            return
+        self._states.forget_pose()
+        if self._executive is not None:
             self._executive.plant_reset()
             self._publish_outputs(self._executive)
 
