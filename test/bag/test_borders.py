@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import random
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -241,6 +242,71 @@ def test_a_message_with_too_many_numbers_has_none_in_a_table(tmp_path: Path) -> 
     np.testing.assert_array_equal(
         table, [[1, 2, 1, 2], [nan, nan, nan, nan], [nan, nan, nan, nan], [1, 2, 1, 2]]
     )
+
+
+def test_a_table_of_nothing_has_no_columns(tmp_path: Path) -> None:
+    with made_bag(tmp_path / "a.mcap") as (_, say):
+        for _ in range(3):
+            say("/joints", joint_states(0.0, [], [], []), 0.0)
+    series = read_bag(tmp_path / "a.mcap")["/joints"]
+    assert series.table([], 0).shape == (3, 0)
+    assert series.table(["position"], 0).shape == (3, 0)
+
+
+WRONG_INDEXES: dict[str, Callable[[list[Any]], list[Any]]] = {
+    "half a pair": lambda pairs: [*pairs, 7],
+    "beyond the chunk": lambda pairs: [*pairs[:-1], 10**6],
+    "at its very end": lambda pairs: [*pairs[:-1], "end"],
+    "inside of a message": lambda pairs: [*pairs[:-1], pairs[-1] + 1],
+    "one message twice": lambda pairs: [*pairs[:-1], pairs[-3]],
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG_INDEXES)
+def test_an_index_that_does_not_fit_its_chunk_is_refused(tmp_path: Path, wrong: str) -> None:
+    """The mcap library writes the bag; the last pair of time and place of its index is changed."""
+    path = tmp_path / "a.mcap"
+    times = [1, 2, 3, 4]
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start("ros2")
+        schema = writer.register_schema(STRING, "ros2msg", b"string data")
+        channel = writer.register_channel("/a", "cdr", schema)
+        for time in times:
+            writer.add_message(channel, time, string("text"), time)
+        writer.finish()
+    content = path.read_bytes()
+    records = ends_of_records(content)
+    starts = [8, *(end for _, end in records)]
+    (start,) = (a for a, (opcode, _) in zip(starts, records, strict=False) if opcode == 0x07)
+    (chunk,) = (end - a for a, (o, end) in zip(starts, records, strict=False) if o == 0x06)
+    pairs = list(struct.unpack_from("<8Q", content, start + 15))
+    assert pairs[::2] == times
+    assert len(list(read_bag(path).messages("/a"))) == 4
+    changed = [chunk if x == "end" else x for x in WRONG_INDEXES[wrong](pairs)]
+    if len(changed) == len(pairs):
+        altered = struct.pack(f"<{len(changed)}Q", *changed)
+        path.write_bytes(content[: start + 15] + altered + content[start + 15 + len(altered) :])
+    else:
+        # Said to be longer by half a pair: what follows is taken for it.
+        size = struct.pack("<QHI", 6 + 72, channel, 72)
+        path.write_bytes(content[: start + 1] + size + content[start + 15 :])
+    with pytest.raises(RecordingError, match="is damaged"):
+        list(read_bag(path).messages("/a"))
+
+
+def test_a_bag_that_cannot_be_begun_is_not_held_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = tmp_path / "a.mcap"
+
+    def full(*_: Any) -> None:
+        raise RecordingError("No space left on device.")
+
+    monkeypatch.setattr("spacerobot_ros.bag.mcap_file.McapFile.append_metadata", full)
+    with pytest.raises(RecordingError, match="No space left"):
+        BagWriter(bag)
+    assert not [path for path in Path("/proc/self/fd").iterdir() if path.resolve() == bag]
 
 
 def test_durations_beyond_the_longest_are_the_longest() -> None:
