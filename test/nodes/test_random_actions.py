@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 
 import pytest
-import rclpy
 from support.random_actions import SETUPS, RandomFlight, random_flights
 from support.ros_harness import Harness
 
@@ -38,9 +37,9 @@ def test_some_random_actions_leave_every_state_as_specified(
 @MODES
 @pytest.mark.parametrize("setup", list(SETUPS))
 def test_many_random_actions_leave_every_state_as_specified(
-    ros_context: rclpy.Context, setup: str, real_time: bool
+    ros_domain: int, setup: str, real_time: bool
 ) -> None:
     count = -(-COUNT // len(SETUPS))
-    figures = random_flights(ros_context, SETUPS[setup], SEED, count, real_time=real_time)
+    figures = random_flights(ros_domain, SETUPS[setup], SEED, count, real_time=real_time)
     print(f"\n{setup}, {'real time' if real_time else 'lockstep'}: {figures}")
     assert not figures.violations, figures.violations[0]

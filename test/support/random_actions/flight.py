@@ -628,9 +628,7 @@ class RandomFlight:
         return tuple((0.2 * Rotation.from_quat(state.pose[3:]).apply(moved)).tolist())
 
 
-def random_flights(
-    context: rclpy.Context, setup: Setup, seed: int, count: int, *, real_time: bool
-) -> Figures:
+def random_flights(domain: int, setup: Setup, seed: int, count: int, *, real_time: bool) -> Figures:
     """Do this many actions to one stack after the other, up to the first violation.
 
     Within one process, Fast DDS delivers nothing to a subscription that is created after 5000
@@ -638,10 +636,14 @@ def random_flights(
     """
     total = Figures()
     while total.actions < count and not total.violations:
+        # Of its own: what is destroyed would still be called back in a shared one.
+        context = rclpy.Context()
+        rclpy.init(args=[], context=context, domain_id=domain)
         harness = Harness(context)
         flight = RandomFlight(harness, setup, seed + total.stacks, real_time=real_time)
         flight.run(count - total.actions)
         harness.close()
+        rclpy.try_shutdown(context=context)
         total.add(flight.figures)
     return total
 
