@@ -13,6 +13,7 @@ from support.oracles import Array
 from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState
 from spacerobot_ros.simulation.joint_stops import at_rest, pushed_out
 
@@ -259,3 +260,20 @@ def test_stops_bring_the_rates_to_the_nearest_admissible(seed: int) -> None:
     found, impulses = at_rest(compliance, rates, chosen)
     np.testing.assert_allclose(found, nearest, atol=1e-10)
     np.testing.assert_allclose(K @ (found - rates), impulses, atol=1e-10)
+
+
+def test_the_moment_of_arrival_within_a_step_counts_where_the_base_spins() -> None:
+    """What the base turns until then depends on the moving joint: one long step is like many."""
+    robot = SpaceRobot.from_file(robot_file("three_joint_arm"))
+    rates, shape = np.array([0.4, 0.0, 0.0]), np.array([2.99, -0.8, 1.5])
+    ends = []
+    for step in (0.05, 1e-3):
+        start = InitialState(
+            joint_positions=shape,
+            joint_velocities=rates,
+            angular_momentum=np.array([5.0, -8.0, 7.0]),
+        )
+        plant = EffortPlant(robot, 0.2, start, integration_step=step)
+        assert plant.step(np.zeros(3))
+        ends.append(np.concatenate([plant.pose, plant.q, plant.qdot, plant.twist]))
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
