@@ -166,3 +166,23 @@ def test_files_carry_the_latest_time(bench: Bench) -> None:
     with bench.path.open("rb") as file:
         (attachment,) = make_reader(file).iter_attachments()
     assert (attachment.log_time, attachment.data) == (5 * S, b"<robot/>")
+
+
+def test_a_disk_that_refuses_a_message_is_reported_once(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = bench.recording
+    recording.start()
+    recording.set_clock(S)
+
+    def full(*_: Any) -> None:
+        raise RecordingError("no space left")
+
+    monkeypatch.setattr("spacerobot_ros.bag.mcap_file.McapFile.append_chunk", full)
+    for _ in range(3):
+        # More than a chunk.
+        recording.record(bench.a, b"x" * 70_000)
+    assert recording.state.value == "failed"
+    assert [str(failure) for failure in bench.failures] == ["no space left"]
+    assert recording.messages == 0
+    recording.close()
