@@ -14,7 +14,7 @@ from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header
+from std_msgs.msg import Header, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 import spacerobot_ros
@@ -315,3 +315,28 @@ def test_the_truth_is_what_was_measured_until_it_is_published(tmp_path: Path) ->
     assert truth("/alone") == [[0, 6.0, -6.0]]
     with pytest.raises(RecordingError, match="nothing is on /nobody/joint_states"):
         truth("/nobody")
+
+
+@pytest.mark.parametrize(("count", "more"), [(39, ""), (40, ""), (41, " and 1 more")])
+def test_a_topic_that_is_not_there_is_refused_with_those_that_are(
+    count: int, more: str, tmp_path: Path
+) -> None:
+    with BagWriter(tmp_path / "many.mcap") as bag:
+        for number in range(count):
+            channel = bag.add_topic(f"/t{number:02}", "std_msgs/msg/String")
+            bag.write(channel, bytes(serialize_message(String(data="here"))), 1, 1)
+    with pytest.raises(RecordingError) as refusal:
+        read_bag(tmp_path / "many.mcap")["/other"]
+    listed = ", ".join(f"/t{number:02}" for number in range(min(count, 40)))
+    assert f"{listed}{more}" in str(refusal.value)
+    assert ("more" in str(refusal.value)) == bool(more)
+
+
+def test_a_table_of_no_fields_has_a_row_for_every_message(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "one.mcap") as bag:
+        channel = bag.add_topic("/joints", "sensor_msgs/msg/JointState")
+        for time in range(3):
+            bag.write(channel, bytes(serialize_message(JointState(name=["a"]))), time, time)
+    series = read_bag(tmp_path / "one.mcap")["/joints"]
+    assert series.table([], 0).shape == (3, 0)
+    assert series.table(["name", "position"], 0).shape == (3, 0)

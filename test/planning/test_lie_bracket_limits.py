@@ -206,3 +206,15 @@ def test_a_drifting_robot_is_refused(momentum: dict[str, Array], shown: str) -> 
     text = refusal_of(paper_robot(), replace(origin(), **momentum), NEAR)
     assert "drifts" in text
     assert shown in text
+
+
+def test_a_slider_that_is_not_used_may_have_no_rate_and_no_room() -> None:
+    """A fourth one that neither the slide nor the turn moves: it rests at the end of its stroke."""
+    fourth = Slider(0.5, np.array([0.6, 0.8, 0.0]), np.zeros(3), stroke=(-1.0, 0.0), rate=0.0)
+    robot = paper_robot()
+    robot = replace(robot, sliders=(*robot.sliders, fourth))
+    state = state_at(np.zeros(3), Rotation.identity(), np.zeros(4))
+    goal = goal_at([0.0, 0.0, 0.0], Rotation.from_rotvec([0.01, 0.0, -0.02]))
+    schedule = planner(robot, Tolerance(1e-3, 1e-3)).plan(state, goal)
+    assert np.all(schedule.positions[:, 3] == 0.0)
+    assert np.ptp(schedule.positions[:, :3]) > 0.01

@@ -30,11 +30,13 @@ def altered(
     parameters: dict[str, str] | None = None,
     urdf: tuple[bytes, bytes] = (b"", b""),
     injected: dict[int, str] | None = None,
+    begin_ns: int = 0,
 ) -> Path:
     """Copy a bag with something changed.
 
     The message of that number on a topic, some of the plant's parameters, or one text in its URDF
-    that another takes the place of. ``injected`` adds messages on /fault_injection, by log time.
+    that another takes the place of. ``injected`` adds messages on /fault_injection, by log time;
+    what was logged before ``begin_ns`` is left out.
     """
     count = 0
     with bag.open("rb") as source, out.open("wb") as target:
@@ -54,6 +56,8 @@ def altered(
                 writer.add_metadata(metadata.name, values)
         for schema, channel, message in reader.iter_messages(log_time_order=False):
             assert schema is not None
+            if message.log_time < begin_ns:
+                continue
             if channel.id not in channels:
                 schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.id] = writer.register_channel(

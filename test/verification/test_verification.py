@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
@@ -161,6 +162,18 @@ def test_a_bag_that_begins_in_mid_flight(tmp_path: Path) -> None:
     difference = verify_bag(bag).difference
     assert difference is not None
     assert difference.time == pytest.approx(8 * TICK)
+
+
+def test_a_flight_under_efforts_that_begins_in_mid_flight_has_its_joint_rates(
+    tmp_path: Path,
+) -> None:
+    whole = share_directory() / "bags" / "coordinated_control.mcap"
+    # The robot starts at rest; half a second later its joints move.
+    bag = altered(whole, tmp_path / "late.mcap", begin_ns=500_000_000)
+    assert np.abs(read_bag(bag)["/joint_states"].field("velocity")[0]).min() > 1e-3
+    result = verify_bag(bag, tolerance=1e-9)
+    assert result.difference is None
+    assert result.ticks == 833, "of 883 ticks, 50 come before"
 
 
 @pytest.mark.parametrize(

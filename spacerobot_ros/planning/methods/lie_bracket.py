@@ -290,8 +290,8 @@ class LieBracketGait(GaitMethod):
             active = swing > 0
             with np.errstate(divide="ignore"):
                 excess = max(
-                    float(np.max((swing / np.maximum(room, 1e-300))[active], initial=0.0)),
-                    float(np.max((rate / robot.velocity_limit)[active], initial=0.0)),
+                    float(np.max(swing[active] / np.maximum(room[active], 1e-300), initial=0.0)),
+                    float(np.max(rate[active] / robot.velocity_limit[active], initial=0.0)),
                 )
             if excess <= 1.0:
                 return _Turn(shapes, n, alpha, amplitudes)
