@@ -79,6 +79,9 @@ class ControlExecutive:
         """Time of the last state, s."""
         self._hold_here = False
         """Whether the robot is to hold where it is at the next measured state, without a goal."""
+        self.plant_blocked = False
+        """Whether the plant obeys no command, for the owner to set: what answers a state from
+        before it obeys again must not move the robot, so each answer holds it where it is."""
         self._abort_sentence = ""
         """The sentence of the status while the state is aborted."""
         self._pending: dict[str, IdentifiedGoal] = {}
@@ -235,7 +238,7 @@ class ControlExecutive:
             self._shift_time(time - self._time)
         self._time = time
         if measured is not None:
-            if self._abort_requested or self._hold_here:
+            if self._abort_requested or self._hold_here or self.plant_blocked:
                 self._hold(time, measured)
             if self._pending:
                 self._begin(time, measured)

@@ -747,6 +747,20 @@ def test_a_held_pose_is_not_flown_back_to_after_a_latch() -> None:
     assert (loop.state, loop.status.goal_id) == ("holding", "")
 
 
+def test_every_answer_to_a_plant_that_does_not_obey_holds_the_robot_where_it_is() -> None:
+    loop = ExecutiveLoop()
+    loop.answer()
+    loop.executive.plant_blocked = True
+    for x in (0.4, 0.9):
+        loop.place = np.array([x, 0.0, 0.0])
+        wrench, _ = loop.answer()
+        np.testing.assert_allclose(wrench, 0.0, atol=1e-12)
+    loop.executive.plant_blocked = False
+    loop.place = np.array([1.0, 0.0, 0.0])
+    wrench, _ = loop.answer()
+    assert wrench[0] < 0.0  # Back to where it was held last.
+
+
 @pytest.mark.parametrize("ticks", [10**8, -3 * 10**5])
 def test_a_jump_of_time_is_no_progress_of_a_goal(ticks: int) -> None:
     loop = ExecutiveLoop(settle_time=0.05, time_limit=0.1)

@@ -85,6 +85,25 @@ def test_a_planner_that_stood_still_ends_its_goal_with_the_true_reason(harness: 
     assert flight.states[-1] == "reached"
 
 
+def test_only_the_last_of_the_states_that_wait_is_answered(harness: Harness) -> None:
+    flight = Flight(harness, {**SLOW, **BACKGROUND}, REAL_TIME)
+    flight.start()
+    flight.send(NEAR)
+    flight.wait("executing")
+    flight.ticks(10)
+    harness.executor.remove_node(flight.planner)
+    flight.ticks(6)
+    waiting = stamp_of(flight.probe.last("joint_states"))
+    before = flight.probe.count("joint_commands")
+    harness.executor.add_node(flight.planner)
+    harness.spin_until(
+        lambda: flight.probe.count("joint_commands") > before + 2, "commands after a standstill"
+    )
+    answered = [stamp_of(m) for m in flight.probe.messages["joint_commands"][before:]]
+    assert min(answered) >= waiting
+    assert answered == sorted(set(answered))
+
+
 def test_a_pause_ends_nothing_and_a_goal_may_come_in_it(harness: Harness) -> None:
     flight = Flight(harness, plant=REAL_TIME)
     flight.start()

@@ -768,6 +768,16 @@ def test_each_change_of_a_goal_is_one_event() -> None:
     assert events_of(loop) == [("plan_started", "goal-2")]
 
 
+def test_no_joint_is_stuck_at_a_plant_where_no_command_is_in_force() -> None:
+    loop = executing(ticks=400, stuck_ticks=5)
+    loop.executive.plant_rests = True
+    loop.plant.hold(np.array([True, False, False]))
+    loop.tick(100)
+    assert loop.executive.phase is Phase.EXECUTING
+    loop.executive.plant_rests = False
+    stuck(loop)
+
+
 def test_stuck_joints_are_an_event_that_names_them() -> None:
     loop = long_flight()
     quick_without_joints(loop)

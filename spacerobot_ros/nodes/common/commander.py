@@ -5,18 +5,21 @@ from __future__ import annotations
 import math
 import time
 from abc import abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS
+from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns
 from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.node import STREAM, RobotNode
 from spacerobot_ros.nodes.common.state_times import StateTimes
@@ -26,6 +29,9 @@ from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
 _LOOK_PERIOD = 0.1
 """Wall s between two looks at states that were set aside."""
+
+_STANDSTILL = 0.005
+"""Wall s without an answer after which only the last of the states that wait is answered."""
 
 _REPORT_PERIOD = 1.0
 """Least wall s between two diagnostics about ignored states."""
@@ -82,6 +88,11 @@ class PlantListener:
         if status.state is PlantState.FAILED:
             return f"The plant has failed: {status.sentence}"
         return ""
+
+    @property
+    def rests(self) -> bool:
+        """Whether no command is in force."""
+        return self._status is not None and self._status.state is PlantState.RESTING
 
     @property
     def paused(self) -> bool:
@@ -150,8 +161,13 @@ class CommanderNode(RobotNode):
         self._statuses = self.create_subscription(
             DiagnosticStatus, "plant/status", self._on_plant_status, _STATUSES
         )
-        self.create_subscription(Odometry, "odom", self._on_odom, STREAM, raw=True)
-        self.create_subscription(JointState, "joint_states", self._on_joints, STREAM, raw=True)
+        self._odom_input = self.create_subscription(
+            Odometry, "odom", self._on_odom, STREAM, raw=True
+        )
+        self._joints_input = self.create_subscription(
+            JointState, "joint_states", self._on_joints, STREAM, raw=True
+        )
+        self._answered = time.monotonic()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_LOOK_PERIOD, self._look_at_times, clock=steady)
 
@@ -196,14 +212,54 @@ class CommanderNode(RobotNode):
             self._take_odom(raw)
 
     def _on_joints(self, raw: bytes) -> None:
+        if time.monotonic() - self._answered > _STANDSTILL:
+            self._take_last(raw)
+        elif self._is_of_the_robot(raw) and self._times.admits(raw):
+            self._take_joints(raw)
+        self._answered = time.monotonic()
+
+    def _take_last(self, raw: bytes) -> None:
+        """Answer only the last of the states that wait after this node stood still.
+
+        An answer to one before it comes too late, and what the joints did in states from before the
+        first answer says nothing about whether they obey it.
+        """
+        odoms = list(self._drained(self._odom_input, Odometry))
+        others = []
+        for newer in self._drained(self._joints_input, JointState):
+            if self._is_later(newer, raw):
+                raw = newer
+            else:
+                others.append(newer)
+        for joint_states in (raw, *others):
+            if self._is_of_the_robot(joint_states) and self._times.admits(joint_states):
+                for odom in odoms:
+                    if first_time_ns(odom) >= self._times.now_ns:
+                        self._on_odom(odom)
+                odoms = []
+                self._take_joints(joint_states)
+
+    def _is_of_the_robot(self, raw: bytes) -> bool:
         # Those of another robot neither tell the time nor take the place of this one's.
         try:
             self._require_joints(raw)
         except CommandError as error:
             self.get_logger().error(f"joint_states: {error}.", throttle_duration_sec=5.0)
-            return
-        if self._times.admits(raw):
-            self._take_joints(raw)
+            return False
+        return True
+
+    def _is_later(self, newer: bytes, raw: bytes) -> bool:
+        """Whether a state that waits takes the place of one before it."""
+        ahead = first_time_ns(newer) - first_time_ns(raw)
+        return ahead > 0 and self._times.would_admit(newer) and self._is_of_the_robot(newer)
+
+    @staticmethod
+    def _drained(subscription: Subscription, kind: type[Any]) -> Iterator[bytes]:
+        """Yield the serialised messages that wait in a subscription."""
+        handle = subscription.handle
+        with handle:
+            while (taken := handle.take_message(kind, True)) is not None:
+                yield taken[0]
 
     def _look_at_times(self) -> None:
         """Take up what waits: statuses, and a state that was set aside once it is believed."""

@@ -97,6 +97,11 @@ class StateTimes:
             self._ignore()
         return True
 
+    def would_admit(self, joint_states: bytes) -> bool:
+        """Return whether a joint_states message is of the present time, and change nothing."""
+        ahead = first_time_ns(joint_states) - self._last_ns
+        return 0 <= ahead <= max(self._longest, self._loss(self._clock()))
+
     def withdraw(self) -> None:
         """Take back the state that was admitted last: it is not one of the robot."""
         if self._before_ns == _NONE:

@@ -256,6 +256,7 @@ class CoordinatedControlNode(CommanderNode):
             q, qdot = self._joints.values["position"], self._joints.values["velocity"]
             measured = self._measured(q, qdot) if pairing is Pairing.WHOLE else None
             now = stamp / NANOSECONDS
+            self._executive.plant_blocked = bool(self._plant.blocked)
             result = self._executive.command(now, measured, q, qdot, self._reference())
         except (CommandError, NotFiniteError) as error:
             self._log_refusal(error)

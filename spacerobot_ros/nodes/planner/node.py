@@ -272,6 +272,7 @@ class PlannerNode(CommanderNode):
             # The state was answered without it, and is planned from when the next joints come.
             executive.observe(measured)
         else:
+            executive.plant_rests = self._plant.rests
             executive.update(measured)
             if executive.outputs:
                 self._publish_outputs(executive)

@@ -188,6 +188,8 @@ class Executive:
         self._stamp_ns = 0
         self._commanded_from_ns = 0
         """Stamp of the first state that is answered for what is executed or planned now."""
+        self.plant_rests = False
+        """Whether the plant reports that no command is in force, for the owner to set."""
         self._longest_gap = round(max(_GAP, _GAP_PERIODS * config.control_period) * 1e9)
 
     @property
@@ -345,7 +347,7 @@ class Executive:
         if phase is not _EXECUTING or self._proposed is not None or tracker.check_due(stamp):
             self._act(phase, measured)
         if tracker.active:
-            stuck = tracker.track(stamp, q)
+            stuck = tracker.track(stamp, q, obeyed=not self.plant_rests)
             if stuck and self._pursuit is not None:
                 self._on_stuck(stuck)
         if not tracker.active:

@@ -291,10 +291,11 @@ class TrajectoryTracker:
         """Return the tracking error of a state that is due, None if it is small enough."""
         return self._check.error(state.position, state.quaternion)
 
-    def track(self, stamp_ns: int, q: Array) -> list[int]:
+    def track(self, stamp_ns: int, q: Array, *, obeyed: bool = True) -> list[int]:
         """Write the setpoint for the shape ``q`` (n,) now; return which joints are found stuck.
 
-        For a shape that is not finite the setpoint is to rest.
+        For a shape that is not finite the setpoint is to rest. While no command is in force at the
+        plant (``obeyed`` is false), joints that do not move prove nothing.
         """
         assert self._follower is not None
         position, velocity = self.setpoint.position, self.setpoint.velocity
@@ -304,6 +305,9 @@ class TrajectoryTracker:
             return []
         if self.stuck:
             velocity[self.stuck] = 0.0
+        if not obeyed:
+            self._watch.restart()
+            return []
         return self._watch.look(q, position, velocity)
 
     def hold(self, q: Array) -> None:
