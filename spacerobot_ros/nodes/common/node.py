@@ -109,7 +109,7 @@ class FlightNode(LifecycleNode):
         """Called with an exit code by a node that has nothing left to do."""
         self.raw_streams: list[RawStream] = []
         """What passes through the node as bytes, from its configuration to its cleanup."""
-        self._failure = ""
+        self._failure, self._destroyed = "", False
         self._liveness: Liveness | None = None
         self._event_stream: RawOutput | None = None
         self.events_have_wall_time = True
@@ -268,6 +268,8 @@ class FlightNode(LifecycleNode):
 
     def _fail(self, what: str, error: Exception) -> None:
         """Stop working after an exception of a callback; whoever spins the node goes on."""
+        if self._destroyed:
+            return  # The executor had the callback in its queue.
         self.get_logger().debug("".join(traceback.format_exception(error)))
         if isinstance(error, SpaceRobotError):
             sentence = str(error)
@@ -312,6 +314,7 @@ class FlightNode(LifecycleNode):
     def destroy_node(self) -> None:
         """Destroy the node and let go of its state machine, which would keep it in the graph."""
         self._end_heartbeats()
+        self._destroyed = True
         super().destroy_node()
         self._state_machine = None
 
