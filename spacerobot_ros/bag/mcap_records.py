@@ -42,6 +42,8 @@ by 3 to 40, what was made to fill memories by 1000 and more."""
 RECORD_HEADER = struct.Struct("<BQ")
 """Opcode, and the length of the body."""
 
+_LENGTH = struct.Struct("<Q")
+
 _CHUNK = struct.Struct("<QQQI")
 """What a chunk begins with: times, size and checksum of what it holds."""
 
@@ -305,6 +307,12 @@ def unpacked(body: bytes, place: int) -> bytes:
     if chunk.compression not in _DECOMPRESSORS:
         raise ValueError(
             f"the compression {chunk.compression!r} of the chunk at byte {place} is unknown"
+        )
+    claimed = _LENGTH.unpack_from(body, _CHUNK.size + 4 + len(chunk.compression.encode()))[0]
+    if claimed != len(chunk.data):
+        raise ValueError(
+            f"the chunk at byte {place} holds {len(chunk.data)} packed bytes, not the {claimed} "
+            "that it claims"
         )
     size = chunk.uncompressed_size
     try:
