@@ -81,7 +81,9 @@ def run_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float | 
         bag = Path(folder, "bench.mcap")
         for _ in range(_ROUNDS):
             peer_rates.append(_peer_rate(ticks, bag))
+            bag.unlink()
             stack_rates.append(_stack_rate(ticks, bag))
+            bag.unlink()
             bare_stack_rates.append(_stack_rate(ticks, None))
             show(
                 f"round: {stack_rates[-1]:8.0f} ticks/s with plant, planner and recorder, "

@@ -65,7 +65,7 @@ class Supervisor:
     def await_flight(self) -> None:
         """Wait until states of a robot that moves are in the bag."""
         deadline = time.monotonic() + PATIENCE
-        while not self.bag.exists() or self.bag.stat().st_size < 80_000:
+        while not self.bag.exists() or self.bag.stat().st_size < 150_000:
             assert self.process.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.02)
