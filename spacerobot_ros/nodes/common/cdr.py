@@ -202,7 +202,9 @@ def carried(time_ns: int) -> int:
 def first_time_ns(raw: bytes) -> int:
     """Return the time that a serialised message begins with, ns; 0 if it is before zero."""
     seconds, nanoseconds = _TIME.unpack_from(raw, _ENCAPSULATION)
-    return min(max(seconds * NANOSECONDS + nanoseconds, 0), _LATEST_NS)
+    time_ns: int = seconds * NANOSECONDS + nanoseconds
+    # Once for every message: three comparisons take less time than min and max.
+    return time_ns if 0 <= time_ns <= _LATEST_NS else 0 if time_ns < 0 else _LATEST_NS
 
 
 def raw_publish(publisher: Publisher) -> Callable[[bytes], None]:
@@ -239,6 +241,7 @@ class TemplateReader(Generic[M]):
         self._spans = spans
         self._largest = largest
         self._size = -1
+        self._raw = bytes(2)  # Of no message.
         self._fixed: list[tuple[slice, bytes]] = []
         self._stretches: list[tuple[slice, bytes]] = []
         self._reads: dict[str, tuple[int, int]] = {}
@@ -256,6 +259,8 @@ class TemplateReader(Generic[M]):
         UnreadableError
             The bytes are not a message of the type; the message before stays.
         """
+        if raw is self._raw:
+            return
         if len(raw) == self._size:
             # One writer repeats its padding too: a few whole stretches are compared first.
             for place, text in self._stretches:
