@@ -347,8 +347,12 @@ class MomentumCheck:
         middle = Rotation.from_quat(before.pose[3:] + now.pose[3:] * _same_side(before, now))
         push = middle.apply(wrench[:3]) * self._period / SECOND
         given = now.expected[:3] - before.expected[:3]
+        attitudes = Rotation.from_quat([before.pose[3:], now.pose[3:]])
+        turns = (attitudes[0].inv() * attitudes[1]).magnitude()
+        # The thrusters turn with the base: their mean direction in a tick in which the rates of the
+        # base change is that of the middle attitude to a small part of the turn.
+        error, bound = np.abs(given - push).max(), (1e-3 + 0.1 * turns) * np.abs(push).max() + 1e-9
         # A command may have been refused: then there is no push at all.
-        error, bound = np.abs(given - push).max(), 1e-3 * np.abs(push).max() + 1e-9
         if np.abs(given).max() > 0 and error > bound:
             return f"the linear momentum changes by {given}, the wrench has given {push}"
         return None
