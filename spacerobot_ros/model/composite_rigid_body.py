@@ -212,31 +212,37 @@ def shape_system(kin: TreeKinematics) -> ShapeSystem:
     return ShapeSystem(parts, tuple(B), D, K)
 
 
-def motion_forces(system: ShapeSystem, omega: ca.SX, qdot: ca.SX) -> tuple[ca.SX, ...]:
+def motion_forces(
+    parts: Composites, omega: ca.SX, qdot: ca.SX, qddot: ca.SX | None = None
+) -> tuple[ca.SX, ...]:
     """Return ``f_k`` (6,) for every composite k: the force that its motion at the rates
-    ``omega_WB_B`` (3,) and ``qdot`` (n,) demands while ``omega`` and ``qdot`` stay as they are.
+    ``omega_WB_B`` (3,) and ``qdot`` (n,) demands while ``omega`` stays as it is, and ``qdot`` too
+    or, where ``qddot`` (n,) is given, changes by that.
 
     Recursive Newton-Euler (Featherstone, table 5.1). What turns with body k at ``omega_k`` and
     ``alpha_k`` accelerates by ``A_k x``, ``A_k = hat(alpha_k) + hat(omega_k)^2``, relative to the
     body's origin. The base's origin is taken as unaccelerated: what a common acceleration adds to
     ``S_j' f_j``, ``B_j' f_0`` takes off in ``Q_j``.
     """
-    kin = system.parts.kin
+    kin = parts.kin
     omegas, alphas = [omega], [ca.SX(3, 1)]
     A, accelerations = [_turning(omega, ca.SX(3, 1))], [ca.SX(3, 1)]
     for k in range(1, kin.n + 1):
         i = kin.parent(k)
         rate = kin.axis[k] * qdot[k - 1]
+        push = ca.SX(3, 1) if qddot is None else kin.axis[k] * qddot[k - 1]
         # Not as a difference of origins, in which CasADi finds nothing to cancel or to share.
         arm = kin.R[i] @ _constant(kin.robot.bodies[k].origin.r)
         if kin.is_revolute(k):
             accelerations.append(accelerations[i] + A[i] @ arm)
             omegas.append(omegas[i] + rate)
-            alphas.append(alphas[i] + ca.cross(omegas[i], rate))
+            alphas.append(alphas[i] + ca.cross(omegas[i], rate) + push)
             A.append(_turning(omegas[k], alphas[k]))
         else:
             arm = arm + kin.axis[k] * kin.q[k - 1]
-            accelerations.append(accelerations[i] + A[i] @ arm + 2 * ca.cross(omegas[i], rate))
+            accelerations.append(
+                accelerations[i] + A[i] @ arm + 2 * ca.cross(omegas[i], rate) + push
+            )
             omegas.append(omegas[i])
             alphas.append(alphas[i])
             A.append(A[i])
@@ -246,7 +252,7 @@ def motion_forces(system: ShapeSystem, omega: ca.SX, qdot: ca.SX) -> tuple[ca.SX
         arm = kin.R[k] @ _constant(kin.robot.bodies[k].inertia.com)
         force = kin.mass(k) * (accelerations[k] + A[k] @ arm)
         # The moment is the integral of rho x A rho over the body: the axial vector of A J.
-        AJ = A[k] @ system.parts.J[k]
+        AJ = A[k] @ parts.J[k]
         spin = ca.vertcat(AJ[2, 1] - AJ[1, 2], AJ[0, 2] - AJ[2, 0], AJ[1, 0] - AJ[0, 1])
         forces.append(ca.vertcat(ca.cross(kin.com[k] - kin.r_BC_B, force) + spin, force))
     for k in range(kin.n, 0, -1):
@@ -262,13 +268,34 @@ def shape_forces(
     ``external`` (6,) is the moment (N m) over the force (N) from outside, base components, about
     the system's centre of mass; ``tau`` (n,) are the joint efforts (N or N m).
     """
-    f = motion_forces(system, omega, qdot)
+    f = motion_forces(system.parts, omega, qdot)
     excess = f[0] - external
     Q = [
         tau[k - 1] - ca.dot(system.parts.S[k], f[k]) + ca.dot(system.B[k], excess)
         for k in range(1, system.parts.kin.n + 1)
     ]
     return ca.vertcat(*Q), -excess[:3]
+
+
+def joint_efforts(kin: TreeKinematics, qdot: ca.SX, qddot: ca.SX) -> ca.SX:
+    """Return the efforts (n,), N or N m, of a free robot at zero momentum whose shape moves at the
+    rates ``qdot`` (n,) and changes them by ``qddot`` (n,): inverse dynamics.
+
+    The base turns and accelerates such that both momenta stay zero: by ``-diag(D, M 1)^-1 f_0``,
+    where ``f_0`` is the force that the motion of the joints alone would demand from outside. So
+    ``tau_j = S_j' f_j - P_j' diag(D, M 1)^-1 f_0``, and no inertia matrix of the shape is needed.
+    They are of second degree in time: the same path in half the time takes four times the efforts.
+    """
+    parts = composites(kin)
+    D = Factor(parts.rotational)
+    f = motion_forces(parts, -D.solve(parts.D_q @ qdot), qdot, qddot)
+    base = ca.vertcat(D.solve(f[0][:3]), f[0][3:] * (1 / parts.mass))
+    return ca.vertcat(
+        *(
+            ca.dot(S, force) - ca.dot(P, base)
+            for S, P, force in zip(parts.S[1:], parts.P[1:], f[1:], strict=True)
+        )
+    )
 
 
 def external_force(kin: TreeKinematics, wrench_B: ca.SX) -> ca.SX:

@@ -20,6 +20,7 @@ from spacerobot_ros.model.compilation import BufferedFunction, compiled, dense_f
 from spacerobot_ros.model.composite_rigid_body import (
     composite_dynamics,
     composites,
+    joint_efforts,
     shape_equations,
     state_rate,
     state_slices,
@@ -128,6 +129,13 @@ class SpaceRobot:
         """
         return self._call("forward_dynamics", q, v_cm_B, omega_WB_B, qdot, wrench_B, tau)[0]
 
+    def joint_efforts(self, q: npt.ArrayLike, qdot: npt.ArrayLike, qddot: npt.ArrayLike) -> Array:
+        """Return the efforts (n,), N or N m, that move the shape so at zero momentum.
+
+        Nothing pushes the base, which moves as the momenta demand.
+        """
+        return self._call("joint_efforts", q, qdot, qddot)[0]
+
     def jacobian(self, link: str, q: npt.ArrayLike) -> Array:
         """Return ``0J+`` (6, 6 + n) of a link's frame origin (paper 4, eq. 10), base components.
 
@@ -230,6 +238,7 @@ class SpaceRobot:
             "shape_equations": lambda: shape_equations(self._kin),
             "flight_step": self._flight_step,
             "holding_step": lambda: self._flight_step(holding=True),
+            "joint_efforts": self._joint_efforts,
             "jacobian": self._jacobian,
             "connection": lambda: self._shape_function("connection", self._A),
             "curvature": self._curvature,
@@ -293,6 +302,11 @@ class SpaceRobot:
     def _flight_step(self, *, holding: bool = False) -> ca.Function:
         rate = state_rate(self._kin, holding=holding)
         return runge_kutta_step(rate, attitude=state_slices(self.n)[1])
+
+    def _joint_efforts(self) -> ca.Function:
+        rates = {"qdot": ca.SX.sym("qdot", self.n), "qddot": ca.SX.sym("qddot", self.n)}
+        efforts = joint_efforts(self._kin, *rates.values())
+        return dense_function("joint_efforts", {"q": self._kin.q, **rates}, {"tau": efforts})
 
     def _jacobian(self, link: str) -> ca.Function:
         index = self._link_index(link)

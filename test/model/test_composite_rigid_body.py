@@ -133,6 +133,22 @@ def test_shape_forces_from_the_papers_acceleration(case: Case) -> None:
     assert_agrees(K @ robot.forward_dynamics(*case.arguments())[6:], Q, 1e-12)
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_efforts_of_a_motion_at_zero_momentum(case: Case, engine: type) -> None:
+    """An engine's robot at zero momentum accelerates under them as they were asked for."""
+    robot, n = case.robot, case.robot.n
+    oracle = engine(case.urdf, robot.joint_names)
+    H = oracle.mass_matrix(case.motion)
+    qdot, qddot = case.motion.qdot, np.linspace(2.0, -3.0, n)
+    omega = -np.linalg.solve(H[3:6, 3:6], H[3:6, 6:] @ qdot)
+    motion = replace(case.motion, v_cm_B=np.zeros(3), omega_WB_B=omega)
+    tau = robot.joint_efforts(motion.q, qdot, qddot)
+    reached = oracle.forward_dynamics(motion, np.zeros(6), tau)
+    assert_agrees(reached[6:], qddot, 1e-9)
+    # The same path in half the time takes four times the efforts.
+    assert_agrees(robot.joint_efforts(motion.q, 2 * qdot, 4 * qddot), 4 * tau, 1e-12)
+
+
 def test_costs_less_than_half_of_the_papers() -> None:
     robot = SpaceRobot.from_file(SERVICER)
     fast, slow = (robot.function(name, compile=False) for name in ("dynamics", "forward_dynamics"))
