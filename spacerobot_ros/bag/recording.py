@@ -18,7 +18,7 @@ class RecordingState(Enum):
     """What is done with a message that arrives."""
 
     PAUSED = "paused"
-    """It is dropped."""
+    """It is dropped, except that the last one of a latched topic is kept until recording starts."""
 
     WAITING = "waiting"
     """It is kept in memory: whether a clock is published is not known yet."""
@@ -90,6 +90,8 @@ class Recording:
         """How many messages of each topic were published and never arrived."""
         self.attached: set[str] = set()
         """Names of the files in the bag."""
+        self.latched: dict[int, _Early | None] = {}
+        """Channels of latched topics, and the last message that each has sent during a pause."""
         self.failure: RecordingError | None = None
         self._clock_wait_ns = clock_wait * _SECOND
         self._on_failure = on_failure
@@ -103,10 +105,20 @@ class Recording:
         """Whether messages are recorded."""
         return self.state not in _DROPPING
 
+    @property
+    def messages_waiting(self) -> int:
+        """How many messages wait for the start, or for the time of the bag to be known."""
+        return len(self._early) + sum(last is not None for last in self.latched.values())
+
     def start(self) -> None:
-        """Record from now on."""
-        if self.state is RecordingState.PAUSED:
-            self.state = self._decided or _WAITING
+        """Record from now on, and what latched topics have sent last before that."""
+        if self.state is not RecordingState.PAUSED:
+            return
+        self.state = self._decided or _WAITING
+        for channel, last in self.latched.items():
+            self.latched[channel] = None
+            if last is not None:
+                self.record(channel, last.message, last.published_ns)
 
     def pause(self) -> None:
         """Record nothing until the next start."""
@@ -127,9 +139,11 @@ class Recording:
         ``published_ns`` is its stamp; 0: the time at which it is recorded.
         """
         if self.state is not _ON_CLOCK:
-            if not self.running:
-                return
             arrival_ns = self._wall_time()
+            if not self.running:
+                if self.state is RecordingState.PAUSED and channel in self.latched:
+                    self.latched[channel] = _Early(channel, message, published_ns, arrival_ns)
+                return
             if self.state is _WAITING:
                 self._early.append(_Early(channel, message, published_ns, arrival_ns))
                 return

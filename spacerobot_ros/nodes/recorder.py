@@ -231,6 +231,8 @@ class RecorderNode(FlightNode):
         if self._taps.tap(topic, take, len(offered)):
             return
         events, qos = loss_events(recording, topic), _subscribed_qos(offered)
+        if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+            recording.latched[channel] = None
         self.create_subscription(kind, topic, take, qos, event_callbacks=events, raw=True)
 
     # -- what the recorder reports ------------------------------------------------------------
@@ -370,7 +372,7 @@ def _take(recording: Recording, stamps: _Stamps, topic: str, kind: Any, channel:
         record(channel, raw, time_of(raw))
 
     def on_description(raw: bytes) -> None:
-        if recording.running and urdf_name not in recording.attached:
+        if urdf_name not in recording.attached:
             urdf = deserialize_message(raw, String).data.encode()
             recording.attach(urdf_name, urdf, "application/xml")
         record(channel, raw)

@@ -62,6 +62,27 @@ def test_nothing_is_recorded_before_the_start_and_in_a_pause(bench: Bench) -> No
     assert recording.messages == 2
 
 
+def test_the_last_message_of_a_latched_topic_in_a_pause_is_recorded(bench: Bench) -> None:
+    recording = bench.recording
+    recording.latched[bench.b] = None
+    recording.record(bench.b, b"configured")
+    recording.record(bench.b, b"inactive")
+    assert recording.messages_waiting == 1
+    recording.start()
+    recording.set_clock(4 * S)
+    recording.record(bench.b, b"running")
+    recording.pause()
+    recording.set_clock(5 * S)
+    recording.start()  # Nothing was sent in this pause: nothing is repeated.
+    recording.pause()
+    recording.record(bench.b, b"latched")
+    recording.set_clock(6 * S)
+    recording.start()
+    assert recording.messages_waiting == 0
+    texts = [(text, log_ns) for _, text, log_ns, _ in bench.written()]
+    assert texts == [("inactive", 4 * S), ("running", 4 * S), ("latched", 6 * S)]
+
+
 def test_what_comes_before_the_clock_carries_its_first_time(bench: Bench) -> None:
     recording = bench.recording
     recording.start()

@@ -101,6 +101,13 @@ class Stack:
             latched = topic in LATCHED_TOPICS
             self.probe.watch(topic, message_class(types[topic][0]), latched=latched)
         self.harness.connect()
+        recording = self.recorder.recording
+        assert recording is not None
+        # A matched subscription has not yet received what its publisher sent before.
+        if "/plant/status" in self.recorder.topics:
+            self.harness.spin_until(
+                lambda: recording.messages_waiting > 0, "the recorder receives the plant's status"
+            )
 
     def await_topics(self, *topics: str) -> None:
         self.harness.spin_until(
