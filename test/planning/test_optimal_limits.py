@@ -16,10 +16,10 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, RobotState, plan
 from spacerobot_ros.planning.methods.optimal import multiple_shooting, search
-from spacerobot_ros.planning.methods.optimal.multiple_shooting import Transcription
 from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
 from spacerobot_ros.planning.methods.optimal.problem import PathConstraints
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
+from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages, program
 
 Array = npt.NDArray[np.float64]
 
@@ -298,18 +298,23 @@ def test_derivatives_of_the_program_are_those_of_its_functions(arm: SpaceRobot) 
             keep_out=(0.5, 0.0, 0.0, 1.0, 1.0, 1.0),
         ),
     )
-    program = Transcription(arm, 3, np.eye(3), position=True, constraints=constraints).program()
-    x, p, g = (program.problem[name] for name in ("x", "p", "g"))
+    q, v, a = (ca.SX.sym(name, 3) for name in "qva")
+    power = ca.Function("power", [q, v, a], [5.0 - ca.cos(q) * v * a])
+    stages = Stages.of(
+        arm, np.eye(3), position=True, constraints=constraints, inequalities=[PathInequality(power)]
+    )
+    made = program(stages, 3)
+    x, p, g = (made.problem[name] for name in ("x", "p", "g"))
     lam = ca.MX.sym("lam", g.numel())
-    lagrangian = 0.7 * program.problem["f"] + ca.dot(lam, g)
+    lagrangian = 0.7 * made.problem["f"] + ca.dot(lam, g)
     plain = ca.Function(
         "plain", [x, p, lam], [ca.jacobian(g, x), ca.triu(ca.hessian(lagrangian, x)[0])]
     )
     rng = np.random.default_rng(0)
     at, of, by = (rng.uniform(0.2, 0.8, s.numel()) for s in (x, p, lam))
     jacobian, hessian = plain(at, of, by)
-    values, jac = program.jac_g(at, of)
-    assert values.numel() == len(program.lower) == len(program.upper)
+    values, jac = made.jac_g(at, of)
+    assert values.numel() == len(made.lower) == len(made.upper)
     np.testing.assert_allclose(jac.full(), jacobian.full(), atol=1e-9)
-    found = program.hess_lag(at, of, 0.7, by).full()
+    found = made.hess_lag(at, of, 0.7, by).full()
     np.testing.assert_allclose(found, hessian.full(), rtol=1e-9, atol=1e-8)

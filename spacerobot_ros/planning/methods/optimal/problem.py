@@ -33,7 +33,7 @@ class CandidateError(PlanningError):
 
 @dataclass(frozen=True)
 class BoundaryConditions:
-    """Both ends of a motion from rest to rest, seen from the attitude that it starts at.
+    """Both ends of a motion that ends at rest, seen from the attitude that it starts at.
 
     Attributes
     ----------
@@ -49,6 +49,9 @@ class BoundaryConditions:
         (3,) centre of mass of the system in the base at the end, m; None: anywhere.
     direction
         (3,) kept direction of the path constraints, in the starting base.
+    velocity
+        (n,) first velocities of the joints, m/s or rad/s, at zero momentum; a number is that of
+        all.
     """
 
     start: Array
@@ -57,6 +60,7 @@ class BoundaryConditions:
     final: Array | None = None
     center: Array | None = None
     direction: Array = field(default_factory=lambda: np.zeros(3))
+    velocity: Array | float = 0.0
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,7 @@ from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
 from spacerobot_ros.planning.methods.optimal.held_commands import CommandHolder, HeldCommands
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
-from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
-    MultipleShooting,
-    StopRule,
-    turn_function,
-)
+from spacerobot_ros.planning.methods.optimal.multiple_shooting import MultipleShooting, StopRule
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     CandidateError,
@@ -30,6 +26,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     PathConstraints,
     Trajectory,
 )
+from spacerobot_ros.planning.methods.optimal.transcription import Stages
 
 _LOG = logging.getLogger(__name__)
 
@@ -155,7 +152,7 @@ class ManoeuvreSearch:
             deadline, last_call = (began + x * budget.time_budget for x in (1.0, _LAST_CALL))
         solver = self._solver(intervals, boundary.center is not None)
         curvature = self._robot.function("curvature", compile=False)
-        guesses = InitialGuesses(turn_function(self._robot), curvature, intervals)
+        guesses = InitialGuesses(solver.turn, curvature, intervals)
         found: list[Manoeuvre] = []
         starts, rejection = 0, ""
         for guess in guesses.of(boundary, limits, boundary.likely):
@@ -197,9 +194,8 @@ class ManoeuvreSearch:
     def _solver(self, intervals: int, position: bool) -> MultipleShooting:
         key = intervals, position
         if key not in self._solvers:
-            self._solvers[key] = MultipleShooting(
-                self._robot, intervals, self._axes, position, self._constraints
-            )
+            stages = Stages.of(self._robot, self._axes, position, self._constraints)
+            self._solvers[key] = MultipleShooting(stages, intervals)
         return self._solvers[key]
 
     def _solution(

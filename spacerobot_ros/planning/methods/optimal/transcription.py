@@ -1,0 +1,473 @@
+"""Direct multiple shooting: the optimal control problem as a nonlinear program, stage by stage.
+
+Knots k = 0..N carry the attitude X, the joint velocity v and the vertex s; the control of interval
+k is its constant joint acceleration a; all intervals take the same time h, which is free. The
+shape runs along a parabola in each interval, from ``q_k = s_k - h v_k / 2`` to ``q_{k+1}``, whose
+tangents at both ends meet in the vertex ``s_k``. As the parabola lies in the triangle of the three,
+simple bounds on s keep the joint limits between the knots, too. The dynamics are
+
+``v+ = v + h a``, ``s+ = s + h v+``, ``X+ = X exp(Omega(s, h v, h v+))``.
+
+Omega is the Magnus expansion, order four, of the rates at two Gauss points of the interval, where
+momentum is zero: ``D(q) w + D_q(q) u = 0`` (paper 1, eq. 3). So the attitude follows from the path
+of the shape, however fast it is travelled, and the base's position needs no state: the centre of
+mass rests, and the last shape and attitude tell where the base is.
+
+All stages have the same functions. Their derivatives are made once, and put in their places in
+the program's sparse matrices.
+
+Method: H. G. Bock and K. J. Plitt, "A multiple shooting algorithm for direct solution of optimal
+control problems", IFAC World Congress, 1984.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.dynamics import solve_positive_definite
+from spacerobot_ros.model.symbolic_rotations import (
+    quaternion_from_small_rotvec,
+    quaternion_multiply,
+    relative_vector,
+)
+from spacerobot_ros.planning.methods.optimal.problem import PathConstraints
+
+GAUSS = (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6)
+"""Gauss points of an interval, from 0 to 1."""
+
+Indices = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class PathInequality:
+    """An inequality ``function(q, qdot, qddot) >= 0`` that holds on the way.
+
+    Attributes
+    ----------
+    function
+        Of SX: shape, velocities and accelerations of the joints, each (n,), to any number of rows.
+    instants
+        Where in each interval it is imposed, 0 its beginning, 1 its end.
+    """
+
+    function: ca.Function
+    instants: tuple[float, ...] = (0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Block:
+    """Rows of the program that depend on few variables z, with their derivatives.
+
+    ``values`` is ``(z, p) -> g``, ``jacobian`` ``(z, p) -> g, J`` and ``hessian``
+    ``(z, p, lambda) -> H``, the upper triangle of the Hessian of ``lambda' g``.
+    """
+
+    values: ca.Function
+    jacobian: ca.Function
+    hessian: ca.Function
+
+    @property
+    def rows(self) -> int:
+        """How many."""
+        return int(self.values.size1_out(0))
+
+    @property
+    def functions(self) -> tuple[ca.Function, ca.Function, ca.Function]:
+        """All three."""
+        return self.values, self.jacobian, self.hessian
+
+    @classmethod
+    def of(cls, name: str, z: ca.SX, p: ca.SX, g: ca.SX) -> Block:
+        """Differentiate ``g`` (SX)."""
+        multiplier = ca.SX.sym("lambda", g.shape[0])
+        hessian = ca.hessian(ca.dot(multiplier, g), z)[0]
+        return cls.with_derivatives(name, z, p, multiplier, g, ca.jacobian(g, z), hessian)
+
+    @classmethod
+    def with_derivatives(
+        cls, name: str, z: ca.SX, p: ca.SX, multiplier: ca.SX, g: ca.SX, J: ca.SX, H: ca.SX
+    ) -> Block:
+        """Take the expressions of rows, Jacobian and Hessian."""
+        g = ca.densify(g)
+        return cls(
+            ca.Function(name, [z, p], [ca.cse(g)]),
+            ca.Function(f"{name}_jac", [z, p], ca.cse([g, J])),
+            ca.Function(f"{name}_hess", [z, p, multiplier], [ca.cse(ca.triu(H))]),
+        )
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The functions of one robot's problem, whatever the number of intervals.
+
+    Attributes
+    ----------
+    joints
+        n.
+    beginning, interval, end
+        Rows of the first knot, of two neighbouring knots, and of the last one.
+    path
+        Rows of the interval that are inequalities, ``>= 0``: the last ones of it.
+    turn
+        ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step that begins at q.
+    """
+
+    joints: int
+    beginning: Block
+    interval: Block
+    end: Block
+    path: int
+    turn: ca.Function
+
+    @classmethod
+    def of(
+        cls,
+        robot: SpaceRobot,
+        axes: Array,
+        position: bool,
+        constraints: PathConstraints,
+        inequalities: Sequence[PathInequality] = (),
+    ) -> Stages:
+        """Derive them.
+
+        Parameters
+        ----------
+        robot
+            The model.
+        axes
+            (m, 3) directions in the base along which the attitude is to be reached.
+        position
+            Whether the centre of mass is to end at ``center`` in the base.
+        constraints, inequalities
+            What the path must keep.
+        """
+        n = robot.n
+        X, s, v = ca.SX.sym("X", 4), ca.SX.sym("s", n), ca.SX.sym("v", n)
+        h = ca.SX.sym("h")
+        start, turn, center = ca.SX.sym("start", n), ca.SX.sym("turn", 4), ca.SX.sym("center", 3)
+        begins = Block.of("beginning", ca.vertcat(h, s, v), start, s - h * v / 2 - start)
+        reached = [ca.DM(axes) @ relative_vector(turn, X)]
+        if position:
+            center_of_mass = robot.function("center_of_mass", compile=False)
+            reached.append(center_of_mass(s) - center)
+        ends = Block.of("end", ca.vertcat(X, s), ca.vertcat(turn, center), ca.vertcat(*reached))
+        interval, path = _interval(robot, constraints, inequalities)
+        return cls(n, begins, interval, ends, path, turn_function(robot))
+
+
+def _interval(
+    robot: SpaceRobot, constraints: PathConstraints, inequalities: Sequence[PathInequality]
+) -> tuple[Block, int]:
+    """Return the dynamics of an interval, then its path constraints, and how many these are."""
+    n = robot.n
+    X, s, v, a = (ca.SX.sym(name, size) for name, size in zip("Xsva", (4, n, n, n), strict=True))
+    X_next, s_next, v_next = ca.SX.sym("X+", 4), ca.SX.sym("s+", n), ca.SX.sym("v+", n)
+    h, direction = ca.SX.sym("h"), ca.SX.sym("direction", 3)
+    z = ca.vertcat(h, X, s, v, a, X_next, s_next, v_next)
+    rotation, rotation_jac, rotation_hess = _rotation(robot)
+
+    points = [_at(tau, s, h * v, h * v_next) for tau in GAUSS]
+    rates = [rotation(point) for point in points]
+    motion = ca.vertcat(v_next - v - h * a, s_next - s - h * v_next)
+
+    # The attitude, by the chain rule: only what goes through the robot's inertia is large.
+    w = [ca.SX.sym(f"w_{i}", 3) for i in range(len(GAUSS))]
+    by_attitude = ca.SX.sym("lambda_X", 4)
+    inner = ca.vertcat(X, *w)
+    stepped = quaternion_multiply(X, quaternion_from_small_rotvec(magnus(*w)))
+    outer_hess, outer_grad = ca.hessian(-ca.dot(by_attitude, stepped), inner)
+    stepped, outer_jac, outer_hess, outer_grad = ca.substitute(
+        [stepped, ca.jacobian(stepped, inner), outer_hess, outer_grad], w, rates
+    )
+    by_rate = ca.vertsplit(outer_grad[4:], 3)
+    point_jac = [ca.jacobian(point, z) for point in points]
+    rate_jac = [rotation_jac(p) for p in points]
+    inner_jac = ca.vertcat(
+        ca.jacobian(X, z), *(A @ B for A, B in zip(rate_jac, point_jac, strict=True))
+    )
+    attitude_jac = ca.jacobian(X_next, z) - outer_jac @ inner_jac
+    attitude_hess = inner_jac.T @ outer_hess @ inner_jac
+    for point, P, W, mu in zip(points, point_jac, rate_jac, by_rate, strict=True):
+        weight = ca.SX.sym("weight", 2 * n)
+        bent = ca.substitute(ca.hessian(ca.dot(weight, point), z)[0], weight, ca.densify(W.T @ mu))
+        attitude_hess += P.T @ rotation_hess(point, mu) @ P + bent
+
+    kept = _path(n, constraints, inequalities, z, rates, direction)
+    by_motion, by_path = ca.SX.sym("lambda_v", 2 * n), ca.SX.sym("lambda_g", kept.shape[0])
+    plain = ca.dot(by_motion, motion) + ca.dot(by_path, kept)
+    block = Block.with_derivatives(
+        "interval",
+        z,
+        direction,
+        ca.vertcat(by_motion, by_attitude, by_path),
+        ca.vertcat(motion, X_next - stepped, kept),
+        ca.vertcat(ca.jacobian(motion, z), attitude_jac, ca.jacobian(kept, z)),
+        ca.hessian(plain, z)[0] + attitude_hess,
+    )
+    return block, int(kept.shape[0])
+
+
+def _path(
+    n: int,
+    constraints: PathConstraints,
+    inequalities: Sequence[PathInequality],
+    z: ca.SX,
+    rates: Sequence[ca.SX],
+    direction: ca.SX,
+) -> ca.SX:
+    """Return the rows of an interval that must not be negative."""
+    h, X, s, v, a, _, _, v_next = ca.vertsplit(z, np.cumsum([0, 1, 4, n, n, n, 4, n, n]).tolist())
+    rows = [ca.SX(0, 1), constraints.symbolic(s - h * v / 2, X, direction)]
+    if constraints.base_rate > 0:
+        # Rates change steadily within an interval and are largest at its ends.
+        fastest = h * constraints.imposed_base_rate
+        first, second = rates
+        for end in (0.0, 1.0):
+            w = first + (end - GAUSS[0]) / (GAUSS[1] - GAUSS[0]) * (second - first)
+            rows.append(1 - ca.sumsqr(w / fastest))
+    for each in inequalities:
+        for tau in each.instants:
+            point = _at(tau, s, h * v, h * v_next)
+            rows.append(each.function(point[:n], point[n:] / h, a))
+    return ca.vertcat(*rows)
+
+
+def _at(tau: float, s: ca.SX, u: ca.SX, u_next: ca.SX) -> ca.SX:
+    """Return shape and step (2 n,) in an interval with vertex s, tau of the way."""
+    change = u_next - u
+    return ca.vertcat(s + (tau - 1 / 2) * u + tau**2 / 2 * change, u + tau * change)
+
+
+def _rotation(robot: SpaceRobot) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Return the base's rotation ``w = -D^-1 D_q u`` (3,) of ``[q; u]``, Jacobian and Hessian.
+
+    The Hessian is that of ``mu' w``, by differentiating ``D w + D_q u = 0`` twice.
+    """
+    n = robot.n
+    locked_inertia = robot.function("locked_inertia", compile=False)
+    q, u, w, mu = (ca.SX.sym(name, k) for name, k in (("q", n), ("u", n), ("w", 3), ("mu", 3)))
+    point = ca.vertcat(q, u)
+    D, D_q = locked_inertia(q)
+    at = -solve_positive_definite(D, D_q @ u)
+    momentum = D @ w + D_q @ u
+    W = -solve_positive_definite(D, ca.jacobian(momentum, point))
+    eta, adjoint = ca.SX.sym("eta", 3), -solve_positive_definite(D, mu)
+    weighted = ca.dot(eta, momentum)
+    mixed = ca.jacobian(ca.gradient(weighted, w), point).T @ W
+    hessian = ca.hessian(weighted, point)[0] + mixed + mixed.T
+    W, hessian = ca.substitute([W, hessian], [w, eta], [at, adjoint])
+    return (
+        ca.Function("rotation", [point], [at]),
+        ca.Function("rotation_jac", [point], [W]),
+        ca.Function("rotation_hess", [point, mu], [hessian]),
+    )
+
+
+def magnus(first: ca.SX, second: ca.SX) -> ca.SX:
+    """Return the rotation vector (3,) of a step from its rotations at the two Gauss points."""
+    return (first + second) / 2 + math.sqrt(3) / 12 * ca.cross(first, second)
+
+
+def turn_function(robot: SpaceRobot) -> ca.Function:
+    """Return ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step, base components."""
+    q, u, u_next = (ca.SX.sym(name, robot.n) for name in ("q", "u", "u_next"))
+    rotation = _rotation(robot)[0]
+    rates = [rotation(_at(tau, q + u / 2, u, u_next)) for tau in GAUSS]
+    return ca.Function("turn", [q, u, u_next], [ca.cse(magnus(*rates))])
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the variables of N intervals are: the step, then knot after knot ``X, s, v, a``.
+
+    The last knot has no acceleration.
+    """
+
+    joints: int
+    intervals: int
+
+    @property
+    def _knot(self) -> int:
+        return 4 + 3 * self.joints
+
+    @property
+    def size(self) -> int:
+        """How many."""
+        return 1 + self._knot * self.intervals + 4 + 2 * self.joints
+
+    def knots(self) -> tuple[Indices, Indices, Indices, Indices]:
+        """Return the places of X (N + 1, 4), s, v (N + 1, n) and a (N, n)."""
+        n, first = self.joints, 1 + self._knot * np.arange(self.intervals + 1)[:, np.newaxis]
+        ends = np.cumsum([0, 4, n, n, n])
+        X, s, v, a = (first + np.arange(i, j) for i, j in pairwise(ends))
+        return X, s, v, a[:-1]
+
+
+@dataclass(frozen=True)
+class Program:
+    """Functions of variables x and parameters p, as IPOPT takes them; the bounds are those of g."""
+
+    layout: Layout
+    problem: dict[str, ca.MX]
+    jac_g: ca.Function
+    hess_lag: ca.Function
+    lower: Array
+    upper: Array
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """A block at all its places.
+
+    Attributes
+    ----------
+    block
+        Its functions.
+    variables, rows
+        Places (count, ...) of its variables in x, and of its rows in g; rows of -1 are left out.
+    parameters
+        What it takes of p.
+    """
+
+    block: Block
+    variables: Indices
+    rows: Indices
+    parameters: ca.MX
+
+    def called(self, function: ca.Function, x: ca.MX, *more: ca.MX) -> list[ca.MX]:
+        """Return the results at all places, each place's nonzeros after the other's."""
+        count = len(self.variables)
+        z = ca.reshape(x[self.variables.ravel().tolist()], -1, count)
+        p = ca.repmat(self.parameters, 1, count)
+        results = function.map(count)(z, p, *more)
+        results = results if isinstance(results, (list, tuple)) else [results]
+        # A row of nonzeros, where the result is one, becomes a column.
+        return [ca.vec(result.nz[:]) for result in results]
+
+    def multipliers(self, lam_g: ca.MX) -> ca.MX:
+        """Return the multipliers of its rows, one place's after the other's; of none, zero."""
+        padded = ca.vertcat(lam_g, 0)
+        rows = np.where(self.rows < 0, lam_g.numel(), self.rows)
+        return ca.reshape(padded[rows.ravel().tolist()], -1, len(rows))
+
+
+def program(stages: Stages, intervals: int) -> Program:
+    """Put the stages of a problem together."""
+    n, N = stages.joints, intervals
+    layout = Layout(n, N)
+    X, s, v, a = layout.knots()
+    x = ca.MX.sym("x", layout.size)
+    sizes = {"start": n, "turn": 4, "direction": 3, "center": 3, "typical": n, "weights": 2}
+    p = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
+    zero = np.zeros((N, 1), dtype=np.int64)
+
+    first = stages.beginning.rows
+    dynamics = stages.interval.rows - stages.path
+    of_intervals = first + np.arange(N * dynamics).reshape(N, dynamics)
+    of_end = first + N * dynamics + np.arange(stages.end.rows)[np.newaxis]
+    equalities = first + N * dynamics + stages.end.rows
+    of_path = equalities + np.arange(N * stages.path).reshape(N, stages.path)
+    placed = [
+        _Placed(
+            stages.beginning,
+            np.hstack([zero[:1], s[:1], v[:1]]),
+            np.arange(first)[np.newaxis],
+            p["start"],
+        ),
+        _Placed(
+            stages.interval,
+            np.hstack([zero, X[:-1], s[:-1], v[:-1], a, X[1:], s[1:], v[1:]]),
+            np.hstack([of_intervals, of_path]),
+            p["direction"],
+        ),
+        _Placed(
+            stages.end,
+            np.hstack([X[-1:], s[-1:]]),
+            of_end,
+            ca.vertcat(p["turn"], p["center"]),
+        ),
+    ]
+    rows = equalities + N * stages.path
+    change = ca.reshape(x[a.ravel().tolist()], n, N) / ca.repmat(p["typical"], 1, N)
+    f = p["weights"][0] * N * x[0] + p["weights"][1] * ca.sumsqr(change) / N
+
+    g = _gathered(rows, [(each.rows, each.called(each.block.values, x)[0]) for each in placed])
+    values, jacobian = _jacobian(placed, x, rows)
+    lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", rows)
+    of_objective = ca.triu(ca.hessian(lam_f * f, x)[0])
+    hessian = of_objective + _hessian(placed, x, lam_g)
+    parameters = ca.vertcat(*p.values())
+    return Program(
+        layout,
+        {"x": x, "p": parameters, "f": f, "g": g},
+        ca.Function("jac_g", [x, parameters], [values, jacobian]),
+        ca.Function("hess_lag", [x, parameters, lam_f, lam_g], [hessian]),
+        np.zeros(rows),
+        np.where(np.arange(rows) < equalities, 0.0, np.inf),
+    )
+
+
+def _gathered(rows: int, parts: Sequence[tuple[Indices, ca.MX]]) -> ca.MX:
+    """Return rows (rows,) from their places and values, part after part."""
+    order = np.empty(rows, dtype=np.int64)
+    places = np.concatenate([places.ravel() for places, _ in parts])
+    order[places] = np.arange(len(places))
+    return ca.vertcat(*(values for _, values in parts))[order.tolist()]
+
+
+def _jacobian(placed: Sequence[_Placed], x: ca.MX, rows: int) -> tuple[ca.MX, ca.MX]:
+    """Return g and its Jacobian."""
+    values, nonzeros, at_row, at_column = [], [], [], []
+    for each in placed:
+        g, J = each.called(each.block.jacobian, x)
+        values.append((each.rows, g))
+        nonzeros.append(J)
+        i, j = _places(each.block.jacobian.sparsity_out(1))
+        at_row.append(each.rows[:, i].ravel())
+        at_column.append(each.variables[:, j].ravel())
+    return _gathered(rows, values), _scattered(
+        (rows, x.numel()), np.concatenate(at_row), np.concatenate(at_column), nonzeros
+    )
+
+
+def _hessian(placed: Sequence[_Placed], x: ca.MX, lam_g: ca.MX) -> ca.MX:
+    """Return the upper triangle of the Hessian of ``lambda' g``."""
+    nonzeros, at_row, at_column = [], [], []
+    for each in placed:
+        (H,) = each.called(each.block.hessian, x, each.multipliers(lam_g))
+        nonzeros.append(H)
+        i, j = _places(each.block.hessian.sparsity_out(0))
+        places = np.sort([each.variables[:, i].ravel(), each.variables[:, j].ravel()], axis=0)
+        at_row.append(places[0])
+        at_column.append(places[1])
+    size = x.numel()
+    return _scattered((size, size), np.concatenate(at_row), np.concatenate(at_column), nonzeros)
+
+
+def _places(sparsity: ca.Sparsity) -> tuple[Indices, Indices]:
+    """Return rows and columns of the nonzeros, in their order."""
+    rows, columns = (np.array(each, dtype=np.int64) for each in sparsity.get_triplet())
+    return rows, columns
+
+
+def _scattered(
+    shape: tuple[int, int], rows: Indices, columns: Indices, nonzeros: Sequence[ca.MX]
+) -> ca.MX:
+    """Return the sparse matrix with these nonzeros; what is for one place is added up."""
+    places, number = np.unique(columns * shape[0] + rows, return_inverse=True)
+    at_row, at_column = (each.tolist() for each in (places % shape[0], places // shape[0]))
+    sparsity = ca.Sparsity.triplet(*shape, at_row, at_column)
+    every = ca.vertcat(*nonzeros)
+    add = ca.DM.triplet(
+        number.tolist(), list(range(len(number))), ca.DM.ones(len(number)), len(places), len(number)
+    )
+    return ca.MX(sparsity, add @ every)
