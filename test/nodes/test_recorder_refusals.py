@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.lifecycle import TransitionCallbackReturn
 from support.recorded_stack import LATCHED_TOPICS, STREAMS, BagContent, Stack, message_class
 from support.ros_harness import Harness, Probe, construction
@@ -118,13 +120,14 @@ def test_a_bag_that_goes_is_reported_within_a_second(
         text=True,
     ) as process:
         try:
-            harness.spin_until(
-                lambda: (
-                    any("Recording has begun" in e.message for e in probe.messages["/events"])
-                    or (bag.exists() and probe.count_publishers("/events") > 0)
-                ),
-                "it records",
-            )
+            change = probe.create_client(ChangeState, "recorder/change_state")
+            while not probe.messages["/events"]:  # Until these have met: paused, and on again.
+                for transition in (
+                    Transition.TRANSITION_DEACTIVATE,
+                    Transition.TRANSITION_ACTIVATE,
+                ):
+                    request = ChangeState.Request(transition=Transition(id=transition))
+                    assert harness.call(change, request).success
             bag.unlink()
             bag.parent.rmdir()
             gone = time.monotonic()

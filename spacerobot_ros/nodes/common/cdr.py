@@ -373,6 +373,8 @@ class JointReader:
         self._reader = TemplateReader(JointState, self._spans, largest)
         self._changes = 0
         self._problem = ""
+        self._required: bytes | None = None
+        """The last message that was not refused: it may come again at once."""
         self._order: npt.NDArray[np.intp] | None = None
         self._copies: list[tuple[memoryview, slice]] = []
         self.values = {name: np.zeros(len(joint_names)) for name in quantities}
@@ -406,12 +408,16 @@ class JointReader:
         CommandError
             As :meth:`accept` does.
         """
+        if raw is self._required:
+            return
+        self._required = None
         self._reader.accept(raw)
         if self._reader.changes != self._changes:
             self._changes = self._reader.changes
             self._check()
         if self._problem:
             raise CommandError(self._problem)
+        self._required = raw
 
     @property
     def stamp_ns(self) -> int:

@@ -19,7 +19,7 @@ from sensor_msgs.msg import JointState
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns
+from spacerobot_ros.nodes.common.cdr import NANOSECONDS, JointReader, first_time_ns
 from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.node import STREAM, RobotNode
 from spacerobot_ros.nodes.common.state_times import StateTimes
@@ -156,6 +156,8 @@ class CommanderNode(RobotNode):
         """Subscribe to what the plant publishes; to be called while the node is configured."""
         self._times = StateTimes(control_period)
         self._plant = PlantListener()
+        self._joint_reader: JointReader | None = None
+        """Reads joint_states; None before the robot is known."""
         self._ignored_reported, self._next_report = 0, 0.0
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
         self._statuses = self.create_subscription(
@@ -174,10 +176,6 @@ class CommanderNode(RobotNode):
     # -- hooks --------------------------------------------------------------------------------
 
     @abstractmethod
-    def _require_joints(self, raw: bytes) -> None:
-        """Refuse joint states that are not of the robot, with a CommandError."""
-
-    @abstractmethod
     def _take_odom(self, raw: bytes) -> None:
         """Take up an odom message of the present time."""
 
@@ -192,6 +190,10 @@ class CommanderNode(RobotNode):
     @abstractmethod
     def _plant_changed(self, change: Change) -> None:
         """Do what the change asks for."""
+
+    @abstractmethod
+    def _plant_reported(self) -> None:
+        """Take up what ``self._plant`` knows of the plant now."""
 
     @property
     def simulated_time_s(self) -> float | None:
@@ -242,7 +244,8 @@ class CommanderNode(RobotNode):
     def _is_of_the_robot(self, raw: bytes) -> bool:
         # Those of another robot neither tell the time nor take the place of this one's.
         try:
-            self._require_joints(raw)
+            if self._joint_reader is not None:
+                self._joint_reader.require(raw)
         except CommandError as error:
             self.get_logger().error(f"joint_states: {error}.", throttle_duration_sec=5.0)
             return False
@@ -306,3 +309,4 @@ class CommanderNode(RobotNode):
                     self._plant_stopped(news)
                 case Change():
                     self._plant_changed(news)
+        self._plant_reported()

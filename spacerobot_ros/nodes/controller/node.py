@@ -115,6 +115,8 @@ class CoordinatedControlNode(CommanderNode):
             self.report_event,
         )
         self._joints = JointReader(robot.joint_names, ["position", "velocity"], complete=True)
+        self._joint_reader = self._joints
+        self._plant_reported()
         self._references = JointReader(robot.joint_names, ["position", "velocity"])
         self._held_velocities = HeldVelocityReference(self.config.control_period)
         self._effort, self._wrench = np.zeros(robot.n), np.zeros(6)
@@ -216,9 +218,9 @@ class CoordinatedControlNode(CommanderNode):
         if change is Change.OBEYS and self._robot is not None:
             self._executive.plant_obeys_again()
 
-    def _require_joints(self, raw: bytes) -> None:
+    def _plant_reported(self) -> None:
         if self._robot is not None:
-            self._joints.require(raw)
+            self._executive.plant_blocked = bool(self._plant.blocked)
 
     def _take_odom(self, raw: bytes) -> None:
         if self._states.put_odom(raw):
@@ -256,7 +258,6 @@ class CoordinatedControlNode(CommanderNode):
             q, qdot = self._joints.values["position"], self._joints.values["velocity"]
             measured = self._measured(q, qdot) if pairing is Pairing.WHOLE else None
             now = stamp / NANOSECONDS
-            self._executive.plant_blocked = bool(self._plant.blocked)
             result = self._executive.command(now, measured, q, qdot, self._reference())
         except (CommandError, NotFiniteError) as error:
             self._log_refusal(error)

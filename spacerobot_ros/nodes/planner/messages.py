@@ -48,12 +48,12 @@ class StateReader:
         self.stamp_ns = 0
         self.base_error: CommandError | None = None
         """Why the last :meth:`base` could not be read."""
-        self._shape = JointReader(joint_names, ["position"], complete=True)
+        self.shape_reader = JointReader(joint_names, ["position"], complete=True)
         self._joints = JointReader(joint_names, ["position", "velocity"], complete=True)
         self._odom = TemplateReader(
             Odometry, lambda _: {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
         )
-        self.q = self._shape.values["position"]
+        self.q = self.shape_reader.values["position"]
 
     def accept(self, joint_states: bytes, odom: bytes | None) -> None:
         """Make this the measured state; ``odom`` is of the same stamp, or None.
@@ -63,18 +63,8 @@ class StateReader:
         CommandError
             The joints are not those of the robot; the state before stays.
         """
-        self.stamp_ns = self._shape.accept(joint_states)
+        self.stamp_ns = self.shape_reader.accept(joint_states)
         self._joints_raw, self._odom_raw = joint_states, odom
-
-    def require(self, joint_states: bytes) -> None:
-        """Refuse joint states that :meth:`accept` would refuse; the state stays.
-
-        Raises
-        ------
-        CommandError
-            The joints are not those of the robot.
-        """
-        self._shape.require(joint_states)
 
     def base(self) -> BaseMeasurement | None:
         """Return pose and twist of the base and the rates of the joints, None without odom."""

@@ -146,6 +146,8 @@ class PlannerNode(CommanderNode):
         self._executive = executive = Executive(robot, self.config, worker, self._goal_file)
         self._robot = robot
         self._measured = StateReader(robot.joint_names)
+        self._joint_reader = self._measured.shape_reader
+        self._plant_reported()
         self._setpoint = setpoint_template(robot.joint_names, executive.setpoint)
         if self._waiting is not None:
             executive.propose(self._waiting)
@@ -237,9 +239,9 @@ class PlannerNode(CommanderNode):
             self._executive.plant_reset()
             self._publish_outputs(self._executive)
 
-    def _require_joints(self, raw: bytes) -> None:
+    def _plant_reported(self) -> None:
         if self._executive is not None:
-            self._measured.require(raw)
+            self._executive.plant_rests = self._plant.rests
 
     def _take_odom(self, raw: bytes) -> None:
         if self._states.put_odom(raw):
@@ -272,7 +274,6 @@ class PlannerNode(CommanderNode):
             # The state was answered without it, and is planned from when the next joints come.
             executive.observe(measured)
         else:
-            executive.plant_rests = self._plant.rests
             executive.update(measured)
             if executive.outputs:
                 self._publish_outputs(executive)
