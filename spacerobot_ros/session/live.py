@@ -78,7 +78,8 @@ def send_goal(
 ) -> Outcome:
     """Send one goal pose, show what becomes of it, and return how it ended.
 
-    ``timeout`` is wall time in s, 0: for ever.
+    ``timeout`` is wall time in s, 0: for ever. A commander is looked for no longer than that, and
+    for ten seconds at most.
 
     Raises
     ------
@@ -107,7 +108,7 @@ def send_goal(
         try:
             for each in clients:
                 executor.add_node(each.node)
-            client = _with_decider(clients, executor)
+            client = _with_decider(clients, executor, min(timeout or _DISCOVERY, _DISCOVERY))
             with ended_on_request() as stopped:
                 client.send(goal)
                 began, sentences = time.monotonic(), _Sentences(client, show)
@@ -126,18 +127,20 @@ def send_goal(
             executor.shutdown()
 
 
-def _with_decider(clients: list[MissionClient], executor: EventsExecutor) -> MissionClient:
+def _with_decider(
+    clients: list[MissionClient], executor: EventsExecutor, patience: float
+) -> MissionClient:
     """Return the client that listens to the planner, or to the controller if there is none."""
-    deadline = time.monotonic() + _DISCOVERY
+    deadline = time.monotonic() + patience
     while time.monotonic() < deadline:
         executor.spin_once(timeout_sec=0.05)
         for client in clients:
             if client.is_connected() and client.has_decider():
-                patience = time.monotonic() + _LATCHED
-                while client.status is None and time.monotonic() < patience:
+                latest = time.monotonic() + _LATCHED
+                while client.status is None and time.monotonic() < latest:
                     executor.spin_once(timeout_sec=0.05)
                 return client
     raise SpaceRobotError(
-        f"No commander takes goals on 'goal_pose' after {_DISCOVERY:g} s: start a planner or a "
+        f"No commander takes goals on 'goal_pose' after {patience:g} s: start a planner or a "
         "controller, `spacerobot up SCENARIO`, in the same ROS domain and namespace."
     )

@@ -122,9 +122,11 @@ def test_goals_are_sent_to_a_robot_that_is_up(
 def test_a_goal_that_nobody_takes_is_one_sentence(
     environment: dict[str, str], tmp_path: Path
 ) -> None:
-    run = spacerobot("goal", "0", "0", "0", environment=environment, folder=tmp_path)
+    words = ("goal", "0", "0", "0", "--timeout", "0.5")
+    run = spacerobot(*words, environment=environment, folder=tmp_path)
     assert run.returncode == 2
     assert run.stderr.count("\n") == 1
+    assert "after 0.5 s" in run.stderr
     assert "spacerobot up" in run.stderr
 
 
