@@ -3,7 +3,7 @@
 from spacerobot_ros.planning.api import plan
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
-from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
+from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.methods.registry import METHODS, build_method, method_options
 
@@ -15,6 +15,7 @@ __all__ = [
     "GaitMethod",
     "GaitSchedule",
     "Goal",
+    "InitialMotion",
     "PlanRequest",
     "PlanningCancelled",
     "PoseError",

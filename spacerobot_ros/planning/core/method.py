@@ -24,13 +24,30 @@ _BEYOND = 1e-9
 
 
 @dataclass(frozen=True)
+class InitialMotion:
+    """How the joints move where a gait begins.
+
+    Attributes
+    ----------
+    velocity
+        (n,) joint velocities that are held until then, m/s or rad/s.
+    remaining
+        (M + 1, n) shapes at the ticks that are planned from there on so far, to rest; the first is
+        that in which the gait begins.
+    """
+
+    velocity: Array
+    remaining: Array
+
+
+@dataclass(frozen=True)
 class PlanRequest:
     """Everything that a plan depends on, beside the robot and the options of the method.
 
     Attributes
     ----------
     state
-        Where the gait begins; the joints are at rest.
+        Where the gait begins.
     goal
         Where it is to end.
     tolerance
@@ -42,6 +59,9 @@ class PlanRequest:
         The schedule that was executed last for the same goal, None for the first. Methods keep to
         the choices that it made: ``auto`` tries its method first, and methods that plan piece by
         piece go on from its ``progress``.
+    motion
+        How the joints move where the gait begins; None: they rest. Only methods that declare
+        ``starts_in_motion`` are asked with it.
     """
 
     state: RobotState
@@ -49,6 +69,7 @@ class PlanRequest:
     tolerance: Tolerance
     correction: bool = False
     previous: GaitSchedule | None = None
+    motion: InitialMotion | None = None
 
 
 @dataclass(frozen=True)
@@ -80,6 +101,8 @@ class GaitMethod(ABC):
     controls
         The parts of a goal that the method's schedules control; the others come out as they must.
         A method that chooses among others states them in each schedule alone.
+    starts_in_motion
+        Whether its gaits may begin while the joints move (``PlanRequest.motion``).
     Options
         A frozen dataclass, whose fields are declared by :mod:`spacerobot_ros.parameters`.
 
@@ -91,6 +114,7 @@ class GaitMethod(ABC):
 
     name: ClassVar[str]
     controls: frozenset[Controlled] = POSE
+    starts_in_motion: ClassVar[bool] = False
     Options: ClassVar[type[Any]] = NoOptions
     options: Any
 
@@ -122,7 +146,7 @@ class GaitMethod(ABC):
 
     @abstractmethod
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
-        """Return a gait that begins and ends at rest: for equal requests, an equal one.
+        """Return a gait as requested that ends at rest: for equal requests, an equal one.
 
         Raises
         ------

@@ -37,6 +37,7 @@ class AutoGait(GaitMethod):
     """
 
     name: ClassVar[str] = "auto"
+    starts_in_motion: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -70,6 +71,9 @@ class AutoGait(GaitMethod):
         parts = frozenset[str]()
         for name in self._order(request):
             if name in self._unsuitable:
+                continue
+            if request.motion is not None and not self._candidates[name].method.starts_in_motion:
+                reasons[name] = f"{name} plans from rest only."
                 continue
             method = self._method(name)
             pose = method.controls & POSE

@@ -94,7 +94,7 @@ class CommandHolder:
             held = self._bent(trajectory.at_ticks(ticks), boundary, final, limits)
             if held is None:
                 return None
-            factor, overrun = limits.excess(held.positions, self._period)
+            factor, overrun = limits.excess(held.positions, self._period, boundary.velocity)
             if overrun > _WITHIN:
                 return None
             if factor <= 1 + _WITHIN:

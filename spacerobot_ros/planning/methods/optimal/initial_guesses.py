@@ -34,6 +34,10 @@ _CANDIDATES = 24
 _WIDEST = 0.85
 """Share of half the joints' ranges that a guess uses at most."""
 
+_COMES_BACK = 4.0
+"""A joint that moves at the start is back on the way of its guess after this many times the time
+that it takes to brake."""
+
 Loop = Callable[[np.random.Generator, Array, int], Array]
 """A closed path (N + 1, n) of order one at instants (N + 1,) from 0 to 1."""
 
@@ -99,13 +103,42 @@ class InitialGuesses:
         speed = float((np.abs(u) / limits.velocity).max())
         change = float((np.abs(np.diff(u, axis=0)) / limits.acceleration).max())
         h = max(speed, math.sqrt(change), 1e-6)
-        Omega = self._turn(shapes[:-1].T, u[:-1].T, u[1:].T).full().T
+        return Trajectory(h, shapes, u / h, self._attitudes(shapes, u))
+
+    def _attitudes(self, shapes: Array, steps: Array) -> Array:
+        """Return the attitudes (N + 1, 4) that shapes and steps (N + 1, n) lead to."""
+        Omega = self._turn(shapes[:-1].T, steps[:-1].T, steps[1:].T).full().T
         quaternions = [np.array([0.0, 0.0, 0.0, 1.0])]
         for rotation in Omega:
             quaternions.append(
                 quaternion_multiply(quaternions[-1], quaternion_from_rotvec(rotation))
             )
-        return Trajectory(h, shapes, u / h, np.array(quaternions))
+        return np.array(quaternions)
+
+    def along(self, positions: Array, velocity: Array, period: float) -> Trajectory:
+        """Return shapes (M + 1, n) at ticks that begin with a velocity (n,) and end at rest."""
+        ticks = np.linspace(0.0, 1.0, len(positions))
+        step = period * (len(positions) - 1) / (len(self._instants) - 1)
+        rates = np.gradient(positions, period, axis=0)
+        rates[0], rates[-1] = velocity, 0.0
+        shapes, velocities = (
+            np.column_stack([np.interp(self._instants, ticks, column) for column in values.T])
+            for values in (positions, rates)
+        )
+        return Trajectory(step, shapes, velocities, self._attitudes(shapes, step * velocities))
+
+    def moving(self, guess: Trajectory, velocity: Array, limits: MotionLimits) -> Trajectory:
+        """Return a guess from rest as one that begins with a velocity (n,) and comes back to it."""
+        brakes = float((np.abs(velocity) / limits.acceleration).max(initial=0.0))
+        back = min(guess.duration, _COMES_BACK * brakes)
+        if back == 0:
+            return guess
+        x = np.clip(self._instants * guess.duration / back, 0.0, 1.0)[:, np.newaxis]
+        shapes = guess.shapes + back * x * (1 - x) ** 2 * velocity
+        velocities = guess.velocities + (1 - x) * (1 - 3 * x) * velocity
+        shapes = np.clip(shapes, limits.lower, limits.upper)
+        quaternions = self._attitudes(shapes, guess.step * velocities)
+        return Trajectory(guess.step, shapes, velocities, quaternions)
 
 
 def _trigonometric(rng: np.random.Generator, s: Array, n: int) -> Array:

@@ -28,10 +28,11 @@ from spacerobot_ros.model.rotations import attitude_error
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
-from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
+from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
+from spacerobot_ros.planning.methods.optimal.in_motion import MotionBudget, MotionSearch
 from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -44,6 +45,9 @@ from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch, Sear
 from spacerobot_ros.private_files import Cache
 
 _CORRECTION_INTERVALS = 40
+
+_ANSWERS_IN_MOTION = 3
+"""Manoeuvres from moving joints that are enough: the robot flies on meanwhile."""
 
 _NOTHING_LEFT = 1e-10
 """A goal this near, rad, m and joint coordinates, is where the robot is."""
@@ -68,6 +72,7 @@ class OptimalGait(GaitMethod):
     """
 
     name: ClassVar[str] = "optimal"
+    starts_in_motion: ClassVar[bool] = True
     Options: ClassVar[type[OptimalOptions]] = OptimalOptions
     options: OptimalOptions
 
@@ -81,13 +86,12 @@ class OptimalGait(GaitMethod):
             self._margin = per_joint(robot, "joint_margin", chosen.joint_margin)
         self._constraints = PathConstraints.of(robot, chosen)
         self._prediction = BasePrediction(robot, self.control_period, self.integration_step)
-        self._search = ManoeuvreSearch(
-            robot,
-            self._prediction,
-            self.control_period,
-            self._specification.axes,
-            self._constraints,
+        problem = (
+            *(robot, self._prediction, self.control_period),
+            *(self._specification.axes, self._constraints),
         )
+        self._search = ManoeuvreSearch(*problem)
+        self._motion_search = MotionSearch(*problem, self._search.solver)
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
 
     @classmethod
@@ -106,15 +110,21 @@ class OptimalGait(GaitMethod):
         state, goal, correction = replace(request.state, q=q), request.goal, request.correction
         request = replace(request, state=state)
         margin = np.zeros(self.robot.n) if correction else self._margin
+        shape = self._goal_shape(goal)
+        if request.motion is not None and shape is None and self._specification.same_shape:
+            # The shape of now is one on the way.
+            shape = request.motion.remaining[-1]
         boundary = self._specification.boundary_conditions(
             self.robot,
             request,
-            self._goal_shape(goal),
+            shape,
             self._limits,
             self._constraints.direction_W,
         )
         # Where a goal needs the margin, the manoeuvre ends in it.
         limits = self._limits.within(margin, q, boundary.likely)
+        if request.motion is not None:
+            return self._plan_in_motion(request, request.motion, boundary, limits, cancellation)
         if self._is_reached(state, goal):
             return self._schedule(state, goal, q[np.newaxis], {"starts": 0.0})
         attitude = state.quaternion[np.newaxis]
@@ -153,6 +163,43 @@ class OptimalGait(GaitMethod):
             kept_plan = _KeptPlan(schedule.positions, notes)
             self._cache.store(_file(key), key, kept_plan.to_bytes())
         return schedule
+
+    def _plan_in_motion(
+        self,
+        request: PlanRequest,
+        motion: InitialMotion,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        cancellation: Cancellation,
+    ) -> GaitSchedule:
+        """Plan from moving joints; what remains of the motion so far is the first guess."""
+        too_fast = np.abs(motion.velocity) > limits.velocity * (1 + _ROUNDING)
+        if too_fast.any():
+            names = ", ".join(np.array(self.robot.joint_names)[too_fast])
+            raise PlanningError(f"Joints move faster than optimal may: {names}.")
+        chosen, again = self.options, request.previous is not None
+        duration = chosen.duration
+        if again and duration > 0:
+            # The same manoeuvre goes on, and is to be over when it was.
+            duration = (len(motion.remaining) - 1) * self.control_period
+        budget = MotionBudget(
+            duration,
+            chosen.longest,
+            starts=1 if again else chosen.starts,
+            solutions=1 if again else min(chosen.answers, _ANSWERS_IN_MOTION),
+            iterations=chosen.iterations,
+        )
+        found = self._motion_search.search(
+            replace(boundary, velocity=motion.velocity),
+            limits,
+            request.state.quaternion,
+            self._intervals(True),
+            budget,
+            motion.remaining,
+            cancellation,
+        )
+        notes: Notes = {"starts": float(found.starts), "durations": list(found.durations)}
+        return self._schedule(request.state, request.goal, found.held.positions, notes)
 
     def _intervals(self, correction: bool) -> int:
         intervals = self.options.intervals

@@ -125,15 +125,19 @@ class MotionLimits:
         middle = np.where(np.isfinite(self.lower) & np.isfinite(self.upper), (lower + upper) / 2, q)
         return middle, np.minimum((upper - lower) / 2, _FREE_SPAN)
 
-    def excess(self, positions: Array, period: float) -> tuple[float, float]:
+    def excess(
+        self, positions: Array, period: float, velocity: Array | float = 0.0
+    ) -> tuple[float, float]:
         """Return by what factor held commands would have to be slower, and what they overrun.
 
-        ``positions`` (N + 1, n) are the shapes at ticks of ``period`` seconds, at rest before and
-        after. The factor is at most 1 where velocities and accelerations keep their limits; the
-        overrun is the farthest that a joint is beyond its limits, m or rad.
+        ``positions`` (N + 1, n) are the shapes at ticks of ``period`` seconds, at rest after;
+        before, ``velocity`` (n,) is held. The factor is at most 1 where velocities and
+        accelerations keep their limits; the overrun is the farthest that a joint is beyond its
+        limits, m or rad.
         """
-        rest = np.zeros((1, positions.shape[1]))
-        rates = np.vstack([rest, np.diff(positions, axis=0) / period, rest])
+        ends = np.zeros((2, positions.shape[1]))
+        ends[0] = velocity
+        rates = np.vstack([ends[:1], np.diff(positions, axis=0) / period, ends[1:]])
         speed = np.abs(rates) / self.velocity
         change = np.abs(np.diff(rates, axis=0)) / period / self.acceleration
         beyond = np.maximum(self.lower - positions, positions - self.upper)

@@ -150,7 +150,7 @@ class ManoeuvreSearch:
         deadline = last_call = math.inf
         if budget.time_budget > 0:
             deadline, last_call = (began + x * budget.time_budget for x in (1.0, _LAST_CALL))
-        solver = self._solver(intervals, boundary.center is not None)
+        solver = self.solver(intervals, boundary.center is not None)
         curvature = self._robot.function("curvature", compile=False)
         guesses = InitialGuesses(solver.turn, curvature, intervals)
         found: list[Manoeuvre] = []
@@ -191,7 +191,8 @@ class ManoeuvreSearch:
         durations = [one.duration for one in found]
         return replace(best, starts=starts, solutions=durations, cut_short=cut_short)
 
-    def _solver(self, intervals: int, position: bool) -> MultipleShooting:
+    def solver(self, intervals: int, position: bool) -> MultipleShooting:
+        """Return what solves the problem on so many intervals, with or without a position."""
         key = intervals, position
         if key not in self._solvers:
             stages = Stages.of(self._robot, self._axes, position, self._constraints)
