@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from spacerobot_ros.model.shared_parameters import WatchdogConfig
 from spacerobot_ros.parameters import parameter
 
 
 @dataclass(frozen=True)
-class RecorderConfig:
+class RecorderConfig(WatchdogConfig):
     """What is recorded, and how the file is written."""
 
     bag: str = parameter("", "file to write; '': spacerobot-<date>-<time>.mcap here")
@@ -35,13 +36,6 @@ class RecorderConfig:
     )
     max_duration: float = parameter(
         0.0, "bag time in a file, likewise; 0: never", unit="s", minimum=0.0
-    )
-    watchdog_timeout: float = parameter(
-        0.8,
-        "wall time without a heartbeat after which a node that this one depends on is silent; 0: "
-        "never",
-        unit="s",
-        minimum=0.0,
     )
 
 

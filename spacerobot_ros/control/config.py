@@ -10,19 +10,18 @@ from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.reference import PROFILES
-from spacerobot_ros.model.robot_source import BelievedRobotConfig
+from spacerobot_ros.model.shared_parameters import CommanderConfig
 from spacerobot_ros.parameters import group, parameter, registered
 
 
 @dataclass(frozen=True)
-class ControllerConfig(BelievedRobotConfig):
+class ControllerConfig(CommanderConfig):
     """What a controller controls, by which law, and when a goal is reached."""
 
     law: str = parameter("transposed_jacobian", "control law", choices=tuple(LAWS))
     tick_rate: float = parameter(
         100.0, "commands per second; that of the plant", unit="Hz", minimum=0.001, maximum=100000.0
     )
-    world_frame: str = parameter("world", "frame that goals must be given in")
     end_effector_frame: str = parameter(
         "", "link of the end-effector; '': 'end_effector', if there is one"
     )
@@ -42,27 +41,6 @@ class ControllerConfig(BelievedRobotConfig):
     estimation_time: float = parameter(
         1.0, "time for which the base is estimated while odom is missing", unit="s", minimum=0.0
     )
-    position_tolerance: float = parameter(
-        0.001,
-        "largest position error at a goal that is reached",
-        unit="m",
-        minimum=0.0,
-        read_only=False,
-    )
-    attitude_tolerance: float = parameter(
-        0.001,
-        "largest attitude error at a goal that is reached",
-        unit="rad",
-        minimum=0.0,
-        read_only=False,
-    )
-    joint_tolerance: float = parameter(
-        0.001,
-        "largest error of a joint at a goal that is reached",
-        unit="m or rad",
-        minimum=0.0,
-        read_only=False,
-    )
     settle_time: float = parameter(
         1.0,
         "time for which all errors must stay within the tolerances",
@@ -79,26 +57,5 @@ class ControllerConfig(BelievedRobotConfig):
     status_period: float = parameter(
         1.0, "simulated time between status messages", unit="s", minimum=0.01
     )
-    resume_file: str = parameter(
-        "", "file that keeps the present goals for a controller that is restarted; '': none"
-    )
-    stop_when_decided: bool = parameter(
-        False, "answer no states once a goal is decided: a lockstep plant stays at that tick"
-    )
     gains: Gains = group(Gains())
-    watchdog_timeout: float = parameter(
-        0.8,
-        "wall time without a heartbeat after which a node that this one depends on is silent; 0: "
-        "never",
-        unit="s",
-        minimum=0.0,
-    )
-    watchdog_action: str = parameter(
-        "report", "what a silent plant leads to beside a report", choices=("report", "abort")
-    )
     options: Mapping[str, Any] = registered(LAWS)
-
-    @property
-    def control_period(self) -> float:
-        """Time between two commands, a whole number of nanoseconds, s."""
-        return round(1e9 / self.tick_rate) / 1e9

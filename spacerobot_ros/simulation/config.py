@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from spacerobot_ros.model.robot_source import RobotConfig
+from spacerobot_ros.model.shared_parameters import WatchdogConfig
 from spacerobot_ros.parameters import group, parameter
 
 _SECOND = 10**9
@@ -19,6 +21,18 @@ _FAR = 1e9
 def period_ns(tick_rate: float) -> int:
     """Return the duration of a tick in ns: stamps are whole multiples of it."""
     return round(_SECOND / tick_rate)
+
+
+def _bias(default: tuple[float, ...], description: str, unit: str) -> Any:
+    """Return the parameter of a bias, with as many components as its default has, if any."""
+    return parameter(
+        default,
+        description,
+        unit=unit,
+        minimum=-_LARGEST,
+        maximum=_LARGEST,
+        length=len(default) or None,
+    )
 
 
 @dataclass(frozen=True)
@@ -43,34 +57,14 @@ class SensorConfig:
     joint_rate_noise: float = parameter(
         0.0, "of every joint velocity", unit="m/s or rad/s", minimum=0.0, maximum=_LARGEST
     )
-    position_bias: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        "of odom, in world",
-        unit="m",
-        minimum=-_LARGEST,
-        maximum=_LARGEST,
-        length=3,
-    )
-    attitude_bias: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        "rotation vector in base",
-        unit="rad",
-        minimum=-_LARGEST,
-        maximum=_LARGEST,
-        length=3,
-    )
-    joint_bias: tuple[float, ...] = parameter(
-        (),
-        "by joint order of the URDF; []: none",
-        unit="m or rad",
-        minimum=-_LARGEST,
-        maximum=_LARGEST,
-    )
+    position_bias: tuple[float, ...] = _bias((0.0, 0.0, 0.0), "of odom, in world", "m")
+    attitude_bias: tuple[float, ...] = _bias((0.0, 0.0, 0.0), "rotation vector in base", "rad")
+    joint_bias: tuple[float, ...] = _bias((), "by joint order of the URDF; []: none", "m or rad")
     seed: int = parameter(0, "of the noise of sensors and actuators", minimum=0)
 
 
 @dataclass(frozen=True)
-class PlantConfig(RobotConfig):
+class PlantConfig(WatchdogConfig, RobotConfig):
     """What a plant is: actuation, time, limits, initial state, faults, sensors."""
 
     actuation: str = parameter(
@@ -104,13 +98,6 @@ class PlantConfig(RobotConfig):
         "reasons to refuse a command after which nothing moves until ~/rearm, separated by "
         "spaces: malformed not_finite stale early unknown_state out_of_order beyond_limits "
         "second_commander",
-    )
-    watchdog_timeout: float = parameter(
-        0.8,
-        "wall time without a heartbeat after which a node that this one depends on is silent; 0: "
-        "never",
-        unit="s",
-        minimum=0.0,
     )
     watchdog_action: str = parameter(
         "report", "what a silent commander leads to beside a report", choices=("report", "latch")

@@ -6,32 +6,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from spacerobot_ros.model.robot_source import BelievedRobotConfig
+from spacerobot_ros.model.shared_parameters import CommanderConfig
 from spacerobot_ros.parameters import parameter, registered
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.methods.registry import METHODS
 
 
 @dataclass(frozen=True)
-class PlannerConfig(BelievedRobotConfig):
+class PlannerConfig(CommanderConfig):
     """How a planner plans, tracks its schedules and corrects what remains."""
 
     method: str = parameter("auto", "gait method", choices=tuple(METHODS))
-    tick_rate: float = parameter(
-        20.0, "commands a second; the plant's", unit="Hz", minimum=0.001, maximum=100000.0
-    )
     integration_step: float = parameter(
         0.01, "longest step of the prediction", unit="s", minimum=1e-06
-    )
-    world_frame: str = parameter("world", "frame that goals must be given in")
-    position_tolerance: float = parameter(
-        0.001, "a goal is reached within", unit="m", minimum=0.0, read_only=False
-    )
-    attitude_tolerance: float = parameter(
-        0.001, "a goal is reached within", unit="rad", minimum=0.0, read_only=False
-    )
-    joint_tolerance: float = parameter(
-        0.001, "a shape is reached within", unit="m or rad", minimum=0.0, read_only=False
     )
     output: str = parameter(
         "commands",
@@ -83,28 +70,7 @@ class PlannerConfig(BelievedRobotConfig):
         False,
         "plan in a thread, from rest, while states are answered; false: states wait (lockstep)",
     )
-    resume_file: str = parameter(
-        "", "file of the present goal, from which a planner that is restarted resumes; '': none"
-    )
-    stop_when_decided: bool = parameter(
-        False, "answer no states once a goal is decided: a lockstep plant stays at that tick"
-    )
-    watchdog_timeout: float = parameter(
-        0.8,
-        "wall time without a heartbeat after which a node that this one depends on is silent; 0: "
-        "never",
-        unit="s",
-        minimum=0.0,
-    )
-    watchdog_action: str = parameter(
-        "report", "what a silent plant leads to beside a report", choices=("report", "abort")
-    )
     options: Mapping[str, Any] = registered(METHODS)
-
-    @property
-    def control_period(self) -> float:
-        """How long a command is held, s: a whole number of nanoseconds."""
-        return round(1e9 / self.tick_rate) / 1e9
 
     @property
     def tolerance(self) -> Tolerance:
