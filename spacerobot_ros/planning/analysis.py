@@ -23,6 +23,7 @@ from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.methods.auto import AutoGait
 from spacerobot_ros.planning.methods.geometric_phase import planar_chain
 from spacerobot_ros.planning.methods.nominal_shape import NominalShape, best_nominal, given_nominal
+from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS
 
 _SHAPES = 300
@@ -67,8 +68,9 @@ class Analysis:
 
     @property
     def chosen(self) -> str:
-        """The method that ``auto`` tries first; "" if none suits."""
-        return next((name for name, objection in self.objections.items() if not objection), "")
+        """The method that ``auto`` mostly chooses, ``optimal`` where it suits; "" if none does."""
+        suits = [name for name, objection in self.objections.items() if not objection]
+        return OptimalGait.name if OptimalGait.name in suits else next(iter(suits), "")
 
 
 def analyze(robot: SpaceRobot, shape: Sequence[float] | None = None) -> Analysis:

@@ -67,7 +67,7 @@ CASES = {
     "optimal with sliders": Case(
         "optimal", "sliding_masses", SLIDERS, TURNS, 0.05, POSE | {"shape"}
     ),
-    "auto": Case("auto", "three_joint_arm", ARM, TURNS, 0.0, ATTITUDE),
+    "auto": Case("auto", "planar_chain", CHAIN, ((0, 0, 0.5), (0, 0, -1.0)), 0.0, ATTITUDE),
     "remaining_joints": Case("remaining_joints", "servicer", SERVICER_SHAPE, TURNS, 0.0, ATTITUDE),
 }
 
@@ -209,14 +209,14 @@ def test_what_was_planned_with_all_joints_is_not_gone_on_with_without_some() -> 
 
 
 def test_auto_goes_on_with_the_method_of_the_schedule_before() -> None:
-    case = CASES["optimal"]
+    case = CASES["area_loop"]
     robot, request = robot_named(case.robot), requests(case)[0]
     options = {"optimal": method_options("optimal", FEW_STARTS)}
-    by_optimal = build_method("optimal", robot, PERIOD, STEP, options).plan(request)
+    by_loops = build_method("area_loop", robot, PERIOD, STEP, options).plan(request)
     auto = build_method("auto", robot, PERIOD, STEP, options)
-    assert auto.plan(request).method == "area_loop"
-    assert auto.plan(replace(request, previous=by_optimal)).method == "optimal"
-    assert auto.plan(request).method == "area_loop"
+    assert auto.plan(request).method == "optimal"
+    assert auto.plan(replace(request, previous=by_loops)).method == "area_loop"
+    assert auto.plan(request).method == "optimal"
 
 
 # -- cancellation -----------------------------------------------------------------------------

@@ -57,7 +57,7 @@ class PlanRequest:
         and options that fix the size of the first manoeuvre do not apply.
     previous
         The schedule that was executed last for the same goal, None for the first. Methods keep to
-        the choices that it made: ``auto`` tries its method first, and methods that plan piece by
+        the choices that it made: ``auto`` stays with its method, and methods that plan piece by
         piece go on from its ``progress``.
     motion
         How the joints move where the gait begins; None: they rest. Only methods that declare
@@ -164,6 +164,7 @@ class GaitMethod(ABC):
         notes: Notes,
         *,
         partial: bool = False,
+        remaining: float = 0.0,
         progress: object = None,
     ) -> GaitSchedule:
         """Return shapes (N + 1, n) at the ticks as a schedule of this method."""
@@ -176,6 +177,7 @@ class GaitMethod(ABC):
             goal=goal,
             notes=notes,
             partial=partial,
+            remaining=remaining,
             controls=self.controls,
             progress=progress,
         )

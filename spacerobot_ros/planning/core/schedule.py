@@ -46,6 +46,8 @@ class GaitSchedule:
     partial
         It ends short of the goal on purpose: the next piece is planned from the pose that is
         measured at its end.
+    remaining
+        What the schedules after a partial one are expected to take until the goal is reached, s.
     controls
         The parts of the goal that it controls, and by which its result is evaluated.
     progress
@@ -61,6 +63,7 @@ class GaitSchedule:
     goal: Goal
     notes: Notes = field(default_factory=dict)
     partial: bool = False
+    remaining: float = 0.0
     controls: frozenset[Controlled] = POSE
     progress: object = None
 
@@ -73,6 +76,11 @@ class GaitSchedule:
     def duration(self) -> float:
         """Time the gait takes, s."""
         return self.ticks * self.control_period
+
+    @property
+    def expected_duration(self) -> float:
+        """Time until the goal is reached, with the schedules that are expected after it, s."""
+        return self.duration + self.remaining
 
     @cached_property
     def velocities(self) -> Array:

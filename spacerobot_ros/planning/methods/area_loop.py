@@ -156,6 +156,7 @@ class AreaLoopGait(GaitMethod):
         # The way from the nominal to the final shape turns the base too: aim that far beside.
         aside = self._turn(nominal, final)
         target = quaternion_multiply(goal.quaternion, quaternion_inverse(aside))
+        remaining = 0.0
         for planned in range(self.options.cycles_per_plan + 1):
             cancellation.raise_if_requested()
             left = attitude_error(gait.attitudes[-1], target)
@@ -164,12 +165,16 @@ class AreaLoopGait(GaitMethod):
                     gait = self._moved(gait, [(final, self.options.edge_time)])
                 break
             if planned < self.options.cycles_per_plan:
-                gait, cycle_notes = self._cycle(
+                before = len(gait.positions)
+                gait, cycle_notes, cycles = self._cycle(
                     gait, target, left, nominal, tolerance.attitude, flown
                 )
                 flown += 1
                 notes = {**cycle_notes, "cycles": float(planned + 1)}
-        return self._schedule(gait, request, notes, AreaLoopProgress(chosen, flown))
+                cycle = (len(gait.positions) - before) * self.control_period
+                remaining = max(0.0, cycles - flown) * cycle
+        progress = AreaLoopProgress(chosen, flown)
+        return self._schedule(gait, request, notes, progress, remaining)
 
     def _cycle(
         self,
@@ -179,8 +184,10 @@ class AreaLoopGait(GaitMethod):
         nominal: NominalShape,
         enough: float,
         flown: int,
-    ) -> tuple[_Gait, Notes]:
-        """Add one cycle for the turn ``left`` (3,), rad; return the paper's symbols as well.
+    ) -> tuple[_Gait, Notes, float]:
+        """Add one cycle for the turn ``left`` (3,), rad.
+
+        The paper's symbols are returned as well, and how many cycles the goal is expected to take.
 
         Cycles go on until the attitude is off by ``enough`` (rad); ``flown`` are done.
         """
@@ -213,15 +220,19 @@ class AreaLoopGait(GaitMethod):
                 f"The manoeuvre would take about {cycles:.4g} cycles of {duration:.4g} s, more "
                 f"than longest = {self.options.longest:.6g} s."
             )
-        return after, {
-            "joints": ", ".join(self.robot.joint_names[i] for i in nominal.joints),
-            "nominal": nominal.shape.tolist(),
-            "condition": nominal.condition,
-            "S": (share * S).tolist(),
-            "path": path.kind,
-            "edges": np.ptp(np.vstack(path.loops), axis=0).tolist(),
-            "expected_cycles": cycles,
-        }
+        return (
+            after,
+            {
+                "joints": ", ".join(self.robot.joint_names[i] for i in nominal.joints),
+                "nominal": nominal.shape.tolist(),
+                "condition": nominal.condition,
+                "S": (share * S).tolist(),
+                "path": path.kind,
+                "edges": np.ptp(np.vstack(path.loops), axis=0).tolist(),
+                "expected_cycles": cycles,
+            },
+            cycles,
+        )
 
     def _cycles_left(self, missing: float, share: float, enough: float) -> float:
         """Return how many cycles a turn (rad) takes to first order, the first by a share of k.
@@ -273,7 +284,12 @@ class AreaLoopGait(GaitMethod):
         )
 
     def _schedule(
-        self, gait: _Gait, request: PlanRequest, notes: Notes, progress: AreaLoopProgress | None
+        self,
+        gait: _Gait,
+        request: PlanRequest,
+        notes: Notes,
+        progress: AreaLoopProgress | None,
+        remaining: float = 0.0,
     ) -> GaitSchedule:
         goal = request.goal
         path = self._prediction.path(request.state, gait.positions, gait.attitudes)
@@ -281,7 +297,13 @@ class AreaLoopGait(GaitMethod):
         notes = {**notes, "predicted_attitude_error": left.angle}
         partial = not request.tolerance.admits(left, self.controls)
         return self._schedule_of(
-            goal, gait.positions, path, notes, partial=partial, progress=progress
+            goal,
+            gait.positions,
+            path,
+            notes,
+            partial=partial,
+            remaining=remaining if partial else 0.0,
+            progress=progress,
         )
 
 

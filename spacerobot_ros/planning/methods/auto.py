@@ -1,16 +1,16 @@
-"""``auto``: the method that robot and goal allow, chosen goal by goal."""
+"""``auto``: the shortest manoeuvre of all methods that suit the robot, compared goal by goal."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
-from spacerobot_ros.planning.core.goal import POSE
+from spacerobot_ros.planning.core.goal import POSE, Controlled, PoseError
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 
@@ -24,16 +24,18 @@ class Candidate:
 
 
 class AutoGait(GaitMethod):
-    """Tries the methods that suit the robot, in a given order, and takes the first that plans.
+    """Plans by every method that suits the robot, and takes the shortest manoeuvre.
 
     Where a method that suits the robot moves the base to a position, one that leaves the position
-    as it comes does not stand in for it. The method of the schedule flown before for the same goal
-    is tried first. A schedule is that of the chosen method, in all but its notes.
+    as it comes does not stand in for it. A manoeuvre that ends off the goal, or controls less of
+    it than another, is taken only where there is no better one. A goal stays with the method of
+    the schedule that was flown for it before, as long as that plans. A schedule is that of the
+    chosen method, in all but its notes.
 
     Parameters
     ----------
     candidates
-        The methods by name, in the order in which they are tried.
+        The methods by name; of equally long manoeuvres that of the first is taken.
     """
 
     name: ClassVar[str] = "auto"
@@ -58,57 +60,139 @@ class AutoGait(GaitMethod):
         self._built: dict[str, GaitMethod] = {}
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
-        """Plan by the first method that can; see :meth:`GaitMethod.plan`.
+        """Plan by the methods that suit, and compare; see :meth:`GaitMethod.plan`.
 
-        ``notes`` name it (``chosen``) and why (``because``).
+        ``notes`` name the method that is taken (``chosen``), why (``because``), and what all of
+        them came to (``compared``).
 
         Raises
         ------
         PlanningError
             No method plans; the sentences of all of them say why.
         """
-        reasons = dict(self._unsuitable)
-        parts = frozenset[str]()
-        for name in self._order(request):
-            if name in self._unsuitable:
-                continue
-            if request.motion is not None and not self._candidates[name].method.starts_in_motion:
-                reasons[name] = f"{name} plans from rest only."
-                continue
-            method = self._method(name)
-            pose = method.controls & POSE
-            if not parts <= pose:
-                lost = " and ".join(sorted(parts - pose))
-                reasons[name] = f"{name} would leave the {lost} of the base as it comes."
+        refusals = dict(self._unsuitable)
+        names = self._standing(refusals)
+        if request.motion is not None:
+            for name in names:
+                if not self._candidates[name].method.starts_in_motion:
+                    refusals[name] = f"{name} plans from rest only."
+            names = [name for name in names if name not in refusals]
+        flying = "" if request.previous is None else request.previous.method
+        if flying in names:
+            names.remove(flying)
+            kept = self._planned(flying, request, refusals, cancellation)
+            if kept is not None:
+                result = {flying: _Result.of(kept, request)}
+                return _noted(kept, flying, f"{flying} planned this goal before.", result, {})
+        results: dict[str, _Result] = {}
+        for name in names:
+            schedule = self._planned(name, request, refusals, cancellation)
+            if schedule is not None:
+                results[name] = _Result.of(schedule, request)
+        if not results:
+            raise PlanningError(
+                f"No method plans this goal of robot '{self.robot.description.name}'. "
+                + " ".join(f"{name}: {refusals[name]}" for name in self._candidates)
+            )
+        chosen = min(results, key=lambda name: results[name].rank(results.values()))
+        because = f"{chosen} suits robot '{self.robot.description.name}' and " + (
+            f"plans the shortest of {len(results)} manoeuvres to this goal."
+            if len(results) > 1
+            else "is the only one that plans this goal."
+        )
+        return _noted(results[chosen].schedule, chosen, because, results, refusals)
+
+    def _standing(self, refusals: dict[str, str]) -> list[str]:
+        """Return the methods to compare; give the reason against the others.
+
+        These are methods that leave a part of the pose as it comes, which another one controls.
+        """
+        pose: dict[str, frozenset[Controlled]] = {}
+        for name in self._candidates:
+            if name in refusals:
                 continue
             try:
-                schedule = method.plan(request, cancellation)
-            except PlanningCancelled:
-                raise
-            except PlanningError as refusal:
-                reasons[name] = str(refusal)
-                parts |= pose
-                continue
-            notes = {**schedule.notes, "chosen": name, "because": self._because(name, reasons)}
-            return replace(schedule, notes=notes)
-        raise PlanningError(
-            f"No method plans this goal of robot '{self.robot.description.name}'. "
-            + " ".join(f"{name}: {reasons[name]}" for name in self._candidates)
-        )
+                pose[name] = self._method(name).controls & POSE
+            except ParameterError as refusal:
+                refusals[name] = str(refusal)
+        for name, parts in pose.items():
+            more = [other for other in pose.values() if parts < other]
+            if more:
+                lost = " and ".join(sorted(frozenset[str]().union(*more) - parts))
+                refusals[name] = f"{name} would leave the {lost} of the base as it comes."
+        return [name for name in pose if name not in refusals]
 
-    def _order(self, request: PlanRequest) -> list[str]:
-        """Return the names in the order of trial: first that of the schedule before."""
-        flying = "" if request.previous is None else request.previous.method
-        return sorted(self._candidates, key=lambda name: name != flying)
+    def _planned(
+        self,
+        name: str,
+        request: PlanRequest,
+        refusals: dict[str, str],
+        cancellation: Cancellation,
+    ) -> GaitSchedule | None:
+        """Return the schedule of one method, None where it refuses; its sentence is kept."""
+        try:
+            return self._method(name).plan(request, cancellation)
+        except PlanningCancelled:
+            raise
+        except (ParameterError, PlanningError) as refusal:
+            refusals[name] = str(refusal)
+            return None
 
     def _method(self, name: str) -> GaitMethod:
         if name not in self._built:
             self._built[name] = self._candidates[name].build()
         return self._built[name]
 
-    def _because(self, chosen: str, reasons: Mapping[str, str]) -> str:
-        """Return the reasons against what comes before the chosen method, and that it suits."""
-        names = list(self._candidates)
-        before = [reasons[name] for name in names[: names.index(chosen)] if name in reasons]
-        suits = f"{chosen} suits robot '{self.robot.description.name}'"
-        return " ".join([f"{suits} and is the first that plans this goal.", *before])
+
+@dataclass(frozen=True)
+class _Result:
+    """What a method planned.
+
+    Attributes
+    ----------
+    schedule
+        Its schedule.
+    parts
+        The parts of the goal that it controls.
+    reaches
+        Whether it is predicted to end on the goal, by itself or with the schedules after it.
+    """
+
+    schedule: GaitSchedule
+    parts: frozenset[Controlled]
+    reaches: bool
+
+    @classmethod
+    def of(cls, schedule: GaitSchedule, request: PlanRequest) -> _Result:
+        goal, path = request.goal, schedule.path
+        asked = POSE if goal.joint_positions is None else POSE | {"shape"}
+        q = schedule.positions[-1]
+        error = PoseError.between(path.position[-1], path.quaternion[-1], goal, q)
+        reaches = schedule.partial or request.tolerance.admits(error, schedule.controls)
+        return cls(schedule, schedule.controls & asked, reaches)
+
+    def rank(self, others: Collection[_Result]) -> tuple[bool, bool, float]:
+        """Return what is smaller for the better of two results among ``others``."""
+        less = any(self.parts < other.parts and other.reaches for other in others)
+        return not self.reaches, less, self.schedule.expected_duration
+
+    @property
+    def sentence(self) -> str:
+        """The duration, and what there is to say against it."""
+        about = "about " if self.schedule.partial else ""
+        off = "" if self.reaches else ", which ends off the goal"
+        return f"{about}{self.schedule.expected_duration:.6g} s{off}"
+
+
+def _noted(
+    schedule: GaitSchedule,
+    chosen: str,
+    because: str,
+    results: Mapping[str, _Result],
+    refusals: Mapping[str, str],
+) -> GaitSchedule:
+    """Return a schedule whose notes say what it was compared with."""
+    compared = [f"{name}: {result.sentence}." for name, result in results.items()]
+    compared += [f"{name}: {refusal}" for name, refusal in refusals.items()]
+    notes = {"chosen": chosen, "because": because, "compared": " ".join(compared)}
+    return replace(schedule, notes={**schedule.notes, **notes})

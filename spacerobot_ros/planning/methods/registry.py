@@ -17,7 +17,7 @@ from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.square_path import SquarePathGait
 
 METHODS: dict[str, type[GaitMethod]] = {
-    # In the order in which `auto` tries them: those made for a kind of robot first.
+    # Those made for a kind of robot first; of equally long manoeuvres `auto` takes the first.
     LieBracketGait.name: LieBracketGait,
     SquarePathGait.name: SquarePathGait,
     AreaLoopGait.name: AreaLoopGait,
