@@ -30,6 +30,7 @@ PLANT = {
 # A slide of 2 s in one swing and turns in cycles of 1 s: hundreds of ticks instead of 98,000.
 PLANNER = {
     "robot": "sliding_masses",
+    "method": "lie_bracket",
     "tick_rate": 20.0,
     "lie_bracket.t1": 2.0,
     "lie_bracket.n1": 1,
