@@ -37,7 +37,12 @@ START = 60.0
 
 TICK_NS = 50_000_000
 FAST = {"robot": "sliding_masses", "tick_rate": "20", "real_time_factor": "5.0"}
-GAIT = {"method": "lie_bracket", "lie_bracket.t1": "2.0", "lie_bracket.n1": "1", "lie_bracket.cycle_period": "1.0"}
+GAIT = {
+    "method": "lie_bracket",
+    "lie_bracket.t1": "2.0",
+    "lie_bracket.n1": "1",
+    "lie_bracket.cycle_period": "1.0",
+}
 
 
 class Process:

@@ -29,6 +29,7 @@ from spacerobot_ros.planning import (
     build_method,
     method_options,
 )
+from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.methods.auto import AutoGait, Candidate
 
 FOLDER = Path(__file__).parents[2] / "urdf"
@@ -292,6 +293,18 @@ def test_a_goal_stays_with_its_method() -> None:
     correction = method.plan(at(np.zeros(2)), other.goal, correction=True)
     assert correction.notes["chosen"] == "second"
     assert "first: Not now." in str(correction.notes["compared"])
+
+
+def test_only_methods_that_start_in_motion_are_asked_for_moving_joints() -> None:
+    rests, moves = made("rests"), made("moves", ticks=9)
+    moves.starts_in_motion = True
+    motion = InitialMotion(np.array([0.1, 0.0]), np.zeros((2, 2)))
+    request = PlanRequest(at(np.zeros(2)), goal_of([0, 0, 1]), TOLERANCE, motion=motion)
+    schedule = choice_of(rests, moves)[0].method.plan(request)
+    assert schedule.notes["chosen"] == "moves"
+    assert "rests: rests plans from rest only." in str(schedule.notes["compared"])
+    with pytest.raises(PlanningError, match=r"rests plans from rest only\."):
+        choice_of(rests)[0].method.plan(request)
 
 
 def test_a_refused_goal_does_not_change_what_a_schedule_controls() -> None:
