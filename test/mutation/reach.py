@@ -16,8 +16,8 @@ from coverage import Coverage
 _FOLDER = Path(os.environ["SPACEROBOT_REACH"])
 _WORKER = os.environ.get("PYTEST_XDIST_WORKER", "main")
 
-_measured: dict[str, tuple[float, bool]] = {}
-"""Seconds of each test with its fixtures, and whether it passed."""
+_measured: dict[str, tuple[float, float, bool]] = {}
+"""CPU and wall time (s) of each test with its fixtures, and whether it passed."""
 
 _coverage = Coverage(
     data_file=str(_FOLDER / f"lines-{_WORKER}"),
@@ -31,15 +31,24 @@ _coverage.start()
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     _coverage.switch_context(item.nodeid)
+    begin = _spent()
     try:
         return (yield)
     finally:
         _coverage.switch_context("")
+        _, wall, passed = _measured.get(item.nodeid, (0.0, 0.0, False))
+        _measured[item.nodeid] = (_spent() - begin, wall, passed)
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    seconds, passed = _measured.get(report.nodeid, (0.0, True))
-    _measured[report.nodeid] = (seconds + report.duration, passed and report.passed)
+    cpu, wall, passed = _measured.get(report.nodeid, (0.0, 0.0, True))
+    _measured[report.nodeid] = (cpu, wall + report.duration, passed and report.passed)
+
+
+def _spent() -> float:
+    """Return the CPU time of this process and of those that it has waited for, s."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import itertools
 import json
 import math
 import os
@@ -18,14 +19,15 @@ import subprocess
 import sys
 import threading
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from difflib import SequenceMatcher
+from enum import Enum
 from pathlib import Path
-from typing import ClassVar
 
 from coverage import CoverageData
+from mutation.forked import ENDED, can_be_exchanged, limits_of
 from mutation.mutants import Mutant, described, mutants_of, sample, statement_lines
 
 PROJECT = Path(__file__).parents[2]
@@ -63,8 +65,10 @@ class Verdict:
         Whether a test failed, or hung.
     by : str
         That test, or why there is none.
-    run, reaching : int
-        Tests that were run; tests that reach the change.
+    how : str
+        How it noticed: the value of a :class:`How`.
+    run, tried, reaching : int
+        Tests that were run; tests that there was time for; tests that reach the change.
     seconds : float
         Time that this took.
     """
@@ -72,7 +76,9 @@ class Verdict:
     mutant: Mutant
     noticed: bool
     by: str
+    how: str
     run: int
+    tried: int
     reaching: int
     seconds: float
 
@@ -83,22 +89,22 @@ class Reach:
 
     Attributes
     ----------
-    seconds : dict[str, float]
-        By node id, of tests that pass.
+    seconds : dict[str, tuple[float, float]]
+        CPU and wall time by node id, of tests that pass.
     lines : dict[str, dict[int, list[str]]]
         Node ids by file and line; "" for what is run when the file is imported.
     """
 
-    seconds: dict[str, float]
+    seconds: dict[str, tuple[float, float]]
     lines: dict[str, dict[int, list[str]]] = field(default_factory=lambda: defaultdict(dict))
 
     @classmethod
     def read(cls, folder: Path) -> Reach:
         """Read what the workers of `measure` have written."""
-        measured: dict[str, tuple[float, bool]] = {}
+        measured: dict[str, tuple[float, float, bool]] = {}
         for file in folder.glob("tests-*.json"):
             measured |= json.loads(file.read_text())
-        found = cls({name: seconds for name, (seconds, passed) in measured.items() if passed})
+        found = cls({name: (cpu, wall) for name, (cpu, wall, passed) in measured.items() if passed})
         for file in folder.glob("lines-*"):
             data = CoverageData(str(file))
             data.read()
@@ -135,26 +141,29 @@ class Reach:
                 both.lines[file][line] = [*names, *more.get(line, ())]
         return both
 
-    def tests_for(self, mutant: Mutant, source: str, limit: float) -> list[str]:
-        """Return the tests that reach a change, fastest first, as many as fit into a time (s)."""
+    def tests_for(self, mutant: Mutant, source: str) -> tuple[list[str], bool]:
+        """Return the tests that reach a change, fastest first.
+
+        Also whether the change is executed while its file is imported.
+        """
         lines = self.lines.get(mutant.path, {})
         reaching = set(lines.get(mutant.line, ()))
         if not reaching - {""}:
             for line in statement_lines(source, mutant.line):
                 reaching |= set(lines.get(line, ()))
-        if "" in reaching or not reaching:
+        imported = "" in reaching or not reaching
+        if imported:
             # Constants and defaults: whoever uses anything of the file may see them.
             reaching |= {name for names in lines.values() for name in names}
             folder = "test/" + mutant.path.split("/")[1] + "/"
             reaching |= {name for name in self.seconds if name.startswith((folder, *_ANYWHERE))}
-        known = sorted((n for n in reaching if n in self.seconds), key=self.seconds.__getitem__)
-        chosen, total = [], 0.0
-        for name in known:
-            total += self.seconds[name]
-            if total > limit:
-                break
-            chosen.append(name)
-        return chosen
+        known = (name for name in reaching if name in self.seconds)
+        return sorted(known, key=lambda name: (self.seconds[name][0], name)), imported
+
+    def within(self, tests: Sequence[str], limit: float) -> list[str]:
+        """Return as many of some tests as take a time together (CPU, s)."""
+        total = itertools.accumulate(self.seconds[name][0] for name in tests)
+        return [name for name, sum_ in zip(tests, total, strict=True) if sum_ <= limit]
 
 
 def measure(project: Path, folder: Path, cache: Path, tests: Sequence[str], workers: int) -> None:
@@ -173,108 +182,209 @@ def measure(project: Path, folder: Path, cache: Path, tests: Sequence[str], work
     )
 
 
+class How(str, Enum):
+    """How a test notices an error."""
+
+    FAILED = "failed"
+    ENDLESS = "used more CPU time than an endless loop only"
+    WAITED = "waited without an end, twice"
+    CRASHED = "crashed"
+    NOT_IMPORTED = "could not be imported"
+
+
+class _Server:
+    """A process that has collected tests and runs some of them in a fork at a time."""
+
+    def __init__(self, project: Path, folder: Path, cache: Path, files: Sequence[str]) -> None:
+        self._folder = folder
+        jobs, answers = os.pipe(), os.pipe()
+        pipes = {"SPACEROBOT_MUTANT_PIPES": f"{jobs[0]} {answers[1]}"}
+        plugin = ("-x", "-p", "mutation.forked", f"--basetemp={folder / 'tmp'}")
+        with (folder / "output").open("w") as output:
+            self._process = subprocess.Popen(
+                [*_PYTEST, *plugin, *files],
+                cwd=project,
+                env=_environment(project, cache) | pipes,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                pass_fds=(jobs[0], answers[1]),
+                start_new_session=True,
+            )
+        os.close(jobs[0])
+        os.close(answers[1])
+        self._jobs, self._answers = os.fdopen(jobs[1], "w"), os.fdopen(answers[0])
+        self.ready = self._answers.readline() == "ready\n"
+        """False where tests could not be collected."""
+
+    def run(
+        self, limits: dict[str, tuple[float, float]], exchange: tuple[str, str] | None
+    ) -> tuple[str, How | None, list[str]]:
+        """Run tests until one fails.
+
+        Parameters
+        ----------
+        limits
+            CPU and wall time (s) that each test may take, in the order in which they are run.
+        exchange
+            A file whose functions are to be those that it has now, and its text before.
+
+        Returns
+        -------
+        tuple
+            The test that failed ("": none), how it did, and all that were begun.
+        """
+        log = self._folder / "log"
+        log.write_text("")
+        mark = f"{os.getpid()}-{id(self)}-{time.monotonic_ns()}"
+        job = {"tests": limits, "exchange": exchange, "mark": mark, "log": str(log)}
+        self._jobs.write(json.dumps(job) + "\n")
+        self._jobs.flush()
+        answer = self._answers.readline()
+        _end_what_is_left(mark)
+        if not answer:
+            raise RuntimeError(f"the process with the tests has ended; see {self._folder}")
+        lines = log.read_text().splitlines()
+        begun = [line for line in lines if line != ENDED]
+        code = int(answer)
+        if code == 0 or not begun:
+            return "", None, begun
+        if lines[-1] == ENDED:
+            how = How.FAILED
+        elif code == -signal.SIGPROF:
+            how = How.ENDLESS
+        else:
+            how = How.WAITED if code == 1 else How.CRASHED
+        return begun[-1], how, begun
+
+    def close(self) -> None:
+        """End the process."""
+        self._jobs.close()
+        self._answers.close()
+        try:
+            self._process.wait(30.0)
+        except subprocess.TimeoutExpired:
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+
+
 class Worker:
     """A copy of the project in which mutants are judged, one after the other."""
 
-    _sound: ClassVar[dict[str, bool]] = {}
-    """Whether a test passes without any error, as far as that was asked."""
-    _sound_lock = threading.Lock()
-
     def __init__(
-        self, folder: Path, project: Path, cache: Path, reach: Reach, limit: float
+        self, folder: Path, project: Path, cache: Path, reach: Reach, tests: Sequence[str]
     ) -> None:
-        self._project, self._original = folder / "project", project
-        self._folder = folder
+        self._project = folder / "project"
+        self._folder, self._cache = folder, folder / "cache"
         self._filled_cache = cache
         self._reach = reach
-        self._limit = limit
+        self._sound: dict[str, bool] = {}
+        """Whether a test passes without any error, as far as that was asked."""
+        self._noticing: dict[str, Counter[str]] = defaultdict(Counter)
+        """How many errors each test has noticed, by file."""
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(project, self._project, ignore=_LEFT_OUT)
+        self._server = self._serve("all", tests)
+        if not self._server.ready:
+            raise RuntimeError(f"the tests cannot be collected; see {folder}")
 
-    def judge(self, mutant: Mutant) -> Verdict:
-        """Put an error in, run the tests that reach it, take it out."""
+    def close(self) -> None:
+        """End the process with the tests."""
+        self._server.close()
+
+    def judge(self, mutant: Mutant, limit: float, earlier: Verdict | None = None) -> Verdict:
+        """Put an error in, run the tests that reach it, take it out.
+
+        Parameters
+        ----------
+        limit
+            CPU time (s) of the tests that may be run.
+        earlier
+            The verdict with a smaller limit: what was run then is not run again.
+        """
         file = self._project / mutant.path
         source = file.read_text()
-        tests = self._reach.tests_for(mutant, source, self._limit)
+        reaching, imported = self._reach.tests_for(mutant, source)
+        chosen = self._reach.within(reaching, limit)
+        tests = chosen[0 if earlier is None else earlier.tried :]
+        # What has noticed errors in this file may notice this one.
+        tests.sort(key=lambda test: -self._noticing[mutant.path][test])
         begin = time.monotonic()
         changed = mutant.apply(source)
         assert changed is not None
+        exchanged = not imported and can_be_exchanged(source, changed)
+        _write(file, changed)
         try:
-            _write(file, changed)
-            noticed, by, run = self._run(tests)
+            by, how, run = self._run(tests, file, source, changed, exchanged)
         finally:
             _write(file, source)
-        return Verdict(mutant, noticed, by, run, len(tests), time.monotonic() - begin)
+        seconds = time.monotonic() - begin + (0.0 if earlier is None else earlier.seconds)
+        noticed = how is not None
+        if not reaching:
+            by = "no test reaches it"
+        elif noticed:
+            self._noticing[mutant.path][by] += 1
+        elif len(chosen) < len(reaching):
+            by = f"{len(reaching) - len(chosen)} slower tests were not run"
+        word = how.value if how else ""
+        run += 0 if earlier is None else earlier.run
+        return Verdict(mutant, noticed, by, word, run, len(chosen), len(reaching), seconds)
 
-    def _run(self, tests: list[str]) -> tuple[bool, str, int]:
-        """Return whether a test failed, which one, and how many were run."""
-        done: list[str] = []
-        until = time.monotonic() + 60 + 4 * self._limit
-        stages = [tests[:_FIRST], tests[_FIRST:]]
+    def _run(
+        self, tests: list[str], file: Path, source: str, changed: str, exchanged: bool
+    ) -> tuple[str, How | None, int]:
+        """Return which test failed and how, and how many were run."""
+        run = 0
+        stages = [tests] if exchanged else [tests[:_FIRST], tests[_FIRST:]]
         while stages:
             stage = stages.pop(0)
             if not stage:
                 continue
-            code, ran = self._pytest(stage, until - time.monotonic())
-            done += ran
-            if code is None:
-                return False, "the time was over", len(done)
-            if code in (0, 5):
-                continue
-            if not ran:
-                return True, "collection", len(done)
-            if self._notices(ran[-1]):
-                return True, ran[-1], len(done)
-            stages.insert(0, [name for name in stage if name not in done])
-        return False, "" if tests else "no test reaches it", len(done)
+            exchange = (str(file), source) if exchanged else None
+            server = self._server
+            if not exchanged:
+                files = dict.fromkeys(name.split("::")[0] for name in stage)
+                server = self._serve("one", list(files))
+            try:
+                if not server.ready:
+                    return stage[0].split("::")[0], How.NOT_IMPORTED, run
+                while stage:
+                    by, how, begun = self._attempt(server, stage, exchange)
+                    run += len(begun)
+                    if how is None:
+                        break
+                    again = by.startswith(_REPEATED) or how is How.WAITED
+                    if not again or self._attempt(server, [by], exchange)[1] is not None:
+                        _write(file, source)
+                        sound = self._passes_without(by)
+                        _write(file, changed)
+                        if sound:
+                            return by, how, run
+                    stage = stage[stage.index(by) + 1 :]
+            finally:
+                if server is not self._server:
+                    server.close()
+        return "", None, run
 
-    def _notices(self, test: str) -> bool:
-        """Whether a test that failed fails by the error and not by itself."""
-        if test.startswith(_REPEATED) and self._pytest([test], 300)[0] == 0:
-            return False
-        with self._sound_lock:
-            if test not in self._sound:
-                mutated, self._project = self._project, self._original
-                try:
-                    self._sound[test] = self._pytest([test], 300)[0] == 0
-                finally:
-                    self._project = mutated
-            return self._sound[test]
+    def _passes_without(self, test: str) -> bool:
+        """Whether a test fails by the error and not by itself."""
+        if test not in self._sound:
+            self._sound[test] = self._attempt(self._server, [test], None)[1] is None
+        return self._sound[test]
 
-    def _pytest(self, tests: list[str], timeout: float) -> tuple[int | None, list[str]]:
-        """Return pytest's exit code (None: time over) and the tests that were begun."""
-        log, limits, cache = (self._folder / n for n in ("log", "limits.json", "cache"))
-        log.write_text("")
-        seconds = self._reach.seconds
-        limits.write_text(json.dumps({n: 20 + 8 * seconds[n] for n in tests}))
+    def _attempt(
+        self, server: _Server, tests: Sequence[str], exchange: tuple[str, str] | None
+    ) -> tuple[str, How | None, list[str]]:
         # What a mutant compiles or plans must not be found by the next one.
-        shutil.rmtree(cache, ignore_errors=True)
-        shutil.copytree(self._filled_cache, cache)
-        mark = f"{os.getpid()}-{id(self)}-{time.monotonic_ns()}"
-        environment = _environment(self._project, cache) | {
-            "SPACEROBOT_MUTANT_TESTS": str(limits),
-            "SPACEROBOT_MUTANT_LOG": str(log),
-            "SPACEROBOT_MUTANT": mark,
-        }
-        files = list(dict.fromkeys(name.split("::")[0] for name in tests))
-        temporary = f"--basetemp={self._folder / 'tmp'}"
-        process = subprocess.Popen(
-            [*_PYTEST, "-x", "-p", "mutation.one_mutant", temporary, *files],
-            cwd=self._project,
-            env=environment,
-            stdout=(self._folder / "output").open("w"),
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-        code: int | None = None
-        try:
-            code = process.wait(max(1.0, timeout))
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-        finally:
-            _end_what_is_left(mark)
-        return code, log.read_text().splitlines()
+        shutil.rmtree(self._cache, ignore_errors=True)
+        shutil.copytree(self._filled_cache, self._cache)
+        seconds = self._reach.seconds
+        return server.run({name: limits_of(*seconds[name]) for name in tests}, exchange)
+
+    def _serve(self, name: str, files: Sequence[str]) -> _Server:
+        folder = self._folder / name
+        folder.mkdir(exist_ok=True)
+        return _Server(self._project, folder, self._cache, files)
 
 
 _PYTEST = [sys.executable, "-m", "pytest", "-q", "--no-header", "-p", "no:cacheprovider"]
@@ -307,32 +417,46 @@ def _end_what_is_left(mark: str) -> None:
             continue
 
 
-def judge_all(mutants: Sequence[Mutant], workers: Sequence[Worker], results: Path) -> list[Verdict]:
-    """Judge mutants, several at a time; write each verdict to a file at once."""
-    waiting: queue.SimpleQueue[Mutant] = queue.SimpleQueue()
-    for mutant in mutants:
-        waiting.put(mutant)
-    verdicts: list[Verdict] = []
+def judge_all(
+    mutants: Sequence[Mutant], workers: Sequence[Worker], results: Path, limits: Sequence[float]
+) -> list[Verdict]:
+    """Judge mutants, several at a time; write each verdict to a file at once.
+
+    Parameters
+    ----------
+    limits
+        CPU time (s) of the tests for one mutant: all mutants with the first, those that survive
+        with the next.
+    """
+    verdicts: dict[Mutant, Verdict] = {}
     lock = threading.Lock()
 
-    def work(worker: Worker) -> None:
+    def work(worker: Worker, limit: float) -> None:
         while True:
             try:
                 mutant = waiting.get_nowait()
             except queue.Empty:
                 return
-            verdict = worker.judge(mutant)
+            verdict = worker.judge(mutant, limit, verdicts.get(mutant))
             with lock, results.open("a") as file:
-                verdicts.append(verdict)
+                verdicts[mutant] = verdict
                 file.write(json.dumps(asdict(verdict)) + "\n")
-                print(f"{len(verdicts)}/{len(mutants)} {_line(verdict)}", flush=True)
+                noticed = sum(v.noticed for v in verdicts.values())
+                print(f"{noticed}/{len(verdicts)} {_line(verdict)}", flush=True)
 
-    threads = [threading.Thread(target=work, args=[worker]) for worker in workers]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return verdicts
+    for limit in limits:
+        waiting: queue.SimpleQueue[Mutant] = queue.SimpleQueue()
+        for mutant in mutants:
+            verdict = verdicts.get(mutant)
+            if verdict is None or (not verdict.noticed and verdict.tried < verdict.reaching):
+                waiting.put(mutant)
+        print(f"{waiting.qsize()} mutants, {limit:g} s of tests each", flush=True)
+        threads = [threading.Thread(target=work, args=[worker, limit]) for worker in workers]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    return list(verdicts.values())
 
 
 def _line(verdict: Verdict) -> str:
@@ -340,7 +464,7 @@ def _line(verdict: Verdict) -> str:
     state = "noticed" if verdict.noticed else "SURVIVED"
     return (
         f"{verdict.seconds:5.1f} s {state} {mutant.path}:{mutant.line} "
-        f"[{mutant.before}] -> [{mutant.after}] {verdict.by}"
+        f"[{mutant.before}] -> [{mutant.after}] {verdict.by} {verdict.how}"
     )
 
 
@@ -392,11 +516,9 @@ def _fingerprint(project: Path, tests: Sequence[str]) -> str:
 
 def _survivors(project: Path, results: Path, mutants: Sequence[Mutant]) -> list[Mutant]:
     """Find the survivors of an earlier run again, wherever they are by now."""
-    keys = set()
-    for line in results.read_text().splitlines():
-        verdict = json.loads(line)
-        if not verdict["noticed"]:
-            keys.add(Mutant(**verdict["mutant"]).key)
+    found = (json.loads(line) for line in results.read_text().splitlines())
+    last = {Mutant(**verdict["mutant"]): verdict["noticed"] for verdict in found}
+    keys = {mutant.key for mutant, noticed in last.items() if not noticed}
     places = {(path, definition, operator) for path, definition, operator, _, _ in keys}
     some = (m for m in mutants if (m.path, m.definition, m.operator) in places)
     return [m for m in (described(project, m) for m in some) if m is not None and m.key in keys]
@@ -408,7 +530,13 @@ def main() -> int:
     parser.add_argument("--sample", type=int, default=400)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--limit", type=float, default=60.0, help="s of tests for one mutant")
+    parser.add_argument(
+        "--limits",
+        type=float,
+        nargs="+",
+        default=[5.0, 60.0],
+        help="CPU time (s) of tests for one mutant, then for those that survive",
+    )
     parser.add_argument("--wanted", type=float, default=85.0, help="%% that must be noticed")
     parser.add_argument("--out", type=Path, default=PROJECT / "out" / "mutants")
     parser.add_argument("--mutate", nargs="+", default=MUTATED, help="folders of the package")
@@ -446,13 +574,17 @@ def main() -> int:
         drawn = sample(PROJECT, population, chosen.sample, chosen.seed)
     print(f"{len(drawn)} of {len(population)} mutants, {len(reach.seconds)} tests", flush=True)
     workers = [
-        Worker(out / f"worker{n}", PROJECT, cache, reach, chosen.limit)
+        Worker(out / f"worker{n}", PROJECT, cache, reach, chosen.tests)
         for n in range(chosen.workers)
     ]
     results = out / "results.jsonl"
     if chosen.again is None or chosen.again.resolve() != results:
         results.unlink(missing_ok=True)
-    verdicts = judge_all(drawn, workers, results)
+    try:
+        verdicts = judge_all(drawn, workers, results, chosen.limits)
+    finally:
+        for worker in workers:
+            worker.close()
     text = table(verdicts)
     (out / "survivors.md").write_text(text)
     print(text)

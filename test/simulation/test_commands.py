@@ -429,6 +429,73 @@ def test_slow_plants_brake_without_a_joint_turning_back(tick_rate: float) -> Non
     assert np.abs(before).max() < 1e-5
 
 
+@pytest.mark.parametrize(
+    ("stamp", "now", "clause"),
+    [
+        (3.15, 7.4, "it is stale: stamped 3.15 s, the plant is at 7.4 s"),
+        (7.45, 7.4, "it is ahead of time: stamped 7.45 s, the plant is at 7.4 s"),
+    ],
+)
+def test_in_lockstep_a_refusal_names_both_times(stamp: float, now: float, clause: str) -> None:
+    assert clause_of(Rig(), stamp, now) == clause
+
+
+@pytest.mark.parametrize(
+    ("stamp", "now", "clause"),
+    [
+        (6.65, 7.4, "it is 0.75 s old"),
+        (7.65, 7.4, "it is 0.25 s ahead of time"),
+        (7.12, 7.4, "it is stamped 7.12 s, and states have multiples of 0.05 s"),
+    ],
+)
+def test_in_real_time_a_refusal_says_how_far_off_it_is(
+    stamp: float, now: float, clause: str
+) -> None:
+    rig = real_time()
+    assert clause_of(rig, stamp, now) == clause
+    assert rig.offer(round(7.4 * SECOND), round(7.4 * SECOND)) is None
+    assert clause_of(rig, 7.15, 7.4) == "it is 0.25 s older than the one in force"
+    rig.joints.commanders = 3
+    same = "the same state was answered before, and 3 nodes command"
+    assert clause_of(rig, 7.4, 7.4) == same
+    assert rig.commands.fault == f"a command on 'joint_commands' was refused: {same}"
+
+
+def clause_of(rig: Rig, stamp: float, now: float) -> str:
+    refusal = rig.offer(round(stamp * SECOND), round(now * SECOND))
+    assert refusal is not None
+    return refusal.clause
+
+
+def test_a_command_as_old_as_the_timeout_is_accepted_and_a_nanosecond_older_is_not() -> None:
+    period = 1_000_000
+    rig = real_time(tick_rate=SECOND / period)
+    now = 10 * SECOND
+    assert rig.offer(now - SECOND // 2, now) is None
+    assert rig.reason(now - SECOND // 2 - period, now) is Reason.STALE
+    assert rig.commands.drop_old(now) == []
+    assert rig.commands.drop_old(now + 1) == [rig.joints]
+    assert rig.commands.timeouts == 1
+    assert rig.commands.last_stamp_ns == now - SECOND // 2
+    assert rig.commands.timed_out
+
+
+def test_a_stamp_is_rounded_by_a_microsecond_and_no_further() -> None:
+    rig, now = real_time(), 10 * SECOND
+    for off in (1000, -1000):
+        assert rig.offer(now - TICK + off, now) is None
+        assert rig.joints.stamp_ns == now - TICK
+        rig.joints.rest()
+        assert rig.reason(now - TICK + off + off // 1000, now) is Reason.UNKNOWN_STATE
+
+
+def test_a_limit_is_named_beside_what_is_beyond_it() -> None:
+    refusal = Rig(beyond_limits="refuse").offer(0, 0, np.array([0.0, 0.5, -9.0]))
+    assert refusal is not None
+    limits = SLIDERS.velocity_limit.tolist()
+    assert refusal.clause == f"[0.0, 0.5, -9.0] is beyond the limits {limits}"
+
+
 def test_names_and_lengths() -> None:
     joints = ("a", "b", "c")
     assert joint_order(joints, ["c", "a"]).tolist() == [2, 0]

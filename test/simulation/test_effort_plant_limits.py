@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -84,6 +85,25 @@ def test_commands_of_the_wrong_length_are_refused() -> None:
         plant.step([0.1, 0.2])
     with pytest.raises(ValueError, match="could not broadcast"):
         plant.step([0.1, 0.2, 0.3], [1, 2, 3])
+
+
+def test_a_tick_without_limits_is_taken_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stops are only looked at where a joint touches one: a tick is one compiled function."""
+    plant = EffortPlant(robot_of(random_urdf(0)), TICK)
+    taken: list[int] = []
+    advance = plant._stops.advance
+
+    def counted(*arguments: Any) -> Any:
+        taken.append(tick)
+        return advance(*arguments)
+
+    monkeypatch.setattr(plant._stops, "advance", counted)
+    for tick in range(20):
+        assert plant.step([0.01, -0.02, 0.01], [0.1, 0, 0, 0, 0, 0]) is False
+    assert taken == []
+    plant.hold(np.array([False, True, False]))
+    plant.step([0.01, -0.02, 0.01])
+    assert len(taken) == 1
 
 
 def test_motion_beyond_numbers_is_refused_and_undone() -> None:

@@ -1,0 +1,119 @@
+"""Numbers that methods state, and defaults of tolerances: against other ways to get them."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from planning.sliding_robots import Slider, SlidingRobot, paper_robot
+from scipy.spatial.transform import Rotation
+from support.planar_manoeuvres import phase_density
+from support.planners import planner_of
+from support.planning_refusals import refusal_in
+from support.slides_and_turns import PERIOD, goal_at, note, origin, planner, state_at
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import Tolerance, plan
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
+from spacerobot_ros.planning.methods.geometric_phase import planar_chain
+from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
+
+FOLDER = Path(__file__).parents[2] / "urdf"
+
+
+def test_tolerances_are_those_of_the_planner_where_none_are_given() -> None:
+    assert Tolerance(1.0, 1.0).shape == PlannerConfig().joint_tolerance == 1e-3
+    given = inspect.signature(plan).parameters["tolerance"].default
+    assert given == Tolerance(1e-6, 1e-6, 1e-6), "who calls the API wants what the method can do"
+
+
+# -- lie_bracket ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate", [0.04, 0.02])
+def test_no_more_cycles_than_the_rates_of_the_sliders_demand(rate: float) -> None:
+    """Amplitudes go as the root of the number of cycles: the fastest slider is at its rate."""
+    goal = goal_at([0.0, 0.0, 0.0], Rotation.from_rotvec([0.02, 0.01, -0.015]))
+    schedule = planner(paper_robot(rate=rate), Tolerance(1e-2, 1e-2)).plan(origin(), goal)
+    assert note(schedule, "cycles") > 20
+    share = np.abs(schedule.velocities).max() / rate
+    # One cycle more than necessary, and 1 in 1000.
+    assert 0.97 < share <= 1.0
+
+
+def two_along_x(reach: float) -> SlidingRobot:
+    """Return the robot of paper 1 with a second slider along x; both have the same stroke."""
+    axes = [*np.eye(3), np.eye(3)[0]]
+    along = [(-reach, reach) if axis[0] else (-2.5, 2.5) for axis in axes]
+    sliders = tuple(
+        Slider(2.0, axis, np.array([0.0, 0.1 * k, 0.1]), stroke=stroke)
+        for k, (axis, stroke) in enumerate(zip(axes, along, strict=True))
+    )
+    return SlidingRobot(10.0, np.diag([1.0, 1.5, 1.5]), np.zeros(3), sliders)
+
+
+def test_two_sliders_share_a_way_up_to_the_ends_of_both_strokes_and_no_further() -> None:
+    # 0.1 m of 18 kg is 0.9 m of 2 kg; from the ends of the strokes on the other side.
+    goal = goal_at([-0.1, 0.0, 0.0], Rotation.identity())
+    for reach, fits in ((0.225, True), (0.2249, False)):
+        ends = state_at(np.zeros(3), Rotation.identity(), [-reach, 0.0, 0.0, -reach])
+        method = planner(two_along_x(reach)).method
+        assert isinstance(method, LieBracketGait)
+        if fits:
+            z_f = method.final_shape(ends, goal)
+            np.testing.assert_allclose(z_f, [reach, 0.0, 0.0, reach], atol=1e-9)
+            continue
+        text = refusal_in(partial(method.final_shape, ends, goal))
+        assert "beyond stroke" in text
+        assert "its stroke is [-0.2249, 0.2249] m" in text
+
+
+def test_the_path_of_many_cycles_is_predicted_at_the_end_of_some() -> None:
+    goal = goal_at([0.0, 0.0, 0.0], Rotation.from_rotvec([0.02, 0.01, -0.015]))
+    gait = planner(paper_robot(rate=0.02), Tolerance(1e-2, 1e-2))
+    schedule = gait.plan(origin(), goal)
+    cycle = schedule.ticks / note(schedule, "cycles")
+    ends = schedule.path.time[1:] / PERIOD / cycle
+    np.testing.assert_allclose(ends, np.round(ends), atol=1e-9)
+    assert 100 <= len(ends) <= 200
+    assert np.diff(ends).max() <= 2 * note(schedule, "cycles") / 100
+
+
+# -- planar robots ----------------------------------------------------------------------------
+
+
+def test_a_planar_robot_is_described_by_its_links_and_by_its_largest_curvature() -> None:
+    found = planar_chain(SpaceRobot.from_file(FOLDER / "planar_chain.urdf"))
+    words = found.sentence
+    assert words.startswith("3 links in a plane: loops of joints 'pin_1' and 'pin_2' turn")
+    shapes = np.stack(np.meshgrid(*2 * [np.linspace(-np.pi, np.pi, 181)]), axis=-1)
+    top = np.abs(phase_density(shapes)).max()
+    assert float(words.split(" rad a unit")[0].rsplit(" ", 1)[1]) == pytest.approx(top, rel=5e-3)
+    assert abs(phase_density(found.shape)) == pytest.approx(top, rel=1e-3)
+    assert str(np.round(found.shape, 3).tolist()) in words
+
+
+# -- area_loop --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("k", [0.15, 0.9])
+def test_the_cycles_that_are_left_are_those_of_a_count(k: float) -> None:
+    """While edges are as long as they may be, a cycle turns by k times what they can make up for;
+    then by k times what is missing.
+    """
+    robot = SpaceRobot.from_file(FOLDER / "three_joint_arm.urdf")
+    method = planner_of("area_loop", robot, 0.25, Tolerance(1.0, 1.0), 0.05, k=k).method
+    assert isinstance(method, AreaLoopGait)
+    for missing, share in ((0.3, 1.0), (0.3, 0.2), (1.5, 0.05), (2e-3, 1.0)):
+        for enough in (1e-3, 0.9 * missing, 0.5 * missing * share):
+            left, cycles = missing, 0
+            while left > enough:
+                left -= k * min(left, missing * share)
+                cycles += 1
+            assert abs(method._cycles_left(missing, share, enough) - cycles) <= 1.1
+        assert math.isinf(method._cycles_left(missing, share, 0.0))
