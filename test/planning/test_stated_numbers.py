@@ -12,13 +12,17 @@ import pytest
 from planning.sliding_robots import Slider, SlidingRobot, paper_robot
 from scipy.spatial.transform import Rotation
 from support.planar_manoeuvres import phase_density
+from support.planner_loop import NEAR, TICK, Loop, StubMethod
 from support.planners import planner_of
 from support.planning_refusals import refusal_in
 from support.slides_and_turns import PERIOD, goal_at, note, origin, planner, state_at
 
+from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Tolerance, plan
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.state_machine import Phase
+from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
 from spacerobot_ros.planning.methods.geometric_phase import planar_chain
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
@@ -117,3 +121,39 @@ def test_the_cycles_that_are_left_are_those_of_a_count(k: float) -> None:
                 cycles += 1
             assert abs(method._cycles_left(missing, share, enough) - cycles) <= 1.1
         assert math.isinf(method._cycles_left(missing, share, 0.0))
+
+
+def test_the_last_cycle_that_a_goal_may_take_is_flown() -> None:
+    robot = SpaceRobot.from_file(FOLDER / "three_joint_arm.urdf")
+    shape = np.radians([0.0, -45.0, 90.0])
+    goal = goal_at(np.zeros(3), Rotation.from_rotvec([0.0, 1e-3, 0.0]))
+    options = {"most_cycles": 1, "k": 1.0, "nominal": shape.tolist()}
+    method = planner_of("area_loop", robot, 0.25, Tolerance(1.0, 5e-4), 0.05, **options)
+    schedule = method.plan(state_at(np.zeros(3), Rotation.identity(), shape), goal)
+    assert (schedule.notes["cycles"], schedule.notes["expected_cycles"]) == (1.0, 1.0)
+
+
+# -- the executive ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("jump", "after"), [(12.0, "13.1"), (-0.9, "0.2")])
+def test_a_jump_of_time_is_reported_with_both_times(jump: float, after: str) -> None:
+    loop = Loop(method=StubMethod(ticks=20))
+    loop.measured.stamp_ns = 1_000_000_000
+    loop.propose(NEAR)
+    loop.tick(2)
+    before = f"{loop.measured.stamp_ns / 1e9 - TICK:.9g}"
+    assert loop.executive.phase is Phase.EXECUTING
+    loop.measured.stamp_ns += round(jump * 1e9)
+    loop.tick()
+    words = f"has jumped from {before} s to {after} s, where no motion is planned."
+    assert any(words in notice for notice in loop.notices), loop.notices
+
+
+def test_plan_and_execution_are_reported_with_the_duration_of_the_gait() -> None:
+    loop = Loop(method=StubMethod(ticks=13))
+    loop.propose(NEAR)
+    status = loop.until(PlannerState.EXECUTING)
+    assert status.sentence == "Executing a stub gait of 0.65 s."
+    reported = [output.sentence for output in loop.outputs if isinstance(output, Event)]
+    assert "The plan is a stub gait of 0.65 s." in reported

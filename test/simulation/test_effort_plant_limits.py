@@ -90,15 +90,15 @@ def test_commands_of_the_wrong_length_are_refused() -> None:
 def test_a_tick_without_limits_is_taken_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stops are only looked at where a joint touches one: a tick is one compiled function."""
     plant = EffortPlant(robot_of(random_urdf(0)), TICK)
-    taken: list[int] = []
+    taken: list[Any] = []
     advance = plant._stops.advance
 
     def counted(*arguments: Any) -> Any:
-        taken.append(tick)
+        taken.append(arguments)
         return advance(*arguments)
 
     monkeypatch.setattr(plant._stops, "advance", counted)
-    for tick in range(20):
+    for _ in range(20):
         assert plant.step([0.01, -0.02, 0.01], [0.1, 0, 0, 0, 0, 0]) is False
     assert taken == []
     plant.hold(np.array([False, True, False]))

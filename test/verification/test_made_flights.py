@@ -264,3 +264,33 @@ def test_a_flight_that_begins_at_a_limit_but_for_rounding(tmp_path: Path) -> Non
     result = verified(tmp_path, moved, config=config, first=5, error=-1e-10)
     assert result.difference is None, str(result.difference)
     assert result.ticks == 5
+
+
+@pytest.mark.parametrize("at", [4, 7])
+def test_a_reset_is_refused_with_the_time_of_its_state(tmp_path: Path, at: int) -> None:
+    """The plant's time goes on, and its first state is published once more."""
+    path = tmp_path / "a.mcap"
+    made = Made([RATES] * 10)
+    start = JointState(name=NAMES, position=[0.0] * 3, velocity=[0.0] * 3, effort=[0.0] * 3)
+    with made_bag(path) as (bag, say):
+
+        def again(topic: str, message: Any, time: float) -> None:
+            say(topic, message, time)
+            if topic == "/joint_states" and round(time / TICK) == at:
+                say(topic, stamped(start, time - TICK, "base_link"), time)
+
+        made.add(bag, again)
+    with pytest.raises(RecordingError) as refusal:
+        verify_bag(path)
+    assert f"the plant was reset at {(at - 1) * TICK:.9g} s; only flights" in str(refusal.value)
+
+
+def test_a_message_between_two_ticks_is_refused_with_its_time(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with made_bag(path) as (bag, say):
+        Made([RATES] * 3).add(bag, say)
+        late = JointState(name=NAMES, position=[0.0] * 3, velocity=[0.0] * 3, effort=[0.0] * 3)
+        say("/joint_states", stamped(late, 0.25, "base_link"), 0.25)
+    words = "is stamped 0.25 s, between the ticks of the plant in it"
+    with pytest.raises(RecordingError, match=words):
+        verify_bag(path)

@@ -1,0 +1,241 @@
+"""Records, chunks and definitions of a bag at the borders of what is accepted.
+
+The bytes are put together here; what is exactly right is read, and one byte more is refused.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from io import BytesIO
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from mcap.opcode import Opcode
+from rosbags.interfaces import Nodetype
+
+from spacerobot_ros.bag.definitions import MessageTypes, _Sizes
+from spacerobot_ros.bag.mcap_reading import _check_entries
+from spacerobot_ros.bag.mcap_records import (
+    LIMIT_VARIABLE,
+    Allowance,
+    record_at,
+    records,
+    records_in,
+    unpacked,
+)
+
+
+def record(opcode: int, body: bytes, claims: int | None = None) -> bytes:
+    return struct.pack("<BQ", opcode, len(body) if claims is None else claims) + body
+
+
+def message(data: bytes, claims: int | None = None) -> bytes:
+    return record(Opcode.MESSAGE, struct.pack("<HIQQ", 1, 0, 7, 8) + data, claims)
+
+
+# -- records ----------------------------------------------------------------------------------
+
+
+def test_a_record_may_end_where_the_file_does() -> None:
+    first, last = record(Opcode.HEADER, b"abc"), record(Opcode.FOOTER, b"")
+    content = first + last
+    file = BytesIO(content)
+    assert list(records(file, 0, len(content))) == [
+        (0, Opcode.HEADER, b"abc"),
+        (12, Opcode.FOOTER, b""),
+    ]
+    assert record_at(file, 0, Opcode.HEADER) == b"abc"
+    assert record_at(file, 12, Opcode.FOOTER) == b""
+    with pytest.raises(ValueError, match="there is no footer at byte 0"):
+        record_at(file, 0, Opcode.FOOTER)
+    with pytest.raises(ValueError, match="its index names byte 13, and it has 21 bytes"):
+        record_at(file, 13, Opcode.FOOTER)
+
+
+def test_a_record_that_claims_one_byte_more_than_is_left_is_refused() -> None:
+    content = record(Opcode.HEADER, b"abc") + record(Opcode.CHUNK, b"de", claims=3)
+    words = "the record at byte 12 claims 3 bytes, where 2 are left"
+    with pytest.raises(ValueError, match=words):
+        list(records(BytesIO(content), 0, len(content)))
+    with pytest.raises(ValueError, match=words):
+        record_at(BytesIO(content), 12, Opcode.CHUNK)
+    # What lies behind the end that is asked for does not count.
+    with pytest.raises(ValueError, match="claims 3 bytes, where 1 are left"):
+        list(records(BytesIO(content), 0, len(content) - 1))
+    with pytest.raises(ValueError, match="claims 3 bytes, where 0 are left"):
+        list(records(BytesIO(content), 0, 15))
+
+
+def test_a_file_may_end_inside_of_the_head_of_a_record() -> None:
+    content = record(Opcode.HEADER, b"abc") + record(Opcode.FOOTER, b"")[:8]
+    with pytest.raises(ValueError, match="it ends inside of the record at byte 12"):
+        list(records(BytesIO(content), 0, len(content)))
+
+
+def test_records_of_a_chunk_end_with_it() -> None:
+    whole = message(b"") + record(Opcode.SCHEMA, b"")
+    assert list(records_in(whole, 40)) == [(Opcode.MESSAGE, 0, 31), (Opcode.SCHEMA, 31, 40)]
+    assert list(records_in(b"", 40)) == []
+    for chunk, words in (
+        (whole[:-1], "the chunk at byte 40 ends inside of a record"),
+        (message(b"", claims=23), "a record reaches out of the chunk at byte 40"),
+        (record(0, b"abc"), "the chunk at byte 40 has records of no kind"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            list(records_in(chunk, 40))
+
+
+# -- indexes of messages ----------------------------------------------------------------------
+
+
+def test_an_index_may_name_the_last_message_though_it_holds_nothing() -> None:
+    chunk = message(b"text") + message(b"")
+    _check_entries(chunk, np.array([35, 0], np.uint64), 40)
+    _check_entries(chunk, np.array([], np.uint64), 40)
+
+
+@pytest.mark.parametrize(
+    ("chunk", "places"),
+    [
+        (message(b"text") + message(b""), [0, 36]),
+        (message(b"text") + message(b""), [0, 2**63]),
+        (message(b"text") + message(b""), [35, 35]),
+        # Messages that claim more than there is, less than a message has, or what follows them.
+        (message(b"text") + message(b"", claims=23), [0, 35]),
+        (message(b"text") + message(b"", claims=21), [0, 35]),
+        (message(b"text", claims=27) + message(b""), [0, 35]),
+        (message(b"text") + message(b"", claims=2**64 - 1), [0, 35]),
+        (message(b"text") + record(Opcode.SCHEMA, bytes(22)), [0, 35]),
+    ],
+)
+def test_an_index_that_names_anything_else_does_not_fit(chunk: bytes, places: list[int]) -> None:
+    with pytest.raises(ValueError, match="the message indexes of the chunk at byte 40 do not fit"):
+        _check_entries(chunk, np.array(places, np.uint64), 40)
+
+
+# -- what chunks inflate to -------------------------------------------------------------------
+
+
+def test_chunks_may_inflate_to_the_limit_together_and_no_further() -> None:
+    allowance = Allowance(1000)
+    assert allowance.most == 32_000_000
+    allowance.take(31_999_999, 8)
+    allowance.take(1, 50)
+    allowance.take(0, 60)
+    words = "the chunk at byte 70 it inflates to 32000001 bytes, more than the 32000000 that"
+    with pytest.raises(ValueError, match=words):
+        allowance.take(1, 70)
+    assert Allowance(160_000).most == Allowance(0).most == 32_000_000
+    assert Allowance(160_001).most == 32_000_200
+
+
+@pytest.mark.parametrize(
+    ("text", "most"),
+    [
+        ("5", 5_000_000),
+        ("0.5", 500_000),
+        ("0", 32_000_000),
+        ("-3", 32_000_000),
+        ("1e12", 32_000_000),
+        ("nan", 32_000_000),
+        ("much", 32_000_000),
+    ],
+)
+def test_the_limit_is_a_positive_number_of_megabytes(
+    text: str, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(LIMIT_VARIABLE, text)
+    assert Allowance(0).most == most
+
+
+PACKED: dict[str, Callable[[bytes], bytes]] = {
+    "": lambda data: data,
+    "zstd": lambda data: zstandard.ZstdCompressor().compress(data) if data else b"",
+    "lz4": lambda data: lz4.frame.compress(data) if data else b"",
+}
+
+
+def chunk(compression: str, data: bytes, size: int, crc: int = 0, off: int = 0) -> bytes:
+    packed, name = PACKED[compression](data), compression.encode()
+    head = struct.pack("<QQQII", 0, 0, size, crc, len(name)) + name
+    return head + struct.pack("<Q", len(packed) + off) + packed
+
+
+@pytest.mark.parametrize("compression", PACKED)
+def test_a_chunk_holds_what_it_claims_to_the_byte(compression: str) -> None:
+    data = message(b"text") * 3
+    for held in (data, b"", b"x"):
+        assert unpacked(chunk(compression, held, len(held)), 40) == held
+        assert unpacked(chunk(compression, held, len(held), zlib.crc32(held)), 40) == held
+    for size in (len(data) - 1, len(data) + 1):
+        with pytest.raises(ValueError, match="the chunk at byte 40 "):
+            unpacked(chunk(compression, data, size), 40)
+    with pytest.raises(ValueError, match="the checksum of the chunk at byte 40 is wrong"):
+        unpacked(chunk(compression, data, len(data), zlib.crc32(data) ^ 1), 40)
+    packed = len(PACKED[compression](data))
+    words = f"holds {packed} packed bytes, not the {packed + 1} that it claims"
+    with pytest.raises(ValueError, match=words):
+        unpacked(chunk(compression, data, len(data), off=1), 40)
+
+
+@pytest.mark.parametrize(("size", "more"), [(2, "more"), (4, "less")])
+def test_whether_a_chunk_holds_more_or_less_is_said(size: int, more: str) -> None:
+    with pytest.raises(ValueError, match=f"holds {more} than the {size} bytes it claims"):
+        unpacked(chunk("", b"abc", size), 40)
+
+
+# -- definitions ------------------------------------------------------------------------------
+
+
+def refused(text: str) -> str:
+    try:
+        MessageTypes().decoder("a/msg/A", text.encode())
+    except ValueError as error:
+        return str(error)
+    raise AssertionError("it is accepted")
+
+
+def accepted(text: str) -> None:
+    MessageTypes().decoder("a/msg/A", text.encode())
+
+
+def test_a_message_may_have_a_thousand_fields_and_no_more() -> None:
+    other = f"{'=' * 80}\nMSG: a/B\nfloat64 x\nfloat64 y\n"
+    accepted("string[1000] s\n")
+    accepted("a/B[500] b\n" + other)
+    accepted("a/B[499] b\nfloat64 x\nuint8[70000] y\n" + other)
+    accepted(f"a/B[] b\na/B[498] c\nfloat64[] x\nstring y\n{other}")
+    for text in (
+        "string[1001] s\n",
+        "string[1000] s\nfloat64 x\n",
+        "a/B[500] b\nfloat64 x\n" + other,
+        "a/B[499] b\nstring[3] y\n" + other,
+        f"a/B[] b\na/B[499] c\nfloat64 x\n{other}",
+    ):
+        assert "a/msg/A has more than 1000 fields" in refused(text)
+
+
+def test_a_message_without_fields_counts_as_one() -> None:
+    sizes = _Sizes({"E": ([], []), "A": ([], [("e", (Nodetype.NAME, "E"))] * 1000)})
+    assert sizes.of("E", 0) == 1
+    assert sizes.of("A", 0) == 1000
+
+
+def test_types_may_be_nested_32_deep() -> None:
+    def chain(count: int) -> str:
+        parts = [f"a/T{k + 1} t\n{'=' * 80}\nMSG: a/T{k + 1}\n" for k in range(count)]
+        return "".join(parts) + "uint8 x\n"
+
+    accepted(chain(32))
+    assert "nested more than 32 deep" in refused(chain(33))
+
+
+def test_a_text_may_have_so_many_bytes_and_lines() -> None:
+    accepted("float64 x\n" + "#" * (262_144 - 10))
+    assert "longer than 262144 bytes or 5000 lines" in refused("float64 x\n" + "#" * 262_135)
+    accepted("float64 x\n" + "\n" * 4_999)
+    assert "longer than 262144 bytes or 5000 lines" in refused("float64 x\n" + "\n" * 5_000)

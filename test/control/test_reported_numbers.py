@@ -1,0 +1,45 @@
+"""Numbers in the statuses of a controller: each kind is another, so that none is taken for one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.executive_loop import PERIOD, TIP, ExecutiveLoop, goal_at
+
+from spacerobot_ros.control.executive import _command_report
+from spacerobot_ros.control.limits import Saturated
+from spacerobot_ros.control.state import Actuation
+
+
+def test_what_actuators_lose_is_reported_by_kind() -> None:
+    loop = ExecutiveLoop()
+    loop.answer()
+    nothing = Actuation(np.zeros(6), np.zeros(2))
+    lost = Actuation(np.array([3.0, 4.0, 12.0, -8.0, 9.0, 12.0]), np.array([0.5, -2.5]))
+    report = _command_report(loop.executive.controller, Saturated(nothing, lost))
+    assert report.lost_force_N == pytest.approx(13.0)
+    assert report.lost_torque_Nm == pytest.approx(17.0)
+    assert report.lost_effort == 2.5
+
+
+def test_the_distances_of_a_sentence_are_those_of_its_kind() -> None:
+    loop = ExecutiveLoop(settle_time=0.02, time_limit=0.05)
+    loop.answer()
+    loop.place = np.array([0.03, -0.04, 0.0])
+    loop.answer(3)
+    assert loop.status.sentence == "Holding; off by 0.04 m, 0 rad."
+    loop.place = np.zeros(3)
+    loop.aim(base=goal_at([0.3, 0.4, 0.0]), end_effector=goal_at(TIP))
+    loop.answer()
+    assert loop.status.sentence == "Flying to the goal; 0.4 m, 0 rad from the reference."
+    loop.answer(8)
+    assert loop.status.sentence == "The goal is not reached in time: 0.4 m, 0 rad from it."
+
+
+def test_the_time_without_a_base_is_reported() -> None:
+    loop = ExecutiveLoop(estimation_time=1.0)
+    loop.answer(2)
+    for count in (1, 2, 3):
+        loop.answer(measured=False)
+        words = f"it is estimated since {count * PERIOD:.3g} s."
+        assert loop.status.sentence.endswith(words)
