@@ -23,9 +23,16 @@ def test_parameters_keep_names_types_defaults_and_limits() -> None:
     # New ones are no difference for anybody's files.
     listed = {node: {name: found[node][name] for name in kept[node]} for node in kept}
     assert not differences(listed, kept), WRITE
+    assert listed == kept, f"Defaults and limits have no rounding. {WRITE}"
     for node, entries in kept.items():
         for name, entry in entries.items():
             assert type(found[node][name]["default"]) is type(entry["default"]), (node, name)
+
+
+def test_every_parameter_is_kept() -> None:
+    kept = json.loads(PARAMETERS.read_text("utf-8"))
+    new = {node: sorted(set(found) - set(kept[node])) for node, found in parameters().items()}
+    assert not any(new.values()), f"New parameters have no expectation. {WRITE}"
 
 
 def test_plans_stay_as_they_are() -> None:
