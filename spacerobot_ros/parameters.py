@@ -45,7 +45,7 @@ class Parameter:
     length
         Entries of an array that is not empty; None: any number of them.
     read_only
-        Whether it keeps its value as long as the node lives.
+        Whether it keeps its value as long as the node is configured.
     texts
         An array of texts, also taken as one text with its parts on lines of their own or between
         semicolons.

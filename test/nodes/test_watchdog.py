@@ -141,7 +141,8 @@ def test_a_look_that_is_due_when_the_node_is_stopped_is_no_failure(harness: Harn
         return create(period, act, **clock)
 
     node.create_timer = create_timer
-    liveness = Liveness(node, Role.PLANT, [Role.COMMANDER], 1.0, lambda silence: None)
+    liveness = Liveness(node, Role.PLANT, [Role.COMMANDER], lambda silence: None)
+    liveness.configure(1.0)
     liveness.begin()
     liveness.end()
     for act in due:  # The executor had taken them up before they were destroyed.

@@ -37,7 +37,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import robot_from_text, robot_of
 from spacerobot_ros.nodes.common.connections import Connections
 from spacerobot_ros.nodes.common.messages import diagnostic_status
-from spacerobot_ros.nodes.common.ros_parameters import declare
+from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
 from spacerobot_ros.nodes.common.streams import RawInput, RawOutput, RawStream, Take
 from spacerobot_ros.nodes.common.watchdog import Liveness, Pulse, Role, Silence
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
@@ -117,14 +117,15 @@ class FlightNode(LifecycleNode):
         self._raising = False
         self._guard_transitions()
         try:
-            values = declare(self, (AUTOSTART, *declared(self.Config)))
+            self._parameters_declared = {each.name: each for each in declared(self.Config)}
+            values = declare(self, (AUTOSTART, *self._parameters_declared.values()))
+            fix(self, [AUTOSTART], fixed=True)
             self._autostart = bool(values[AUTOSTART.name])
             self.config = configured(self.Config, values)
             self.add_on_set_parameters_callback(self._on_set_parameters)
             self._event_stream = self.send_raw(DiagnosticStatus, "events", EVENTS)
             self.create_service(Trigger, "~/connections", self._on_connections)
-            timeout = float(getattr(self.config, "watchdog_timeout", 0.0))
-            self._liveness = Liveness(self, self.role, self.depends_on, timeout, self._on_silence)
+            self._liveness = Liveness(self, self.role, self.depends_on, self._on_silence)
             self.prepare()
             self._permanent_streams = list(self.raw_streams)
             self._permanent = set(self._entities())
@@ -299,11 +300,31 @@ class FlightNode(LifecycleNode):
         """The value of every parameter by its full name."""
         return {AUTOSTART.name: self._autostart, **values_of(self.config)}
 
+    def set_parameters(self, parameter_list: list[RosParameter]) -> list[SetParametersResult]:
+        """Set parameters one by one; see :meth:`set_parameters_atomically`."""
+        return [self.set_parameters_atomically([each]) for each in parameter_list]
+
+    def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
+        """Set parameters together, or none: most of them only while the node is not configured.
+
+        Values are taken in the types of the declarations where they can be: a whole number for a
+        real one.
+        """
+        try:
+            self._require_free(parameter_list)
+            changes = typed(self._parameters_declared, parameter_list)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return super().set_parameters_atomically(changes)
+
     @property
     def is_active(self) -> bool:
         """Whether the node is in its active state."""
+        return self._is_in(State.PRIMARY_STATE_ACTIVE)
+
+    def _is_in(self, state: int) -> bool:
         machine = self._state_machine
-        return bool(machine and machine.current_state[0] == State.PRIMARY_STATE_ACTIVE)
+        return bool(machine and machine.current_state[0] == state)
 
     def finalize(self) -> None:
         """Take the transition to the end, unless somebody has had the node take it before."""
@@ -374,9 +395,13 @@ class FlightNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run the hook; what it has created goes again where it fails."""
+        if self._liveness is not None:
+            self._liveness.configure(float(getattr(self.config, "watchdog_timeout", 0.0)))
         result = self._run(self.configure)
         if result is TransitionCallbackReturn.FAILURE:
             self._destroy_configured()
+        if result is TransitionCallbackReturn.SUCCESS:
+            self._fix_parameters(fixed=True)
         return self._report_transition(result, EventKind.CONFIGURED)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -477,6 +502,7 @@ class FlightNode(LifecycleNode):
 
     def _destroy_configured(self) -> None:
         """Destroy what configure made; the services of every ROS node stay for the next start."""
+        self._fix_parameters(fixed=False)
         self.raw_streams[:] = self._permanent_streams
         if self._liveness is not None:
             self._liveness.forget_configured()
@@ -489,6 +515,36 @@ class FlightNode(LifecycleNode):
         for entity in self._entities():
             if entity not in self._permanent:
                 next(act for kind, act in destroy.items() if isinstance(entity, kind))(entity)
+
+    def _fix_parameters(self, *, fixed: bool) -> None:
+        """Have the parameters that :meth:`configure` reads keep their values, or not."""
+        declared = self._parameters_declared.values()
+        fix(self, (each for each in declared if each.read_only), fixed=fixed)
+
+    def _require_free(self, changes: list[RosParameter]) -> None:
+        """Refuse changes of parameters that keep their values now.
+
+        Raises
+        ------
+        ParameterError
+            There is one; the sentence says what to do.
+        """
+        for change in changes:
+            if change.name == AUTOSTART.name:
+                raise ParameterError(
+                    "Parameter 'autostart' is read once, when the node starts: change the state of "
+                    "the node instead."
+                )
+            declaration = self._parameters_declared.get(change.name)
+            if declaration is None or not declaration.read_only:
+                continue
+            if not self._is_in(State.PRIMARY_STATE_UNCONFIGURED):
+                name = self.get_fully_qualified_name()
+                raise ParameterError(
+                    f"Parameter '{change.name}' keeps its value while the node is configured: "
+                    f"deactivate and clean it up first (ros2 lifecycle set {name} deactivate, "
+                    "then cleanup), set it, and configure and activate the node again."
+                )
 
     def _on_set_parameters(self, changes: list[RosParameter]) -> SetParametersResult:
         given, before = {change.name: change.value for change in changes}, self.config

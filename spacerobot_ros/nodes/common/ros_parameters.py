@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -24,7 +24,6 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     described = ParameterDescriptor(
         name=parameter.name,
         description=f"{parameter.description}{unit}",
-        read_only=parameter.read_only,
         additional_constraints=f"one of: {choices}" if choices else "",
     )
     low = max(parameter.minimum, -_LARGEST_FLOAT)
@@ -59,11 +58,47 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
         given = node.get_parameter(name).value
         node.undeclare_parameter(name)
         value = parameter.default if given is None else parameter.checked(given)
-        stored = list(value) if isinstance(value, tuple) else value
-        if value == ():
-            # rclpy cannot tell the type of an empty list: declare the type and leave it unset.
-            kind = RosParameter.Type
-            stored = kind.STRING_ARRAY if parameter.texts else kind.DOUBLE_ARRAY
-        node.declare_parameter(name, stored, _descriptor(parameter), ignore_override=True)
+        stored = _ros_parameter(parameter, value)
+        # By its type, because rclpy cannot tell that of an empty list. One parameter that is left
+        # unset would have get_parameters answer nothing, whatever else it is asked for.
+        node.declare_parameter(name, stored.type_, _descriptor(parameter), ignore_override=True)
+        Node.set_parameters(node, [stored])
         values[name] = value
     return values
+
+
+def fix(node: Node, parameters: Iterable[Parameter], *, fixed: bool) -> None:
+    """Have ``ros2 param describe`` say whether parameters keep their values now."""
+    for parameter in parameters:
+        # Node.set_descriptor never makes a parameter writable again.
+        node.describe_parameter(parameter.name).read_only = fixed
+
+
+def typed(
+    parameters: Mapping[str, Parameter], changes: Iterable[RosParameter]
+) -> list[RosParameter]:
+    """Return what a user wants to set, in the types of the declarations; others as they are.
+
+    So a whole number does for a real one (``ros2 param set /plant tick_rate 50``), and an empty
+    list for any.
+
+    Raises
+    ------
+    ParameterError
+        A value is refused; the sentence names the parameter.
+    """
+    known = [(parameters.get(change.name), change) for change in changes]
+    return [
+        change if parameter is None else _ros_parameter(parameter, parameter.checked(change.value))
+        for parameter, change in known
+    ]
+
+
+def _ros_parameter(parameter: Parameter, value: Value) -> RosParameter:
+    kind = RosParameter.Type
+    if isinstance(value, tuple):
+        of_texts = parameter.texts
+        return RosParameter(
+            parameter.name, kind.STRING_ARRAY if of_texts else kind.DOUBLE_ARRAY, list(value)
+        )
+    return RosParameter(parameter.name, value=value)

@@ -146,8 +146,6 @@ class Liveness:
         Its own.
     depends_on
         The roles that it watches.
-    timeout
-        See :class:`Watchdog`; 0: nothing is watched.
     on_silence
         Called when a node has become silent, or is back.
     """
@@ -157,7 +155,6 @@ class Liveness:
         node: Node,
         role: Role | None,
         depends_on: Iterable[Role],
-        timeout: float,
         on_silence: Callable[[Silence], None],
     ) -> None:
         self._node, self._role, self._on_silence = node, role, on_silence
@@ -166,10 +163,17 @@ class Liveness:
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers: list[Timer] = []
         self._watched = {each.value for each in depends_on}
-        self._timeout = timeout
+        self._timeout = 0.0
         self._watchdog: Watchdog | None = None
+
+    def configure(self, timeout: float) -> None:
+        """Prepare to watch, until what was created since the construction is destroyed.
+
+        ``timeout``: see :class:`Watchdog`; 0: nothing is watched.
+        """
+        self._timeout = timeout
         if self._watched and timeout:
-            node.create_subscription(DiagnosticStatus, TOPIC, self._on_heartbeat, _HEARTBEATS)
+            self._node.create_subscription(DiagnosticStatus, TOPIC, self._on_heartbeat, _HEARTBEATS)
 
     def begin(self) -> None:
         """Give heartbeats, and watch, from now on."""

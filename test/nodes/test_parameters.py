@@ -1,0 +1,162 @@
+"""Parameters as the ros2 command reads and sets them: all at once, and between two lives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
+from rclpy.parameter import Parameter, parameter_value_to_python
+from sensor_msgs.msg import JointState
+from support.ros_harness import Harness
+
+from spacerobot_ros.nodes import NODE_TYPES
+from spacerobot_ros.nodes.common.node import FlightNode
+from spacerobot_ros.nodes.replay import ReplayNode
+
+KINDS: dict[str, Any] = {**NODE_TYPES, "replay": ReplayNode}
+
+LOCKSTEP = {"robot": "sliding_masses", "time_mode": "lockstep"}
+
+
+class Remote:
+    """What the parameter services of a node answer to a client."""
+
+    def __init__(self, harness: Harness, node: FlightNode) -> None:
+        self._harness, self._node = harness, node
+        self._client = harness.probe({}, name=f"client_of_{node.get_name()}")
+
+    def ask(self, kind: Any, service: str, **request: Any) -> Any:
+        name = f"{self._node.get_fully_qualified_name()}/{service}"
+        client = self._client.create_client(kind, name)
+        return self._harness.call(client, kind.Request(**request))
+
+    def names(self) -> list[str]:
+        listed: list[str] = self.ask(ListParameters, "list_parameters").result.names
+        return listed
+
+    def values(self, names: Sequence[str]) -> dict[str, Any]:
+        answer = self.ask(GetParameters, "get_parameters", names=list(names)).values
+        return dict(zip(names, map(parameter_value_to_python, answer), strict=True))
+
+    def is_read_only(self, name: str) -> bool:
+        (described,) = self.ask(DescribeParameters, "describe_parameters", names=[name]).descriptors
+        return bool(described.read_only)
+
+    def set(self, **values: Any) -> list[Any]:
+        given = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        results: list[Any] = self.ask(SetParameters, "set_parameters", parameters=given).results
+        return results
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_all_parameters_are_answered_at_once(harness: Harness, name: str) -> None:
+    node = harness.add(KINDS[name](autostart=False, context=harness.context))
+    remote = Remote(harness, node)
+    values = remote.values(remote.names())
+    declared = node.parameter_values
+    assert len(declared) >= 8
+    for each, value in declared.items():
+        assert values[each] == (list(value) if isinstance(value, tuple) else value)
+
+
+def test_empty_lists_keep_their_type_through_the_services(harness: Harness) -> None:
+    plant = harness.make(NODE_TYPES["plant"], {"faults": ["joint_stuck x"]}, autostart=False)
+    remote = Remote(harness, plant)
+    nothing = ParameterMessage(name="faults")
+    nothing.value.type = Parameter.Type.STRING_ARRAY.value
+    empty = ParameterMessage(name="initial_joint_positions")
+    # What the ros2 command makes of `[]`, which says nothing of its entries.
+    empty.value.type = Parameter.Type.BYTE_ARRAY.value
+    result = remote.ask(
+        SetParametersAtomically, "set_parameters_atomically", parameters=[nothing, empty]
+    ).result
+    assert result.successful, result.reason
+    assert plant.config.faults == plant.config.initial_joint_positions == ()
+    assert remote.set(initial_joint_positions=[1, 2, 0])[0].successful
+    assert list(remote.values(["initial_joint_positions"]).values()) == [[1.0, 2.0, 0.0]]
+    assert plant.config.initial_joint_positions == (1.0, 2.0, 0.0)
+
+
+def test_a_plant_is_another_after_its_cleanup(harness: Harness) -> None:
+    plant = harness.make(NODE_TYPES["plant"], LOCKSTEP)
+    remote = Remote(harness, plant)
+    probe = harness.probe({"odom": Odometry, "joint_states": JointState})
+    assert remote.is_read_only("robot")
+    (refused,) = remote.set(robot="servicer")
+    assert not refused.successful
+    assert "'robot'" in refused.reason
+    assert "clean it up" in refused.reason
+    plant.trigger_deactivate()
+    assert not remote.set(robot="servicer")[0].successful, "it is configured still"
+    plant.trigger_cleanup()
+    assert not remote.is_read_only("robot")
+    results = remote.set(robot="servicer", tick_rate=50, initial_position=[1.0, 2.0, 3.0])
+    assert all(result.successful for result in results), results
+    plant.start()
+    harness.spin_until(lambda: probe.messages["joint_states"] and probe.messages["odom"])
+    assert len(probe.last("joint_states").name) == 6
+    assert probe.last("odom").pose.pose.position.y == 2.0
+    assert plant.config.control_period == 0.02
+    assert not remote.set(tick_rate=20.0)[0].successful
+
+
+def test_a_node_that_waits_is_set_up_before_it_starts(harness: Harness, tmp_path: Path) -> None:
+    recorder = harness.make(NODE_TYPES["recorder"], {"autostart": False})
+    remote = Remote(harness, recorder)
+    assert remote.set(bag=str(tmp_path / "mine.mcap"))[0].successful
+    (autostart,) = remote.set(autostart=True)
+    assert not autostart.successful
+    assert "autostart" in autostart.reason
+    recorder.start()
+    assert (tmp_path / "mine.mcap").is_file()
+
+
+def test_what_is_set_is_checked_and_leaves_the_rest(harness: Harness) -> None:
+    plant = harness.make(NODE_TYPES["plant"], LOCKSTEP, autostart=False)
+    remote = Remote(harness, plant)
+    for name, value in (
+        ("tick_rate", -1.0), ("tick_rate", "fast"), ("time_mode", "soon"), ("robot", 3),
+        ("initial_position", [1.0]), ("initial_position", [1.0, 2.0, float("nan")]),
+        ("thrusters", False),
+    ):  # fmt: skip
+        (result,) = remote.set(**{name: value})
+        assert not result.successful
+        assert f"'{name}'" in result.reason
+    assert plant.parameter_values == KINDS["plant"](
+        autostart=False, context=harness.context, parameter_overrides=[
+            Parameter(key, value=value) for key, value in LOCKSTEP.items()
+        ],
+    ).parameter_values  # fmt: skip
+
+
+def test_a_bad_robot_fails_the_configuration_and_may_be_mended(harness: Harness) -> None:
+    plant = harness.make(NODE_TYPES["plant"], {}, autostart=False)
+    remote = Remote(harness, plant)
+    plant.trigger_configure()
+    assert "needs a robot" in str(plant.fault)
+    assert not remote.is_read_only("robot")
+    assert remote.set(robot="sliding_masses")[0].successful
+    plant.start()
+    assert plant.is_active
+
+
+def test_a_watchdog_heeds_a_timeout_that_was_set_since(harness: Harness) -> None:
+    plant = harness.make(NODE_TYPES["plant"], {**LOCKSTEP, "watchdog_timeout": 0.0})
+    heard = {each.topic_name for each in plant.subscriptions}
+    assert "/heartbeat" not in heard
+    plant.trigger_deactivate()
+    plant.trigger_cleanup()
+    assert plant.set_parameters([Parameter("watchdog_timeout", value=2.0)])[0].successful
+    plant.start()
+    assert "/heartbeat" in {each.topic_name for each in plant.subscriptions}
