@@ -49,6 +49,9 @@ _STILL = 1e-12
 _TRIES = 8
 """Shapes from which one that puts the base somewhere is looked for."""
 
+_STEPS, _COARSE_INTEGRAL = 1000, 1e-5
+"""Steps in which the turn by one joint is integrated, and the error that this may make, rad."""
+
 _BEYOND = 1e-9
 """Rounding that a joint may be beyond its limits by, m or rad."""
 
@@ -149,6 +152,10 @@ class GoalSpecification:
             shape = state.q
         if self.attitude:
             self._require_turn(robot, turn, shape, tolerance.attitude)
+            if robot.n == 1 and len(self.turning.axes):
+                _require_within_one_joint(
+                    robot, limits, state.q, self.turning.axes[0], turn, tolerance.attitude
+                )
         R_WB = matrix_from_quaternion(state.quaternion)
         direction = np.zeros(3) if direction_W is None else R_WB.T @ direction_W
         if not self.position:
@@ -233,6 +240,39 @@ class Turning:
             axis = U[:, 0] * np.sign(U[np.argmax(np.abs(U[:, 0])), 0])
             return cls(axis[np.newaxis], moves=True, loops=loops)
         return cls(np.eye(3) if loops else none, moves=True, loops=loops)
+
+
+def _require_within_one_joint(
+    robot: SpaceRobot, limits: MotionLimits, q: Array, axis: Array, turn: Array, tolerance: float
+) -> None:
+    """Refuse a turn beyond those between the limits of the only joint, which is at ``q`` (1,).
+
+    The base turns about ``axis`` (3,), to and fro with the joint: by how much is an integral.
+    """
+    ends = np.array([limits.lower[0], limits.upper[0]])
+    if not np.all(np.isfinite(ends)):
+        return
+    connection = robot.function("connection", compile=False)
+    angles = [0.0]
+    for end in ends:
+        step = (end - q[0]) / _STEPS
+        middle = q[0] + step * (np.arange(_STEPS) + 0.5)
+        rates = -axis @ connection(middle[np.newaxis]).full()[3:]
+        angles.extend(np.cumsum(rates) * step)
+    least, most = min(angles), max(angles)
+    wanted = 2 * np.arctan2(axis @ turn[:3], turn[3])
+    whole = 2 * np.pi
+    # The same attitude may also be reached the other way round.
+    nearest = wanted + whole * np.arange(-2, 3)
+    beyond = np.maximum(least - nearest, nearest - most)
+    if beyond.min() > max(tolerance, _COARSE_INTEGRAL):
+        joint = robot.description.movable_joints[0]
+        angle = (wanted + np.pi) % whole - np.pi
+        raise PlanningError(
+            f"The goal attitude is beyond the joint limits: joint '{joint.name}', which is the "
+            f"only one, turns the base by {least:.4g} to {most:.4g} rad from here, and the goal "
+            f"is turned by {angle:.4g} rad."
+        )
 
 
 def slides_anywhere(robot: SpaceRobot) -> bool:

@@ -10,6 +10,10 @@ the plant's own prediction ends on the goal. The first variation of the final at
 
 for a bend ``dq`` that vanishes at both ends. Where a bend needs more speed or acceleration than
 there is, the manoeuvre takes a few ticks longer.
+
+Where that fails and the last shape is free, it is bent as well: loops of some robots do not turn
+the base. A manoeuvre of a few ticks only is a polygon, whose chords are no image of the curve any
+more; one of two or three may have too few corners to end on the goal, and takes a tick more.
 """
 
 from __future__ import annotations
@@ -39,6 +43,12 @@ _MOST_STEPS = 25
 _MOST_STRETCHES = 40
 _LONGEST_STRETCH = 1.25
 """A manoeuvre is not made longer than this to keep its limits: another start does better."""
+
+_COARSE = 20
+"""Manoeuvres of fewer ticks are polygons."""
+
+_ROUNDING = 0.02
+"""Share of a tick by which the solver may have missed a whole number of them."""
 
 _WITHIN = 1e-9
 """Rounding that a limit may be exceeded by, relative."""
@@ -71,6 +81,7 @@ class CommandHolder:
         self._period = control_period
         self._axes = axes
         self._curvature = robot.function("curvature", compile=False)
+        self._connection = robot.connection
         self._n = robot.n
 
     def hold(
@@ -86,34 +97,57 @@ class CommandHolder:
         """Return the commands of a trajectory that end in ``final`` (n,) and the goal attitude.
 
         They take the trajectory's time, rounded up to ticks, or as much longer as it takes to keep
-        the limits (``fixed``: not longer); None where that is not found.
+        the limits (``fixed``: not longer); None where that is not found. Where the boundary
+        conditions leave the last shape free, some end near ``final`` only.
         """
-        ticks = max(fewest_ticks, math.ceil(trajectory.duration / self._period - 1e-6))
-        most = ticks if fixed else math.ceil(_LONGEST_STRETCH * ticks) + 4
+        ticks = max(fewest_ticks, math.ceil(trajectory.duration / self._period - _ROUNDING))
+        most = ticks if fixed else max(_COARSE, math.ceil(_LONGEST_STRETCH * ticks) + 4)
+        free = boundary.final is None and boundary.center is None
         for _ in range(_MOST_STRETCHES):
-            held = self._bent(trajectory.at_ticks(ticks), boundary, final, limits)
-            if held is None:
-                return None
-            factor, overrun = limits.excess(held.positions, self._period, boundary.velocity)
-            if overrun > _WITHIN:
-                return None
-            if factor <= 1 + _WITHIN:
-                return held
+            factor = math.inf
+            for moves_end in (False, True)[: 1 + free]:
+                positions = trajectory.at_ticks(ticks)
+                held = self._bent(positions, boundary, final, limits, moves_end=moves_end)
+                if held is None:
+                    continue
+                needed, overrun = limits.excess(held.positions, self._period, boundary.velocity)
+                if overrun <= _WITHIN:
+                    if needed <= 1 + _WITHIN:
+                        return held
+                    factor = min(factor, needed)
+                if ticks >= _COARSE:
+                    break
+            if factor == math.inf:
+                if ticks >= _COARSE:
+                    return None
+                # A polygon of more corners may do.
+                factor = 1.0
             ticks = max(ticks + 1, math.ceil(ticks * factor - 1e-9))
             if ticks > most:
                 return None
         return None
 
     def _bent(
-        self, positions: Array, boundary: BoundaryConditions, final: Array, limits: MotionLimits
+        self,
+        positions: Array,
+        boundary: BoundaryConditions,
+        final: Array,
+        limits: MotionLimits,
+        *,
+        moves_end: bool,
     ) -> HeldCommands | None:
-        """Bend shapes (N + 1, n) until they end in the goal attitude; None if they do not."""
+        """Bend shapes (N + 1, n) until they end in the goal attitude; None if they do not.
+
+        ``moves_end``: the last shape is bent, too.
+        """
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         # The solver's last shape is the wanted one to its own precision.
         positions = positions + s**3 * (10 - 15 * s + 6 * s**2) * (final - positions[-1])
         positions = np.clip(positions, limits.lower, limits.upper)
         positions[0], positions[-1] = boundary.start, final
         waves, best = self._waves(positions, limits), math.inf
+        if moves_end:
+            waves = np.hstack([waves, self._ramps(s, limits)])
         for _ in range(_MOST_STEPS):
             quaternions = self._prediction.attitudes(
                 positions, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
@@ -135,16 +169,25 @@ class CommandHolder:
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         order = np.arange(1, _WAVES + 1)
         shape = np.sin(math.pi * s) * np.sin(math.pi * s * order) / order
-        half = limits.span(positions[0])[1]
+        speed, half = self._speed(positions[0], limits)
         room = np.minimum(positions - limits.lower, limits.upper - positions)
         with np.errstate(divide="ignore", invalid="ignore"):
             shy = np.clip(np.nan_to_num(room / (_SHYNESS * half), nan=0.0), 0.0, 1.0)
         # Smooth where it begins, so that accelerations stay small.
         shy = shy**2 * (3 - 2 * shy)
-        speed = np.where(np.isfinite(limits.velocity), limits.velocity, half)
         joints = np.eye(self._n) * speed
         bends = shape[:, :, np.newaxis, np.newaxis] * (shy[:, np.newaxis] * joints)[:, np.newaxis]
         return np.asarray(bends.reshape(len(positions), -1, self._n))
+
+    def _ramps(self, s: Array, limits: MotionLimits) -> Array:
+        """Return bends (N + 1, n, n) that move the last shape."""
+        speed, _ = self._speed(np.zeros(self._n), limits)
+        return np.asarray((s**2 * (3 - 2 * s))[:, :, np.newaxis] * np.eye(self._n) * speed)
+
+    def _speed(self, q: Array, limits: MotionLimits) -> tuple[Array, Array]:
+        """Return a speed (n,) of every joint, and half of its range round q (n,)."""
+        half = limits.span(q)[1]
+        return np.where(np.isfinite(limits.velocity), limits.velocity, half), half
 
     def _first_variation(self, positions: Array, quaternions: Array, waves: Array) -> Array:
         """Return how waves (N + 1, w, n) turn the final attitude: (3, w), base components."""
@@ -158,4 +201,6 @@ class CommandHolder:
         twists = np.einsum("akji,kj,kwi->kaw", K, moved, waves[chosen])
         R = np.array([matrix_from_quaternion(x) for x in quaternions[chosen]])
         R_f = matrix_from_quaternion(quaternions[-1])
-        return np.asarray(R_f.T @ np.einsum("kab,kbw->aw", R, twists))
+        # The last step of a bend that does not vanish at the end turns the base directly.
+        direct = self._connection(positions[-1])[3:] @ waves[-1].T
+        return np.asarray(R_f.T @ np.einsum("kab,kbw->aw", R, twists) - direct)

@@ -30,8 +30,12 @@ from spacerobot_ros.planning.methods.optimal.transcription import Stages
 
 _LOG = logging.getLogger(__name__)
 
-_FEWEST_TICKS = 20
-"""A manoeuvre has at least as many: chords of fewer are no image of a curve."""
+_FEWEST_TICKS = 2
+"""A manoeuvre has at least as many: one begins to move, another one stops."""
+
+_GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
+"""A gentle manoeuvre has as many ticks or takes as long, s, whichever is less: it corrects what is
+left, and haste would leave more."""
 
 _LAST_CALL = 5.0
 """Without anything found, a search goes on for this many times its time budget."""
@@ -210,6 +214,8 @@ class ManoeuvreSearch:
     ) -> Trajectory | None:
         """Return what the solver makes of a guess, None if nothing."""
         shortest = _FEWEST_TICKS * self._period
+        if budget.gentle:
+            shortest = max(shortest, min(_GENTLE_TICKS * self._period, _GENTLE_TIME))
         guess = self._constraints.slowed(guess)
         if budget.duration > 0:
             limits = replace(
