@@ -39,6 +39,10 @@ class EventKind(str, Enum):
     GOAL_ABORTED = "goal_aborted"
     PLAN_STARTED = "plan_started"
     PLAN_READY = "plan_ready"
+    PLAN_TAKEN_OVER = "plan_taken_over"
+    """A plan takes over from another one while the joints move."""
+    PLAN_LATE = "plan_late"
+    """A plan was not ready at the time at which it was to take over."""
     CORRECTION = "correction"
     STUCK_JOINT = "stuck_joint"
 

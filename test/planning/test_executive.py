@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.planner_loop import HERE, NEAR, TICK_NS, Loop, Place, StubMethod, goal_at
+from support.planner_loop import HERE, NEAR, TICK_NS, Loop, MovingStub, Place, StubMethod, goal_at
 
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
@@ -90,6 +90,32 @@ def braking_off_path(**options: Any) -> Loop:
 def evaluating(**options: Any) -> Loop:
     """Wait for a second measured state after a schedule."""
     return until(executing(averaging=2, **options), Phase.EVALUATING)
+
+
+def flying_on(*, again: bool = False, **parameters: Any) -> Loop:
+    """Fly while a plan is made that takes over in motion: for another goal, or for this one."""
+    if again:
+        parameters = {"replan_period": 0.2, **parameters}
+    parameters = {"takeover_time": 0.5, **parameters}
+    loop = Loop(parameters, method=MovingStub(80), held=True)
+    stub_of(loop).wrong_path = 0.1
+    loop.propose(NEAR)
+    loop.tick()
+    loop.held.release()
+    loop.tick(5)
+    if not again:
+        loop.propose(OTHER)
+        loop.tick()
+    return until(loop, Phase.REPLANNING)
+
+
+def taking_over(*, again: bool = False, **parameters: Any) -> Loop:
+    """Fly on until the plan that is there takes over."""
+    loop = flying_on(again=again, **parameters)
+    loop.held.release()
+    loop.tick()
+    assert loop.executive.phase is Phase.TAKING_OVER
+    return loop
 
 
 def until(loop: Loop, phase: Phase, *, base: bool = True, ticks: int = 600) -> Loop:
@@ -172,6 +198,27 @@ def long_braking() -> Loop:
     return braking_off_path(abort_time=100.0, stuck_ticks=5)
 
 
+def again(start: Callable[..., Loop]) -> Callable[[], Loop]:
+    """Start with a plan for the remaining motion instead of one for another goal."""
+    return lambda: start(again=True)
+
+
+def long_before(start: Callable[..., Loop]) -> Callable[..., Loop]:
+    """Start long before the plan is to take over."""
+    return lambda **options: start(takeover_time=3.0, stuck_ticks=3, **options)
+
+
+def ticks_later(count: int) -> Act:
+    """Let states be missing for a while, and show the one after it, at the end of the schedule."""
+
+    def act(loop: Loop) -> None:
+        loop.plant.q[:] = loop.starts[-1].schedule.positions[-1]
+        loop.measured.stamp_ns += count * TICK_NS
+        loop.tick(base=False)
+
+    return act
+
+
 def without_base(act: Callable[..., object]) -> Act:
     return lambda loop: act(loop, base=False)
 
@@ -202,6 +249,31 @@ HAPPENS: dict[tuple[Phase, Event, Phase], tuple[Callable[..., Any], ...]] = {
         *(long_flight, propose(OTHER), without_base(stuck)),
     ),
     (P.EXECUTING, E.ABORTED, P.BRAKING): (braking,),
+    (P.EXECUTING, E.PLAN_REQUESTED, P.REPLANNING): (flying_on,),
+    (P.REPLANNING, E.PLANNED, P.TAKING_OVER): (taking_over,),
+    (P.REPLANNING, E.REFUSED, P.EXECUTING): (
+        *(flying_on, lambda loop: setattr(stub_of(loop), "refusing", True), release),
+    ),
+    (P.REPLANNING, E.PLAN_LATE, P.EXECUTING): (flying_on, to(P.EXECUTING)),
+    (P.REPLANNING, E.SCHEDULE_ENDED, P.MEASURING): (flying_on, ticks_later(80)),
+    (P.REPLANNING, E.SCHEDULE_ENDED, P.EVALUATING): (again(flying_on), ticks_later(80)),
+    (P.TAKING_OVER, E.TAKEN_OVER, P.EXECUTING): (taking_over, to(P.EXECUTING)),
+    **{
+        (phase, event, target): story
+        for phase, start in ((P.REPLANNING, flying_on), (P.TAKING_OVER, taking_over))
+        for event, target, story in (
+            (E.NEW_GOAL, P.EXECUTING, (start, propose(HERE))),
+            (E.JOINTS_STUCK, P.MEASURING, (long_before(start), stuck)),
+            (E.JOINTS_STUCK, P.EVALUATING, (again(long_before(start)), stuck)),
+            (E.TIME_JUMPED, P.MEASURING, (start, jump(1e6))),
+            (E.TIME_JUMPED, P.EVALUATING, (again(start), jump(-100.0))),
+            (E.PLANT_RESET, P.MEASURING, (start, reset_plant)),
+            (E.PLANT_RESET, P.EVALUATING, (again(start), reset_plant)),
+            (E.ABORTED, P.BRAKING, (start, abort)),
+            (E.PLANT_STOPPED, P.IDLE, (start, stopped_plant)),
+            (E.DEACTIVATED, P.IDLE, (start, stop)),
+        )
+    },
     (P.BRAKING, E.PLAN_REQUESTED, P.PLANNING): (braking, propose(OTHER), tick),
     (P.BRAKING, E.AT_REST, P.IDLE): (braking, to(P.IDLE)),
     (P.BRAKING, E.AT_REST, P.MEASURING): (*(braking, propose(OTHER), to(P.MEASURING, base=False)),),
@@ -629,6 +701,9 @@ ACTIONS: dict[str, Callable[[Loop], object]] = {
 }
 
 
+IN_MOTION = (Phase.EXECUTING, Phase.REPLANNING, Phase.TAKING_OVER, Phase.BRAKING)
+
+
 def quick_without_joints(loop: Loop) -> None:
     """Have the stub plan without stuck joints too: models without them take seconds to build."""
     loop.held._method_for = lambda task: stub_of(loop)  # type: ignore[method-assign]
@@ -648,26 +723,28 @@ def broken(loop: Loop) -> None:
 @settings(max_examples=150, deadline=None)
 @given(
     st.booleans(),
+    st.booleans(),
     st.integers(1, 3),
     st.lists(st.sampled_from(sorted(ACTIONS)), min_size=1, max_size=25),
 )
-def test_no_sequence_of_events_leads_astray(held: bool, averaging: int, actions: list[str]) -> None:
-    loop = resting(
-        held=held, ticks=12, averaging=averaging, stuck_ticks=3, drift_position=0.05, abort_time=0.3
-    )
+def test_no_sequence_of_events_leads_astray(
+    held: bool, moving: bool, averaging: int, actions: list[str]
+) -> None:
+    parameters = {"averaging": averaging, "stuck_ticks": 3, "abort_time": 0.3}
+    motion = {"takeover_time": 0.2, "replan_period": 0.1}
+    method = MovingStub(12) if moving else StubMethod(12)
+    loop = Loop({"drift_position": 0.05, **parameters, **motion}, method=method, held=held)
     quick_without_joints(loop)
     for action in actions:
         ACTIONS[action](loop)  # A tick asserts that its command is finite.
-        moving = loop.executive._tracker.active
         phase = loop.executive.phase
-        assert moving == (phase in (Phase.EXECUTING, Phase.BRAKING))
-        assert held or phase is not Phase.PLANNING
+        assert loop.executive._tracker.active == (phase in IN_MOTION)
+        assert held or phase not in (Phase.PLANNING, Phase.REPLANNING)
     check_chain(loop)
     # Whatever happened, it can be stopped, and the next goal is reached.
     loop.stop()
     loop.plant.hold(np.zeros(3, dtype=np.bool_))
     loop.measured.broken = False
-    method = stub_of(loop)
     method.refusing = method.partial = False
     method.overshoot = method.wrong_path = 0.0
     loop.set(position_tolerance=1e-3)

@@ -20,14 +20,10 @@ from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.executive import (
-    BaseMeasurement,
-    Executive,
-    Notice,
-    Output,
-    ScheduleStart,
-)
+from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.outputs import Notice, Output, ScheduleStart
+from spacerobot_ros.planning.execution.state_average import BaseMeasurement
 from spacerobot_ros.planning.execution.state_machine import Transition
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.planning.execution.worker import (
@@ -94,26 +90,36 @@ class StubMethod(GaitMethod):
         state, way = request.state, request.goal.position - request.state.position
         if self.refusing or np.linalg.norm(request.goal.position) > 1.0:
             raise PlanningError("It is too far.")
-        swing = (1 - np.cos(np.linspace(0.0, np.pi, self.ticks + 1))) / 2
-        share = (1.0 + self.overshoot) * swing[:, np.newaxis]
+        s = np.linspace(0.0, 1.0, self.ticks + 1)[:, np.newaxis]
+        share = (1.0 + self.overshoot) * (1 - np.cos(np.pi * s)) / 2
         if self.partial:
             share /= 2
         time: Array = TICK * np.arange(self.ticks + 1, dtype=float)
+        moved = share * way
+        if request.motion is not None:
+            # Comes to rest and back meanwhile.
+            moved = moved - TICK * self.ticks * s * (1 - s) ** 2 * request.motion.velocity / 8
         path = BasePath(
             time,
-            state.position + share * (way + self.wrong_path),
+            state.position + moved + share * self.wrong_path,
             np.tile(state.quaternion, (self.ticks + 1, 1)),
         )
         schedule = GaitSchedule(
             method=self.name,
             joint_names=self.robot.joint_names,
             control_period=TICK,
-            positions=state.q - 8 * share * way,
+            positions=state.q - 8 * moved,
             path=path,
             goal=request.goal,
             partial=self.partial,
         )
         return replace(schedule, controls=frozenset({"position"}))
+
+
+class MovingStub(StubMethod):
+    """The same; its gaits may begin in motion."""
+
+    starts_in_motion: ClassVar[bool] = True
 
 
 class HeldWorker(PlanningWorker):

@@ -28,13 +28,13 @@ from spacerobot_ros.nodes.common.cdr import (
 )
 from spacerobot_ros.nodes.common.messages import diagnostic_status, shape_marker
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
-from spacerobot_ros.planning.execution.executive import BaseMeasurement
+from spacerobot_ros.planning.execution.state_average import BaseMeasurement
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.planning.execution.tracker import Setpoint
 
 
 class StateReader:
-    """The :class:`~spacerobot_ros.planning.execution.executive.MeasuredState` of raw messages.
+    """The :class:`~spacerobot_ros.planning.execution.state_average.MeasuredState` of raw messages.
 
     Everything but the positions of the joints is read only where it is needed.
 

@@ -33,13 +33,9 @@ from spacerobot_ros.nodes.planner.messages import (
     status_message,
 )
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.executive import (
-    Executive,
-    Notice,
-    ScheduleStart,
-    Severity,
-)
+from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
+from spacerobot_ros.planning.execution.outputs import Notice, ScheduleStart, Severity
 from spacerobot_ros.planning.execution.state_machine import Transition
 from spacerobot_ros.planning.execution.status import (
     PlannerState,

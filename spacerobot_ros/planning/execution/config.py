@@ -11,6 +11,9 @@ from spacerobot_ros.parameters import parameter, registered
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.methods.registry import METHODS
 
+_REPLAN_PERIOD = 2.0
+"""Default of ``replan_period`` where plans are made in the background, s."""
+
 
 @dataclass(frozen=True)
 class PlannerConfig(CommanderConfig):
@@ -34,6 +37,22 @@ class PlannerConfig(CommanderConfig):
         unit="s",
         minimum=0.01,
         maximum=1000.0,
+    )
+    takeover_time: float = parameter(
+        1.0,
+        "flown on along the schedule, before a plan for another goal takes over in motion, by "
+        "methods that can; 0: the joints brake first, as for other methods",
+        unit="s",
+        minimum=0.0,
+        maximum=1000.0,
+    )
+    replan_period: float = parameter(
+        -1.0,
+        "time after which the remaining motion is planned again from the measured state, without "
+        "a stop, by methods that can; 0: never, -1: 2 s with plan_in_background, else never",
+        unit="s",
+        minimum=-1.0,
+        maximum=1e6,
     )
     drift_position: float = parameter(
         0.0,
@@ -71,6 +90,13 @@ class PlannerConfig(CommanderConfig):
         "plan in a thread, from rest, while states are answered; false: states wait (lockstep)",
     )
     options: Mapping[str, Any] = registered(METHODS)
+
+    @property
+    def replanning(self) -> float:
+        """Time after which the remaining motion is planned again, s; 0: never."""
+        if self.replan_period >= 0:
+            return self.replan_period
+        return _REPLAN_PERIOD if self.plan_in_background else 0.0
 
     @property
     def tolerance(self) -> Tolerance:

@@ -8,40 +8,42 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from enum import Enum
-from typing import NamedTuple, Protocol
+from dataclasses import replace
 
 from spacerobot_ros.errors import ParameterError, PlanningError
-from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.goal import POSE, Controlled, PoseError, RobotState
-from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.core.goal import POSE, PoseError, RobotState
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
-from spacerobot_ros.planning.execution.state_average import StateAverage
+from spacerobot_ros.planning.execution.in_motion import InMotion, same_goal
+from spacerobot_ros.planning.execution.outputs import (
+    Output,
+    OutputQueue,
+    Pursuit,
+    ScheduleStart,
+    Severity,
+)
+from spacerobot_ros.planning.execution.plan_desk import PlanDesk, ReadyPlan, Ticket
+from spacerobot_ros.planning.execution.state_average import MeasuredState, StateAverage
 from spacerobot_ros.planning.execution.state_machine import (
     Event,
     Phase,
     PlanReason,
     StateMachine,
-    Transition,
 )
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatistics,
     PlannerStatus,
-    goal_values,
     remaining_error,
 )
+from spacerobot_ros.planning.execution.take_over import TakeOver
 from spacerobot_ros.planning.execution.tracker import Setpoint, TrackingError, TrajectoryTracker
 from spacerobot_ros.planning.execution.worker import (
     Braking,
     Planned,
-    PlanningTask,
     PlanningWorker,
     Refused,
 )
@@ -52,89 +54,6 @@ _EXECUTING, _EVALUATING = Phase.EXECUTING, Phase.EVALUATING
 
 _GAP, _GAP_PERIODS = 1.0, 10
 """Longest time between two states beyond which time has jumped: s, or control periods."""
-
-
-class Severity(Enum):
-    """How grave a notice is."""
-
-    INFO = "info"
-    WARNING = "warning"
-    ERROR = "error"
-
-
-@dataclass(frozen=True)
-class Notice:
-    """A sentence for the log."""
-
-    severity: Severity
-    sentence: str
-
-
-@dataclass(frozen=True)
-class ScheduleStart:
-    """A schedule that is tracked from a stamp on, ns."""
-
-    schedule: GaitSchedule
-    stamp_ns: int
-
-
-Output = PlannerStatus | ScheduleStart | Notice | Transition | FlightEvent
-"""What an executive hands out beside setpoints, in order."""
-
-
-class BaseMeasurement(NamedTuple):
-    """The rest of a measured state: ``pose`` (7,), ``twist`` (6,) of the base, ``qdot`` (n,)."""
-
-    pose: Array
-    twist: Array
-    qdot: Array
-
-
-class MeasuredState(Protocol):
-    """A measured state: the joints always, the base where it is measured at the same time."""
-
-    @property
-    def stamp_ns(self) -> int:
-        """When it was measured, ns."""
-
-    @property
-    def q(self) -> Array:
-        """Shape (n,), m or rad."""
-
-    def base(self) -> BaseMeasurement | None:
-        """Return the rest of the state; None where the base was not measured with the joints."""
-
-
-@dataclass
-class _Pursuit:
-    """A goal that was accepted, and what was done for it so far."""
-
-    identified: IdentifiedGoal
-    schedule: GaitSchedule
-    """The schedule that was executed last."""
-    begins_ns: int
-    """Stamp of the state from which the first one was planned."""
-    corrections: int = 0
-    manoeuvre_time: float = 0.0
-    """Duration of all its schedules, s."""
-    ends_at: float = 0.0
-    """Simulated time at which the last one ends, s."""
-    next_plan: PlanReason = PlanReason.CORRECTION
-    """Why the next plan is made, if one has to be."""
-    stuck_at: dict[str, float] | None = field(default_factory=dict)
-    """Where the stuck joints are; None: to be measured."""
-    required: frozenset[Controlled] = frozenset()
-    """Parts of the goal that plans without the stuck joints must control."""
-
-
-@dataclass(frozen=True)
-class _Ticket:
-    """A plan that was requested: what for and why, and how far the robot was from the goal."""
-
-    identified: IdentifiedGoal
-    reason: PlanReason
-    tracking_error: TrackingError | None = None
-    remaining: PoseError | None = None
 
 
 class Executive:
@@ -178,14 +97,12 @@ class Executive:
         self._machine = StateMachine()
         self._proposed: IdentifiedGoal | None = None
         """A goal that is to be planned for."""
-        self._ticket: _Ticket | None = None
-        """The plan that is being made."""
-        self._pursuit: _Pursuit | None = None
+        self._pursuit: Pursuit | None = None
         """The goal that is executed or evaluated."""
-        self.outputs: deque[Output] = deque()
-        """What is to be published and logged, in order; the node takes it out."""
-        self._plan_time, self._plans, self._commands = 0.0, 0, 0
-        self._stamp_ns = 0
+        self._out = OutputQueue()
+        self._desk = PlanDesk(self._worker, self._out)
+        self._in_motion = InMotion(self._tracker, self._worker)
+        self._commands = 0
         self._commanded_from_ns = 0
         """Stamp of the first state that is answered for what is executed or planned now."""
         self.plant_rests = False
@@ -196,6 +113,15 @@ class Executive:
     def phase(self) -> Phase:
         """What is being done."""
         return self._machine.phase
+
+    @property
+    def outputs(self) -> deque[Output]:
+        """What is to be published and logged, in order; the node takes it out."""
+        return self._out.waiting
+
+    @property
+    def _stamp_ns(self) -> int:
+        return self._out.stamp_ns
 
     @property
     def setpoint(self) -> Setpoint:
@@ -210,16 +136,21 @@ class Executive:
     @property
     def statistics(self) -> PlannerStatistics:
         """What was done so far."""
-        return PlannerStatistics(self._plan_time, self._plans, self._commands)
+        return PlannerStatistics(self._desk.plan_time, self._desk.plans, self._commands)
 
     # -- what comes from outside --------------------------------------------------------------
 
     def propose(self, identified: IdentifiedGoal) -> None:
         """Plan for a goal from the states that are measured next; it replaces any other."""
         self._proposed = identified
+        self._in_motion.begin_goal()
         self._average.restart()
-        if self.phase in (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING):
-            self._go(Event.NEW_GOAL, Phase.MEASURING)
+        match self.phase:
+            case Phase.IDLE | Phase.MEASURING | Phase.EVALUATING:
+                self._go(Event.NEW_GOAL, Phase.MEASURING)
+            case Phase.REPLANNING | Phase.TAKING_OVER:
+                self._desk.drop()
+                self._go(Event.NEW_GOAL, Phase.EXECUTING)
 
     def abort(self) -> str | None:
         """Give up all goals and come to rest.
@@ -231,7 +162,8 @@ class Executive:
         match self.phase:
             case Phase.IDLE:
                 return None
-            case Phase.EXECUTING | Phase.BRAKING:
+            case Phase.EXECUTING | Phase.REPLANNING | Phase.TAKING_OVER | Phase.BRAKING:
+                self._desk.drop()
                 self._tracker.brake(self._stamp_ns)
                 duration = self.config.abort_time
                 sentence = f"The joints brake along the planned path within {duration:g} s."
@@ -242,8 +174,8 @@ class Executive:
                 if waits_only:
                     self._proposed = None
                     return None
-                self._worker.cancel()
-        self._proposed = self._ticket = self._pursuit = None
+                self._desk.drop()
+        self._proposed = self._pursuit = None
         self.outputs.append(
             PlannerStatus(PlannerState.ABORTED, f"Aborted on request. {sentence}", goal_id=goal_id)
         )
@@ -279,11 +211,11 @@ class Executive:
         self._file.delete()
         if self.phase is Phase.IDLE:
             return False
-        goal_id, pursued = self._goal_id(), self._proposed or self._ticket or self._pursuit
+        goal_id, pursued = self._goal_id(), self._proposed or self._desk.current or self._pursuit
         self._tracker.stop()
-        self._worker.cancel()
+        self._desk.drop()
         self._average.restart()
-        self._proposed = self._ticket = self._pursuit = None
+        self._proposed = self._pursuit = None
         self._go(Event.PLANT_STOPPED, Phase.IDLE)
         if pursued is None:
             return False
@@ -304,16 +236,12 @@ class Executive:
         if self.phase in (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING):
             return
         self._tracker.stop()
-        if self._ticket is not None:
-            # What is planned begins at a state that is gone.
-            self._worker.cancel()
-            ticket, self._ticket = self._ticket, None
-            if ticket.reason in (PlanReason.NEW_GOAL, PlanReason.BLEND):
-                self._proposed = self._proposed or ticket.identified
+        # What is planned begins at a state that is gone.
+        self._plan_again_for(self._desk.drop())
         if self._pursuit is not None:
             self._pursuit.next_plan = PlanReason.REPLAN
         self._go(Event.PLANT_RESET, self._phase_at_rest())
-        self._notice(Severity.WARNING, "The plant was reset: the motion is planned again.")
+        self._out.notice(Severity.WARNING, "The plant was reset: the motion is planned again.")
 
     def cancel_plan(self) -> None:
         """Have a plan that is being made end without a result; may be called in any thread."""
@@ -322,8 +250,9 @@ class Executive:
     def stop(self) -> None:
         """Give up everything at once and wait for the worker to end; the goal file stays."""
         self._tracker.stop()
+        self._desk.drop()
         self._worker.close()
-        self._proposed = self._ticket = self._pursuit = None
+        self._proposed = self._pursuit = None
         self._go(Event.DEACTIVATED, Phase.IDLE)
 
     def observe(self, measured: MeasuredState) -> None:
@@ -339,9 +268,9 @@ class Executive:
         stamp, q, tracker = measured.stamp_ns, measured.q, self._tracker
         if not 0 <= stamp - self._stamp_ns <= self._longest_gap and tracker.active:
             self._on_time_jump(stamp)
-        self._stamp_ns = stamp
+        self._out.stamp_ns = stamp
         if tracker.ended(stamp, q):
-            self._on_end()
+            self._on_end(stamp)
         phase = self._machine.phase
         # In most states a schedule is tracked, and nothing else is to be done.
         if phase is not _EXECUTING or self._proposed is not None or tracker.check_due(stamp):
@@ -362,6 +291,8 @@ class Executive:
                 self._measure_at_rest(measured)
             case Phase.PLANNING:
                 self._take_result()
+            case Phase.REPLANNING | Phase.TAKING_OVER:
+                self._await_take_over()
             case Phase.EXECUTING | Phase.BRAKING if self._proposed is not None:
                 self._measure_in_motion(measured)
             case Phase.EXECUTING:
@@ -394,58 +325,170 @@ class Executive:
         self._average.restart()
 
     def _measure_in_motion(self, measured: MeasuredState) -> None:
-        """Plan for a new goal from the state now, or from rest if the plan will take time."""
-        if self._worker.background:
+        """Plan for a new goal from the state now, or from rest if the plan will take time.
+
+        A plan takes over in motion where the methods allow for it.
+        """
+        take_over = None
+        if self.phase is Phase.EXECUTING and not self.plant_rests:
+            take_over = self._in_motion.take_over(
+                self.config, self._pursuit, self._stamp_ns, measured.q
+            )
+        if take_over is None and self._worker.background:
             if self.phase is Phase.EXECUTING:
                 self._brake_for_replan(Event.NEW_GOAL)
+            return
+        if not self._desk.free():
             return
         base = measured.base()
         if base is not None:
             self._average.restart()
             self._average.add(base.pose, base.twist, measured.q, base.qdot)
-        if self._average.count:
+        if not self._average.count:
+            return
+        if take_over is None:
             self._plan_for_new_goal()
-            self._average.restart()
+        else:
+            self._plan_in_motion(take_over)
+        self._average.restart()
 
     def _check_tracking(self, measured: MeasuredState) -> None:
-        """Plan again when the base is too far off the path that was predicted."""
+        """Plan again when the base is too far off the path that was predicted, or in time."""
         pursuit = self._pursuit
         assert pursuit is not None
         self._average.restart()
-        if pursuit.corrections >= self.config.max_corrections or not self._add(measured):
+        corrected = pursuit.corrections >= self.config.max_corrections
+        if not self._desk.free():
+            return
+        if corrected and (self.plant_rests or not self._in_motion.replans(self.config, pursuit)):
+            return
+        if not self._add(measured):
             return
         try:
             state = self._average.state()
         except PlanningError as reason:
-            self._notice(Severity.WARNING, f"The path is not known: {reason}")
+            self._out.notice(Severity.WARNING, f"The path is not known: {reason}")
             return
-        error = self._tracker.error(state)
+        error = None if corrected else self._tracker.error(state)
         if error is None:
-            return
-        if self._worker.background:
+            self._plan_remaining(pursuit, state)
+        elif self._worker.background:
             self._correct_tracking(pursuit, error)
             self._brake_for_replan(Event.TRACKING_ERROR)
         else:
-            ticket = _Ticket(pursuit.identified, PlanReason.TRACKING_ERROR, tracking_error=error)
+            ticket = Ticket(pursuit.identified, PlanReason.TRACKING_ERROR, tracking_error=error)
             self._request(ticket, state)
 
-    def _correct_tracking(self, pursuit: _Pursuit, error: TrackingError) -> None:
+    def _correct_tracking(self, pursuit: Pursuit, error: TrackingError) -> None:
         self._count_correction(pursuit, f"{error}: the remaining motion is planned again.")
-        self._notice(Severity.WARNING, f"{error}: the remaining motion is planned again.")
+        self._out.notice(Severity.WARNING, f"{error}: the remaining motion is planned again.")
 
-    def _count_correction(self, pursuit: _Pursuit, sentence: str) -> None:
+    def _count_correction(self, pursuit: Pursuit, sentence: str) -> None:
         pursuit.corrections += 1
         about = {"corrections": str(pursuit.corrections)}
-        self._happened(EventKind.CORRECTION, sentence, pursuit.identified, 1, **about)
+        self._out.happened(EventKind.CORRECTION, sentence, pursuit.identified, 1, **about)
+
+    # -- planning in motion -------------------------------------------------------------------
+
+    def _plan_in_motion(self, take_over: TakeOver) -> None:
+        """Have a plan made for the new goal that takes over without a stop."""
+        identified, pursuit = self._proposed, self._pursuit
+        assert identified is not None
+        assert pursuit is not None
+        if same_goal(identified.goal, pursuit.identified.goal):
+            self._go_on_for(identified, pursuit)
+            return
+        averages = self.config.averaging > 1
+        if averages and not self._tracker.check_due(self._stamp_ns):
+            return
+        try:
+            state = self._average.state()
+        except PlanningError:
+            # The next state may be better; if none is, the schedule ends.
+            return
+        if averages:
+            state = self._tracker.averaged(state)
+        self._proposed = None
+        self._desk.begin_goal()
+        self._request(Ticket(identified, PlanReason.IN_MOTION, take_over=take_over), state)
+
+    def _go_on_for(self, identified: IdentifiedGoal, pursuit: Pursuit) -> None:
+        """Pursue another goal with the same pose and shape by what is tracked already."""
+        self._proposed = None
+        self._pursuit = replace(
+            pursuit,
+            identified=identified,
+            corrections=0,
+            manoeuvre_time=pursuit.ends_at - self._stamp_ns / 1e9,
+        )
+        self._accepted(self._pursuit)
+        sentence = "The schedule that is executed leads to this goal, too."
+        self._out.report(PlannerState.EXECUTING, sentence, identified, self._pursuit)
+
+    def _plan_remaining(self, pursuit: Pursuit, state: RobotState) -> None:
+        """Have the remaining motion planned again from a state that is due, if it is time."""
+        if self.plant_rests:
+            return
+        found = self._in_motion.remaining(self.config, pursuit, self._stamp_ns, state)
+        if found is not None:
+            take_over, state = found
+            reason = PlanReason.SHRINKING_HORIZON
+            self._request(Ticket(pursuit.identified, reason, take_over=take_over), state)
+
+    def _await_take_over(self) -> None:
+        """Take the plan that is made in motion, and have it take over at its tick."""
+        if self.phase is Phase.REPLANNING:
+            self._take_result()
+        ready, ticket = self._desk.ready, self._desk.ticket
+        if ready is not None and self._stamp_ns >= ready.take_over.stamp_ns:
+            self._switch(ready)
+        elif ticket is not None and ticket.is_late(self._stamp_ns):
+            self._on_late(ticket)
+
+    def _on_late(self, ticket: Ticket) -> None:
+        """Go on along the schedule of now: a new goal is planned for once more."""
+        self._plan_again_for(self._desk.drop())
+        if ticket.reason.for_new_goal:
+            self._in_motion.attempt_failed()
+        self._go(Event.PLAN_LATE, Phase.EXECUTING)
+        sentence = "The plan was not ready when it was to take over."
+        self._out.notice(Severity.WARNING, sentence)
+        reason = ticket.reason.value
+        self._out.happened(EventKind.PLAN_LATE, sentence, ticket.identified, 1, reason=reason)
+
+    def _switch(self, ready: ReadyPlan) -> None:
+        """Track the plan that is there from its first tick on."""
+        ticket, schedule, begins_ns = ready.ticket, ready.schedule, ready.take_over.stamp_ns
+        self._desk.ready = None
+        if ticket.reason.for_new_goal:
+            self._accept(Pursuit(ticket.identified, schedule, begins_ns))
+        else:
+            assert self._pursuit is not None
+            # What the schedule before had yet to do is not done.
+            self._pursuit.manoeuvre_time -= self._pursuit.ends_at - begins_ns / 1e9
+        reason = ticket.reason.value
+        self._out.happened(
+            EventKind.PLAN_TAKEN_OVER,
+            f"A plan takes over in motion: {reason}.",
+            ticket.identified,
+            reason=reason,
+            method=schedule.method,
+            duration_s=f"{schedule.duration:.9g}",
+        )
+        self._execute(schedule, start_ns=begins_ns)
+
+    def _plan_again_for(self, dropped: IdentifiedGoal | None) -> None:
+        """Plan for a new goal whose plan was dropped, unless there is a newer one."""
+        self._proposed = self._proposed or dropped
 
     # -- planning -----------------------------------------------------------------------------
 
     def _plan_for_new_goal(self) -> None:
         assert self._proposed is not None
         reason = PlanReason.BLEND if self._tracker.active else PlanReason.NEW_GOAL
-        ticket = _Ticket(self._proposed, reason)
+        ticket = Ticket(self._proposed, reason)
         self._proposed = None
-        self._plan_time, self._plans = 0.0, 0
+        self._desk.begin_goal()
         try:
             state = self._average.state()
         except PlanningError as refusal:
@@ -454,75 +497,52 @@ class Executive:
         else:
             self._request(ticket, state)
 
-    def _request(self, ticket: _Ticket, state: RobotState) -> None:
-        """Have a plan made from a measured state; what is tracked brakes first."""
-        follower = self._tracker.braked(self._stamp_ns)
-        pursuit = self._pursuit
-        if ticket.reason in (PlanReason.NEW_GOAL, PlanReason.BLEND):
-            pursuit = None
-        stuck = self._stuck_at(pursuit, state)
-        request = PlanRequest(
-            state,
-            ticket.identified.goal,
-            self.config.tolerance,
-            correction=ticket.reason in (PlanReason.CORRECTION, PlanReason.CONTINUATION),
-            previous=None if pursuit is None else pursuit.schedule,
-        )
-        self._ticket, self._commanded_from_ns = ticket, self._stamp_ns
-        self._go(Event.PLAN_REQUESTED, Phase.PLANNING)
-        reason = ticket.reason.value
-        sentence = f"A plan is made: {reason}."
-        self._happened(EventKind.PLAN_STARTED, sentence, ticket.identified, reason=reason)
-        self._worker.submit(
-            PlanningTask(
-                request,
-                stuck,
-                frozenset() if pursuit is None else pursuit.required,
-                None if follower is None else Braking(follower, self._stamp_ns),
-            )
-        )
-        self._take_result()
-
-    def _stuck_at(self, pursuit: _Pursuit | None, state: RobotState) -> dict[str, float]:
-        """Return where the joints are that the present goal is pursued without."""
-        if pursuit is None:
-            return {}
-        if pursuit.stuck_at is None:
+    def _request(self, ticket: Ticket, state: RobotState) -> None:
+        """Have a plan made from a measured state; unless it takes over, what is tracked brakes."""
+        pursuit, braking = None if ticket.reason.for_new_goal else self._pursuit, None
+        if pursuit is not None and pursuit.stuck_at is None:
             names = self._robot.joint_names
             pursuit.stuck_at = {names[i]: float(state.q[i]) for i in self._tracker.stuck}
-        return pursuit.stuck_at
+        if ticket.take_over is not None:
+            self._go(Event.PLAN_REQUESTED, Phase.REPLANNING)
+        else:
+            follower = self._tracker.braked(self._stamp_ns)
+            braking = None if follower is None else Braking(follower, self._stamp_ns)
+            self._commanded_from_ns = self._stamp_ns
+            self._go(Event.PLAN_REQUESTED, Phase.PLANNING)
+        self._desk.request(ticket, state, self.config.tolerance, pursuit, braking)
+        self._take_result()
 
     def _take_result(self) -> None:
         """Act on the result of the plan that is being made, if it is there."""
-        result = self._worker.poll()
-        if result is None:
-            return
-        ticket, self._ticket = self._ticket, None
-        assert ticket is not None
-        self._plan_time += result.wall_time
-        self._plans += 1
-        self._notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
-        if isinstance(result, Planned):
-            method, duration = result.schedule.method, f"{result.schedule.duration:.9g}"
-            self._happened(
-                EventKind.PLAN_READY,
-                f"The plan is a {method} gait of {result.schedule.duration:.6g} s.",
-                ticket.identified,
-                method=method,
-                duration_s=duration,
-            )
-        self._conclude_plan(ticket, result)
+        taken = self._desk.take()
+        if taken is not None:
+            self._conclude_plan(*taken)
 
-    def _conclude_plan(self, ticket: _Ticket, result: Planned | Refused) -> None:
+    def _conclude_plan(self, ticket: Ticket, result: Planned | Refused) -> None:
         """Execute a plan, or say why there is none: it depends on why it was requested."""
         pursuit = self._pursuit
         match ticket.reason, result:
+            case PlanReason.IN_MOTION | PlanReason.SHRINKING_HORIZON, Planned(schedule=schedule):
+                assert ticket.take_over is not None
+                self._desk.ready = ReadyPlan(ticket, ticket.take_over, schedule)
+                self._go(Event.PLANNED, Phase.TAKING_OVER)
+            case PlanReason.IN_MOTION, Refused(reason=reason):
+                self._plan_again_for(ticket.identified)
+                self._in_motion.attempt_failed(for_good=True)
+                sentence = f"The goal is planned for from rest, since in motion it is not: {reason}"
+                self._out.notice(Severity.WARNING, sentence)
+                self._go(Event.REFUSED, Phase.EXECUTING)
+            case PlanReason.SHRINKING_HORIZON, Refused(reason=reason):
+                sentence = f"The remaining motion is not planned again: {reason}"
+                self._out.notice(Severity.INFO, sentence)
+                self._go(Event.REFUSED, Phase.EXECUTING)
             case PlanReason.NEW_GOAL | PlanReason.BLEND, Planned(schedule=schedule):
-                self._accept(_Pursuit(ticket.identified, schedule, self._stamp_ns))
+                self._accept(Pursuit(ticket.identified, schedule, self._stamp_ns))
                 self._execute(schedule)
             case PlanReason.NEW_GOAL | PlanReason.BLEND, Refused(reason=reason):
                 earlier = " The earlier goal is still pursued." if pursuit is not None else ""
-                self._report(PlannerState.REFUSED, f"{reason}{earlier}", ticket.identified)
+                self._out.report(PlannerState.REFUSED, f"{reason}{earlier}", ticket.identified)
                 self._go(Event.REFUSED, self._phase_without_plan())
             case PlanReason.TRACKING_ERROR, Planned(schedule=schedule):
                 assert pursuit is not None
@@ -530,7 +550,7 @@ class Executive:
                 self._correct_tracking(pursuit, ticket.tracking_error)
                 self._execute(schedule)
             case PlanReason.TRACKING_ERROR, Refused(reason=reason):
-                self._notice(
+                self._out.notice(
                     Severity.WARNING,
                     f"{ticket.tracking_error}, and the remaining motion cannot be planned again: "
                     f"{reason}",
@@ -557,35 +577,54 @@ class Executive:
 
     # -- executing ----------------------------------------------------------------------------
 
-    def _accept(self, pursuit: _Pursuit) -> None:
+    def _accept(self, pursuit: Pursuit) -> None:
         """Pursue a new goal, with all joints."""
         self._pursuit, self._tracker.stuck = pursuit, []
-        self._happened(EventKind.GOAL_ACCEPTED, "The goal is accepted.", pursuit.identified)
+        self._accepted(pursuit)
+
+    def _accepted(self, pursuit: Pursuit) -> None:
+        """Report that a goal is pursued, and save it."""
+        self._out.happened(EventKind.GOAL_ACCEPTED, "The goal is accepted.", pursuit.identified)
         try:
             self._file.save({BASE: pursuit.identified})
         except ParameterError as error:
-            self._notice(Severity.ERROR, f"{error} The goal is pursued, but would not be resumed.")
+            sentence = f"{error} The goal is pursued, but would not be resumed."
+            self._out.notice(Severity.ERROR, sentence)
 
-    def _execute(self, schedule: GaitSchedule, remaining: PoseError | None = None) -> None:
-        """Track a schedule for the present goal; ``remaining`` is where it begins from."""
+    def _execute(
+        self,
+        schedule: GaitSchedule,
+        remaining: PoseError | None = None,
+        start_ns: int | None = None,
+    ) -> None:
+        """Track a schedule for the present goal.
+
+        ``remaining`` is where it begins from, ``start_ns`` its first tick where it takes over.
+        """
         pursuit = self._pursuit
         assert pursuit is not None
-        self._tracker.start(schedule, self._stamp_ns)
-        self._commanded_from_ns = self._stamp_ns
+        begins = self._stamp_ns if start_ns is None else start_ns
         pursuit.schedule = schedule
+        average = self._in_motion.begin_schedule(self.config, schedule, begins)
+        self._tracker.start(schedule, begins, average)
+        self._commanded_from_ns = self._stamp_ns
         pursuit.manoeuvre_time += schedule.duration
-        pursuit.ends_at = self._stamp_ns / 1e9 + schedule.duration
+        pursuit.ends_at = begins / 1e9 + schedule.duration
         pursuit.next_plan = PlanReason.CONTINUATION if schedule.partial else PlanReason.CORRECTION
-        self._go(Event.PLANNED, Phase.EXECUTING)
-        self._report(
+        if start_ns is None:
+            self._go(Event.PLANNED, Phase.EXECUTING)
+        else:
+            self._go(Event.TAKEN_OVER, Phase.EXECUTING)
+        from_where = "" if start_ns is None else ", which begins in motion"
+        self._out.report(
             PlannerState.EXECUTING,
-            f"Executing a {schedule.method} gait of {schedule.duration:.6g} s.",
+            f"Executing a {schedule.method} gait of {schedule.duration:.6g} s{from_where}.",
             pursuit.identified,
             pursuit,
             remaining,
             schedule,
         )
-        self.outputs.append(ScheduleStart(schedule, self._stamp_ns))
+        self.outputs.append(ScheduleStart(schedule, begins))
 
     def _brake_for_replan(self, event: Event) -> None:
         """Come to rest along the planned path: in the background plans are made from rest."""
@@ -595,8 +634,15 @@ class Executive:
         self._average.restart()
         self._go(event, Phase.BRAKING)
 
-    def _on_end(self) -> None:
+    def _on_end(self, stamp_ns: int) -> None:
         """End what was tracked; its result is evaluated unless its goal was given up."""
+        ready = self._desk.ready
+        if ready is not None:
+            # No state was measured since the tick at which it takes over.
+            self._switch(ready)
+            if not self._tracker.ended(stamp_ns, ready.schedule.positions[-1]):
+                return
+        self._plan_again_for(self._desk.drop())
         at_rest = self.phase is Phase.BRAKING
         self._tracker.stop(at_last_shape=not at_rest)
         self._average.restart()
@@ -606,13 +652,14 @@ class Executive:
         """Plan the remaining motion where what is tracked has no shape for the time now."""
         if self._tracker.covers(stamp_ns):
             return
+        self._plan_again_for(self._desk.drop())
         self._tracker.stop()
         self._average.restart()
         if self._pursuit is not None:
             self._pursuit.next_plan = PlanReason.REPLAN
         self._go(Event.TIME_JUMPED, self._phase_at_rest())
         before, now = self._stamp_ns / 1e9, stamp_ns / 1e9
-        self._notice(
+        self._out.notice(
             Severity.WARNING,
             f"The time of the states has jumped from {before:.9g} s to {now:.9g} s, where no "
             "motion is planned.",
@@ -623,6 +670,7 @@ class Executive:
         pursuit, tracker = self._pursuit, self._tracker
         assert pursuit is not None
         tracker.stuck += stuck
+        self._plan_again_for(self._desk.drop())
         tracker.stop()
         pursuit.stuck_at = None
         pursuit.required = pursuit.schedule.controls & POSE
@@ -631,9 +679,9 @@ class Executive:
         self._go(Event.JOINTS_STUCK, self._phase_at_rest())
         names = ", ".join(self._robot.joint_names[i] for i in tracker.stuck)
         sentence = f"Stuck: {names}. The remaining motion is planned without."
-        self._notice(Severity.WARNING, sentence)
+        self._out.notice(Severity.WARNING, sentence)
         joints = {"joints": names}
-        self._happened(EventKind.STUCK_JOINT, sentence, pursuit.identified, 1, **joints)
+        self._out.happened(EventKind.STUCK_JOINT, sentence, pursuit.identified, 1, **joints)
 
     # -- evaluating ---------------------------------------------------------------------------
 
@@ -645,13 +693,13 @@ class Executive:
         try:
             state = self._average.state()
         except PlanningError as reason:
-            self._report(PlannerState.FAILED, str(reason), pursuit.identified)
+            self._out.report(PlannerState.FAILED, str(reason), pursuit.identified)
             self._forget_pursuit(Event.FAILED)
             return
         error = PoseError.between(state.position, state.quaternion, goal, state.q)
         if self.config.tolerance.admits(error, controls):
             sentence = f"The goal is reached: {remaining_error(error, controls)}."
-            self._report(PlannerState.REACHED, sentence, pursuit.identified, pursuit, error)
+            self._out.report(PlannerState.REACHED, sentence, pursuit.identified, pursuit, error)
             self._forget_pursuit(Event.REACHED)
             return
         if pursuit.next_plan is PlanReason.CORRECTION:
@@ -660,7 +708,7 @@ class Executive:
                 return
             left = remaining_error(error, controls)
             self._count_correction(pursuit, f"The remaining motion is planned: {left}.")
-        self._request(_Ticket(pursuit.identified, pursuit.next_plan, remaining=error), state)
+        self._request(Ticket(pursuit.identified, pursuit.next_plan, remaining=error), state)
 
     def _fail(self, remaining: PoseError, why: str, event: Event) -> None:
         """Report that the present goal is not reached; ``why`` ends the sentence."""
@@ -668,7 +716,7 @@ class Executive:
         assert pursuit is not None
         where = remaining_error(remaining, pursuit.schedule.controls)
         sentence = f"The goal is not reached: {where}{why}"
-        self._report(PlannerState.FAILED, sentence, pursuit.identified, pursuit, remaining)
+        self._out.report(PlannerState.FAILED, sentence, pursuit.identified, pursuit, remaining)
         self._forget_pursuit(event)
 
     def _forget_pursuit(self, event: Event) -> None:
@@ -683,50 +731,9 @@ class Executive:
         """Change the phase; every change comes through here."""
         self.outputs.append(self._machine.go(event, target))
 
-    def _notice(self, severity: Severity, sentence: str) -> None:
-        self.outputs.append(Notice(severity, sentence))
-
-    def _happened(
-        self,
-        kind: EventKind,
-        sentence: str,
-        identified: IdentifiedGoal,
-        level: int = 0,
-        **about: str,
-    ) -> None:
-        now = self._stamp_ns / 1e9
-        self.outputs.append(FlightEvent(kind, sentence, level, now, identified.goal_id, about))
-
-    def _report(
-        self,
-        state: PlannerState,
-        sentence: str,
-        identified: IdentifiedGoal,
-        pursuit: _Pursuit | None = None,
-        remaining: PoseError | None = None,
-        schedule: GaitSchedule | None = None,
-    ) -> None:
-        """Report on a goal: with what its pursuit has taken, its error, and its schedule."""
-        self.outputs.append(
-            PlannerStatus(
-                state,
-                sentence,
-                goal_id=identified.goal_id,
-                goal=goal_values(identified.goal),
-                corrections=0 if pursuit is None else pursuit.corrections,
-                position_error_m=None if remaining is None else remaining.distance,
-                attitude_error_rad=None if remaining is None else remaining.angle,
-                manoeuvre_time_s=0.0 if pursuit is None else pursuit.manoeuvre_time,
-                ends_at_s=0.0 if pursuit is None else pursuit.ends_at,
-                method="" if schedule is None else schedule.method,
-                duration_s=0.0 if schedule is None else schedule.duration,
-                notes={} if schedule is None else schedule.notes,
-            )
-        )
-
     def _goal_id(self) -> str:
         """Return the id of the latest goal, empty where there is none."""
         if self._proposed is not None:
             return self._proposed.goal_id
-        current = self._ticket or self._pursuit
+        current = self._desk.current or self._pursuit
         return "" if current is None else current.identified.goal_id

@@ -1,6 +1,8 @@
-"""Where a robot at rest is, from several measurements of it."""
+"""Measured states, and where a robot at rest is, from several of them."""
 
 from __future__ import annotations
+
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -16,6 +18,29 @@ from spacerobot_ros.planning.core.goal import RobotState
 
 _AT_REST = 1e-9
 """Joint rates below which the joints rest, m/s or rad/s."""
+
+
+class BaseMeasurement(NamedTuple):
+    """The rest of a measured state: ``pose`` (7,), ``twist`` (6,) of the base, ``qdot`` (n,)."""
+
+    pose: Array
+    twist: Array
+    qdot: Array
+
+
+class MeasuredState(Protocol):
+    """A measured state: the joints always, the base where it is measured at the same time."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """When it was measured, ns."""
+
+    @property
+    def q(self) -> Array:
+        """Shape (n,), m or rad."""
+
+    def base(self) -> BaseMeasurement | None:
+        """Return the rest of the state; None where the base was not measured with the joints."""
 
 
 class StateAverage:

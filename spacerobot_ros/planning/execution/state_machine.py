@@ -21,6 +21,12 @@ class Phase(Enum):
     EXECUTING = "executing"
     """A schedule is tracked."""
 
+    REPLANNING = "replanning"
+    """A schedule is tracked, and a plan is made that takes over from it in motion."""
+
+    TAKING_OVER = "taking over"
+    """A schedule is tracked until the tick at which the plan that is there takes over."""
+
     BRAKING = "braking"
     """The joints brake along the planned path."""
 
@@ -42,6 +48,12 @@ class Event(Enum):
 
     REFUSED = "refused"
     """There is no plan, for a reason."""
+
+    PLAN_LATE = "plan late"
+    """The tick at which a plan was to take over has come, and the plan is not there."""
+
+    TAKEN_OVER = "taken over"
+    """The tick has come at which a plan takes over."""
 
     SCHEDULE_ENDED = "schedule ended"
     """The schedule that was tracked is over."""
@@ -97,13 +109,29 @@ _TABLE: dict[tuple[Phase, Event], tuple[Phase, ...]] = {
     (Phase.PLANNING, Event.PLANT_RESET): (Phase.MEASURING, Phase.EVALUATING),
     (Phase.PLANNING, Event.ABORTED): (Phase.IDLE,),
     (Phase.EXECUTING, Event.NEW_GOAL): (Phase.BRAKING,),
-    (Phase.EXECUTING, Event.PLAN_REQUESTED): (Phase.PLANNING,),
+    (Phase.EXECUTING, Event.PLAN_REQUESTED): (Phase.PLANNING, Phase.REPLANNING),
     (Phase.EXECUTING, Event.SCHEDULE_ENDED): (Phase.EVALUATING, Phase.MEASURING),
     (Phase.EXECUTING, Event.TRACKING_ERROR): (Phase.BRAKING,),
     (Phase.EXECUTING, Event.JOINTS_STUCK): (Phase.EVALUATING, Phase.MEASURING),
     (Phase.EXECUTING, Event.TIME_JUMPED): (Phase.EVALUATING, Phase.MEASURING),
     (Phase.EXECUTING, Event.PLANT_RESET): (Phase.EVALUATING, Phase.MEASURING),
     (Phase.EXECUTING, Event.ABORTED): (Phase.BRAKING,),
+    (Phase.REPLANNING, Event.PLANNED): (Phase.TAKING_OVER,),
+    (Phase.REPLANNING, Event.REFUSED): (Phase.EXECUTING,),
+    (Phase.REPLANNING, Event.PLAN_LATE): (Phase.EXECUTING,),
+    (Phase.REPLANNING, Event.SCHEDULE_ENDED): (Phase.EVALUATING, Phase.MEASURING),
+    (Phase.TAKING_OVER, Event.TAKEN_OVER): (Phase.EXECUTING,),
+    **{
+        (phase, event): targets
+        for phase in (Phase.REPLANNING, Phase.TAKING_OVER)
+        for event, targets in (
+            (Event.NEW_GOAL, (Phase.EXECUTING,)),
+            (Event.JOINTS_STUCK, (Phase.EVALUATING, Phase.MEASURING)),
+            (Event.TIME_JUMPED, (Phase.EVALUATING, Phase.MEASURING)),
+            (Event.PLANT_RESET, (Phase.EVALUATING, Phase.MEASURING)),
+            (Event.ABORTED, (Phase.BRAKING,)),
+        )
+    },
     (Phase.BRAKING, Event.PLAN_REQUESTED): (Phase.PLANNING,),
     (Phase.BRAKING, Event.AT_REST): (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING),
     (Phase.BRAKING, Event.JOINTS_STUCK): (Phase.EVALUATING, Phase.MEASURING),
@@ -136,6 +164,12 @@ class PlanReason(Enum):
     BLEND = "blend"
     """A goal while the joints move: they brake along the planned path first."""
 
+    IN_MOTION = "new goal in motion"
+    """A goal while the joints move: its plan takes over at a tick ahead, without a stop."""
+
+    SHRINKING_HORIZON = "shrinking horizon"
+    """The remaining motion once more, from the measured state, to take over at a tick ahead."""
+
     CORRECTION = "correction"
     """The schedule has ended, and the goal is not reached."""
 
@@ -150,6 +184,11 @@ class PlanReason(Enum):
 
     STUCK_JOINTS = "stuck joints"
     """Joints do not follow; the plan is made with the others."""
+
+    @property
+    def for_new_goal(self) -> bool:
+        """Whether the plan is for a goal that is not pursued yet."""
+        return self in (PlanReason.NEW_GOAL, PlanReason.BLEND, PlanReason.IN_MOTION)
 
 
 class IllegalTransitionError(RuntimeError):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.stuck_joints import StuckJointWatch
+from spacerobot_ros.planning.execution.take_over import PathDeviation, TakeOver
 
 _AT_END = 1e-6
 """A schedule has ended when every joint is this near its last position, m or rad."""
@@ -87,6 +88,10 @@ class ScheduleFollower:
     def covers(self, stamp_ns: int) -> bool:
         """Whether the schedule says where the shape is to be at a time, or its end still does."""
         return self._start_ns <= stamp_ns <= self._end_ns + _LONGEST_SETTLING * 1e9
+
+    def take_over(self, stamp_ns: int, after: float) -> TakeOver | None:
+        """Return the tick ``after`` s from now or later; None where the schedule is over then."""
+        return TakeOver.of(self.schedule, self._start_ns, stamp_ns, after)
 
     def braking(self, stamp_ns: int, duration: float) -> BrakingFollower:
         """Return what brakes along this schedule to rest within ``duration`` s from now."""
@@ -181,17 +186,25 @@ class TrackingErrorCheck:
         Stamp of its first tick, ns.
     position, attitude
         Largest distance and angle that are near enough, m and rad; 0: any.
+    average
+        Measured poses whose mean deviation from the path counts for plans in motion; 0: none are.
     """
 
     def __init__(
-        self, schedule: GaitSchedule, start_ns: int, position: float, attitude: float
+        self,
+        schedule: GaitSchedule,
+        start_ns: int,
+        position: float,
+        attitude: float,
+        average: int = 0,
     ) -> None:
         self._path = schedule.path
+        self._deviation = PathDeviation(schedule.path, average)
         self._position, self._attitude = position or np.inf, attitude or np.inf
         self._stamps = start_ns + (schedule.path.time * 1e9).round().astype(np.int64)
         self._slack = round(schedule.control_period * 0.5e9)
         self._next = 0
-        self._used = position > 0 or attitude > 0
+        self._used = position > 0 or attitude > 0 or average > 0
 
     def due(self, stamp_ns: int) -> bool:
         """Whether the path predicts a pose for this time."""
@@ -201,6 +214,20 @@ class TrackingErrorCheck:
         while self._next < len(stamps) and stamps[self._next] < stamp_ns - self._slack:
             self._next += 1
         return self._next < len(stamps) and stamps[self._next] <= stamp_ns + self._slack
+
+    def add(self, position: Array, quaternion: Array) -> None:
+        """Take a pose that is due into the mean deviation from the path."""
+        self._deviation.add(self._next, position, quaternion)
+
+    @property
+    def pose(self) -> tuple[Array, Array]:
+        """The pose that is due by the mean deviation: position (3,), attitude (4,)."""
+        return self._deviation.pose(self._next)
+
+    @property
+    def end(self) -> tuple[Array, Array]:
+        """Where the base will be at the end of the path by the mean deviation: (3,), (4,)."""
+        return self._deviation.end(self._next)
 
     def error(self, position: Array, quaternion: Array) -> TrackingError | None:
         """Return the tracking error of a pose that is due, None if it is small enough."""
@@ -246,13 +273,16 @@ class TrajectoryTracker:
         """Whether the joints brake along a schedule."""
         return isinstance(self._follower, BrakingFollower)
 
-    def start(self, schedule: GaitSchedule, stamp_ns: int) -> None:
-        """Track a schedule from now on."""
+    def start(self, schedule: GaitSchedule, stamp_ns: int, average: int = 0) -> None:
+        """Track a schedule whose first tick has this stamp.
+
+        ``average`` measured poses are averaged for plans that begin in motion; 0: none are wanted.
+        """
         config = self._config
         gain = config.shape_gain if self._commands_plant else 0.0
         self._follower = ScheduleFollower(schedule, stamp_ns, gain, config.shape_deadband)
         self._check = TrackingErrorCheck(
-            schedule, stamp_ns, config.drift_position, config.drift_attitude
+            schedule, stamp_ns, config.drift_position, config.drift_attitude, average
         )
         self._watch.restart()
 
@@ -265,6 +295,20 @@ class TrajectoryTracker:
     def brake(self, stamp_ns: int) -> None:
         """Brake along the planned path from now on."""
         self._follower = self.braked(stamp_ns)
+
+    def take_over(self, stamp_ns: int, q: Array, after: float) -> TakeOver | None:
+        """Return the tick ``after`` s from now or later at which a plan may take over.
+
+        Its first shape is ``q`` (n,), which is measured, where that is not the wanted one but for
+        noise. None where no schedule is tracked, or it is over then.
+        """
+        if not isinstance(self._follower, ScheduleFollower):
+            return None
+        take_over = self._follower.take_over(stamp_ns, after)
+        if take_over is not None:
+            first = take_over.shapes[0]
+            first[:] = np.where(np.abs(q - first) > self._config.shape_deadband, q, first)
+        return take_over
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether what is tracked has a shape for a time."""
@@ -286,6 +330,17 @@ class TrajectoryTracker:
     def check_due(self, stamp_ns: int) -> bool:
         """Whether the pose at this time is to be compared with the predicted one."""
         return isinstance(self._follower, ScheduleFollower) and self._check.due(stamp_ns)
+
+    def averaged(self, state: RobotState) -> RobotState:
+        """Return a state that is due with its pose by the mean deviation from the path."""
+        self._check.add(state.position, state.quaternion)
+        position, quaternion = self._check.pose
+        return replace(state, position=position, quaternion=quaternion)
+
+    @property
+    def end(self) -> tuple[Array, Array]:
+        """Where the base will be at the end of the path by the mean deviation: (3,), (4,)."""
+        return self._check.end
 
     def error(self, state: RobotState) -> TrackingError | None:
         """Return the tracking error of a state that is due, None if it is small enough."""

@@ -19,8 +19,9 @@ from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.take_over import TakeOver
 from spacerobot_ros.planning.execution.tracker import BrakingFollower
-from spacerobot_ros.planning.methods.registry import build_method
+from spacerobot_ros.planning.methods.registry import METHODS, build_method
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 
 LONGEST_END = 1.5
@@ -49,12 +50,16 @@ class PlanningTask:
         Parts of the goal that a plan without them must control.
     braking
         What is tracked and brakes first; None: the joints rest.
+    take_over
+        When the plan takes over from a schedule that is tracked until then; None: it begins at
+        rest, or with the braking. The state of the request is that of now.
     """
 
     request: PlanRequest
     stuck: Mapping[str, float] = field(default_factory=dict)
     required: frozenset[Controlled] = frozenset()
     braking: Braking | None = None
+    take_over: TakeOver | None = None
 
 
 @dataclass(frozen=True)
@@ -122,6 +127,11 @@ class PlanningWorker:
         """Whether a plan is being made, or its result waits, or it has yet to end."""
         return self._job is not None
 
+    def starts_in_motion(self, schedule: GaitSchedule) -> bool:
+        """Whether a plan may take over from a schedule: the methods of both allow for it."""
+        maker = METHODS.get(schedule.method, type(self._method))
+        return self._method.starts_in_motion and maker.starts_in_motion
+
     def submit(self, task: PlanningTask) -> None:
         """Make a plan: at once, or in a thread."""
         assert self._job is None, "one plan at a time"
@@ -167,6 +177,10 @@ class PlanningWorker:
             There is none; the sentence says why.
         """
         method = self._method_for(task)
+        if task.take_over is not None:
+            state = self._predicted(task.request.state, task.take_over.shapes)[0]
+            motion = task.take_over.motion
+            return method.plan(replace(task.request, state=state, motion=motion), cancellation)
         if task.braking is None:
             return method.plan(task.request, cancellation)
         return self._blended(task.braking, task.request, method, cancellation)
@@ -205,13 +219,8 @@ class PlanningWorker:
         state, period = request.state, braking.follower.schedule.control_period
         shapes = braking.follower.shapes(braking.stamp_ns)
         shapes[0] = state.q
-        prediction = BasePrediction(self._robot, period, self._config.integration_step)
-        attitudes = prediction.attitudes(shapes, state.quaternion, state.angular_momentum)
+        at_rest, positions, attitudes = self._predicted(state, shapes)
         times: Array = period * np.arange(len(shapes), dtype=float)
-        positions = prediction.positions(state, times, shapes, attitudes)
-        at_rest: RobotState = replace(
-            state, position=positions[-1], quaternion=attitudes[-1], q=shapes[-1].copy()
-        )
         gait = method.plan(replace(request, state=at_rest), cancellation)
         path = BasePath(
             np.append(times[:-1], times[-1] + gait.path.time),
@@ -219,6 +228,21 @@ class PlanningWorker:
             np.vstack([attitudes[:-1], gait.path.quaternion]),
         )
         return replace(gait, positions=np.vstack([shapes[:-1], gait.positions]), path=path)
+
+    def _predicted(self, state: RobotState, shapes: Array) -> tuple[RobotState, Array, Array]:
+        """Return the state after shapes (K + 1, n) at ticks, and the base poses at these.
+
+        The positions are (K + 1, 3), the attitudes (K + 1, 4).
+        """
+        config = self._config
+        prediction = BasePrediction(self._robot, config.control_period, config.integration_step)
+        times: Array = config.control_period * np.arange(len(shapes), dtype=float)
+        attitudes = prediction.attitudes(shapes, state.quaternion, state.angular_momentum)
+        positions = prediction.positions(state, times, shapes, attitudes)
+        after: RobotState = replace(
+            state, position=positions[-1], quaternion=attitudes[-1], q=shapes[-1].copy()
+        )
+        return after, positions, attitudes
 
 
 class _Job(Thread):

@@ -1,0 +1,372 @@
+"""Plans that take over while the joints move: when, from what state, and what else happens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+from support.planner_loop import (
+    HERE,
+    NEAR,
+    TICK,
+    TICK_NS,
+    TURNED,
+    Loop,
+    MovingStub,
+    Place,
+    StubMethod,
+    goal_at,
+)
+
+from spacerobot_ros.events import Event as FlightEvent
+from spacerobot_ros.planning import BasePath
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile
+from spacerobot_ros.planning.execution.state_machine import Phase
+from spacerobot_ros.planning.execution.status import PlannerState
+from spacerobot_ros.planning.execution.take_over import PathDeviation
+
+Array = npt.NDArray[np.float64]
+
+OTHER: Place = ([-0.04, 0.0, 0.01], [0.0, 0.0, 0.0])
+FAR: Place = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+AHEAD = 6
+"""Ticks from the request to the take-over."""
+
+
+def flying(ticks: int = 40, *, held: bool = False, **parameters: Any) -> Loop:
+    """Fly to NEAR for ten ticks."""
+    times = {"takeover_time": AHEAD * TICK, "abort_time": 0.5}
+    loop = Loop({**times, **parameters}, method=MovingStub(ticks), held=held)
+    loop.propose(NEAR)
+    loop.tick()
+    if held:
+        loop.held.release()
+        loop.tick()
+    loop.tick(10)
+    return loop
+
+
+def stub_of(loop: Loop) -> MovingStub:
+    assert isinstance(loop.method, MovingStub)
+    return loop.method
+
+
+def phase_of(loop: Loop) -> Phase:
+    return loop.executive.phase
+
+
+def events_of(loop: Loop) -> list[tuple[str, str]]:
+    events = [output for output in loop.outputs if isinstance(output, FlightEvent)]
+    return [(event.kind.value, event.goal_id) for event in events]
+
+
+# -- another goal -----------------------------------------------------------------------------
+
+
+def test_a_plan_takes_over_at_its_tick_from_the_state_of_the_plant_then() -> None:
+    loop = flying()
+    now = len(loop.commands)
+    loop.propose(OTHER)
+    loop.tick(AHEAD)
+    first = loop.starts[0].schedule
+    assert len(loop.starts) == 1, "it is not there yet"
+    np.testing.assert_allclose(loop.commands[now:], first.velocities[now : now + AHEAD], atol=1e-12)
+    loop.tick()
+    second = loop.starts[1]
+    assert second.stamp_ns == (now + AHEAD) * TICK_NS
+    # What was predicted is where the plant has come to, and how it moves.
+    request = stub_of(loop).requests[-1]
+    assert request.motion is not None
+    pose = loop.poses[now + AHEAD]
+    np.testing.assert_allclose(request.state.q, loop.shapes[now + AHEAD], atol=1e-12)
+    np.testing.assert_allclose(request.state.position, pose[:3], atol=1e-12)
+    np.testing.assert_allclose(request.state.quaternion, pose[3:], atol=1e-12)
+    np.testing.assert_allclose(request.motion.velocity, loop.commands[now + AHEAD - 1], atol=1e-12)
+    np.testing.assert_array_equal(request.motion.remaining, first.positions[now + AHEAD :])
+    np.testing.assert_allclose(loop.commands[-1], second.schedule.velocities[0], atol=1e-12)
+    status = loop.until(PlannerState.REACHED)
+    assert status.goal_id == "goal-2"
+    assert loop.error_to(OTHER)[0] < 1e-3
+    assert status.manoeuvre_time_s == pytest.approx(40 * TICK)
+    assert loop.states == ["executing", "executing", "reached"]
+
+
+def test_nothing_but_parameters_decides_when_a_plan_takes_over() -> None:
+    """In the background the plan is there sooner or later: the flight is the same."""
+    flights = []
+    for released_after in (0, 2, AHEAD):
+        loop = flying(held=True)
+        loop.propose(OTHER)
+        loop.tick(released_after + 1 if released_after < AHEAD else AHEAD)
+        loop.held.release()
+        loop.until(PlannerState.REACHED)
+        flights.append(np.array(loop.commands[:80]))
+    np.testing.assert_array_equal(flights[0], flights[1])
+    np.testing.assert_array_equal(flights[0], flights[2])
+    # In lockstep the first plan is there a tick earlier.
+    lockstep = flying()
+    lockstep.propose(OTHER)
+    lockstep.until(PlannerState.REACHED)
+    np.testing.assert_array_equal(np.array(lockstep.commands[:57]), flights[0][1:58])
+
+
+def test_a_late_plan_is_tried_for_once_more_and_then_from_rest() -> None:
+    loop = flying(ticks=80, held=True)
+    loop.propose(OTHER)
+    loop.tick(AHEAD)
+    for attempt in (1, 2):
+        assert phase_of(loop) is Phase.REPLANNING
+        assert len(loop.held.tasks) == 1 + attempt
+        loop.tick()
+        assert loop.held.cancelled
+        assert phase_of(loop) is Phase.EXECUTING
+        first = loop.starts[0].schedule.velocities[: len(loop.commands) - 1]
+        np.testing.assert_allclose(np.array(loop.commands[1:]), first, atol=1e-12)
+        if attempt == 1:
+            loop.held.release()
+            loop.tick(1 + 2 * AHEAD)
+    loop.held.release()
+    loop.tick()
+    assert phase_of(loop) is Phase.BRAKING
+    assert [kind for kind, _ in events_of(loop)].count("plan_late") == 2
+    loop.tick(20)
+    assert phase_of(loop) is Phase.PLANNING
+    loop.held.release()
+    assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
+
+
+def test_a_goal_that_is_refused_in_motion_is_planned_for_from_rest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    loop = flying()
+    plan = StubMethod.plan
+
+    def from_rest_only(self: StubMethod, request: Any, *rest: Any) -> Any:
+        monkeypatch.setattr(stub_of(loop), "refusing", request.motion is not None)
+        return plan(self, request, *rest)
+
+    monkeypatch.setattr(MovingStub, "plan", from_rest_only)
+    loop.propose(OTHER)
+    status = loop.until(PlannerState.REACHED)
+    assert (status.goal_id, loop.error_to(OTHER)[0] < 1e-3) == ("goal-2", True)
+    assert any("planned for from rest, since in motion it is not: It" in n for n in loop.notices)
+    assert "refused" not in loop.states
+
+
+def test_a_goal_out_of_reach_leaves_the_earlier_one_as_it_is() -> None:
+    loop = flying()
+    loop.propose(FAR)
+    assert loop.until(PlannerState.REACHED).goal_id == "goal-1"
+    assert loop.states == ["executing", "refused", "reached"]
+    assert len(loop.starts) == 1
+    assert loop.error_to(NEAR)[0] < 1e-3
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_of_many_goals_only_the_newest_is_planned_for(held: bool) -> None:
+    loop = flying(held=held, ticks=80)
+    for k in range(8):
+        loop.propose(([0.01 * k, 0.02, 0.0], [0.0, 0.0, 0.0]))
+        loop.tick(2)
+        loop.held.release()
+        loop.tick(k % 2)
+    newest = loop.propose(OTHER)
+    for _ in range(200):
+        loop.tick()
+        loop.held.release()
+    assert loop.statuses[-1].state is PlannerState.REACHED
+    assert loop.statuses[-1].goal_id == newest
+    assert [goal for kind, goal in events_of(loop) if kind == "goal_accepted"] == ["goal-1", newest]
+    assert len(loop.starts) == 2
+    assert loop.error_to(OTHER)[0] < 1e-3
+
+
+def test_the_present_goal_once_more_goes_on_under_its_new_id(tmp_path: Path) -> None:
+    loop = flying()
+    loop.executive._file = GoalFile(str(tmp_path / "goal.json"))
+    loop.propose(NEAR)
+    loop.tick()
+    assert loop.executive._file.load()[BASE].goal_id == "goal-2"
+    assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
+    assert len(loop.starts) == 1
+    assert [(s.state.value, s.goal_id) for s in loop.statuses] == [
+        ("executing", "goal-1"),
+        ("executing", "goal-2"),
+        ("reached", "goal-2"),
+    ]
+    assert len(loop.commands) <= 43, "and takes no longer"
+
+
+def test_what_is_planned_for_another_goal_is_aborted_with_all_goals(tmp_path: Path) -> None:
+    for ticks in (1, 4):
+        loop = flying(held=True)
+        loop.executive._file = GoalFile(str(tmp_path / "goal.json"))
+        loop.propose(OTHER)
+        loop.tick()
+        if ticks > 1:
+            loop.held.release()
+            loop.tick()
+            assert phase_of(loop) is Phase.TAKING_OVER
+        assert loop.abort() == "The joints brake along the planned path within 0.5 s."
+        assert (loop.statuses[-1].state, loop.statuses[-1].goal_id) == (
+            PlannerState.ABORTED,
+            "goal-2",
+        )
+        loop.held.release()
+        loop.tick(40)
+        assert phase_of(loop) is Phase.IDLE
+        assert len(loop.starts) == 1
+        assert not (tmp_path / "goal.json").exists()
+        assert not any(loop.speeds[-20:])
+
+
+def test_joints_that_stick_before_the_take_over_have_the_new_goal_planned_from_rest() -> None:
+    loop = flying(ticks=200, stuck_ticks=3, takeover_time=3.0)
+    loop.propose(OTHER)
+    loop.tick()
+    assert phase_of(loop) is Phase.TAKING_OVER
+    loop.plant.hold(np.array([True, False, False]))
+    for _ in range(40):
+        loop.tick()
+        if phase_of(loop) is not Phase.TAKING_OVER:
+            break
+    loop.plant.hold(np.zeros(3, dtype=np.bool_))
+    assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
+    assert stub_of(loop).requests[-1].motion is None
+
+
+def test_a_gap_in_the_states_over_the_take_over_tick_delays_nothing_that_follows() -> None:
+    loop = flying(ticks=80)
+    loop.propose(OTHER)
+    loop.tick()
+    loop.measured.stamp_ns += (AHEAD + 3) * TICK_NS
+    loop.tick()
+    second = loop.starts[1]
+    assert second.stamp_ns == (11 + AHEAD) * TICK_NS
+    tick = (loop.measured.stamp_ns - TICK_NS - second.stamp_ns) // TICK_NS
+    np.testing.assert_array_equal(loop.executive.setpoint.position, second.schedule.positions[tick])
+    loop.until(PlannerState.REACHED)
+
+
+@pytest.mark.parametrize(
+    "parameters", [{"takeover_time": 0.0}, {"takeover_time": 1.6}], ids=["never", "too far"]
+)
+def test_where_no_plan_can_take_over_the_joints_brake(parameters: dict[str, Any]) -> None:
+    for held in (False, True):
+        loop = flying(held=held, **parameters)
+        loop.propose(OTHER)
+        for _ in range(30):
+            loop.tick()
+            loop.held.release()
+        assert stub_of(loop).requests[-1].motion is None
+        assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
+
+
+def test_methods_that_plan_from_rest_are_not_asked_in_motion() -> None:
+    loop = Loop({"takeover_time": AHEAD * TICK}, method=StubMethod(40))
+    loop.propose(NEAR)
+    loop.tick(10)
+    loop.propose(OTHER)
+    loop.until(PlannerState.REACHED)
+    assert isinstance(loop.method, StubMethod)
+    assert [request.motion for request in loop.method.requests] == [None, None]
+
+
+# -- events -----------------------------------------------------------------------------------
+
+
+def test_a_take_over_is_one_event() -> None:
+    loop = flying()
+    loop.outputs.clear()
+    loop.propose(OTHER)
+    loop.until(PlannerState.REACHED)
+    assert events_of(loop) == [
+        ("plan_started", "goal-2"),
+        ("plan_ready", "goal-2"),
+        ("goal_accepted", "goal-2"),
+        ("plan_taken_over", "goal-2"),
+    ]
+    (taken,) = [
+        output
+        for output in loop.outputs
+        if isinstance(output, FlightEvent) and output.kind.value == "plan_taken_over"
+    ]
+    assert taken.time_s == loop.starts[-1].stamp_ns / 1e9
+    assert taken.about["reason"] == "new goal in motion"
+
+
+# -- the remaining motion, again --------------------------------------------------------------
+
+
+def test_the_remaining_motion_is_planned_again_where_it_leads_beside_the_goal() -> None:
+    """The plant's base goes by half of what the plan says: with each plan less is left."""
+    loop = flying(ticks=40, replan_period=0.5, max_corrections=0)
+    stub_of(loop).wrong_path = 0.05
+    loop.propose(([0.05, 0.0, 0.0], [0.0, 0.0, 0.0]))
+    loop.tick(200)
+    reasons = [
+        output.about["reason"]
+        for output in loop.outputs
+        if isinstance(output, FlightEvent) and output.kind.value == "plan_taken_over"
+    ]
+    assert reasons[0] == "new goal in motion"
+    assert set(reasons[1:]) == {"shrinking horizon"}
+    stamps = [start.stamp_ns for start in loop.starts[1:]]
+    assert min(np.diff(stamps)) >= 0.5e9
+    assert len({s.goal_id for s in loop.statuses[1:]}) == 1
+
+
+def test_a_motion_that_leads_to_the_goal_is_left_alone() -> None:
+    loop = flying(ticks=80, replan_period=0.2)
+    loop.until(PlannerState.REACHED)
+    assert len(stub_of(loop).requests) == 1
+
+
+def test_the_deviation_from_a_path_is_carried_to_its_end_as_a_rigid_motion() -> None:
+    """A path in the world, and the same one seen from a base that is off by a rigid motion."""
+    rng = np.random.default_rng(5)
+    positions = rng.normal(size=(6, 3))
+    attitudes = Rotation.random(6, random_state=7)
+    path = BasePath(np.arange(6.0), positions, attitudes.as_quat())
+    turn, shift = Rotation.from_rotvec([0.3, -0.5, 0.2]), np.array([0.4, 0.1, -0.2])
+    moved, turned = turn.apply(positions) + shift, turn * attitudes
+    deviation = PathDeviation(path, 1)
+    deviation.add(2, moved[2], turned[2].as_quat())
+    for (position, quaternion), k in ((deviation.pose(2), 2), (deviation.end(2), 5)):
+        np.testing.assert_allclose(position, moved[k], atol=1e-12)
+        assert (Rotation.from_quat(quaternion).inv() * turned[k]).magnitude() < 1e-12
+
+
+def test_noise_is_averaged_over_the_last_measurements() -> None:
+    path = BasePath(np.arange(9.0), np.zeros((9, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (9, 1)))
+    deviation = PathDeviation(path, 4)
+    for k, (x, angle) in enumerate([(9.0, 1.0), (0.1, 0.01), (0.3, 0.03), (0.2, 0.0), (0.4, 0.04)]):
+        turned = Rotation.from_rotvec([0.0, 0.0, angle]).as_quat()
+        deviation.add(k, np.array([x, 0.0, 0.0]), turned)
+    position, quaternion = deviation.pose(4)
+    np.testing.assert_allclose(position, [0.25, 0.0, 0.0])
+    np.testing.assert_allclose(Rotation.from_quat(quaternion).as_rotvec(), [0.0, 0.0, 0.02])
+
+
+def test_noise_of_joints_is_not_taken_for_another_shape() -> None:
+    loop = flying(shape_deadband=1e-3)
+    shape = loop.plant.q + np.array([4e-4, 0.0, 5e-3])
+    taken = loop.executive._tracker.take_over(loop.measured.stamp_ns, shape, 0.3)
+    assert taken is not None
+    wanted = loop.starts[0].schedule.positions[len(loop.commands)]
+    np.testing.assert_array_equal(taken.shapes[0], [wanted[0], wanted[1], shape[2]])
+
+
+def test_goals_are_the_same_where_every_number_is() -> None:
+    from spacerobot_ros.planning.execution.in_motion import same_goal
+
+    assert same_goal(goal_at(TURNED), goal_at(TURNED))
+    assert not same_goal(goal_at(TURNED), goal_at(HERE))
+    shaped = goal_at(TURNED)
+    object.__setattr__(shaped, "joint_positions", np.zeros(3))
+    assert not same_goal(goal_at(TURNED), shaped)
+    assert same_goal(shaped, shaped)
