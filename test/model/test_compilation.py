@@ -203,9 +203,18 @@ def test_a_compiler_that_hangs_is_waited_for_once_and_ended(
 ) -> None:
     compiler(f"sleep 600 & echo $! >> {tmp_path}/children; wait")
     monkeypatch.setenv("SPACEROBOT_COMPILE_TIMEOUT", "1.0")
+    waited: list[float | None] = []
+    wait = subprocess.Popen.wait
+
+    def noted(process: subprocess.Popen[bytes], timeout: float | None = None) -> int:
+        waited.append(timeout)
+        return wait(process, timeout)
+
+    monkeypatch.setattr(subprocess.Popen, "wait", noted)
     for number in range(5):
         x = ca.SX.sym("x")
         compiled(ca.Function(f"f{number}", [x], [x]))
+    assert waited[0] == 1.0, "and not longer"
     # One line: the compiler was called once.
     child = int((tmp_path / "children").read_text())
     status = Path(f"/proc/{child}/stat")

@@ -210,5 +210,8 @@ def _unnoticeable(source: str) -> list[tuple[Position, Position]]:
 
 
 def _mutated(source: str, operator: str, occurrence: int) -> str | None:
-    changed = mutate_code(source, cosmic_ray.plugins.get_operator(operator)(), occurrence)
+    try:
+        changed = mutate_code(source, cosmic_ray.plugins.get_operator(operator)(), occurrence)
+    except AttributeError:
+        return None  # Its ExceptionReplacer takes no names with dots.
     return None if changed is None else str(changed)

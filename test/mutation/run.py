@@ -11,24 +11,22 @@ import hashlib
 import itertools
 import json
 import math
-import os
 import queue
 import shutil
-import signal
 import subprocess
 import sys
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from difflib import SequenceMatcher
-from enum import Enum
 from pathlib import Path
 
 from coverage import CoverageData
-from mutation.forked import ENDED, can_be_exchanged, limits_of
 from mutation.mutants import Mutant, described, mutants_of, sample, statement_lines
+from support.fork_server import ForkServer, How, environment_of, limits_of, write_source
+from support.forked import NotExchangedError, can_be_exchanged
 
 PROJECT = Path(__file__).parents[2]
 
@@ -69,6 +67,8 @@ class Verdict:
         How it noticed: the value of a :class:`How`.
     run, tried, reaching : int
         Tests that were run; tests that there was time for; tests that reach the change.
+    exact : bool
+        Whether the tests ran as if the file had been imported anew.
     seconds : float
         Time that this took.
     """
@@ -80,7 +80,13 @@ class Verdict:
     run: int
     tried: int
     reaching: int
+    exact: bool
     seconds: float
+
+    @property
+    def complete(self) -> bool:
+        """Whether no more can be done to notice it."""
+        return self.exact and self.tried == self.reaching
 
 
 @dataclass
@@ -170,7 +176,7 @@ def measure(project: Path, folder: Path, cache: Path, tests: Sequence[str], work
     """Run the quick tests once, recording which line each reaches."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    environment = _environment(project, cache) | {
+    environment = environment_of(project, cache) | {
         "SPACEROBOT_REACH": str(folder),
         "SPACEROBOT_REACH_SOURCE": str(project / "spacerobot_ros"),
     }
@@ -180,92 +186,6 @@ def measure(project: Path, folder: Path, cache: Path, tests: Sequence[str], work
         env=environment,
         check=False,
     )
-
-
-class How(str, Enum):
-    """How a test notices an error."""
-
-    FAILED = "failed"
-    ENDLESS = "used more CPU time than an endless loop only"
-    WAITED = "waited without an end, twice"
-    CRASHED = "crashed"
-    NOT_IMPORTED = "could not be imported"
-
-
-class _Server:
-    """A process that has collected tests and runs some of them in a fork at a time."""
-
-    def __init__(self, project: Path, folder: Path, cache: Path, files: Sequence[str]) -> None:
-        self._folder = folder
-        jobs, answers = os.pipe(), os.pipe()
-        pipes = {"SPACEROBOT_MUTANT_PIPES": f"{jobs[0]} {answers[1]}"}
-        plugin = ("-x", "-p", "mutation.forked", f"--basetemp={folder / 'tmp'}")
-        with (folder / "output").open("w") as output:
-            self._process = subprocess.Popen(
-                [*_PYTEST, *plugin, *files],
-                cwd=project,
-                env=_environment(project, cache) | pipes,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                pass_fds=(jobs[0], answers[1]),
-                start_new_session=True,
-            )
-        os.close(jobs[0])
-        os.close(answers[1])
-        self._jobs, self._answers = os.fdopen(jobs[1], "w"), os.fdopen(answers[0])
-        self.ready = self._answers.readline() == "ready\n"
-        """False where tests could not be collected."""
-
-    def run(
-        self, limits: dict[str, tuple[float, float]], exchange: tuple[str, str] | None
-    ) -> tuple[str, How | None, list[str]]:
-        """Run tests until one fails.
-
-        Parameters
-        ----------
-        limits
-            CPU and wall time (s) that each test may take, in the order in which they are run.
-        exchange
-            A file whose functions are to be those that it has now, and its text before.
-
-        Returns
-        -------
-        tuple
-            The test that failed ("": none), how it did, and all that were begun.
-        """
-        log = self._folder / "log"
-        log.write_text("")
-        mark = f"{os.getpid()}-{id(self)}-{time.monotonic_ns()}"
-        job = {"tests": limits, "exchange": exchange, "mark": mark, "log": str(log)}
-        self._jobs.write(json.dumps(job) + "\n")
-        self._jobs.flush()
-        answer = self._answers.readline()
-        _end_what_is_left(mark)
-        if not answer:
-            raise RuntimeError(f"the process with the tests has ended; see {self._folder}")
-        lines = log.read_text().splitlines()
-        begun = [line for line in lines if line != ENDED]
-        code = int(answer)
-        if code == 0 or not begun:
-            return "", None, begun
-        if lines[-1] == ENDED:
-            how = How.FAILED
-        elif code == -signal.SIGPROF:
-            how = How.ENDLESS
-        else:
-            how = How.WAITED if code == 1 else How.CRASHED
-        return begun[-1], how, begun
-
-    def close(self) -> None:
-        """End the process."""
-        self._jobs.close()
-        self._answers.close()
-        try:
-            self._process.wait(30.0)
-        except subprocess.TimeoutExpired:
-            os.killpg(self._process.pid, signal.SIGKILL)
-            self._process.wait()
 
 
 class Worker:
@@ -306,18 +226,25 @@ class Worker:
         source = file.read_text()
         reaching, imported = self._reach.tests_for(mutant, source)
         chosen = self._reach.within(reaching, limit)
-        tests = chosen[0 if earlier is None else earlier.tried :]
+        tests = chosen[earlier.tried :] if earlier is not None and earlier.exact else chosen[:]
         # What has noticed errors in this file may notice this one.
         tests.sort(key=lambda test: -self._noticing[mutant.path][test])
         begin = time.monotonic()
         changed = mutant.apply(source)
         assert changed is not None
-        exchanged = not imported and can_be_exchanged(source, changed)
-        _write(file, changed)
+        exact = not imported and can_be_exchanged(source, changed)
+        write_source(file, changed)
         try:
-            by, how, run = self._run(tests, file, source, changed, exchanged)
+            try:
+                # First without importing the file anew, even where that is not quite the same.
+                exchanged = exact or earlier is None
+                by, how, run = self._run(tests, file, source, changed, exchanged)
+            except NotExchangedError:
+                exchanged, exact = False, True
+                by, how, run = self._run(tests, file, source, changed, exchanged)
         finally:
-            _write(file, source)
+            write_source(file, source)
+        exact = exact or not exchanged
         seconds = time.monotonic() - begin + (0.0 if earlier is None else earlier.seconds)
         noticed = how is not None
         if not reaching:
@@ -328,7 +255,7 @@ class Worker:
             by = f"{len(reaching) - len(chosen)} slower tests were not run"
         word = how.value if how else ""
         run += 0 if earlier is None else earlier.run
-        return Verdict(mutant, noticed, by, word, run, len(chosen), len(reaching), seconds)
+        return Verdict(mutant, noticed, by, word, run, len(chosen), len(reaching), exact, seconds)
 
     def _run(
         self, tests: list[str], file: Path, source: str, changed: str, exchanged: bool
@@ -355,9 +282,9 @@ class Worker:
                         break
                     again = by.startswith(_REPEATED) or how is How.WAITED
                     if not again or self._attempt(server, [by], exchange)[1] is not None:
-                        _write(file, source)
+                        write_source(file, source)
                         sound = self._passes_without(by)
-                        _write(file, changed)
+                        write_source(file, changed)
                         if sound:
                             return by, how, run
                     stage = stage[stage.index(by) + 1 :]
@@ -373,7 +300,7 @@ class Worker:
         return self._sound[test]
 
     def _attempt(
-        self, server: _Server, tests: Sequence[str], exchange: tuple[str, str] | None
+        self, server: ForkServer, tests: Sequence[str], exchange: tuple[str, str] | None
     ) -> tuple[str, How | None, list[str]]:
         # What a mutant compiles or plans must not be found by the next one.
         shutil.rmtree(self._cache, ignore_errors=True)
@@ -381,10 +308,10 @@ class Worker:
         seconds = self._reach.seconds
         return server.run({name: limits_of(*seconds[name]) for name in tests}, exchange)
 
-    def _serve(self, name: str, files: Sequence[str]) -> _Server:
+    def _serve(self, name: str, files: Sequence[str]) -> ForkServer:
         folder = self._folder / name
         folder.mkdir(exist_ok=True)
-        return _Server(self._project, folder, self._cache, files)
+        return ForkServer(folder, self._project, environment_of(self._project, self._cache), files)
 
 
 _PYTEST = [sys.executable, "-m", "pytest", "-q", "--no-header", "-p", "no:cacheprovider"]
@@ -394,31 +321,12 @@ def _text(path: Path) -> str:
     return path.read_text("utf-8") if path.exists() else ""
 
 
-def _environment(project: Path, cache: Path) -> dict[str, str]:
-    paths = os.pathsep.join((str(project), str(project / "test")))
-    return os.environ | {"PYTHONPATH": paths, "SPACEROBOT_CACHE_DIR": str(cache)}
-
-
-def _write(file: Path, source: str) -> None:
-    """Write a file such that Python cannot take bytecode of the one before for it."""
-    file.write_text(source)
-    for compiled in (file.parent / "__pycache__").glob(f"{file.stem}.*.pyc"):
-        compiled.unlink()
-
-
-def _end_what_is_left(mark: str) -> None:
-    """End processes that a test has started and a mutant has kept from ending."""
-    wanted = f"SPACEROBOT_MUTANT={mark}".encode()
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            if wanted in (entry / "environ").read_bytes().split(b"\0"):
-                os.kill(int(entry.name), signal.SIGKILL)
-        except OSError:
-            continue
-
-
 def judge_all(
-    mutants: Sequence[Mutant], workers: Sequence[Worker], results: Path, limits: Sequence[float]
+    mutants: Sequence[Mutant],
+    workers: Sequence[Worker],
+    results: Path,
+    limits: Sequence[float],
+    known: Mapping[Mutant, Verdict],
 ) -> list[Verdict]:
     """Judge mutants, several at a time; write each verdict to a file at once.
 
@@ -427,8 +335,10 @@ def judge_all(
     limits
         CPU time (s) of the tests for one mutant: all mutants with the first, those that survive
         with the next.
+    known
+        What is known already.
     """
-    verdicts: dict[Mutant, Verdict] = {}
+    verdicts = {mutant: known[mutant] for mutant in mutants if mutant in known}
     lock = threading.Lock()
 
     def work(worker: Worker, limit: float) -> None:
@@ -448,7 +358,7 @@ def judge_all(
         waiting: queue.SimpleQueue[Mutant] = queue.SimpleQueue()
         for mutant in mutants:
             verdict = verdicts.get(mutant)
-            if verdict is None or (not verdict.noticed and verdict.tried < verdict.reaching):
+            if verdict is None or not (verdict.noticed or verdict.complete):
                 waiting.put(mutant)
         print(f"{waiting.qsize()} mutants, {limit:g} s of tests each", flush=True)
         threads = [threading.Thread(target=work, args=[worker, limit]) for worker in workers]
@@ -514,11 +424,20 @@ def _fingerprint(project: Path, tests: Sequence[str]) -> str:
     return digest.hexdigest()
 
 
+def _known(results: Path) -> dict[Mutant, Verdict]:
+    """Return the last verdict on each mutant of a file with results."""
+    found = {}
+    for line in _text(results).splitlines():
+        verdict = json.loads(line)
+        mutant = Mutant(**verdict.pop("mutant"))
+        found[mutant] = Verdict(mutant, **verdict)
+    return found
+
+
 def _survivors(project: Path, results: Path, mutants: Sequence[Mutant]) -> list[Mutant]:
     """Find the survivors of an earlier run again, wherever they are by now."""
-    found = (json.loads(line) for line in results.read_text().splitlines())
-    last = {Mutant(**verdict["mutant"]): verdict["noticed"] for verdict in found}
-    keys = {mutant.key for mutant, noticed in last.items() if not noticed}
+    known = _known(results).items()
+    keys = {mutant.key for mutant, verdict in known if not verdict.noticed}
     places = {(path, definition, operator) for path, definition, operator, _, _ in keys}
     some = (m for m in mutants if (m.path, m.definition, m.operator) in places)
     return [m for m in (described(project, m) for m in some) if m is not None and m.key in keys]
@@ -541,6 +460,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=PROJECT / "out" / "mutants")
     parser.add_argument("--mutate", nargs="+", default=MUTATED, help="folders of the package")
     parser.add_argument("--tests", nargs="*", default=[], help="fewer than all quick tests")
+    parser.add_argument("--resume", action="store_true", help="go on where a run was stopped")
     parser.add_argument("--again", type=Path, help="results whose survivors are judged again")
     parser.add_argument(
         "--keep-reach", action="store_true", help="although the code has changed a little"
@@ -578,10 +498,11 @@ def main() -> int:
         for n in range(chosen.workers)
     ]
     results = out / "results.jsonl"
-    if chosen.again is None or chosen.again.resolve() != results:
+    known = _known(results) if chosen.resume else {}
+    if not chosen.resume and (chosen.again is None or chosen.again.resolve() != results):
         results.unlink(missing_ok=True)
     try:
-        verdicts = judge_all(drawn, workers, results, chosen.limits)
+        verdicts = judge_all(drawn, workers, results, chosen.limits, known)
     finally:
         for worker in workers:
             worker.close()

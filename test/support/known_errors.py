@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,6 +25,8 @@ from queue import SimpleQueue
 from typing import Any
 
 import yaml
+from support.fork_server import ForkServer, How, environment_of, write_source
+from support.forked import NotExchangedError
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "test" / "known_errors"
@@ -34,8 +36,14 @@ _AT_ONCE = 2
 _TIME_LIMIT = 240.0
 """Wall time for the tests of one error, s."""
 
+_LIMITS = (60.0, _TIME_LIMIT)
+"""CPU and wall time of a test in a fork, s."""
+
 _KEEPS_RESULTS = ("spacerobot_ros/model/", "spacerobot_ros/planning/")
-"""What is compiled or planned here is kept in a cache: an error in it gets a cache of its own."""
+"""What is planned here is kept in a cache: an error in it gets a cache of its own, without plans.
+
+What is compiled is kept under a hash of its source, in which an error shows.
+"""
 
 
 @dataclass(frozen=True)
@@ -154,31 +162,110 @@ class Outcome(Enum):
 
 
 class Workplace:
-    """A copy of the project, in which one error is tried at a time."""
+    """A copy of the project, in which one error is tried at a time.
 
-    def __init__(self, folder: Path, shared_cache: Path, project: Path = ROOT) -> None:
+    Most errors are tried in a fork of a process that has collected the tests already, where the
+    functions that differ are exchanged. An error in what is executed while its file is imported,
+    and one that is not noticed so, is tried by a pytest of its own.
+
+    Parameters
+    ----------
+    folder
+        That of the copy, which is made.
+    shared_cache
+        What is compiled is kept there.
+    project
+        Where the original is.
+    files
+        Files with tests that the process with the forks collects; none: there is no such process.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        shared_cache: Path,
+        project: Path = ROOT,
+        files: Iterable[str] = (),
+    ) -> None:
         self._folder, self._cache = folder, shared_cache
+        self._own_cache = folder / "own_cache"
         ignored = shutil.ignore_patterns("__pycache__", ".*")
         folder.mkdir(parents=True)
+        shared_cache.mkdir(exist_ok=True, mode=0o700)
         for path in project.iterdir():
             if path.is_file():
                 shutil.copy(path, folder)
             elif path.name in _COPIED:
                 shutil.copytree(path, folder / path.name, ignore=ignored)
+        named = tuple(files)
+        self._server = self._serve(named) if named else None
 
-    def pytest(self, words: Iterable[str], cache: Path | None = None) -> tuple[int | None, str]:
+    def _serve(self, files: Sequence[str]) -> ForkServer:
+        server = ForkServer(self._folder / "forks", self._folder, self._environment(), files)
+        if not server.ready:
+            output = (self._folder / "forks" / "output").read_text("utf-8")
+            raise RuntimeError(f"The tests cannot be collected:\n{output}")
+        return server
+
+    def close(self) -> None:
+        """End the process with the forks."""
+        if self._server is not None:
+            self._server.close()
+
+    def failing(self, tests: Iterable[str]) -> str:
+        """Return the first test that fails in a fork though there is no error; "": none does."""
+        assert self._server is not None
+        return self._server.run(dict.fromkeys(tests, _LIMITS))[0]
+
+    def try_error(self, error: KnownError) -> tuple[Outcome, str]:
+        """Return what its tests make of an error, and their output where they did not run."""
+        path = self._folder / error.file
+        text = path.read_text("utf-8")
+        try:
+            changed = error.put_into(text)
+        except ValueError as problem:
+            return Outcome.NOT_RUN, str(problem)
+        own = error.file.startswith(_KEEPS_RESULTS)
+        write_source(path, changed)
+        try:
+            if own:
+                # Plans of the code as it is, under the names of those that it would make now.
+                shutil.copytree(
+                    self._cache, self._own_cache, ignore=shutil.ignore_patterns("plans")
+                )
+            if self._noticed_in_a_fork(error, path, text):
+                return Outcome.NOTICED, ""
+            code, output = self._pytest(error.noticed_by)
+        finally:
+            write_source(path, text)
+            shutil.rmtree(self._own_cache, ignore_errors=True)
+        match code:
+            case 0:
+                return Outcome.NOT_NOTICED, ""
+            case 1:
+                return Outcome.NOTICED, ""
+            case None:
+                return Outcome.NOT_RUN, f"They took longer than {_TIME_LIMIT:g} s."
+        return Outcome.NOT_RUN, output
+
+    def _noticed_in_a_fork(self, error: KnownError, path: Path, text: str) -> bool:
+        if self._server is None:
+            return False
+        exchange = (str(path), text) if path.suffix == ".py" else None
+        limits = dict.fromkeys(error.noticed_by, _LIMITS)
+        cache = {"SPACEROBOT_CACHE_DIR": str(self._cache_in_use)}
+        try:
+            return self._server.run(limits, exchange, **cache)[1] is How.FAILED
+        except NotExchangedError:
+            return False
+
+    def _pytest(self, words: Iterable[str]) -> tuple[int | None, str]:
         """Run tests in the copy; return pytest's exit code, None out of time, and its output."""
-        environment = os.environ | {
-            "PYTHONPATH": str(self._folder),
-            # A compiled module is taken for up to date by the second in which its source changed.
-            "PYTHONDONTWRITEBYTECODE": "1",
-            "SPACEROBOT_CACHE_DIR": str(cache or self._cache),
-        }
         options = ("-q", "-x", "-p", "no:cacheprovider", "--tb=line")
         process = subprocess.Popen(
             [sys.executable, "-m", "pytest", *options, *words],
             cwd=self._folder,
-            env=environment,
+            env=self._environment(),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -192,32 +279,26 @@ class Workplace:
             return None, output
         return process.returncode, output
 
-    def try_error(self, error: KnownError) -> tuple[Outcome, str]:
-        """Return what its tests make of an error, and their output where they did not run."""
-        path = self._folder / error.file
-        text = path.read_text("utf-8")
-        own = self._folder / "own_cache" if error.file.startswith(_KEEPS_RESULTS) else None
-        path.write_text(error.put_into(text), "utf-8")
-        try:
-            code, output = self.pytest(error.noticed_by, own)
-        finally:
-            path.write_text(text, "utf-8")
-            shutil.rmtree(self._folder / "own_cache", ignore_errors=True)
-        match code:
-            case 0:
-                return Outcome.NOT_NOTICED, ""
-            case 1:
-                return Outcome.NOTICED, ""
-            case None:
-                return Outcome.NOT_RUN, f"They took longer than {_TIME_LIMIT:g} s."
-        return Outcome.NOT_RUN, output
+    @property
+    def _cache_in_use(self) -> Path:
+        return self._own_cache if self._own_cache.exists() else self._cache
+
+    def _environment(self) -> dict[str, str]:
+        # A compiled module is taken for up to date by the second in which its source changed.
+        return environment_of(self._folder, self._cache_in_use) | {"PYTHONDONTWRITEBYTECODE": "1"}
 
 
 @contextmanager
-def _workplaces() -> Iterator[list[Workplace]]:
+def _workplaces(files: Sequence[str]) -> Iterator[list[Workplace]]:
     with tempfile.TemporaryDirectory(prefix="spacerobot_ros_known_errors_") as folder:
-        root = Path(folder)
-        yield [Workplace(root / str(i), root / "cache") for i in range(_AT_ONCE)]
+        root, places = Path(folder), list[Workplace]()
+        try:
+            for i in range(_AT_ONCE):
+                places.append(Workplace(root / str(i), root / f"cache{i}", files=files))
+            yield places
+        finally:
+            for place in places:
+                place.close()
 
 
 def main(words: list[str]) -> int:
@@ -233,12 +314,14 @@ def main(words: list[str]) -> int:
     if not errors:
         print("No known error is called so.")
         return 2
-    with _workplaces() as workplaces:
-        tests = sorted({test for error in errors for test in error.noticed_by})
-        code, output = workplaces[0].pytest(["-n", str(_AT_ONCE), *tests])
-        if code != 0:
-            print(f"Without any error in the package its tests do not pass:\n{output}")
-            return 1
+    tests = sorted({test for error in errors for test in error.noticed_by})
+    files = sorted({test.split("::")[0] for test in tests})
+    with _workplaces(files) as workplaces, ThreadPoolExecutor(_AT_ONCE) as pool:
+        shares = [tests[i::_AT_ONCE] for i in range(_AT_ONCE)]
+        for failing in pool.map(Workplace.failing, workplaces, shares):
+            if failing:
+                print(f"Without any error in the package this test does not pass: {failing}")
+                return 1
         free: SimpleQueue[Workplace] = SimpleQueue()
         for workplace in workplaces:
             free.put(workplace)
@@ -254,8 +337,7 @@ def main(words: list[str]) -> int:
                 print(output, flush=True)
             return outcome
 
-        with ThreadPoolExecutor(_AT_ONCE) as pool:
-            outcomes = list(pool.map(attempt, errors))
+        outcomes = list(pool.map(attempt, errors))
     noticed = outcomes.count(Outcome.NOTICED)
     print(f"{noticed} of {len(errors)} known errors were noticed.")
     return 0 if noticed == len(errors) else 1
