@@ -1,5 +1,7 @@
 """The exceptions of this package: every one carries a sentence that a user can act on."""
 
+from enum import Enum
+
 _LONGEST_SENTENCE = 2000
 
 
@@ -29,6 +31,37 @@ class ParameterError(SpaceRobotError):
 
 class PlanningError(SpaceRobotError):
     """A goal that is refused or cannot be reached; the sentence says why."""
+
+
+class Proof(Enum):
+    """What proves that a goal cannot be reached."""
+
+    LIMITS = "joint limits"
+    """No shape within them is that of the goal."""
+
+    MOMENTUM = "momentum"
+    """At zero momentum the centre of mass rests, and the goal would move it."""
+
+    RANK = "rank"
+    """No motion of the joints turns the base so."""
+
+
+class UnreachableError(PlanningError):
+    """A goal that the robot cannot reach: the sentence says why, and ``proof`` of what kind that is.
+
+    A goal that merely was not reached by what was tried is a :class:`NotFoundError`.
+    """
+
+    def __init__(self, sentence: str, proof: Proof) -> None:
+        super().__init__(sentence)
+        self.proof = proof
+
+
+class NotFoundError(PlanningError):
+    """A goal to which no manoeuvre was found, which proves nothing.
+
+    The sentence says how hard it was tried, and what may help.
+    """
 
 
 class GoalError(PlanningError):

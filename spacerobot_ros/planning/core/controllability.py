@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 
@@ -171,12 +171,13 @@ def require_three_slots(robot: SpaceRobot, slots: Array) -> None:
     )
 
 
-def tilted_goal(robot: SpaceRobot, axis: Array, tilt: float) -> PlanningError:
+def tilted_goal(robot: SpaceRobot, axis: Array, tilt: float) -> UnreachableError:
     """Return the refusal of an attitude ``tilt`` (rad) off the turns about an ``axis`` (3,)."""
-    return PlanningError(
+    return UnreachableError(
         f"The goal attitude is {tilt:.4g} rad off any rotation about the axis "
         f"{(np.round(axis, 6) + 0.0).tolist()} of {robot.base_link}: planar robot "
-        f"'{robot.description.name}' turns about no other."
+        f"'{robot.description.name}' turns about no other.",
+        Proof.RANK,
     )
 
 

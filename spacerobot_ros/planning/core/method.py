@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from spacerobot_ros.errors import GoalError, PlanningError
+from spacerobot_ros.errors import GoalError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
@@ -189,7 +189,7 @@ class GaitMethod(ABC):
         ------
         GoalError
             It is of another robot.
-        PlanningError
+        UnreachableError
             It is beyond the joint limits.
         """
         wanted, robot = goal.joint_positions, self.robot
@@ -204,10 +204,11 @@ class GaitMethod(ABC):
         worst = int(np.argmax(beyond))
         if beyond[worst] > _BEYOND:
             joint = robot.description.movable_joints[worst]
-            raise PlanningError(
+            raise UnreachableError(
                 f"The goal shape is beyond limits: joint '{joint.name}' at "
                 f"{wanted[worst]:.4g} {joint.unit}, and its limits are "
-                f"[{robot.lower[worst]:.4g}, {robot.upper[worst]:.4g}] {joint.unit}."
+                f"[{robot.lower[worst]:.4g}, {robot.upper[worst]:.4g}] {joint.unit}.",
+                Proof.LIMITS,
             )
         return np.clip(wanted, robot.lower, robot.upper)
 

@@ -210,9 +210,9 @@ class AreaLoopGait(GaitMethod):
             share /= 2
         else:
             raise PlanningError(
-                "No cycle of area_loop round the nominal shape "
-                f"{np.round(nominal.shape, 4).tolist()}, however small, brings the base nearer to "
-                f"its goal than {missing:.3g} rad."
+                f"None of {_TRIALS} cycles of area_loop round the nominal shape "
+                f"{np.round(nominal.shape, 4).tolist()}, each half as large as the one before, "
+                f"brings the base nearer to its goal than {missing:.3g} rad."
             )
         duration = (len(after.positions) - len(gait.positions)) * self.control_period
         if cycles * duration > self.options.longest:

@@ -6,7 +6,13 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.errors import (
+    NotFoundError,
+    ParameterError,
+    PlanningError,
+    SpaceRobotError,
+    UnreachableError,
+)
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
@@ -51,12 +57,12 @@ class AutoGait(GaitMethod):
     ) -> None:
         super().__init__(robot, control_period, integration_step)
         self._candidates = candidates
-        self._unsuitable: dict[str, str] = {}
+        self._unsuitable: dict[str, SpaceRobotError] = {}
         for name, candidate in candidates.items():
             try:
                 candidate.method.require_suitable(robot)
             except PlanningError as refusal:
-                self._unsuitable[name] = str(refusal)
+                self._unsuitable[name] = refusal
         self._built: dict[str, GaitMethod] = {}
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
@@ -68,14 +74,15 @@ class AutoGait(GaitMethod):
         Raises
         ------
         PlanningError
-            No method plans; the sentences of all of them say why.
+            No method plans; the sentences of all of them say why. It is an `UnreachableError` where
+            one of them proves it, and else a `NotFoundError` where one of them searched.
         """
         refusals = dict(self._unsuitable)
         names = self._standing(refusals)
         if request.motion is not None:
             for name in names:
                 if not self._candidates[name].method.starts_in_motion:
-                    refusals[name] = f"{name} plans from rest only."
+                    refusals[name] = PlanningError(f"{name} plans from rest only.")
             names = [name for name in names if name not in refusals]
         flying = "" if request.previous is None else request.previous.method
         if flying in names:
@@ -90,10 +97,7 @@ class AutoGait(GaitMethod):
             if schedule is not None:
                 results[name] = _Result.of(schedule, request)
         if not results:
-            raise PlanningError(
-                f"No method plans this goal of robot '{self.robot.description.name}'. "
-                + " ".join(f"{name}: {refusals[name]}" for name in self._candidates)
-            )
+            raise self._refusal(refusals)
         chosen = min(results, key=lambda name: results[name].rank(results.values()))
         because = f"{chosen} suits robot '{self.robot.description.name}' and " + (
             f"plans the shortest of {len(results)} manoeuvres to this goal."
@@ -102,7 +106,20 @@ class AutoGait(GaitMethod):
         )
         return _noted(results[chosen].schedule, chosen, because, results, refusals)
 
-    def _standing(self, refusals: dict[str, str]) -> list[str]:
+    def _refusal(self, refusals: Mapping[str, SpaceRobotError]) -> PlanningError:
+        """Return the refusal of a goal that no method plans."""
+        reasons = " ".join(f"{name}: {refusals[name]}" for name in self._candidates)
+        sentence = f"No method plans this goal of robot '{self.robot.description.name}'. {reasons}"
+        # What a method has against a robot says nothing of a goal.
+        of_goal = [refusals[name] for name in self._candidates if name not in self._unsuitable]
+        for refusal in of_goal:
+            if isinstance(refusal, UnreachableError):
+                return UnreachableError(sentence, refusal.proof)
+        if any(isinstance(refusal, NotFoundError) for refusal in of_goal):
+            return NotFoundError(sentence)
+        return PlanningError(sentence)
+
+    def _standing(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
         """Return the methods to compare; give the reason against the others.
 
         These are methods that leave a part of the pose as it comes, which another one controls.
@@ -114,19 +131,21 @@ class AutoGait(GaitMethod):
             try:
                 pose[name] = self._method(name).controls & POSE
             except ParameterError as refusal:
-                refusals[name] = str(refusal)
+                refusals[name] = refusal
         for name, parts in pose.items():
             more = [other for other in pose.values() if parts < other]
             if more:
                 lost = " and ".join(sorted(frozenset[str]().union(*more) - parts))
-                refusals[name] = f"{name} would leave the {lost} of the base as it comes."
+                refusals[name] = PlanningError(
+                    f"{name} would leave the {lost} of the base as it comes."
+                )
         return [name for name in pose if name not in refusals]
 
     def _planned(
         self,
         name: str,
         request: PlanRequest,
-        refusals: dict[str, str],
+        refusals: dict[str, SpaceRobotError],
         cancellation: Cancellation,
     ) -> GaitSchedule | None:
         """Return the schedule of one method, None where it refuses; its sentence is kept."""
@@ -135,7 +154,7 @@ class AutoGait(GaitMethod):
         except PlanningCancelled:
             raise
         except (ParameterError, PlanningError) as refusal:
-            refusals[name] = str(refusal)
+            refusals[name] = refusal
             return None
 
     def _method(self, name: str) -> GaitMethod:
@@ -189,7 +208,7 @@ def _noted(
     chosen: str,
     because: str,
     results: Mapping[str, _Result],
-    refusals: Mapping[str, str],
+    refusals: Mapping[str, SpaceRobotError],
 ) -> GaitSchedule:
     """Return a schedule whose notes say what it was compared with."""
     compared = [f"{name}: {result.sentence}." for name, result in results.items()]

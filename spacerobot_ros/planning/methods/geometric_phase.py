@@ -75,7 +75,7 @@ def planar_axis(robot: SpaceRobot) -> Array:
     if len(bodies) < 3:
         raise PlanningError(
             f"Robot '{name}' has {len(bodies)} link(s) that move against each other: with fewer "
-            "than three, motions of the joints cannot reorient a planar robot (paper 3, section "
+            "than three, loops of the joints do not reorient a planar robot (paper 3, section "
             "III)."
         )
     axes: list[Array] = []

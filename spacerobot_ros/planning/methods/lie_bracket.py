@@ -16,7 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
@@ -128,8 +128,10 @@ class LieBracketGait(GaitMethod):
 
         Raises
         ------
+        UnreachableError
+            ``zf`` is beyond a stroke, of a robot that has sliders only.
         PlanningError
-            There are no three independent slots, or ``zf`` is beyond a stroke.
+            It is, of another robot; or there are no three independent slots.
         """
         robot = self.robot
         R0, Rf = matrix_from_quaternion(state.quaternion), matrix_from_quaternion(goal.quaternion)
@@ -157,13 +159,23 @@ class LieBracketGait(GaitMethod):
         bounded = lsq_linear(P, shift, (lower - z0 - room, upper - z0 + room), method="bvls")
         if np.linalg.norm(P @ bounded.x - shift) <= 1e-9 * max(1.0, float(np.linalg.norm(shift))):
             return np.asarray(bounded.x, dtype=float)
-        z = z0 + dz
-        worst = int(np.argmax(np.maximum(lower - z, z - upper)))
-        name = self.robot.joint_names[self.sliders[worst]]
-        raise PlanningError(
-            f"The goal is beyond stroke: it needs joint '{name}' at {z[worst]:.4g} m, and its "
-            f"stroke is [{lower[worst]:.4g}, {upper[worst]:.4g}] m."
-        )
+        if len(self.sliders) == 3:
+            z = z0 + dz
+            worst = int(np.argmax(np.maximum(lower - z, z - upper)))
+            name = self.robot.joint_names[self.sliders[worst]]
+            sentence = (
+                f"The goal is beyond stroke: it needs joint '{name}' at {z[worst]:.4g} m, and its "
+                f"stroke is [{lower[worst]:.4g}, {upper[worst]:.4g}] m."
+            )
+        else:
+            sentence = (
+                f"The goal is beyond stroke: {len(self.sliders)} sliders put the base no nearer "
+                f"than {np.linalg.norm(P @ bounded.x - shift):.3g} m to it."
+            )
+        # Other joints move the centre of mass too, but not by this method.
+        if len(self.sliders) < self.robot.n:
+            raise PlanningError(sentence)
+        raise UnreachableError(sentence, Proof.LIMITS)
 
     def _slide(self, z0: Array, z_f: Array) -> Array:
         """Step 2: shapes (N + 1, n) under ``v_i = c_i sin^2(2 pi n1 t / t1)``, eq. (10)."""

@@ -344,7 +344,7 @@ class SquareSearch:
         if largest.sides[-1] < _LARGEST_SIDE * _LARGEST_WITHIN:
             most += f", with sides of up to {largest.sides[-1]:.3g} rad within the joint limits"
         if largest.largest < _NO_ROTATION:
-            return f"The base cannot be turned by {wanted:.4g} rad: {most}."
+            return f"The base cannot be turned by {wanted:.4g} rad by square loops: {most}."
         return (
             f"A turn of the base by {wanted:.4g} rad takes "
             f"{math.ceil(abs(wanted) / largest.largest)} loops, more than most_loops = "

@@ -8,15 +8,17 @@ section 4).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
+    quaternion_from_rotvec,
     quaternion_inverse,
     quaternion_multiply,
     swing_angle,
@@ -32,6 +34,7 @@ from spacerobot_ros.planning.core.controllability import (
 )
 from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.core.reach import CenterReach
 from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions, MotionLimits
 
@@ -54,6 +57,16 @@ _STEPS, _COARSE_INTEGRAL = 1000, 1e-5
 
 _BEYOND = 1e-9
 """Rounding that a joint may be beyond its limits by, m or rad."""
+
+_SHARE = 0.5
+"""Share of the tolerance of the position that the base is planned to miss it by, at most, where it
+cannot be on the spot: the rest is for what turns out otherwise."""
+
+_NODES = 48
+"""Nodes of Gauss and Legendre along the way to a shape."""
+
+_LIKELY = 4.0
+"""Times the range of the joints within which a shape beyond it is worth telling."""
 
 _ON_THE_SPOT = 1e-10
 """Distance from where the base is to be that counts as there, m."""
@@ -142,8 +155,12 @@ class GoalSpecification:
 
         Raises
         ------
-        PlanningError
+        UnreachableError
             A part of the goal is out of the robot's reach.
+        NotFoundError
+            No shape that puts the base there was found.
+        PlanningError
+            No such goal is planned.
         """
         self.require_suitable(robot)
         state, goal, tolerance = request.state, request.goal, request.tolerance
@@ -151,11 +168,15 @@ class GoalSpecification:
         if shape is None and self.same_shape:
             shape = state.q
         if self.attitude:
-            self._require_turn(robot, turn, shape, tolerance.attitude)
+            self._require_turn(robot, turn, tolerance.attitude)
             if robot.n == 1 and len(self.turning.axes):
                 _require_within_one_joint(
                     robot, limits, state.q, self.turning.axes[0], turn, tolerance.attitude
                 )
+            if shape is not None and len(self.axes) and not self.turning.loops:
+                turn = self._turn_to(robot, turn, state.q, shape, tolerance.attitude)
+                # The only joint is in the shape of the goal where the attitude is that of the goal.
+                shape = shape if robot.n > 1 else None
         R_WB = matrix_from_quaternion(state.quaternion)
         direction = np.zeros(3) if direction_W is None else R_WB.T @ direction_W
         if not self.position:
@@ -172,36 +193,60 @@ class GoalSpecification:
         if shape is not None:
             miss = float(np.linalg.norm(robot.center_of_mass(shape) - center))
             if miss > tolerance.position:
-                raise PlanningError(
+                raise UnreachableError(
                     f"Attitude and shape of the goal put the base {miss:.3g} m from its position: "
                     "without thrust the centre of mass stays where it is. Leave the shape out, or "
-                    "ignore the position with optimal.base_position 2."
+                    "ignore the position with optimal.base_position 2.",
+                    Proof.MOMENTUM,
                 )
             return BoundaryConditions(state.q, turn, shape, shape, None, direction)
-        likely = shape_for_center(robot, limits, state.q, center)
+        likely = shape_for_center(robot, limits, state.q, center, _SHARE * tolerance.position)
+        center = robot.center_of_mass(likely)
         # Three coordinates have few shapes for one centre of mass, or one.
         if robot.n <= 3:
             return BoundaryConditions(state.q, turn, likely, likely, None, direction)
         return BoundaryConditions(state.q, turn, likely, None, center, direction)
 
     def _require_turn(
-        self, robot: SpaceRobot, turn: Array, shape: Array | None, tolerance: float
+        self, robot: SpaceRobot, turn: Array, tolerance: float
     ) -> None:
         """Refuse attitudes that the joints cannot bring about."""
         axes, name = self.turning.axes, robot.description.name
         tilt = swing_angle(turn, axes)
         if tilt > max(tolerance, _NO_ROTATION):
             if not len(axes):
-                raise PlanningError(
+                raise UnreachableError(
                     f"The attitude of robot '{name}' is uncontrollable: its joints do not turn its "
-                    f"base, and the goal is turned by {tilt:.4g} rad."
+                    f"base, and the goal is turned by {tilt:.4g} rad.",
+                    Proof.RANK,
                 )
             raise tilted_goal(robot, axes[0], tilt)
-        if shape is not None and len(axes) and not self.turning.loops:
-            raise PlanningError(
-                f"The attitude of robot '{name}' is uncontrollable where the final shape is given: "
-                "loops of its joints do not turn its base."
+
+    def _turn_to(
+        self, robot: SpaceRobot, turn: Array, start: Array, shape: Array, tolerance: float
+    ) -> Array:
+        """Return the turn (4,) on all ways to a shape (n,), where loops turn nothing.
+
+        Raises
+        ------
+        UnreachableError
+            It is not the turn of the goal.
+        """
+        axis, way = self.turning.axes[0], shape - start
+        nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+        rates = [
+            -axis @ robot.connection(start + (1 + node) / 2 * way)[3:] @ way for node in nodes
+        ]
+        angle = float(weights @ np.array(rates)) / 2
+        wanted = 2 * math.atan2(float(axis @ turn[:3]), float(turn[3]))
+        if abs(math.remainder(wanted - angle, 2 * math.pi)) > max(tolerance, _NO_ROTATION):
+            raise UnreachableError(
+                f"The attitude of robot '{robot.description.name}' is uncontrollable where the "
+                "final shape is given: loops of its joints do not turn its base, and the way to "
+                f"that shape turns it by {angle:.4g} rad.",
+                Proof.RANK,
             )
+        return quaternion_from_rotvec(axis * angle)
 
 
 @dataclass(frozen=True)
@@ -263,15 +308,17 @@ def _require_within_one_joint(
     wanted = 2 * np.arctan2(axis @ turn[:3], turn[3])
     whole = 2 * np.pi
     # The same attitude may also be reached the other way round.
-    nearest = wanted + whole * np.arange(-2, 3)
+    turns = np.arange(np.floor(least / whole) - 1, np.ceil(most / whole) + 2)
+    nearest = wanted + whole * turns
     beyond = np.maximum(least - nearest, nearest - most)
     if beyond.min() > max(tolerance, _COARSE_INTEGRAL):
         joint = robot.description.movable_joints[0]
         angle = (wanted + np.pi) % whole - np.pi
-        raise PlanningError(
+        raise UnreachableError(
             f"The goal attitude is beyond the joint limits: joint '{joint.name}', which is the "
             f"only one, turns the base by {least:.4g} to {most:.4g} rad from here, and the goal "
-            f"is turned by {angle:.4g} rad."
+            f"is turned by {angle:.4g} rad.",
+            Proof.LIMITS,
         )
 
 
@@ -292,13 +339,19 @@ def center_rate(robot: SpaceRobot, q: Array) -> Array:
     return np.asarray(A[:3] - np.cross(robot.center_of_mass(q), A[3:], axisb=0, axisc=0))
 
 
-def shape_for_center(robot: SpaceRobot, limits: MotionLimits, start: Array, wanted: Array) -> Array:
+def shape_for_center(
+    robot: SpaceRobot, limits: MotionLimits, start: Array, wanted: Array, enough: float
+) -> Array:
     """Return the shape (n,), near ``start``, whose centre of mass is at ``wanted`` (3,), m, in B.
+
+    Where there is none it may be ``enough`` (m) beside.
 
     Raises
     ------
-    PlanningError
-        None was found within the limits: the base cannot be where the goal wants it.
+    UnreachableError
+        There is none within the limits: the base cannot be where the goal wants it.
+    NotFoundError
+        None was found.
     """
     lower, upper = limits.lower, limits.upper
     # The solver wants room between its bounds.
@@ -328,7 +381,9 @@ def shape_for_center(robot: SpaceRobot, limits: MotionLimits, start: Array, want
     found = nearest_for_center(robot, limits, best, wanted)
     if found is not None:
         return found
-    raise _out_of_reach(robot, limits, best, wanted)
+    if _distance(robot, best, wanted) <= enough:
+        return best
+    raise _no_shape(robot, limits, best, wanted)
 
 
 def nearest_for_center(
@@ -357,25 +412,33 @@ def _distance(robot: SpaceRobot, q: Array, wanted: Array) -> float:
     return float(np.linalg.norm(robot.center_of_mass(q) - wanted))
 
 
-def _out_of_reach(
+def _no_shape(
     robot: SpaceRobot, limits: MotionLimits, near: Array, wanted: Array
-) -> PlanningError:
-    """Return why no shape puts the base where it is wanted; ``near`` (n,) comes nearest."""
+) -> UnreachableError | NotFoundError:
+    """Return why no shape puts the base where it is wanted; ``near`` (n,) came nearest."""
+    name, distance = robot.description.name, _distance(robot, near, wanted)
+    gap = CenterReach.of(robot, limits.lower, limits.upper).gap(wanted)
+    if gap <= _ON_THE_SPOT:
+        return NotFoundError(
+            f"No shape of '{name}' that puts the base at the goal position was found from {_TRIES} "
+            f"starts: without thrust the centre of mass stays where it is, and the nearest shape "
+            f"that was found puts the base {distance:.3g} m from it. A nearer position may help, "
+            "another attitude, or optimal.base_position 2, which ignores the position."
+        )
     free = _free_shape(robot, near, wanted)
-    far = float(np.linalg.norm(free - near))
-    if _distance(robot, free, wanted) <= _ON_THE_SPOT and far < 10 * np.linalg.norm(
-        limits.span(near)[1]
-    ):
-        beyond = np.maximum(limits.lower - free, free - limits.upper)
-        worst = int(np.argmax(beyond))
+    # Three sliders have one shape for a centre of mass.
+    if len(sliders_of(robot)) == robot.n == 3 and _distance(robot, free, wanted) <= _ON_THE_SPOT:
+        worst = int(np.argmax(np.maximum(limits.lower - free, free - limits.upper)))
         joint = robot.description.movable_joints[worst]
-        return PlanningError(
+        sentence = (
             f"The goal is beyond the joint limits: it needs joint '{joint.name}' at "
             f"{free[worst]:.4g} {joint.unit}, and optimal keeps it in [{limits.lower[worst]:.4g}, "
             f"{limits.upper[worst]:.4g}] {joint.unit}."
         )
-    return PlanningError(
+        if np.abs(free).max() < _LIKELY * (1 + np.abs(limits.span(near)[1]).max()):
+            return UnreachableError(sentence, Proof.LIMITS)
+    return UnreachableError(
         "The goal position is out of reach: without thrust the centre of mass stays where it is, "
-        f"and the nearest that the joints of '{robot.description.name}' were found to put the base "
-        f"is {_distance(robot, near, wanted):.3g} m from it."
+        f"and the joints of '{name}' put the base no nearer than {gap:.3g} m to it.",
+        Proof.LIMITS,
     )

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import NotFoundError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
@@ -145,7 +145,7 @@ class ManoeuvreSearch:
 
         Raises
         ------
-        PlanningError
+        NotFoundError
             None was found.
         PlanningCancelled
             The search was cancelled.
@@ -186,7 +186,7 @@ class ManoeuvreSearch:
         if not found:
             within = f" within optimal.time_budget {budget.time_budget:g} s" if cut_short else ""
             longer = "A longer optimal.time_budget, more" if cut_short else "More"
-            raise PlanningError(
+            raise NotFoundError(
                 f"No manoeuvre to the goal was found from {starts} start(s){within}: {rejection}. "
                 f"{longer} optimal.starts, optimal.iterations or optimal.intervals, a longer "
                 "optimal.longest, or a smaller goal may help."

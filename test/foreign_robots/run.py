@@ -1,0 +1,321 @@
+"""Plan many random goals for robots that are in none of the papers, and count what becomes of them.
+
+`make foreign-robots` runs it. Every plan is integrated again by Pinocchio, from the conservation of
+momentum, and its end compared with the goal. What is done is kept in ``out/foreign_robots``, goal
+by goal: a run that was ended goes on where it was. The table of the documents is written from it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import statistics
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+from support.oracles import PinocchioOracle
+
+from spacerobot_ros.errors import NotFoundError, PlanningError, UnreachableError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.planning import (
+    GaitMethod,
+    GaitSchedule,
+    Goal,
+    PlanRequest,
+    RobotState,
+    Tolerance,
+    build_method,
+    method_options,
+)
+from spacerobot_ros.planning.core.controllability import shape_box
+from spacerobot_ros.resources import robot_file
+
+Array = npt.NDArray[np.float64]
+
+PROJECT = Path(__file__).parents[2]
+KEPT = PROJECT / "out" / "foreign_robots"
+TABLE = PROJECT / "docs" / "foreign_robots.json"
+
+ROBOTS = {
+    "free_flyer": "a cabin free-flyer with an arm and a gripper",
+    "solar_booms": "a satellite with six solar booms",
+    "seven_joint_arm": "an arm of seven joints on a small satellite",
+    "station_arm": "a manipulator of a space station on a platform",
+    "quadruped": "a robot dog in the air",
+    "dual_arm": "a servicing satellite with two arms",
+}
+
+PERIOD = 0.05
+TOLERANCE = Tolerance(1e-3, 1e-3, 1e-3)
+
+_LONG = 4000
+"""Ticks; of longer gaits every tenth is integrated again."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A goal, where it is reached from, and what is asked of the base.
+
+    ``kind`` is ``attitude``, ``shape`` (and attitude) or ``position`` (and attitude); ``size`` is
+    the angle to turn by, rad.
+    """
+
+    number: int
+    kind: str
+    size: float
+    state: RobotState
+    goal: Goal
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a goal.
+
+    ``result`` is ``met``, ``missed`` (by the second integration), or the class of the refusal.
+    """
+
+    number: int
+    kind: str
+    size: float
+    result: str
+    method: str = ""
+    duration: float = 0.0
+    cpu: float = 0.0
+    error: float = -1.0
+    sentence: str = ""
+
+
+def tasks(robot: SpaceRobot, count: int) -> Iterator[Task]:
+    """Return goals of three kinds in turn, small and large, always the same ones.
+
+    Positions are those that the base has in a random shape, some of them put farther away: up to
+    some of these are out of reach. One shape in ten is beyond the joint limits.
+    """
+    lower, upper = shape_box(robot)
+    for number in range(count):
+        rng = np.random.default_rng([2026, number])
+        start = lower + (upper - lower) * rng.uniform(0.1, 0.9, robot.n)
+        final = lower + (upper - lower) * rng.uniform(0.1, 0.9, robot.n)
+        attitude = Rotation.random(random_state=rng)
+        kind = ("attitude", "shape", "position")[number % 3]
+        size = float(np.exp(rng.uniform(np.log(0.02), np.log(3.1))))
+        axis = rng.normal(size=3)
+        turned = attitude * Rotation.from_rotvec(size * axis / np.linalg.norm(axis))
+        state = RobotState(np.zeros(3), attitude.as_quat(), start)
+        goal = Goal.checked(np.zeros(3), turned.as_quat())
+        if kind == "shape":
+            # Small turns go with small changes of the shape.
+            final = start + (final - start) * min(1.0, size)
+            if rng.uniform() < 0.1:
+                joint = int(rng.integers(robot.n))
+                final[joint] = robot.upper[joint] + rng.uniform(0.01, 1.0)
+            goal = replace(goal, joint_positions=final)
+        elif kind == "position":
+            final = start + (final - start) * min(1.0, size)
+            moved = attitude.apply(robot.center_of_mass(start)) - turned.apply(
+                robot.center_of_mass(final)
+            )
+            if rng.uniform() < 0.3:
+                moved = moved * rng.uniform(1.0, 6.0)
+            goal = replace(goal, position=moved)
+        yield Task(number, kind, size, state, goal)
+
+
+def integrated(oracle: PinocchioOracle, state: RobotState, schedule: GaitSchedule) -> RobotState:
+    """Return where Pinocchio has the base at the end of a schedule, at zero momentum."""
+    h = schedule.control_period
+    attitude = Rotation.from_quat(state.quaternion)
+
+    def rate(q: Array, qdot: Array) -> Array:
+        return oracle.base_twist(q, qdot)[3:]
+
+    for q, qdot in zip(schedule.positions, schedule.velocities, strict=False):
+        if not qdot.any():
+            continue
+        # The rate depends on the shape alone: a commutator-free integrator of fourth order.
+        side = np.sqrt(3) / 6
+        for step in range(2):
+            at = q + qdot * h / 2 * step
+            one, two = (rate(at + qdot * h / 2 * (0.5 + s), qdot) for s in (-side, side))
+            first = h / 2 * ((0.25 + side) * one + (0.25 - side) * two)
+            second = h / 2 * ((0.25 - side) * one + (0.25 + side) * two)
+            attitude = attitude * Rotation.from_rotvec(first) * Rotation.from_rotvec(second)
+    start = Rotation.from_quat(state.quaternion).apply(oracle.center_of_mass(state.q))
+    end = schedule.positions[-1]
+    position = state.position + start - attitude.apply(oracle.center_of_mass(end))
+    return RobotState(position, attitude.as_quat(), end)
+
+
+def worst_error(end: RobotState, goal: Goal, schedule: GaitSchedule) -> float:
+    """Return the largest error of what the schedule controls, in parts of its tolerance."""
+    errors = [0.0]
+    if "attitude" in schedule.controls:
+        turn = Rotation.from_quat(end.quaternion).inv() * Rotation.from_quat(goal.quaternion)
+        errors.append(float(turn.magnitude()) / TOLERANCE.attitude)
+    if "position" in schedule.controls:
+        errors.append(float(np.linalg.norm(goal.position - end.position)) / TOLERANCE.position)
+    if "shape" in schedule.controls and goal.joint_positions is not None:
+        errors.append(float(np.abs(goal.joint_positions - end.q).max()) / TOLERANCE.shape)
+    return max(errors)
+
+
+def cpu_seconds() -> float:
+    """Return the processor time of this process and of those that it has waited for, s."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
+
+
+class Trials:
+    """Plans the goals of one robot by ``auto``."""
+
+    def __init__(self, name: str) -> None:
+        path = robot_file(name)
+        self.robot = SpaceRobot.from_file(path)
+        self._oracle = PinocchioOracle(path.read_text("utf-8"), self.robot.joint_names)
+        self._methods: dict[bool, GaitMethod] = {}
+
+    def _method(self, *, position: bool) -> GaitMethod:
+        if position not in self._methods:
+            options = method_options("optimal", {"base_position": 2 - position, "cache": 0})
+            self._methods[position] = build_method(
+                "auto", self.robot, PERIOD, DEFAULT_INTEGRATION_STEP, {"optimal": options}
+            )
+        return self._methods[position]
+
+    def outcome(self, task: Task) -> Outcome:
+        """Plan one goal, and go on where a schedule is partial."""
+        method, began = self._method(position=task.kind == "position"), cpu_seconds()
+        done = Outcome(task.number, task.kind, task.size, "met")
+        state, pieces, previous = task.state, [], None
+        try:
+            while previous is None or previous.partial:
+                request = PlanRequest(
+                    state, task.goal, TOLERANCE, correction=bool(pieces), previous=previous
+                )
+                previous = method.plan(request)
+                pieces.append(previous)
+                if previous.partial:
+                    path = previous.path
+                    state = RobotState(
+                        path.position[-1], path.quaternion[-1], previous.positions[-1]
+                    )
+        except UnreachableError as refusal:
+            return self._refused(done, refusal.proof.value, refusal, began)
+        except NotFoundError as refusal:
+            return self._refused(done, "not found", refusal, began)
+        except PlanningError as refusal:
+            return self._refused(done, "refused", refusal, began)
+        cpu = cpu_seconds() - began
+        duration = sum(piece.duration for piece in pieces)
+        error = self._checked(task, pieces)
+        return replace(
+            done,
+            result="met" if error <= 1.0 else "missed",
+            method=pieces[0].method,
+            duration=duration,
+            cpu=cpu,
+            error=error,
+        )
+
+    def _refused(self, done: Outcome, why: str, refusal: Exception, began: float) -> Outcome:
+        return replace(done, result=why, sentence=str(refusal), cpu=cpu_seconds() - began)
+
+    def _checked(self, task: Task, pieces: Sequence[GaitSchedule]) -> float:
+        """Return the worst error at the end, in tolerances; infinite where a limit is exceeded."""
+        robot, state = self.robot, task.state
+        ticks = sum(piece.ticks for piece in pieces)
+        for piece in pieces:
+            beyond = np.maximum(robot.lower - piece.positions, piece.positions - robot.upper)
+            fast = np.abs(piece.velocities) / robot.velocity_limit
+            if beyond.max() > 1e-8 or fast.max(initial=0.0) > 1 + 1e-8:
+                return float("inf")
+        if ticks <= _LONG or task.number % 10 == 0:
+            for piece in pieces:
+                state = integrated(self._oracle, state, piece)
+        else:
+            last = pieces[-1]
+            state = RobotState(last.path.position[-1], last.path.quaternion[-1], last.positions[-1])
+        return worst_error(state, task.goal, pieces[-1])
+
+
+def kept(name: str) -> list[Outcome]:
+    """Return what is done of a robot's goals."""
+    file = KEPT / f"{name}.jsonl"
+    if not file.is_file():
+        return []
+    lines = file.read_text("utf-8").splitlines()
+    return [Outcome(**json.loads(line)) for line in lines]
+
+
+def run(name: str, count: int) -> None:
+    """Plan the goals of a robot that are not done, and show each."""
+    KEPT.mkdir(parents=True, exist_ok=True)
+    done = {outcome.number for outcome in kept(name)}
+    trials = Trials(name)
+    for task in tasks(trials.robot, count):
+        if task.number in done:
+            continue
+        outcome = trials.outcome(task)
+        with (KEPT / f"{name}.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(asdict(outcome)) + "\n")
+        flown = f"{outcome.duration:.6g} s by {outcome.method}" if outcome.method else ""
+        print(
+            f"{name} {task.number + 1}/{count}: {task.kind}, {task.size:.3g} rad: {outcome.result} "
+            f"{flown}{outcome.sentence} ({outcome.cpu:.1f} s CPU)",
+            flush=True,
+        )
+
+
+def row(name: str, count: int) -> dict[str, Any] | None:
+    """Return the row of the table of a robot, None where nothing is done."""
+    outcomes = [outcome for outcome in kept(name) if outcome.number < count]
+    if not outcomes:
+        return None
+    robot = SpaceRobot.from_file(robot_file(name))
+    base = robot.description.bodies[0].inertia.mass
+    results = Counter(outcome.result for outcome in outcomes)
+    met = [outcome for outcome in outcomes if outcome.result == "met"]
+    return {
+        "robot": name,
+        "what": ROBOTS[name],
+        "joints": robot.n,
+        "mass_ratio": (robot.total_mass - base) / base,
+        "goals": len(outcomes),
+        "met": len(met),
+        "refused": {why: number for why, number in sorted(results.items()) if why != "met"},
+        "methods": dict(sorted(Counter(outcome.method for outcome in met).items())),
+        "median_duration": statistics.median([outcome.duration for outcome in met] or [0.0]),
+        "median_cpu": statistics.median(outcome.cpu for outcome in outcomes),
+    }
+
+
+def main() -> None:
+    """Run what is not done, and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--goals", type=int, default=100, help="goals a robot")
+    parser.add_argument("--only", default="", help="robots whose name contains this")
+    parser.add_argument("--fresh", action="store_true", help="forget what is done")
+    parser.add_argument("--no-table", action="store_true", help="leave the documents as they are")
+    given = parser.parse_args()
+    names = [name for name in ROBOTS if given.only in name]
+    for name in names:
+        if given.fresh:
+            (KEPT / f"{name}.jsonl").unlink(missing_ok=True)
+        run(name, given.goals)
+    rows = [found for name in ROBOTS if (found := row(name, given.goals))]
+    print(json.dumps(rows, indent=1))
+    if not given.no_table:
+        TABLE.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,249 @@
+"""What is proven to be out of reach: nothing that random motions of the joints reach."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planning.sliding_robots import random_sliding_robot
+from scipy.spatial.transform import Rotation
+from support.oracles import PinocchioOracle
+from support.planar_trees import random_tree
+from support.random_robots import random_chain_urdf, random_robot_urdf
+
+from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import (
+    Goal,
+    PlanRequest,
+    RobotState,
+    Tolerance,
+    build_method,
+    method_options,
+    plan,
+)
+from spacerobot_ros.planning.core.controllability import shape_box
+from spacerobot_ros.planning.core.reach import CenterReach
+from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
+from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
+from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
+from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
+
+Array = npt.NDArray[np.float64]
+
+TOLERANCE = Tolerance(1e-4, 1e-4, 1e-4)
+SEEDS = st.integers(0, 10**6)
+
+
+def urdf_of(kind: str, rng: np.random.Generator) -> str:
+    match kind:
+        case "tree":
+            return random_robot_urdf(rng, int(rng.integers(1, 6)))
+        case "chain":
+            return random_chain_urdf(rng, int(rng.integers(1, 6)))
+        case "planar":
+            return random_tree(rng, int(rng.integers(2, 5))).urdf
+        case _:
+            return random_sliding_robot(rng, int(rng.integers(3, 6))).urdf
+
+
+def some_shape(robot: SpaceRobot, rng: np.random.Generator) -> Array:
+    lower, upper = shape_box(robot)
+    # Ends of travel are likely, and the hardest.
+    return np.asarray(lower + (upper - lower) * np.clip(rng.uniform(-0.3, 1.3, robot.n), 0.0, 1.0))
+
+
+def moved(
+    oracle: PinocchioOracle, robot: SpaceRobot, state: RobotState, rng: np.random.Generator
+) -> tuple[Rotation, Array, Array]:
+    """Return attitude, position and shape after a random motion, by Pinocchio's momentum."""
+    attitude, q = Rotation.from_quat(state.quaternion), state.q
+    for _ in range(2):
+        final = some_shape(robot, rng)
+        way, side = (final - q) / 16, np.sqrt(3) / 6
+        for k in range(16):
+            # A commutator-free integrator of fourth order.
+            one, two = (
+                oracle.base_twist(q + (k + 0.5 + s) * way, way)[3:] for s in (-side, side)
+            )
+            for first, second in ((0.25 + side, 0.25 - side), (0.25 - side, 0.25 + side)):
+                attitude = attitude * Rotation.from_rotvec(first * one + second * two)
+        q = final
+    start = Rotation.from_quat(state.quaternion).apply(oracle.center_of_mass(state.q))
+    return attitude, state.position + start - attitude.apply(oracle.center_of_mass(q)), q
+
+
+def refusal(robot: SpaceRobot, state: RobotState, goal: Goal, **options: Any) -> str:
+    """Return why a goal is no boundary condition of ``optimal``; "" if it is one.
+
+    Fails where it is called unreachable.
+    """
+    chosen = OptimalOptions(**options)
+    # The integrator is some 1e-4 rad off.
+    request = PlanRequest(state, goal, Tolerance(1e-3, 2e-3, 1e-3))
+    try:
+        GoalSpecification.of(robot, chosen).boundary_conditions(
+            robot, request, goal.joint_positions, MotionLimits.of(robot, chosen), None
+        )
+    except UnreachableError as error:
+        pytest.fail(f"{error}")
+    except PlanningError as error:
+        return str(error)
+    return ""
+
+
+KINDS = ["tree", "chain", "planar", "sliders"]
+
+
+@settings(max_examples=2, deadline=None)
+@given(seed=SEEDS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_a_random_motion_reaches_is_never_called_unreachable(kind: str, seed: int) -> None:
+    check_what_a_random_motion_reaches(kind, seed)
+
+
+@pytest.mark.slow
+@settings(max_examples=100, deadline=None)
+@given(seed=SEEDS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_many_random_motions_reach_is_never_called_unreachable(kind: str, seed: int) -> None:
+    check_what_a_random_motion_reaches(kind, seed)
+
+
+def check_what_a_random_motion_reaches(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    urdf = urdf_of(kind, rng)
+    robot = SpaceRobot.from_urdf(urdf)
+    oracle = PinocchioOracle(urdf, robot.joint_names)
+    start = Rotation.random(random_state=rng).as_quat()
+    state = RobotState(rng.normal(size=3), start, some_shape(robot, rng))
+    attitude, position, q = moved(oracle, robot, state, rng)
+    turned = Goal.checked(np.zeros(3), attitude.as_quat())
+    refusal(robot, state, turned, base_position=2)
+    refusal(robot, state, replace(turned, joint_positions=q), base_position=2)
+    placed = replace(turned, position=position)
+    refused = refusal(robot, state, placed, base_position=1)
+    # A search of shapes may fail, and says so; with sliders alone it does not.
+    assert not refused or kind != "sliders", refused
+    assert "out of reach" not in refused
+    refusal(robot, state, replace(placed, joint_positions=q), base_position=1)
+    if kind == "sliders":
+        gait = LieBracketGait(robot, 0.25)
+        final = gait.final_shape(state, placed)
+        center = attitude.apply(oracle.center_of_mass(q) - oracle.center_of_mass(final))
+        assert np.linalg.norm(center) < 1e-6
+
+
+@settings(max_examples=3, deadline=None)
+@given(seed=SEEDS)
+@pytest.mark.parametrize("kind", ["tree", "chain", "sliders"])
+def test_the_bound_holds_every_centre_of_mass(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    urdf = urdf_of(kind, rng)
+    robot = SpaceRobot.from_urdf(urdf)
+    oracle = PinocchioOracle(urdf, robot.joint_names)
+    reach = CenterReach.of(robot, *shape_box(robot))
+    centres = [oracle.center_of_mass(some_shape(robot, rng)) for _ in range(20)]
+    assert max(reach.gap(center) for center in centres) < 1e-9
+    # It is no empty claim: half again as far off is out of reach.
+    far = np.array(centres) - reach.origin
+    spread = reach.radius + np.abs(reach.slots).sum() * 10
+    outward = far[0] / max(float(np.linalg.norm(far[0])), 1e-9)
+    assert reach.gap(reach.origin + 1.5 * spread * outward) > 0.4 * reach.radius
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_of_sliders_the_bound_is_exact(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    robot = SpaceRobot.from_urdf(random_sliding_robot(rng, 4).urdf)
+    lower, upper = shape_box(robot)
+    reach = CenterReach.of(robot, lower, upper)
+    for direction in rng.normal(size=(5, 3)):
+        direction = direction / np.linalg.norm(direction)
+        # The farthest centre of mass in a direction is that of a corner of the box of shapes.
+        slots = [
+            direction @ (robot.center_of_mass(unit) - robot.center_of_mass(np.zeros(robot.n)))
+            for unit in np.eye(robot.n)
+        ]
+        corner = robot.center_of_mass(np.where(np.array(slots) > 0, upper, lower))
+        assert reach.gap(corner) < 1e-9
+        assert reach.gap(corner - 1e-6 * direction) < 1e-6
+        assert reach.gap(corner + 0.01 * direction) == pytest.approx(0.01, rel=1e-6)
+
+
+def test_a_proof_and_a_search_in_vain_are_two_things() -> None:
+    arm: dict[str, Any] = {"robot": "three_joint_arm", "base_position": 1}
+    with pytest.raises(UnreachableError, match="no nearer than") as far:
+        plan(**arm, position=(2.0, 0.0, 0.0))
+    assert far.value.proof is Proof.LIMITS
+    # Within the ball round the shoulder, but the upper arm does not go through the spacecraft.
+    with pytest.raises(NotFoundError, match=r"was found from 8 starts.*may help"):
+        plan(**arm, position=(0.08, -0.04, 0.02))
+    with pytest.raises(UnreachableError, match="beyond limits") as shape:
+        plan("three_joint_arm", joint_positions=(9.0, 0.0, 0.0))
+    assert shape.value.proof is Proof.LIMITS
+    with pytest.raises(UnreachableError, match="off any rotation") as tilt:
+        plan("planar_chain", rotvec=(0.0, 0.1, 1.0))
+    assert tilt.value.proof is Proof.RANK
+    with pytest.raises(UnreachableError, match="centre of mass stays") as resting:
+        plan("sliding_masses", position=(0.1, 0, 0), joint_positions=(0, 0, 0))
+    assert resting.value.proof is Proof.MOMENTUM
+    with pytest.raises(NotFoundError, match=r"from 1 start\(s\)"):
+        plan("planar_chain", rotvec=(0, 0, 1.0), starts=1, iterations=1, cache=0)
+
+
+def test_auto_has_the_proof_of_any_method() -> None:
+    few = method_options("optimal", {"starts": 1, "iterations": 1, "cache": 0})
+    arm = SpaceRobot.from_file(Path(__file__).parents[2] / "urdf" / "three_joint_arm.urdf")
+    loops = method_options("area_loop", {"most_cycles": 1})
+    auto = build_method("auto", arm, 0.05, 0.01, {"optimal": few, "area_loop": loops})
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, -0.8, 1.5]))
+    turned = Goal.checked(np.zeros(3), Rotation.from_rotvec([0.0, 0.4, 1.0]).as_quat())
+    with pytest.raises(NotFoundError, match="No method plans"):
+        auto.plan(PlanRequest(state, turned, TOLERANCE))
+    beyond = replace(turned, joint_positions=np.array([9.0, 0.0, 0.0]))
+    with pytest.raises(UnreachableError, match="No method plans") as refused:
+        auto.plan(PlanRequest(state, beyond, TOLERANCE))
+    assert refused.value.proof is Proof.LIMITS
+
+
+def test_a_goal_a_little_beyond_the_reach_is_aimed_at_as_near_as_it_gets() -> None:
+    # 2.5 m of stroke of 2 kg moves 16 kg by 0.3125 m.
+    for beyond, position_tolerance in ((0.004, 0.01), (0.006, 0.01)):
+        asked: dict[str, Any] = {
+            "position": (0.3125 + beyond, 0.0, 0.0),
+            "tolerance": Tolerance(position_tolerance, 1e-3),
+            "cache": 0,
+            "starts": 2,
+            "answers": 1,
+        }
+        if beyond > position_tolerance / 2:
+            with pytest.raises(UnreachableError, match="beyond the joint limits"):
+                plan("sliding_masses", **asked)
+            continue
+        path = plan("sliding_masses", **asked).path
+        assert path.position[-1] == pytest.approx([0.3125, 0.0, 0.0], abs=1e-6)
+
+
+def test_the_shape_of_one_joint_that_turns_its_base_decides_the_attitude() -> None:
+    """Its loops turn nothing: a shape is reached with the attitude that goes with it, or not."""
+    robot = SpaceRobot.from_urdf(random_tree(np.random.default_rng(3), 2).urdf)
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(1))
+    oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
+    attitude, final = Rotation.identity(), np.array([0.7])
+    for k in range(200):
+        turn = oracle.base_twist((k + 0.5) / 200 * final, final / 200)[3:]
+        attitude = attitude * Rotation.from_rotvec(turn)
+    quick: dict[str, Any] = {"start": state, "cache": 0, "starts": 2, "answers": 1}
+    goal = Goal.checked(np.zeros(3), attitude.as_quat(), final)
+    schedule = plan(robot, goal, tolerance=Tolerance(1.0, 1e-3, 1e-3), **quick)
+    np.testing.assert_allclose(schedule.positions[-1], final, atol=1e-3)
+    other = replace(goal, joint_positions=-final)
+    with pytest.raises(UnreachableError, match="loops of its joints do not turn its base"):
+        plan(robot, other, tolerance=Tolerance(1.0, 1e-3, 1e-3), **quick)
