@@ -47,7 +47,7 @@ class Proof(Enum):
 
 
 class UnreachableError(PlanningError):
-    """A goal that the robot cannot reach: the sentence says why, and ``proof`` of what kind that is.
+    """A goal that the robot cannot reach; ``proof`` is of what kind the reason is.
 
     A goal that merely was not reached by what was tried is a :class:`NotFoundError`.
     """

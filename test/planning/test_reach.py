@@ -69,9 +69,7 @@ def moved(
         way, side = (final - q) / 16, np.sqrt(3) / 6
         for k in range(16):
             # A commutator-free integrator of fourth order.
-            one, two = (
-                oracle.base_twist(q + (k + 0.5 + s) * way, way)[3:] for s in (-side, side)
-            )
+            one, two = (oracle.base_twist(q + (k + 0.5 + s) * way, way)[3:] for s in (-side, side))
             for first, second in ((0.25 + side, 0.25 - side), (0.25 - side, 0.25 + side)):
                 attitude = attitude * Rotation.from_rotvec(first * one + second * two)
         q = final

@@ -1,4 +1,4 @@
-"""Where the joints can put the centre of mass in the base: a bound that proves what is out of reach.
+"""Where the joints can put the centre of mass in the base: a bound that proves what is out of it.
 
 Without thrust the centre of mass rests in the world, so a pose of the base says where it is in the
 base. Sliders whose directions are fixed in the base move it along straight slots, exactly. What

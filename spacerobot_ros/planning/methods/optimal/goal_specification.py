@@ -207,9 +207,7 @@ class GoalSpecification:
             return BoundaryConditions(state.q, turn, likely, likely, None, direction)
         return BoundaryConditions(state.q, turn, likely, None, center, direction)
 
-    def _require_turn(
-        self, robot: SpaceRobot, turn: Array, tolerance: float
-    ) -> None:
+    def _require_turn(self, robot: SpaceRobot, turn: Array, tolerance: float) -> None:
         """Refuse attitudes that the joints cannot bring about."""
         axes, name = self.turning.axes, robot.description.name
         tilt = swing_angle(turn, axes)
@@ -234,9 +232,7 @@ class GoalSpecification:
         """
         axis, way = self.turning.axes[0], shape - start
         nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-        rates = [
-            -axis @ robot.connection(start + (1 + node) / 2 * way)[3:] @ way for node in nodes
-        ]
+        rates = [-axis @ robot.connection(start + (1 + node) / 2 * way)[3:] @ way for node in nodes]
         angle = float(weights @ np.array(rates)) / 2
         wanted = 2 * math.atan2(float(axis @ turn[:3]), float(turn[3]))
         if abs(math.remainder(wanted - angle, 2 * math.pi)) > max(tolerance, _NO_ROTATION):
