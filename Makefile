@@ -81,6 +81,11 @@ actions: $(STAMP)/test ## do COUNT random actions in lockstep and as many in rea
 	SPACEROBOT_ACTIONS=$(COUNT) SPACEROBOT_ACTIONS_SEED=$(SEED) \
 	    $(BIN)/python3 -m pytest -q -s -m slow -k "$(ONLY)" test/nodes/test_random_actions.py
 
+GOALS ?= 100
+.PHONY: foreign-robots
+foreign-robots: $(STAMP)/test ## plan GOALS random goals each for robots that are in no paper; goes on where it was ended; ONLY=WORD: some
+	PYTHONPATH=.:test nice $(BIN)/python3 test/foreign_robots/run.py --goals $(GOALS) --only "$(filter-out many,$(ONLY))"
+
 .PHONY: real-time
 real-time: $(STAMP)/demo ## fly ten minutes in real time in separate processes, at 100, then 200 and 500 Hz
 	$(BIN)/spacerobot bench --real-time 600 --rate 100

@@ -195,7 +195,8 @@ class Trials:
         """Plan one goal, and go on where a schedule is partial."""
         method, began = self._method(position=task.kind == "position"), cpu_seconds()
         done = Outcome(task.number, task.kind, task.size, "met")
-        state, pieces, previous = task.state, [], None
+        state, previous = task.state, None
+        pieces: list[GaitSchedule] = []
         try:
             while previous is None or previous.partial:
                 request = PlanRequest(
