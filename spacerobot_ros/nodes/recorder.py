@@ -83,6 +83,8 @@ class RecorderNode(FlightNode):
     def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
         self._taps = _StreamTaps()
         self._stamps = _Stamps()
+        self._asked: dict[str, RemoteParameters | None] = {}
+        """The records of parameters that are in the bag, or that a node is asked for."""
         super().__init__(name, **kwargs)
 
     # -- life ---------------------------------------------------------------------------------
@@ -103,7 +105,7 @@ class RecorderNode(FlightNode):
         self._clock = self.resolve_topic_name(_CLOCK)
         self._wanted = {self.resolve_topic_name(topic) for topic in config.topics.split()}
         self._shared = {self._clock, *map(self.resolve_topic_name, _SHARED)}
-        self._asked: dict[str, RemoteParameters | None] = {}
+        self._asked = {}
         self._recorded: set[str] = set()
         self._unknown: set[str] = set()
         self._diagnostics: Publisher | None = None
