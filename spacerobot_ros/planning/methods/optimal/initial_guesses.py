@@ -125,6 +125,17 @@ class InitialGuesses:
             )
         return quaternions
 
+    def refined(self, solution: Trajectory) -> Trajectory:
+        """Return a solution on another grid."""
+        intervals = len(self._instants) - 1
+        coarse = np.linspace(0.0, 1.0, len(solution.shapes))
+        shapes = solution.at_ticks(intervals)
+        velocities = np.column_stack(
+            [np.interp(self._instants, coarse, column) for column in solution.velocities.T]
+        )
+        step = solution.duration / intervals
+        return Trajectory(step, shapes, velocities, self._attitudes(shapes, step * velocities))
+
     def along(self, positions: Array, velocity: Array, period: float) -> Trajectory:
         """Return shapes (M + 1, n) at ticks that begin with a velocity (n,) and end at rest."""
         ticks = np.linspace(0.0, 1.0, len(positions))
