@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -9,9 +10,31 @@ from typing import Any
 from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import MotionLimits
-from spacerobot_ros.control.reference import PROFILES
+from spacerobot_ros.control.reference import PROFILES, Errors
 from spacerobot_ros.model.shared_parameters import CommanderConfig
 from spacerobot_ros.parameters import group, parameter, registered
+
+
+@dataclass(frozen=True)
+class ErrorMargin:
+    """By how much the errors of a goal may exceed twice what it asks for before it is given up."""
+
+    position: float = parameter(
+        1.0,
+        "a goal is aborted when position errors exceed twice its distance by more; 0: never",
+        unit="m",
+        minimum=0.0,
+    )
+    attitude: float = parameter(
+        1.0,
+        "a goal is aborted when attitude errors exceed twice its turn by more; 0: never",
+        unit="rad",
+        minimum=0.0,
+    )
+
+    def as_errors(self) -> Errors:
+        """Return the margins, infinite where an error is none; joints have ends of their own."""
+        return Errors(self.position or math.inf, self.attitude or math.inf, math.inf)
 
 
 @dataclass(frozen=True)
@@ -38,6 +61,13 @@ class ControllerConfig(CommanderConfig):
     max_torque: float = parameter(
         0.0, "largest torque of the thrusters; 0: no limit", unit="N m", minimum=0.0
     )
+    joint_rates: float = parameter(
+        1.0,
+        "part of the joint rates of the URDF that joints are kept within by their efforts; 0: "
+        "whatever rates",
+        minimum=0.0,
+        maximum=1000.0,
+    )
     estimation_time: float = parameter(
         1.0, "time for which the base is estimated while odom is missing", unit="s", minimum=0.0
     )
@@ -54,6 +84,7 @@ class ControllerConfig(CommanderConfig):
         unit="s",
         minimum=0.0,
     )
+    error_margin: ErrorMargin = group(ErrorMargin())
     status_period: float = parameter(
         1.0, "simulated time between status messages", unit="s", minimum=0.01
     )

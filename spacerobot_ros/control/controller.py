@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 
 import numpy as np
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.estimator import DeadReckoning
+from spacerobot_ros.control.joint_rates import JointRateLimits
 from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
 from spacerobot_ros.control.laws.law import ControlLaw, Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import ActuatorLimits, MotionLimits, Saturated
 from spacerobot_ros.control.outputs import OutputSelection
-from spacerobot_ros.control.reference import PROFILES, ReferenceProfile, StepReference
+from spacerobot_ros.control.reference import PROFILES, Errors, ReferenceProfile, StepReference
 from spacerobot_ros.control.state import (
     Actuation,
     ControlState,
@@ -39,15 +40,6 @@ class Mode(str, Enum):
     STOPPED = "stopped"
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Largest errors of the outputs: of positions (m), attitudes (rad) and joints (m or rad)."""
-
-    position: float
-    attitude: float
-    joints: float
-
-
 class CoordinatedController:
     """Flies spacecraft and arm together, a command for every state.
 
@@ -60,6 +52,8 @@ class CoordinatedController:
         The control law, with its outputs.
     limits
         Of thrusters and joints; what a command loses to them is reported.
+    rates
+        Of the joints; what a command loses to them is reported as well.
     profile, motion
         How references move to goals; accelerations that the thrusters cannot give are lowered.
     control_period
@@ -73,13 +67,15 @@ class CoordinatedController:
         self,
         law: ControlLaw,
         limits: ActuatorLimits,
+        rates: JointRateLimits,
         profile: type[ReferenceProfile],
         motion: MotionLimits,
         control_period: float,
         estimation_time: float,
     ) -> None:
         self.law = law
-        self._limits, self._profile_type, self._motion = limits, profile, motion
+        self._limits, self._rates = limits, rates
+        self._profile_type, self._motion = profile, motion
         self._control_period, self._estimation_time = control_period, estimation_time
         self.mode = Mode.MEASURED
         self._profile: ReferenceProfile | None = None
@@ -88,10 +84,13 @@ class CoordinatedController:
         self._sent: Actuation | None = None
         self._estimator: DeadReckoning | None = None
         self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
+        self.coming_to_rest = False
+        """Whether the robot is brought to rest, wherever that is."""
 
     def reset(self) -> None:
         """Drop goals and what was measured; the next state is the first."""
         self._profile, self._followed = None, Reference()
+        self.coming_to_rest = False
         self._sent = self._estimator = self._brake = None
         self.mode = Mode.MEASURED
 
@@ -108,7 +107,12 @@ class CoordinatedController:
         end_effector: PoseReference | None = None,
         joints: Array | None = None,
     ) -> None:
-        """Start towards new goals; what is not given keeps its earlier goal."""
+        """Start towards new goals; what is not given keeps its earlier goal.
+
+        A robot that was brought to rest has none: it keeps what is not given where it is.
+        """
+        if self.coming_to_rest:
+            self._profile, self.coming_to_rest = None, False
         start = self._present(time, state)
         goal = start if self._profile is None else self._profile.goal
         if base is not None:
@@ -121,6 +125,16 @@ class CoordinatedController:
         self._profile = self._profile_type(start, goal, motion)
         self._began = time
 
+    def begin_anew(self, time: float, state: ControlState) -> None:
+        """Start towards the present goals from where the robot is, not from where it was to be."""
+        goal, self._profile = self.goal, None
+        joints = None if goal.joints is None else goal.joints.q
+        self.set_goals(time, state, base=goal.base, end_effector=goal.end_effector, joints=joints)
+
+    def come_to_rest(self) -> None:
+        """Bring the whole robot to rest, wherever that is, until there is something to follow."""
+        self.coming_to_rest = True
+
     def shift_time(self, seconds: float) -> None:
         """Let the reference go on from where it is when time has jumped by some s."""
         self._began += seconds
@@ -128,6 +142,7 @@ class CoordinatedController:
     def follow(self, reference: Reference) -> None:
         """Track a reference from outside at the next command; the profile gives what it lacks."""
         self._followed = reference
+        self.coming_to_rest = False
 
     def command(
         self, time: float, measured: ControlState | None, q: Array, qdot: Array
@@ -151,8 +166,15 @@ class CoordinatedController:
                     self._present(time, state), self._present(time, state), self._motion
                 )
                 self._began = time
+            # Evaluated in any case: errors and status are those of the law.
             commanded = self.law.command(state, self._reference(time))
+            if self.coming_to_rest:
+                commanded = self._rates.to_rest(state)
         result = self._limits.apply(commanded)
+        if state is not None:
+            kept = self._rates.apply(state, result.realised, self._limits.effort)
+            if kept is not result.realised:
+                result = Saturated.of(commanded, kept)
         self._sent = result.realised
         return result
 
@@ -160,6 +182,11 @@ class CoordinatedController:
     def goal(self) -> Reference:
         """Where the references of all that is controlled come to rest; empty at first."""
         return Reference() if self._profile is None else self._profile.goal
+
+    @property
+    def joint_rates(self) -> Array:
+        """The rates (n,) that joints are kept within, m/s or rad/s; infinite: none."""
+        return self._rates.rates
 
     @property
     def estimated_for(self) -> float:
@@ -174,14 +201,32 @@ class CoordinatedController:
         """Return the errors of the last command's outputs from the reference."""
         worst = {"position": 0.0, "attitude": 0.0, "joints": 0.0}
         for label, error in zip(self.law.outputs.labels, self.law.error, strict=True):
-            group, _, axis = label.partition(".")
-            kind = "joints" if group == "joint" else "attitude" if axis[0] == "r" else "position"
+            kind = _kind(label)
             worst[kind] = max(worst[kind], abs(float(error)))
         return Errors(**worst)
 
     def labelled_errors(self) -> Mapping[str, float]:
         """Return the error of each output by its label."""
         return dict(zip(self.law.outputs.labels, self.law.error.tolist(), strict=True))
+
+    def error_bounds(self, margins: Errors) -> Array:
+        """Return errors (m,) of the outputs that a sound flight to the present goals stays within.
+
+        To be called after the first command towards them. An error may become twice what is to be
+        gone: the way of the reference, or the error that there is, with what the present speed
+        adds until it is damped; and a margin (m, rad) beyond.
+        """
+        assert self._profile is not None
+        law, far = self.law, self._profile.distances()
+        Kp, Kd = law.gain_diagonals
+        reach = np.abs(law.error) + Kd / Kp * np.abs(law.error_rate)
+        kinds = [_kind(label) for label in law.outputs.labels]
+        bounds = np.empty(len(kinds))
+        for kind in set(kinds):
+            of_kind = np.array([each == kind for each in kinds])
+            largest = max(getattr(far, kind), float(reach[of_kind].max()))
+            bounds[of_kind] = 2 * largest + getattr(margins, kind)
+        return bounds
 
     # -- parts --------------------------------------------------------------------------------
 
@@ -239,6 +284,12 @@ class CoordinatedController:
         return law.command(state, reference)
 
 
+def _kind(label: str) -> str:
+    """Return which of :class:`Errors` the error of an output is."""
+    group, _, axis = label.partition(".")
+    return "joints" if group == "joint" else "attitude" if axis[0] == "r" else "position"
+
+
 def build_controller(robot: SpaceRobot, config: ControllerConfig) -> CoordinatedController:
     """Return the controller of a robot that a configuration describes.
 
@@ -261,6 +312,7 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
         ActuatorLimits(
             config.max_force or math.inf, config.max_torque or math.inf, robot.effort_limit
         ),
+        JointRateLimits(robot, config.joint_rates * robot.velocity_limit, config.control_period),
         PROFILES[config.profile],
         config.motion,
         config.control_period,

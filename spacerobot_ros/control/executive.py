@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.controller import CoordinatedController, Errors, Mode
+from spacerobot_ros.control.controller import CoordinatedController, Mode
 from spacerobot_ros.control.limits import Saturated
+from spacerobot_ros.control.reference import Errors
 from spacerobot_ros.control.state import ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, PlanningError
@@ -35,6 +36,8 @@ class ControlExecutive:
       for the settling time after the reference has come to rest; ``FAILED`` if that does not happen
       within the time limit. Either way the robot goes on to hold the goal.
     * ``ABORTED``: the goal was given up; the robot holds where it was at the next measured state.
+      Where control was lost (a joint is far beyond its rate against its motor, or the errors of a
+      goal grow instead of shrinking), the robot is brought to rest instead, wherever that is.
 
     While the base is not measured, the reported state is ``ESTIMATING`` or ``STOPPED`` instead, and
     the state of the goal stays as it is. ``REFUSED`` is reported of a single goal and is no state.
@@ -79,6 +82,8 @@ class ControlExecutive:
         """Time of the last state, s."""
         self._hold_here = False
         """Whether the robot is to hold where it is at the next measured state, without a goal."""
+        self._begin_anew = False
+        """Whether the goal is to be begun anew at the next measured state."""
         self.plant_blocked = False
         """Whether the plant obeys no command, for the owner to set: what answers a state from
         before it obeys again must not move the robot, so each answer holds it where it is."""
@@ -93,6 +98,12 @@ class ControlExecutive:
         """Time at which the goal was begun, s."""
         self._within_since: float | None = None
         """Time since which all errors are within the tolerances, s."""
+        self._error_bounds: Array | None = None
+        """Errors (m,) of the outputs within which the flight to the goal is sound."""
+        self._lost_rates = self._lost_errors = 0
+        """States one after the other in which a joint was too fast, or an error too large."""
+        self._guided = False
+        """Whether the last command followed a reference from outside."""
         self._next_report = 0.0
         self._limited = False
         self._command_report: CommandReport | None = None
@@ -206,6 +217,15 @@ class ControlExecutive:
         """Hold where the robot is at the next measured state, not where it was before."""
         self._hold_here = True
 
+    def plant_reset(self) -> None:
+        """Begin the goal anew from where the robot is at the next measured state; without one hold
+        it there: where it was to be before is nowhere that it was sent to from there.
+        """
+        if self._goal_state is ControllerState.TRACKING:
+            self._begin_anew = True
+        else:
+            self._hold_here = True
+
     def _give_up(self, sentence: str) -> None:
         """Drop every goal and its file; the sentence is the status from now on."""
         pursued = self._pending or self._goal_state is ControllerState.TRACKING
@@ -237,17 +257,26 @@ class ControlExecutive:
         if self._time is not None and not 0 <= time - self._time <= self._longest_gap:
             self._shift_time(time - self._time)
         self._time = time
+        self._guided = reference is not None
         if measured is not None:
             if self._abort_requested or self._hold_here or self.plant_blocked:
                 self._hold(time, measured)
-            if self._pending:
+            elif self._begin_anew:
+                self.controller.begin_anew(time, measured)
+                self._within_since = self._error_bounds = None
+            self._begin_anew = False
+            too_fast = self.controller.coming_to_rest and self._lost_rates
+            if self._pending and not too_fast:
                 self._begin(time, measured)
+            self._watch_rates(qdot)
         if reference is not None:
             self.controller.follow(reference)
         return self.controller.command(time, measured, q, qdot)
 
     def evaluate(self, time: float, result: Saturated) -> None:
         """Evaluate the errors after the command ``result``, and report what is due."""
+        if self.controller.mode is Mode.MEASURED and self._goal_state is ControllerState.TRACKING:
+            self._watch_errors()
         if self.controller.mode is Mode.MEASURED and self._goal_state is ControllerState.TRACKING:
             self._goal_state = self._outcome(time)
             if self._goal_state.decided:
@@ -266,6 +295,46 @@ class ControlExecutive:
         self._reported_state, self._limited = state, result.limited
         self._command_report = _command_report(self.controller, result)
         self._publish(state, self._sentence(state), self._goal_id)
+
+    # -- control that is lost -----------------------------------------------------------------
+
+    def _watch_rates(self, qdot: Array) -> None:
+        """Give up where a joint stays far beyond its rate: its motor does not master it."""
+        rates = self.controller.joint_rates
+        too_fast = bool((np.abs(qdot) > _LOST_RATE * rates).any())
+        self._lost_rates = self._lost_rates + 1 if too_fast else 0
+        if self._lost_rates < _LOST_STATES or self._not_in_charge:
+            return
+        joint = int(np.argmax(np.abs(qdot) / rates))
+        name = self.controller.law.robot.joint_names[joint]
+        self._lose(f"joint '{name}' moves at {qdot[joint]:.3g}/s instead of {rates[joint]:.3g}/s")
+
+    def _watch_errors(self) -> None:
+        """Give up where the errors of a goal grow far beyond what it asked for."""
+        if self._not_in_charge:
+            return
+        if self._error_bounds is None:
+            margins = self._config.error_margin
+            self._error_bounds = self.controller.error_bounds(margins.as_errors())
+        lost = bool((np.abs(self.controller.law.error) > self._error_bounds).any())
+        self._lost_errors = self._lost_errors + 1 if lost else 0
+        if self._lost_errors >= _LOST_STATES:
+            errors = self.controller.errors()
+            away = f"{errors.position:.3g} m, {errors.attitude:.3g} rad"
+            self._lose(f"the errors grow, the robot is {away} from the reference")
+
+    @property
+    def _not_in_charge(self) -> bool:
+        """Whether the robot's motion is nothing that goals of this controller lead to."""
+        return bool(self._guided or self.plant_blocked or self.controller.coming_to_rest)
+
+    def _lose(self, why: str) -> None:
+        """Give up every goal, and bring the robot to rest."""
+        self._give_up(f"Aborted: control is lost, {why}; the robot is brought to rest.")
+        self.controller.come_to_rest()
+        self._goal_state = self._reported_state = ControllerState.ABORTED
+        self._publish(ControllerState.ABORTED, self._abort_sentence)
+        self._decided(EventKind.GOAL_ABORTED, self._abort_sentence, ControllerState.ABORTED)
 
     def _shift_time(self, seconds: float) -> None:
         """Go on with the goal as if time had not jumped: a jump is no progress of it."""
@@ -307,7 +376,8 @@ class ControlExecutive:
         self._report_event(Event(EventKind.GOAL_ACCEPTED, sentence, goal_id=goal_id))
         self._goal_state = ControllerState.TRACKING
         self._started = self._next_report = time
-        self._within_since = None
+        self._within_since = self._error_bounds = None
+        self._lost_errors = 0
         try:
             self._file.save(self._pursued())
         except ParameterError as error:
@@ -382,6 +452,12 @@ class ControlExecutive:
             case ControllerState.REFUSED:
                 raise ValueError("a refusal has a sentence of its own")
 
+
+_LOST_RATE = 1.5
+"""How many times its largest rate a joint is no more mastered at."""
+
+_LOST_STATES = 3
+"""States one after the other that say so: one bad measurement does not."""
 
 _GAP, _GAP_PERIODS = 1.0, 10
 """Longest time between two states beyond which time has jumped: s, or control periods."""

@@ -78,6 +78,12 @@ class Saturated:
     realised: Actuation
     loss: Actuation
 
+    @classmethod
+    def of(cls, commanded: Actuation, realised: Actuation) -> Saturated:
+        """Return what is realised of a command, and what is lost."""
+        wrench = commanded.wrench_B - realised.wrench_B
+        return cls(realised, Actuation(wrench, commanded.tau - realised.tau))
+
     @property
     def limited(self) -> bool:
         """Whether anything was limited."""
@@ -125,8 +131,7 @@ class ActuatorLimits:
             ]
         )
         tau = np.clip(commanded.tau, -self.effort, self.effort)
-        loss = Actuation(commanded.wrench_B - wrench, commanded.tau - tau)
-        return Saturated(Actuation(wrench, tau), loss)
+        return Saturated.of(commanded, Actuation(wrench, tau))
 
 
 def _scaled(vector: Array, limit: float) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import numpy as np
@@ -27,6 +27,15 @@ _PEAK_RATE = 15 / 8
 
 _PEAK_ACCELERATION = 10 / math.sqrt(3)
 """Largest d2s/dt2 of the quintic over one second."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Largest errors of the outputs: of positions (m), attitudes (rad) and joints (m or rad)."""
+
+    position: float
+    attitude: float
+    joints: float
 
 
 class ReferenceProfile(ABC):
@@ -64,6 +73,25 @@ class ReferenceProfile(ABC):
     @abstractmethod
     def at(self, time: float) -> Reference:
         """Return the reference ``time`` s after its start."""
+
+    def distances(self) -> Errors:
+        """Return how far the goal is from the start."""
+        start, goal, joints = self.start, self.goal, 0.0
+        if start.joints is not None and goal.joints is not None:
+            joints = float(np.abs(goal.joints.q - start.joints.q).max(initial=0.0))
+        lines = [
+            line
+            for line in (
+                _PoseLine.between(start.base, goal.base),
+                _PoseLine.between(start.end_effector, goal.end_effector),
+            )
+            if line is not None
+        ]
+        return Errors(
+            max((line.length for line in lines), default=0.0),
+            max((line.angle for line in lines), default=0.0),
+            joints,
+        )
 
 
 class StepReference(ReferenceProfile):

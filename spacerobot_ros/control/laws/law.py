@@ -208,6 +208,11 @@ class ControlLaw(ABC):
         """Change the gains from the next command on."""
         self._in["kp"][:], self._in["kd"][:] = gains.diagonals(self.outputs.selection)
 
+    @property
+    def gain_diagonals(self) -> tuple[Array, Array]:
+        """The diagonals of Kp and Kd (m,), in the order of ``outputs.labels``."""
+        return self._in["kp"].copy(), self._in["kd"].copy()
+
     def command(self, state: ControlState, reference: Reference) -> Actuation:
         """Return the wrench of the thrusters and the joint efforts, not limited.
 

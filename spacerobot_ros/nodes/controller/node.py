@@ -215,6 +215,8 @@ class CoordinatedControlNode(CommanderNode):
     def _plant_changed(self, change: Change) -> None:
         if change is Change.RESET:
             self._states.forget_pose()
+            if self._robot is not None:
+                self._executive.plant_reset()
         if change is Change.OBEYS and self._robot is not None:
             self._executive.plant_obeys_again()
 
