@@ -66,8 +66,8 @@ class Situation:
         Whether the plant was told so, and has confirmed it.
     resumed, rearmed
         Likewise the opposite: neither is so between a request and its answer.
-    goal_since_stop
-        Whether a goal was sent after the plant was latched last.
+    stopped_once, goals_since_stop
+        Whether the plant was latched, and the goals since then that were not refused.
     status
         What the plant has published last of itself.
     may_repeat, may_jump, may_restart
@@ -85,7 +85,8 @@ class Situation:
     latched: bool = False
     rearmed: bool = True
     latched_at: int = -1
-    goal_since_stop: bool = True
+    stopped_once: bool = False
+    goals_since_stop: set[str] = field(default_factory=set)
     status: PlantStatus = field(default_factory=lambda: PlantStatus(PlantState.INACTIVE))
     may_repeat: bool = False
     may_jump: bool = False
@@ -101,6 +102,11 @@ class Situation:
             for d in self.disturbances
             if d.kind in kinds and d.start - slack <= now <= d.end + slack
         }
+
+    @property
+    def goal_since_stop(self) -> bool:
+        """Whether something may be pursued, since the plant was latched last."""
+        return bool(self.goals_since_stop) or not self.stopped_once
 
     @property
     def active(self) -> bool:
@@ -428,70 +434,6 @@ class GoalCheck:
             goals.latched_for = goals.latched_for + 1 if bound and goals.pursued else 0
             if goals.latched_for == self.PATIENCE + 1:
                 return f"{name} pursues goal {goals.pursued} under a latch: {goals.sentence}"
-        return None
-
-
-class RestCheck:
-    """Nothing moves under a latch, nor after it before another goal, nor without a goal at all."""
-
-    def __init__(self, setup: Setup, situation: Situation, goals: Goals) -> None:
-        self._setup, self._situation, self._goals = setup, situation, goals
-        self._names = setup.model.joint_names
-        self._fastest: float | None = None
-        """Largest joint rate since motors began to brake."""
-        self._since = 0
-
-    def look(self, now: State, before: State | None) -> str | None:
-        """Look whether joints move that must not."""
-        if before is not None and now.time_ns == before.time_ns and now.equals(before):
-            return None  # The state is shown again; the rates are those of the tick before it.
-        if self._setup.servos:
-            why = self._must_rest(now)
-            return self._servos_rest(now, before, why) if why else None
-        return self._motors_brake(now)
-
-    def _must_rest(self, now: State) -> str:
-        situation = self._situation
-        if situation.latched and now.time_ns > situation.latched_at:
-            return "under a latch"
-        if not situation.goal_since_stop:
-            return "after a latch, without another goal"
-        if situation.status.state is not PlantState.RUNNING:
-            return f"while the plant says that it is {situation.status.state.value}"
-        if not self._goals.pursued and now.time_ns > situation.stopping_until:
-            return f"without a goal (the planner is {self._goals.last})"
-        return ""
-
-    def _servos_rest(self, now: State, before: State | None, why: str) -> str | None:
-        period = self._setup.period_ns
-        free = self._situation.acting(now.time_ns, period, "actuator_noise", "actuator_bias")
-        for name, rate in zip(self._names, now.qdot, strict=True):
-            if rate != 0.0 and name not in free:
-                return f"joint {name} moves at {rate:.3g} {why}"
-        if before is None or now.time_ns != before.time_ns + period:
-            return None
-        for name, step in zip(self._names, now.q - before.q, strict=True):
-            if step != 0.0 and name not in free:
-                return f"joint {name} goes on by {step:.3g} {why}"
-        return None
-
-    def _motors_brake(self, now: State) -> str | None:
-        """Rates fall as exp(-5 t) at least; brakes that are strong enough do four times better."""
-        situation = self._situation
-        disturbed = any(
-            not d.kind.startswith("sensor") and d.end + 5.0 > now.time_ns / SECOND
-            for d in situation.disturbances
-        )
-        if not situation.latched or disturbed or now.time_ns <= situation.latched_at:
-            self._fastest = None
-            return None
-        rate = float(np.abs(now.qdot).max(initial=0.0))
-        if self._fastest is None:
-            self._fastest, self._since = rate, now.time_ns
-        elapsed = (now.time_ns - self._since) / SECOND
-        bound = 1.5 * self._fastest * np.exp(-5.0 * elapsed) + 1e-6
-        if rate > bound:
-            return f"joints move at {rate:.3g} {elapsed:.3g} s after a latch ({bound:.3g} at most)"
         return None
 
 

@@ -2,64 +2,39 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
 from time import monotonic
 from typing import Any
 
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
-from support.oracles import Array
 from support.random_actions.actions import PLANT, Action, Draw, Kind
-from support.random_actions.expectations import (
-    SECOND,
-    Check,
-    Disturbance,
-    EventBook,
-    GoalCheck,
-    LimitCheck,
-    MomentumCheck,
-    RestCheck,
-    Situation,
-    StandstillCheck,
-    State,
-    StatusCheck,
-    TimeCheck,
-    commanders,
-)
+from support.random_actions.expectations import SECOND, Disturbance
+from support.random_actions.messages import bad_shape, fill_pose, moved, spoilt
+from support.random_actions.observer import Figures, Observer
 from support.random_actions.setups import CONTROLLER, PLANNER, Setup
-from support.ros_harness import DEEP, DEEP_LATCHED, Harness, nanoseconds
+from support.ros_harness import Harness
 
-from spacerobot_ros.events import Event
 from spacerobot_ros.nodes import CoordinatedControlNode, PlannerNode, PlantNode
-from spacerobot_ros.simulation.status import PlantStatus
 
 _WALL_LIMIT = 20.0
 """Wall s without a state after which time is taken to stand: far beyond any plan."""
 
-_IDLE_SPINS = 25
+_PLANNING_WALL = 60.0
+"""Wall s that plans may take on a busy machine."""
 
-_LAST = 15
-"""Actions that are named with a violation."""
+_IDLE_SPINS = 25
 
 _MOST_STATES = 4000
 """States after which a stack is replaced: see :func:`random_flights`."""
-
-_HEARD = 40
-"""Messages that are named with it."""
 
 _CLASSES: dict[str, Any] = {
     PLANT: PlantNode,
@@ -73,40 +48,6 @@ _TRANSITIONS = {
     "deactivate": (Transition.TRANSITION_DEACTIVATE, "active", "inactive"),
     "cleanup": (Transition.TRANSITION_CLEANUP, "inactive", "unconfigured"),
 }
-
-
-@dataclass
-class Figures:
-    """What was done and seen."""
-
-    actions: int = 0
-    states: int = 0
-    samples: int = 0
-    goals: int = 0
-    recoveries: int = 0
-    second_attempts: int = 0
-    decisions: Counter[str] = field(default_factory=Counter)
-    kinds: Counter[str] = field(default_factory=Counter)
-    violations: list[str] = field(default_factory=list)
-
-    stacks: int = 0
-
-    def add(self, other: Figures) -> None:
-        """Add the figures of one more stack."""
-        self.stacks += 1
-        for name in ("actions", "states", "samples", "goals", "recoveries", "second_attempts"):
-            setattr(self, name, getattr(self, name) + getattr(other, name))
-        self.decisions.update(other.decisions)
-        self.kinds.update(other.kinds)
-        self.violations += other.violations
-
-    def __str__(self) -> str:
-        decided = ", ".join(f"{count} {word}" for word, count in sorted(self.decisions.items()))
-        return (
-            f"{self.actions} actions, {self.goals} goals ({decided}), {self.states} states, "
-            f"{self.samples} compared with Pinocchio, {self.recoveries} recoveries "
-            f"({self.second_attempts} at the second attempt), {len(self.violations)} violations"
-        )
 
 
 class RandomFlight:
@@ -126,12 +67,8 @@ class RandomFlight:
 
     def __init__(self, harness: Harness, setup: Setup, seed: int, *, real_time: bool) -> None:
         self._harness, self._setup, self._real_time = harness, setup, real_time
-        self.name = f"{setup.robot}, {'real time' if real_time else 'lockstep'}, seed {seed}"
-        self._rng = np.random.default_rng(seed)
-        self._draw = Draw(setup, self._rng)
-        self.figures = Figures()
-        self._last: deque[str] = deque(maxlen=_LAST)
-        self._heard: deque[str] = deque(maxlen=_HEARD)
+        rng = np.random.default_rng(seed)
+        self._draw = Draw(setup, rng)
         self._names = list(setup.model.joint_names)
         self._nodes: dict[str, Node] = {}
         self._start_nodes()
@@ -142,9 +79,10 @@ class RandomFlight:
         self._faults = node.create_publisher(String, "fault_injection", 100)
         self._clients: dict[str, Any] = {}
         self._goal_count = 0
-        self._begin()
-        self._situation.may_repeat = not real_time
-        self._subscribe()
+        name = f"{setup.robot}, {'real time' if real_time else 'lockstep'}, seed {seed}"
+        self._seen = Observer(node, setup, self._nodes, name, real_time=real_time)
+        self.figures, self._situation = self._seen.figures, self._seen.situation
+        self._books = self._seen.books
         for name in self._nodes:
             self._transit(name, "configure")
         harness.connect()
@@ -167,141 +105,6 @@ class RandomFlight:
                 _CLASSES[name], parameters[name], name=name, autostart=False
             )
 
-    def _begin(self) -> None:
-        setup = self._setup
-        self._situation = situation = Situation(dict.fromkeys(self._nodes, "unconfigured"))
-        self._books = commanders(setup, self._violate)
-        lockstep = not self._real_time
-        self._momentum = MomentumCheck(setup, situation, lockstep=lockstep)
-        self._plant_status = StatusCheck(setup, situation, lockstep=lockstep, report=self._violate)
-        self._events = EventBook(self._violate)
-        self._checks: list[Check] = [
-            TimeCheck(setup, situation),
-            StandstillCheck(setup, situation),
-            self._plant_status,
-            LimitCheck(setup, situation),
-            self._momentum,
-            GoalCheck(self._books, situation),
-            RestCheck(setup, situation, self._books[setup.decider]),
-        ]
-        self._state: State | None = None
-        self._first: State | None = None
-        self._parts: dict[str, Any] = {}
-
-    def _subscribe(self) -> None:
-        def hear(kind: Any, topic: str, act: Callable[[Any], None], latched: bool = False) -> None:
-            qos = DEEP_LATCHED if latched else DEEP
-            self._node.create_subscription(kind, topic, act, qos)
-
-        def part(topic: str) -> Callable[[Any], None]:
-            def keep(message: Any) -> None:
-                self._parts[topic] = message
-
-            return keep
-
-        hear(Clock, "/clock", lambda message: self._parts.clear())
-        for topic in ("odom", "odom_true"):
-            hear(Odometry, topic, part(topic))
-        hear(JointState, "joint_states_true", part("joint_states_true"))
-        hear(PoseStamped, "base_pose", part("base_pose"))
-        hear(PoseStamped, "end_effector_pose", part("end_effector_pose"))
-        for topic in ("momentum", "momentum_expected"):
-            hear(Float64MultiArray, topic, part(topic))
-        hear(JointState, "joint_states", self._on_joints)
-        hear(JointState, "joint_commands", self._on_command)
-        if not self._setup.servos:
-            hear(WrenchStamped, "base_wrench", self._on_wrench)
-        hear(DiagnosticStatus, "plant/status", self._on_plant_status, True)
-        hear(DiagnosticStatus, "events", self._on_event)
-        for name, topic in ((PLANNER, "planner/status"), (CONTROLLER, "controller/status")):
-            if name in self._nodes:
-                hear(DiagnosticStatus, topic, partial(self._on_status, name), True)
-
-    # -- what is published --------------------------------------------------------------------
-
-    def _on_joints(self, message: JointState) -> None:
-        parts = self._parts
-        joints = parts.get("joint_states_true", message)
-        odom = parts.get("odom_true", parts.get("odom"))
-        pose = parts.get("base_pose")
-        if odom is None or pose is None or "momentum" not in parts:
-            self._violate(f"a state lacks topics: only {', '.join(parts)} are there")
-            return
-        expected = parts.get("momentum_expected")
-        p, o = pose.pose.position, pose.pose.orientation
-        v, w = odom.twist.twist.linear, odom.twist.twist.angular
-        state = State(
-            nanoseconds(message.header.stamp),
-            np.array(joints.position),
-            np.array(joints.velocity),
-            np.array(message.effort),
-            np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w]),
-            np.array([v.x, v.y, v.z, w.x, w.y, w.z]),
-            np.array(parts["momentum"].data),
-            None if expected is None else np.array(expected.data),
-        )
-        self.figures.states += 1
-        self.figures.samples = self._momentum.samples
-        rates = " ".join(f"{rate:.3g}" for rate in state.qdot)
-        self._heard.append(f"{state.time_ns / SECOND:.9g} s: joints at {rates}")
-        before, self._state = self._state, state
-        self._first = self._first or state
-        for check in self._checks:
-            wrong = check.look(state, before)
-            if wrong is not None:
-                self._violate(wrong)
-
-    def _on_command(self, message: JointState) -> None:
-        values = message.velocity if self._setup.servos else message.effort
-        words = " ".join(f"{value:.3g}" for value in values)
-        stamp = nanoseconds(message.header.stamp) / SECOND
-        self._heard.append(f"command for {stamp:.9g} s: {words}")
-
-    def _on_wrench(self, message: WrenchStamped) -> None:
-        f, t = message.wrench.force, message.wrench.torque
-        stamp = nanoseconds(message.header.stamp)
-        self._heard.append(f"wrench for {stamp / SECOND:.9g} s")
-        self._momentum.wrenches.setdefault(stamp, np.array([f.x, f.y, f.z, t.x, t.y, t.z]))
-
-    def _on_status(self, name: str, message: DiagnosticStatus) -> None:
-        values = {pair.key: pair.value for pair in message.values}
-        state, goal_id = values["state"], values.get("goal_id", "")
-        book = self._books[name]
-        self._heard.append(f"{name}: {state} {goal_id}: {message.message}")
-        if state in ("reached", "failed", "refused", "aborted") and goal_id not in book.decided:
-            self.figures.decisions[state] += 1
-        pursued = book.pursued
-        book.on_status(state, goal_id, message.message)
-        if pursued and not book.pursued and (state == "aborted" or self._real_time):
-            # The joints brake; in real time commands are some ticks on their way.
-            self._allow_stop(1.0 if state == "aborted" else 0.0)
-
-    def _on_plant_status(self, message: DiagnosticStatus) -> None:
-        values = {pair.key: pair.value for pair in message.values}
-        self._heard.append(f"plant: {values['state']}: {message.message}")
-        self._plant_status.on_status(PlantStatus.from_values(values, message.message))
-
-    def _on_event(self, message: DiagnosticStatus) -> None:
-        values = {pair.key: pair.value for pair in message.values}
-        self._heard.append(f"event of {message.name}: {values['event']}: {message.message}")
-        self._events.on_event(message.name, Event.from_values(values, message.message))
-
-    def _allow_stop(self, seconds: float) -> None:
-        ticks = 3 * self._setup.period_ns
-        end = self._now_ns + round(seconds * SECOND) + ticks
-        self._situation.stopping_until = max(end, self._situation.stopping_until)
-
-    @property
-    def _now_ns(self) -> int:
-        return 0 if self._state is None else self._state.time_ns
-
-    def _violate(self, sentence: str) -> None:
-        done = "\n".join(f"  {line}" for line in self._last)
-        self.figures.violations.append(
-            f"{self.name}, action {self.figures.actions}, {self._now_ns / SECOND:.6g} s: {sentence}"
-            f"\nthe last actions:\n{done}\nthe last messages:\n  " + "\n  ".join(self._heard)
-        )
-
     # -- services -----------------------------------------------------------------------------
 
     def _call(self, kind: Any, service: str, request: Any) -> Any:
@@ -321,11 +124,11 @@ class RandomFlight:
             situation.may_repeat = True
         if name != PLANT and possible and word == "deactivate":
             self._books[name].drop()
-            self._allow_stop(self._timeout)
+            self._seen.allow_stop(self._timeout)
         request = ChangeState.Request(transition=Transition(id=number))
         answer = self._call(ChangeState, f"{name}/change_state", request)
         if answer.success is not possible:
-            self._violate(f"{name}, {lifecycle[name]}: {word} answers {answer.success}")
+            self._seen.violate(f"{name}, {lifecycle[name]}: {word} answers {answer.success}")
         if possible:
             lifecycle[name] = after
         if name == PLANT and possible and word == "activate":
@@ -373,7 +176,7 @@ class RandomFlight:
             if self.figures.states > states:
                 states, deadline = self.figures.states, monotonic() + _WALL_LIMIT
             if monotonic() > deadline:
-                self._violate(f"nothing for {_WALL_LIMIT:g} s of wall time: {what}")
+                self._seen.violate(f"nothing for {_WALL_LIMIT:g} s of wall time: {what}")
                 return False
             if len(self.figures.violations) > violations:
                 return False
@@ -415,7 +218,8 @@ class RandomFlight:
         """Do one action, and let time pass."""
         self.figures.actions += 1
         self.figures.kinds[action.kind.value] += 1
-        self._last.append(f"{self.figures.actions}: {action}  [{self._now_ns / SECOND:.6g} s]")
+        time = f"[{self._seen.now_ns / SECOND:.6g} s]"
+        self._seen.actions.append(f"{self.figures.actions}: {action}  {time}")
         self._do(action)
         self._pass_ticks(action.ticks)
         self._compare()
@@ -423,11 +227,11 @@ class RandomFlight:
     def _compare(self) -> None:
         """Compare statuses and events with what was done."""
         for wrong in (
-            self._plant_status.agrees(),
-            self._events.compare(self._plant_status.changes),
+            self._seen.plant_status.agrees(),
+            self._seen.events.compare(self._seen.plant_status.changes),
         ):
             if wrong is not None:
-                self._violate(wrong)
+                self._seen.violate(wrong)
 
     def _do(self, action: Action) -> None:
         situation = self._situation
@@ -437,21 +241,22 @@ class RandomFlight:
                     self._send(self._pose(aim.offset, aim.turn))
             case Kind.TIP_GOAL:
                 for aim in action.aims:
-                    tip = self._parts.get("end_effector_pose")
+                    tip = self._seen.parts.get("end_effector_pose")
                     if tip is not None:
-                        self._send(_moved(tip, aim.offset, aim.turn), tip=True)
+                        self._send(moved(tip, aim.offset, aim.turn), tip=True)
             case Kind.SHAPE_GOAL:
                 self._shapes.publish(JointState(name=self._names, position=list(action.shape)))
                 self._send(self._pose(action.aims[0].offset, action.aims[0].turn))
             case Kind.BAD_GOAL:
-                self._send(_spoilt(self._pose(action.aims[0].offset, (0.0, 0.0, 0.0)), action.text))
+                self._send(spoilt(self._pose(action.aims[0].offset, (0.0, 0.0, 0.0)), action.text))
             case Kind.BAD_SHAPE:
-                self._shapes.publish(_bad_shape(self._names, action.text))
+                self._shapes.publish(bad_shape(self._names, action.text))
             case Kind.ABORT if action.node == PLANT:
                 situation.rearmed = False
                 self._trigger("plant/abort")
-                situation.latched, situation.latched_at = True, self._now_ns
-                situation.goal_since_stop = False
+                situation.latched, situation.latched_at = True, self._seen.now_ns
+                situation.goals_since_stop.clear()
+                situation.stopped_once = True
             case Kind.ABORT:
                 self._trigger(f"{action.node}/abort", may_refuse=True)
             case Kind.REARM:
@@ -491,7 +296,7 @@ class RandomFlight:
     def _trigger(self, service: str, *, may_refuse: bool = False) -> None:
         answer = self._call(Trigger, service, Trigger.Request())
         if not answer.message or not (answer.success or may_refuse):
-            self._violate(f"{service} answers {answer.success}: '{answer.message}'")
+            self._seen.violate(f"{service} answers {answer.success}: '{answer.message}'")
 
     def _pause(self, on: bool) -> None:
         situation = self._situation
@@ -510,13 +315,13 @@ class RandomFlight:
         situation.may_jump = True
         self._trigger("plant/reset")
         # An answer to the state before the reset has the stamp of the one after it.
-        self._allow_stop(0.0)
+        self._seen.allow_stop(0.0)
         if situation.lifecycle[PLANT] == "active":
             situation.may_jump = False
             self._compare_start()
 
     def _inject(self, text: str) -> None:
-        now = self._now_ns / SECOND
+        now = self._seen.now_ns / SECOND
         words = text.split()
         times = {"at": now, "until": np.inf}
         line = []
@@ -531,18 +336,18 @@ class RandomFlight:
 
     def _clear(self) -> None:
         self._faults.publish(String(data="clear"))
-        now = self._now_ns / SECOND
+        now = self._seen.now_ns / SECOND
         slack = 5 * self._setup.period_ns / SECOND
         for fault in self._situation.disturbances:
             fault.end = min(fault.end, now + slack)
 
     def _compare_start(self) -> None:
         """Look that a plant that was reset is where it began."""
-        state, first = self._state, self._first
+        state, first = self._seen.state, self._seen.first
         assert state is not None
         assert first is not None
         if not (np.array_equal(state.q, first.q) and np.array_equal(state.pose, first.pose)):
-            self._violate(f"after a reset the robot is at {state.pose}, {state.q}")
+            self._seen.violate(f"after a reset the robot is at {state.pose}, {state.q}")
 
     # -- goals --------------------------------------------------------------------------------
 
@@ -550,10 +355,10 @@ class RandomFlight:
         """Return a pose relative to where the base is."""
         message = PoseStamped()
         message.header.frame_id = "world"
-        state = self._state
+        state = self._seen.state
         pose = np.array([0, 0, 0, 0, 0, 0, 1.0]) if state is None else state.pose
-        _fill(message, pose[:3], pose[3:])
-        return _moved(message, offset, turn)
+        fill_pose(message, pose[:3], pose[3:])
+        return moved(message, offset, turn)
 
     def _send(self, goal: PoseStamped, *, tip: bool = False) -> str:
         self._goal_count += 1
@@ -562,7 +367,7 @@ class RandomFlight:
         goal_id = f"1.{self._goal_count:09d}"
         for book in self._books.values():
             book.sent.add(goal_id)
-        self._situation.goal_since_stop = True
+        self._situation.goals_since_stop.add(goal_id)
         (self._tip_goals if tip else self._goals).publish(goal)
         return goal_id
 
@@ -571,7 +376,7 @@ class RandomFlight:
     def recover(self) -> None:
         """Bring everything back into order; a fresh goal must be reached."""
         self.figures.recoveries += 1
-        self._last.append(f"recovery  [{self._now_ns / SECOND:.6g} s]")
+        self._seen.actions.append(f"recovery  [{self._seen.now_ns / SECOND:.6g} s]")
         for name, state in self._situation.lifecycle.items():
             if state == "unconfigured":
                 self._transit(name, "configure")
@@ -587,12 +392,12 @@ class RandomFlight:
             return
         first = self._books[self._setup.decider].sentence
         self.figures.second_attempts += 1
-        self._last.append(f"second attempt after: {first}")
+        self._seen.actions.append(f"second attempt after: {first}")
         self._reset()
         self._pass_ticks(10)
         if not self.figures.violations and not self._reaches():
             book = self._books[self._setup.decider]
-            self._violate(f"a fresh goal is {book.last}: {book.sentence}")
+            self._seen.violate(f"a fresh goal is {book.last}: {book.sentence}")
 
     def _reaches(self) -> bool:
         """Send a goal that can be reached, and return whether it is."""
@@ -600,24 +405,27 @@ class RandomFlight:
         if setup.shapes:
             self._shapes.publish(JointState(name=self._names, position=setup.home.tolist()))
         step = self._homeward()
-        tip = self._parts.get("end_effector_pose") if setup.tip else None
+        tip = self._seen.parts.get("end_effector_pose") if setup.tip else None
         turn = (0.0,) * 3 if setup.tip else tuple(0.1 * x for x in setup.turn)
         goal_id = self._send(self._pose(step, turn))
         if tip is not None:
             # Otherwise the end-effector stays where it is held.
-            goal_id = self._send(_moved(tip, step, turn), tip=True)
-        end = self._now_ns + round(setup.patience * SECOND)
+            goal_id = self._send(moved(tip, step, turn), tip=True)
+        end = self._seen.now_ns + round(setup.patience * SECOND)
+        # A plan that is made in the background takes its time on the wall, however fast the flight.
+        soonest = monotonic() + _PLANNING_WALL * self._real_time
         self._spin_until(
-            lambda: goal_id in book.decided or self._now_ns > end, f"goal {goal_id} is decided"
+            lambda: goal_id in book.decided or (self._seen.now_ns > end and monotonic() > soonest),
+            f"goal {goal_id} is decided",
         )
         if goal_id not in book.decided and not self.figures.violations:
             late = f"goal {goal_id} is not decided within {setup.patience:g} s"
-            self._violate(f"{late}: {book.sentence}")
+            self._seen.violate(f"{late}: {book.sentence}")
         return book.decided.get(goal_id) == "reached"
 
     def _homeward(self) -> tuple[float, ...]:
         """Return a step (3,) of the base that brings sliders back: a part of the way home, m."""
-        setup, state = self._setup, self._state
+        setup, state = self._setup, self._seen.state
         if not any(setup.reach) or state is None:
             return (0.0, 0.0, 0.0)
         if not setup.servos:
@@ -646,46 +454,3 @@ def random_flights(domain: int, setup: Setup, seed: int, count: int, *, real_tim
         rclpy.try_shutdown(context=context)
         total.add(flight.figures)
     return total
-
-
-def _fill(message: PoseStamped, position: Array, quaternion: Array) -> None:
-    p, o = message.pose.position, message.pose.orientation
-    p.x, p.y, p.z = (float(x) for x in position)
-    o.x, o.y, o.z, o.w = (float(x) for x in quaternion)
-
-
-def _moved(pose: PoseStamped, offset: tuple[float, ...], turn: tuple[float, ...]) -> PoseStamped:
-    """Return a pose moved by an offset in the world, and turned about its own axes."""
-    message = PoseStamped()
-    message.header.frame_id = "world"
-    p, o = pose.pose.position, pose.pose.orientation
-    attitude = Rotation.from_quat([o.x, o.y, o.z, o.w]) * Rotation.from_rotvec(turn)
-    _fill(message, np.array([p.x, p.y, p.z]) + offset, attitude.as_quat())
-    return message
-
-
-def _spoilt(goal: PoseStamped, how: str) -> PoseStamped:
-    o = goal.pose.orientation
-    match how:
-        case "frame":
-            goal.header.frame_id = "moon"
-        case "quaternion":
-            o.x = o.y = o.z = o.w = 0.0
-        case "nan":
-            goal.pose.position.y = float("nan")
-        case _:
-            goal.pose.position.z = float("inf")
-    return goal
-
-
-def _bad_shape(names: list[str], how: str) -> JointState:
-    zeros = [0.0] * len(names)
-    match how:
-        case "unknown":
-            return JointState(name=["nobody", *names[1:]], position=zeros)
-        case "short":
-            return JointState(name=names, position=zeros[1:])
-        case "nan":
-            return JointState(name=names, position=[float("nan"), *zeros[1:]])
-        case _:
-            return JointState(name=[names[0]] * 2, position=[0.0, 0.0])
