@@ -93,6 +93,7 @@ class CommandHolder:
         *,
         fewest_ticks: int = 1,
         fixed: bool = False,
+        before: Array | float = 0.0,
     ) -> HeldCommands | None:
         """Return the commands of a trajectory that end in ``final`` (n,) and the goal attitude.
 
@@ -110,7 +111,7 @@ class CommandHolder:
                 held = self._bent(positions, boundary, final, limits, moves_end=moves_end)
                 if held is None:
                     continue
-                needed, overrun = limits.excess(held.positions, self._period, boundary.velocity)
+                needed, overrun = limits.excess(held.positions, self._period, before)
                 if overrun <= _WITHIN:
                     if needed <= 1 + _WITHIN:
                         return held

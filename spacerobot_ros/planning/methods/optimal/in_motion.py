@@ -19,6 +19,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
+from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
 from spacerobot_ros.planning.methods.optimal.held_commands import CommandHolder, HeldCommands
@@ -32,8 +33,13 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     Trajectory,
 )
 
-ROOM = 0.98
-"""Share of velocities and accelerations that is planned with: bends of a path take the rest."""
+_ROOMS = (0.98, 1.0)
+"""Shares of accelerations that are planned with, one after the other: bends of a path take the
+rest, but a joint near its limit may need all to come to rest in time."""
+
+_SLOWER = 0.02
+"""Share of velocities that is left for the same reason, at most: a joint at full speed is slowed
+down to the rest in a quarter of a control period."""
 
 _MORE_TICKS = (0, 1, 3, 7)
 """Control periods by which a manoeuvre is made longer where its commands exceed a limit."""
@@ -106,12 +112,12 @@ class MotionSearch:
         quaternion: Array,
         intervals: int,
         budget: MotionBudget,
-        remaining: Array,
+        motion: InitialMotion,
         cancellation: Cancellation = NEVER,
     ) -> MovingManoeuvre:
         """Return the fastest manoeuvre found from attitude ``quaternion`` (4,) of R_WB.
 
-        ``remaining`` (M + 1, n) is the first guess: the shapes at the ticks so far.
+        What remains of the motion so far is the first guess.
 
         Raises
         ------
@@ -120,12 +126,15 @@ class MotionSearch:
         PlanningCancelled
             The search was cancelled.
         """
+        boundary = replace(boundary, velocity=self._velocity(motion, limits))
         found: list[HeldCommands] = []
         starts, rejection = 0, ""
         solver = self._solver(intervals, boundary.center is not None)
-        for guess in self._guesses(boundary, limits, solver, remaining):
+        for guess in self._guesses(boundary, limits, solver, motion.remaining):
             try:
-                held = self._manoeuvre(solver, boundary, limits, guess, budget, cancellation)
+                held = self._manoeuvre(
+                    solver, boundary, limits, guess, motion, budget, cancellation
+                )
                 attitudes = np.array([quaternion_multiply(quaternion, x) for x in held.quaternions])
                 self._constraints.check(held.positions, attitudes, self._period)
                 found.append(held)
@@ -143,12 +152,27 @@ class MotionSearch:
         durations = [(len(held.positions) - 1) * self._period for held in found]
         return MovingManoeuvre(min(found, key=lambda held: len(held.positions)), starts, durations)
 
+    def _speed(self, limits: MotionLimits) -> Array:
+        """Return the velocities (n,) that are planned with at most."""
+        given_up = np.minimum(_SLOWER * limits.velocity, limits.acceleration * self._period / 4)
+        return np.where(np.isfinite(limits.velocity), limits.velocity - given_up, limits.velocity)
+
+    def _velocity(self, motion: InitialMotion, limits: MotionLimits) -> Array:
+        """Return the velocities (n,) at the start: between those that are held before and after."""
+        between = motion.velocity
+        if len(motion.remaining) > 1:
+            after = (motion.remaining[1] - motion.remaining[0]) / self._period
+            between = (motion.velocity + after) / 2
+        speed = self._speed(limits)
+        return np.clip(between, -speed, speed)
+
     def _manoeuvre(
         self,
         solver: MultipleShooting,
         boundary: BoundaryConditions,
         limits: MotionLimits,
         guess: Trajectory,
+        motion: InitialMotion,
         budget: MotionBudget,
         cancellation: Cancellation,
     ) -> HeldCommands:
@@ -160,25 +184,21 @@ class MotionSearch:
             There are none that reach the goal within the limits.
         """
         stop = StopRule(budget.iterations, cancellation)
-        # What is held at the start must be admitted all the same.
-        narrowed = replace(
-            limits,
-            velocity=np.maximum(ROOM * limits.velocity, np.abs(boundary.velocity)),
-            acceleration=ROOM * limits.acceleration,
-        )
-        duration = budget.duration
-        if duration == 0:
-            fastest = solver.solve(
-                boundary,
-                narrowed,
-                guess,
-                stop,
-                shortest=4 * self._period,
-                longest=budget.longest,
+        duration, fastest_used = budget.duration, self._speed(limits)
+        for room in _ROOMS:
+            narrowed = replace(
+                limits, velocity=fastest_used, acceleration=room * limits.acceleration
             )
-            if fastest is None:
-                raise CandidateError("the solver came to no way that keeps the limits")
-            guess, duration = fastest, fastest.duration
+            if duration > 0:
+                break
+            fastest = solver.solve(
+                boundary, narrowed, guess, stop, shortest=4 * self._period, longest=budget.longest
+            )
+            cancellation.raise_if_requested()
+            if fastest is not None:
+                guess, duration = fastest, fastest.duration
+        if duration == 0:
+            raise CandidateError("the solver came to no way that keeps the limits")
         ticks = max(1, math.ceil(duration / self._period - 1e-6))
         for more in _MORE_TICKS if budget.duration == 0 else (0,):
             T = (ticks + more) * self._period
@@ -201,7 +221,9 @@ class MotionSearch:
                 final = nearest_for_center(self._robot, limits, final, boundary.center)
             if final is None:
                 continue
-            held = self._holder.hold(solution, boundary, final, limits, fixed=True)
+            held = self._holder.hold(
+                solution, boundary, final, limits, fixed=True, before=motion.velocity
+            )
             if held is not None:
                 return held
         raise CandidateError("held commands could not be brought to the goal within the limits")

@@ -190,12 +190,12 @@ class OptimalGait(GaitMethod):
             iterations=chosen.iterations,
         )
         found = self._motion_search.search(
-            replace(boundary, velocity=motion.velocity),
+            boundary,
             limits,
             request.state.quaternion,
             self._intervals(True),
             budget,
-            motion.remaining,
+            motion,
             cancellation,
         )
         notes: Notes = {"starts": float(found.starts), "durations": list(found.durations)}
