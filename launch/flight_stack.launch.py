@@ -3,69 +3,141 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-import yaml
-from ament_index_python.packages import get_package_share_directory
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.conditions import IfCondition
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchContext, LaunchDescription
+from spacerobot_ros.resources import robot_file, share_directory
+from spacerobot_ros.session.scenario import load_scenario, read_sections
 
 PACKAGE = "spacerobot_ros"
 
+ARGUMENTS = (
+    ("scenario", "", "a scenario of the package, or a YAML file [sliding_masses, if no robot]"),
+    ("robot", "", "a robot of the package, or a URDF file, instead of the scenario's"),
+    ("params_file", "", "a parameter file instead of a scenario's"),
+    ("bag", "", "file to record into [spacerobot-<date>-<time>.mcap here]"),
+    ("record", "true", "whether to record into an MCAP bag"),
+    ("namespace", "", "of all nodes and topics; /clock, /tf and /tf_static are in it then, too"),
+    ("autostart", "true", "whether the nodes configure and activate themselves"),
+    ("use_sim_time", "false", "whether the nodes' own clocks follow the simulated clock"),
+    ("log_level", "info", "debug, info, warn, error or fatal"),
+    ("respawn", "false", "whether a node that dies is started again; else everything ends with it"),
+    ("rviz", "false", "whether to start RViz"),
+)
+
+GLOBAL_TOPICS = ("/clock", "/tf", "/tf_static")
+"""Absolute names; in a namespace each stack has its own."""
+
+RESPAWN_DELAY = 1.0
+"""Wall s from the death of a node to its next start."""
+
 
 def nodes(context: LaunchContext) -> list[Node]:
-    """Return the nodes with the parameter file that the arguments name."""
-    chosen = LaunchConfiguration("params_file").perform(context)
-    scenario = LaunchConfiguration("scenario").perform(context)
-    share = Path(get_package_share_directory(PACKAGE))
-    common = {
-        "package": PACKAGE,
-        "namespace": LaunchConfiguration("namespace"),
-        "output": "screen",
-    }
-    parameter_file = Path(chosen) if chosen else share / "config" / f"{scenario}.yaml"
-    parameters = [
-        str(parameter_file),
-        {"use_sim_time": LaunchConfiguration("use_sim_time")},
-    ]
+    """Return the nodes with the parameters that the arguments name."""
+    chosen = {name: LaunchConfiguration(name).perform(context) for name, _, _ in ARGUMENTS}
+    namespace, files = chosen["namespace"].strip("/"), parameter_files(chosen)
     # The file has a section for each node that its scenario needs.
-    sections = yaml.safe_load(parameter_file.read_text(encoding="utf-8"))
+    sections = read_sections(files[-1]) if files else {"plant": {}, "planner": {}}
     wanted = [name for name in ("plant", "planner", "coordinated_control") if name in sections]
-    recorder = Node(
-        executable="recorder",
-        name="recorder",
-        parameters=parameters,
-        condition=IfCondition(LaunchConfiguration("record")),
-        **common,
-    )
-    plant = (sections.get("plant") or {}).get("ros__parameters") or {}
-    # In real time states are answered while the planner plans; the file may say otherwise.
-    live = plant.get("time_mode", "realtime") == "realtime"
-    own = {"planner": [{"plan_in_background": live}]}
-    return [
-        *(
-            Node(executable=name, name=name, parameters=own.get(name, []) + parameters, **common)
-            for name in wanted
-        ),
-        recorder,
+    if is_true(chosen["record"]):
+        wanted.append("recorder")
+    remappings = [(name, name[1:]) for name in GLOBAL_TOPICS] if namespace else []
+    started = [
+        Node(
+            package=PACKAGE,
+            executable=name,
+            name=name,
+            namespace=namespace,
+            output="screen",
+            parameters=[*map(str, files), parameters(name, chosen, sections)],
+            remappings=remappings,
+            ros_arguments=["--log-level", chosen["log_level"]],
+            **at_its_end(name, respawn=is_true(chosen["respawn"])),
+        )
+        for name in wanted
     ]
+    return [*started, rviz(namespace)] if is_true(chosen["rviz"]) else started
+
+
+def parameter_files(chosen: dict[str, str]) -> list[Path]:
+    """Return the parameter file, if there is one: a robot alone has none."""
+    if chosen["params_file"]:
+        return [Path(chosen["params_file"])]
+    if chosen["scenario"] or not chosen["robot"]:
+        return [load_scenario(chosen["scenario"] or "sliding_masses").path]
+    return []
+
+
+def parameters(
+    name: str, chosen: dict[str, str], sections: dict[str, dict[str, Any]]
+) -> dict[str, Any]:
+    """Return the parameters of a node: those of its section, and what the arguments change.
+
+    ROS itself takes a section ``plant:`` for nodes without a namespace only. It cannot tell of
+    what an empty list in a dictionary is; that one stays in the file.
+    """
+    section = sections.get(name, {})
+    given: dict[str, Any] = {
+        **{key: value for key, value in section.items() if value != []},
+        "use_sim_time": is_true(chosen["use_sim_time"]),
+        "autostart": is_true(chosen["autostart"]) and section.get("autostart", True),
+    }
+    # In real time states are answered while the planner plans, and viewers want to see something.
+    live = sections.get("plant", {}).get("time_mode", "realtime") == "realtime"
+    if name == "recorder":
+        if chosen["bag"]:
+            given["bag"] = chosen["bag"]
+        if live:
+            given["diagnostics_period"] = section.get("diagnostics_period", 1.0)
+        return given
+    if chosen["robot"]:
+        robot = robot_file(chosen["robot"])  # Refused here, with one sentence.
+        given["robot"] = str(robot.resolve())
+    if name == "planner":
+        given["plan_in_background"] = section.get("plan_in_background", live)
+    return given
+
+
+def at_its_end(name: str, *, respawn: bool) -> dict[str, Any]:
+    """Return what launch is to do when a node has ended."""
+    if respawn:
+        return {"respawn": True, "respawn_delay": RESPAWN_DELAY}
+    return {"on_exit": Shutdown(reason=f"the node '{name}' has ended")}
+
+
+def rviz(namespace: str) -> Node:
+    """Return RViz with the view of this package; it may be closed without an end to the flight."""
+    file = share_directory() / "rviz" / "spacerobot.rviz"
+    shown = [
+        *("/markers", "/odom", "/end_effector_pose", "/planned_path", "/robot_description"),
+        *("/goal_pose", "/end_effector/goal_pose"),
+    ]
+    return Node(
+        package="rviz2",
+        executable="rviz2",
+        name="rviz",
+        namespace=namespace,
+        arguments=["-d", str(file)],
+        # Stamps are of simulated time, and transforms are looked up by it.
+        parameters=[{"use_sim_time": True}],
+        remappings=[(name, name[1:]) for name in (*GLOBAL_TOPICS, *shown)] if namespace else [],
+    )
+
+
+def is_true(text: str) -> bool:
+    """Return whether an argument says yes, in the words that launch takes."""
+    return text.lower() in ("true", "1", "yes", "on")
 
 
 def generate_launch_description() -> LaunchDescription:
     """Declare the arguments and the nodes."""
-    arguments = (
-        ("scenario", "sliding_masses", "name of a parameter file in the package's config/"),
-        ("params_file", "", "another parameter file, before the scenario's"),
-        ("namespace", "", "namespace of all nodes and relative topics"),
-        ("use_sim_time", "false", "whether the nodes' own clocks follow /clock"),
-        ("record", "true", "whether to record into an MCAP bag"),
-    )
     return LaunchDescription(
         [
-            *(DeclareLaunchArgument(n, default_value=d, description=t) for n, d, t in arguments),
+            *(DeclareLaunchArgument(n, default_value=d, description=t) for n, d, t in ARGUMENTS),
             OpaqueFunction(function=nodes),
         ]
     )

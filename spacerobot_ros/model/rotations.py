@@ -81,6 +81,12 @@ def quaternion_from_rotvec(rotvec: npt.ArrayLike) -> Array:
     return np.append(0.5 * np.sinc(angle / (2 * math.pi)) * vector, math.cos(angle / 2))
 
 
+def quaternions_from_rotvecs(rotvecs: Array) -> Array:
+    """Return the unit quaternions (N, 4) of rotation vectors (N, 3) in rad."""
+    angle = np.linalg.norm(rotvecs, axis=1, keepdims=True)
+    return np.hstack([0.5 * np.sinc(angle / (2 * math.pi)) * rotvecs, np.cos(angle / 2)])
+
+
 def rotvec_from_quaternion(quaternion: npt.ArrayLike) -> Array:
     """Return the rotation vector (3,) in rad, of length at most pi, of a unit quaternion."""
     q = np.asarray(quaternion, dtype=float)

@@ -29,11 +29,27 @@ from spacerobot_ros.nodes.common.cdr import HEADER_STAMP, NANOSECONDS, first_tim
 from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
+from spacerobot_ros.nodes.common.remote_parameters import RemoteParameters
 from spacerobot_ros.nodes.common.streams import RawInput, RawStream, Take
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.topics import NOT_RECORDED
 
 _CLOCK = "/clock"
+"""Where no remap moves it; as every absolute name that a stack uses."""
+
+_SHARED = ("/diagnostics", "/tf", "/tf_static")
+"""Absolute names of what stacks in different namespaces may have in common, before remaps."""
+
+_CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
+
+_COMMON_NODES = {
+    "odom": "plant",
+    "planner/status": "planner",
+    "controller/status": "coordinated_control",
+}
+"""Topics whose publishers have parameters that belong into the bag, and what the record is called.
+
+A node that publishes them is configured: its parameters keep their values."""
 
 _QUEUE = 2000
 """Messages a subscription may be behind; the events executor wedges above 5000."""
@@ -67,6 +83,8 @@ class RecorderNode(FlightNode):
     def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
         self._taps = _StreamTaps()
         self._stamps = _Stamps()
+        self._asked: dict[str, RemoteParameters | None] = {}
+        """The records of parameters that are in the bag, or that a node is asked for."""
         super().__init__(name, **kwargs)
 
     # -- life ---------------------------------------------------------------------------------
@@ -84,7 +102,10 @@ class RecorderNode(FlightNode):
             max_duration_ns=round(config.max_duration * NANOSECONDS),
         )
         self.recording = Recording(writer, config.clock_wait, self._on_failure)
+        self._clock = self.resolve_topic_name(_CLOCK)
         self._wanted = {self.resolve_topic_name(topic) for topic in config.topics.split()}
+        self._shared = {self._clock, *map(self.resolve_topic_name, _SHARED)}
+        self._asked = {}
         self._recorded: set[str] = set()
         self._unknown: set[str] = set()
         self._diagnostics: Publisher | None = None
@@ -103,7 +124,7 @@ class RecorderNode(FlightNode):
         self.describe("spacerobot", {"version": __version__})
         for title, values in _descriptions(config.describe):
             self.describe(title, values)
-        if self._wanted and _CLOCK not in self._wanted:
+        if self._wanted and self._clock not in self._wanted:
             self._follow_clock(self.recording)
         self.scan()
 
@@ -143,6 +164,8 @@ class RecorderNode(FlightNode):
             The disk refused what was left.
         """
         self._taps.release()
+        for question in filter(None, self._asked.values()):
+            question.close()
         if self.recording is not None:
             self.recording.close()
 
@@ -163,6 +186,11 @@ class RecorderNode(FlightNode):
         return set(self._recorded)
 
     @property
+    def questions(self) -> list[str]:
+        """The records that wait for the parameters of a node."""
+        return [name for name, question in self._asked.items() if question is not None]
+
+    @property
     def messages_recorded(self) -> int:
         """How many messages were written."""
         return self.recording.messages if self.recording is not None else 0
@@ -175,6 +203,7 @@ class RecorderNode(FlightNode):
     def describe(self, name: str, values: dict[str, str]) -> None:
         """Put named values into the bag (parameters, seed, version)."""
         if self.recording is not None:
+            self._asked[name] = None
             self.recording.describe(name, values)
 
     def attach(self, name: str, data: bytes, media_type: str) -> None:
@@ -193,17 +222,59 @@ class RecorderNode(FlightNode):
             else:
                 self._follow_clock(recording)
         for topic, types in self.get_topic_names_and_types():
-            chosen = topic in self._wanted if self._wanted else not topic.endswith(NOT_RECORDED)
-            if chosen and topic not in self._recorded and topic not in self._unknown:
+            known = topic in self._recorded or topic in self._unknown
+            if not known and self._is_chosen(topic, types[0]):
                 self._record(recording, topic, types[0])
+        for name, question in self._asked.items():
+            if question is not None and question.look():
+                self._asked[name] = None
+                if question.values is not None:
+                    recording.describe(name, question.values)
 
     def flush(self) -> None:
         """Hand what was recorded to the operating system, and report what was lost."""
         if self.recording is not None:
-            self.recording.flush(clock_is_published=self.count_publishers(_CLOCK) > 0)
+            clocks = self.count_publishers(self._clock)
+            self.recording.flush(clock_is_published=clocks > 0)
             self._publish_losses(self.recording)
+            if clocks > 1:
+                self.get_logger().warning(
+                    f"{clocks} clocks are published on '{self._clock}': the times of the bag jump "
+                    "from one to the other. Give each stack a namespace and a clock of its own "
+                    "(--ros-args -r __ns:=/NAME -r /clock:=clock).",
+                    throttle_duration_sec=_LOSS_LOG_PERIOD,
+                )
 
     # -- subscriptions ------------------------------------------------------------------------
+
+    def _is_chosen(self, topic: str, type_name: str) -> bool:
+        """Whether a topic is recorded: one that is asked for, or else all of the stack.
+
+        A stack in a namespace is what is in it, and what stacks have in common. Only one clock
+        gives the times of a bag; those of other stacks would say nothing in it.
+        """
+        if self._wanted:
+            return topic in self._wanted
+        if topic in self._shared:
+            return True
+        namespace = self.get_namespace().rstrip("/")
+        ours = topic.startswith(f"{namespace}/") and not topic.endswith(NOT_RECORDED)
+        return ours and type_name != _CLOCK_TYPE
+
+    def _ask_for_parameters(self, topic: str, publishers: Sequence[Any]) -> None:
+        """Have the parameters of a topic's publisher in the bag, unless they are there already."""
+        for name, title in _COMMON_NODES.items():
+            if not topic.endswith(f"/{name}"):
+                continue
+            record = f"parameters{topic.removesuffix(f'/{name}')}/{title}"
+            own = self.get_namespace().rstrip("/")
+            if topic == f"{own}/{name}":
+                record = f"parameters/{title}"
+            owner = publishers[0]
+            full = f"{owner.node_namespace.rstrip('/')}/{owner.node_name}"
+            watched = {node.get_fully_qualified_name() for node in self._taps.nodes}
+            if record not in self._asked and full not in watched:
+                self._asked[record] = RemoteParameters(self, full)
 
     def _follow_clock(self, recording: Recording) -> None:
         """Know the time of a clock that is not recorded itself."""
@@ -211,12 +282,13 @@ class RecorderNode(FlightNode):
         def on_clock(raw: bytes) -> None:
             recording.set_clock(first_time_ns(raw))
 
-        if not self._taps.tap(_CLOCK, on_clock, self.count_publishers(_CLOCK)):
+        if not self._taps.tap(self._clock, on_clock, self.count_publishers(self._clock)):
             depth = QoSProfile(depth=_QUEUE)
-            self.create_subscription(Clock, _CLOCK, on_clock, depth, raw=True)
+            self.create_subscription(Clock, self._clock, on_clock, depth, raw=True)
 
     def _record(self, recording: Recording, topic: str, type_name: str) -> None:
-        offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        publishers = self.get_publishers_info_by_topic(topic)
+        offered = [info.qos_profile for info in publishers]
         if not offered:
             return  # Only readers so far: its quality of service is not known yet.
         try:
@@ -227,7 +299,8 @@ class RecorderNode(FlightNode):
             self.get_logger().warning(f"Topic '{topic}' is not recorded: {error}")
             return
         self._recorded.add(topic)
-        take = _take(recording, self._stamps, topic, kind, channel)
+        self._ask_for_parameters(topic, publishers)
+        take = _take(recording, self._stamps, topic, kind, channel, self._clock)
         if self._taps.tap(topic, take, len(offered)):
             return
         events, qos = loss_events(recording, topic), _subscribed_qos(offered)
@@ -359,7 +432,9 @@ class _Stamps:
         return self._time_ns
 
 
-def _take(recording: Recording, stamps: _Stamps, topic: str, kind: Any, channel: int) -> Take:
+def _take(
+    recording: Recording, stamps: _Stamps, topic: str, kind: Any, channel: int, clock: str = _CLOCK
+) -> Take:
     """Return what is done with a topic's messages: the clock sets the time of all others."""
     record, time_of = recording.record, stamps.time_ns
     urdf_name = f"{topic.strip('/').replace('/', '.')}.urdf"
@@ -377,7 +452,7 @@ def _take(recording: Recording, stamps: _Stamps, topic: str, kind: Any, channel:
             recording.attach(urdf_name, urdf, "application/xml")
         record(channel, raw)
 
-    if topic == _CLOCK:
+    if topic == clock:
         return on_clock
     if topic.endswith("/robot_description"):
         return on_description

@@ -290,26 +290,14 @@ def load_scenario(name: str) -> Scenario:
         raise ParameterError(
             f"There is no scenario '{name}'; there are: {known}, or any YAML file."
         )
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise ParameterError(f"The scenario file {path} cannot be read: {reason}.") from error
-    section = content.get("scenario") if isinstance(content, dict) else None
+    content = _content(path)
+    section = content.get("scenario")
     values = section.get("ros__parameters") if isinstance(section, dict) else None
     if not isinstance(values, dict):
         raise ParameterError(
             f"The scenario file {path} has no 'scenario: ros__parameters:' section with a goal."
         )
-    for node in NODES:
-        given = content.get(node)
-        if given is not None and not (
-            isinstance(given, dict) and isinstance(given.get("ros__parameters", {}), dict)
-        ):
-            raise ParameterError(
-                f"The section '{node}' of the scenario file {path} is not 'ros__parameters:' with "
-                "the parameters under it."
-            )
+    in_file = _sections(content, path)
     unknown = sorted(set(map(str, values)) - set(_KEYS))
     if unknown:
         raise ParameterError(
@@ -326,17 +314,28 @@ def load_scenario(name: str) -> Scenario:
             if any(key.startswith("end_effector_goal") for key in values)
             else None
         ),
-        commanders=tuple(name for name in COMMANDERS if name in content) or ("planner",),
+        commanders=tuple(name for name in COMMANDERS if name in in_file) or ("planner",),
         published=_published(values.get("published", {}), path),
         published_method=str(values.get("published_method", "")),
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
-        in_file={
-            node: _flat(content[node].get("ros__parameters", {}))
-            for node in NODES
-            if content.get(node)
-        },
+        in_file=in_file,
         overrides=_LOCKSTEP,
     )
+
+
+def read_sections(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the parameters by node and full name that a parameter file has.
+
+    A section is for a node in any namespace (``/**/plant``), in one (``/robot_1/plant``), in none
+    (``plant``), or for all nodes (``/**``); of two that set a parameter the later one counts, and
+    the one for all nodes counts least.
+
+    Raises
+    ------
+    ParameterError
+        The file cannot be read, or a section has no ``ros__parameters`` with parameters under it.
+    """
+    return _sections(_content(path), path)
 
 
 def scenario_or_robot(name: str) -> Scenario:
@@ -461,6 +460,39 @@ def _published(rows: Any, path: Path) -> tuple[Published, ...]:
             f"The section 'published' of the scenario file {path} is not "
             f"quantity: {{printed: [numbers], note: text}}: {error!r}."
         ) from error
+
+
+def _content(path: Path) -> dict[Any, Any]:
+    """Return what is in a parameter file; a file that is no mapping has nothing."""
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise ParameterError(f"The scenario file {path} cannot be read: {reason}.") from error
+    return content if isinstance(content, dict) else {}
+
+
+def _sections(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
+    """Return what :func:`read_sections` does, of a content that was read."""
+    found: dict[str, dict[str, Any]] = {}
+    of_all: dict[str, Any] = {}
+    for key, given in content.items():
+        node = str(key).rpartition("/")[2]
+        if node not in (*NODES, "**"):
+            continue
+        given = {} if given is None else given
+        values = given.get("ros__parameters", {}) if isinstance(given, dict) else None
+        if not isinstance(values, dict):
+            raise ParameterError(
+                f"The section '{key}' of the scenario file {path} is not 'ros__parameters:' with "
+                "the parameters under it."
+            )
+        (of_all if node == "**" else found.setdefault(node, {})).update(_flat(values))
+    for node, values in found.items():
+        known = {parameter.name for parameter in declared(CONFIGS[node])}
+        shared = {name: value for name, value in of_all.items() if name in known}
+        found[node] = {**shared, **values}
+    return found
 
 
 def _goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:

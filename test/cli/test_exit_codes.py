@@ -69,7 +69,8 @@ def test_what_a_file_has_wrong_is_bad_input(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     content = yaml.safe_load(load_scenario("sliding_masses").path.read_text("utf-8"))
-    content[section]["ros__parameters"] |= values
+    key = section if section == "scenario" else f"/**/{section}"
+    content[key]["ros__parameters"] |= values
     Path("mine.yaml").write_text(yaml.safe_dump(content), "utf-8")
     result = CliRunner().invoke(main, [command, "mine.yaml"])
     assert result.exit_code == 2, result.output

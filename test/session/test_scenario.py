@@ -6,9 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
+import yaml
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.nodes import NODE_TYPES
+from spacerobot_ros.resources import share_directory
 from spacerobot_ros.session.scenario import (
     CONFIGS,
     NODES,
@@ -114,3 +116,30 @@ def test_kills_are_read_in_order_of_time() -> None:
             parse_kills([line], "a test")
     with pytest.raises(ParameterError, match="names 'recorder'"):
         parse_kills(["recorder at 5"], "a test")
+
+
+@pytest.mark.parametrize("prefix", ["", "/", "/**/", "/robot_1/", "/*/"])
+def test_sections_are_found_whatever_namespace_they_are_for(tmp_path: Path, prefix: str) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        f"""
+scenario: {{ros__parameters: {{}}}}
+/**: {{ros__parameters: {{robot: planar_chain, tick_rate: 5.0, method: square_path}}}}
+{prefix}plant: {{ros__parameters: {{tick_rate: 10.0, sensors: {{seed: 7}}}}}}
+{prefix}coordinated_control: {{ros__parameters: {{robot: servicer}}}}
+""",
+        encoding="utf-8",
+    )
+    scenario = load_scenario(str(path))
+    assert scenario.commanders == ("coordinated_control",)
+    assert scenario.plant.tick_rate == 10.0
+    assert scenario.plant.sensors.seed == 7
+    assert scenario.plant.robot == "planar_chain"
+    assert scenario.controller.robot == "servicer"
+    assert scenario.controller.tick_rate == 5.0
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_nodes_of_any_namespace_take_the_parameters_of_a_file(name: str) -> None:
+    content = yaml.safe_load((share_directory() / "config" / f"{name}.yaml").read_text("utf-8"))
+    assert {key for key in content if key != "scenario"} <= {f"/**/{node}" for node in CONFIGS}

@@ -93,7 +93,7 @@ class Setup:
 
 def _of(scenario: str, node: str, **changes: Any) -> dict[str, Any]:
     text = (_ROOT / "config" / f"{scenario}.yaml").read_text(encoding="utf-8")
-    return {**yaml.safe_load(text)[node]["ros__parameters"], **changes}
+    return {**yaml.safe_load(text)[f"/**/{node}"]["ros__parameters"], **changes}
 
 
 _QUIET = {"marker_period": 0.0, "diagnostics_period": 0.5, "base_pose_period": 0.0}

@@ -19,8 +19,8 @@ import numpy as np
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     attitude_error,
-    quaternion_from_rotvec,
     quaternion_multiply,
+    quaternions_from_rotvecs,
 )
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -63,26 +63,29 @@ class InitialGuesses:
         """Yield guesses that end in the shape ``final`` (n,)."""
         rng = np.random.default_rng(1)
         half = limits.span(boundary.start)[1]
-        direct = self._trajectory(self._direct(boundary.start, final), limits)
+        (direct,) = self._candidates(self._direct(boundary.start, final)[np.newaxis], limits)
         missing = attitude_error(direct.quaternions[-1], boundary.turn)
         size = min(1.0, self._size(final, half, float(np.linalg.norm(missing))))
         for number in itertools.count():
             loop = _LOOPS[number % len(_LOOPS)]
-            found: list[tuple[float, Trajectory]] = []
-            for _ in range(_CANDIDATES):
-                rounds = size * rng.uniform(0.3, 1.5) * loop(rng, self._instants, len(half))
-                shapes = self._path(rounds, boundary.start, final, limits)
-                trajectory = self._trajectory(shapes, limits)
-                left = attitude_error(trajectory.quaternions[-1], boundary.turn)
-                found.append((float(np.linalg.norm(left)), trajectory))
-            yield min(found, key=lambda entry: entry[0])[1]
+            rounds = [
+                size * rng.uniform(0.3, 1.5) * loop(rng, self._instants, len(half))
+                for _ in range(_CANDIDATES)
+            ]
+            shapes = self._paths(np.array(rounds), boundary.start, final, limits)
+            yield min(
+                self._candidates(shapes, limits),
+                key=lambda each: float(
+                    np.linalg.norm(attitude_error(each.quaternions[-1], boundary.turn))
+                ),
+            )
 
     def _direct(self, start: Array, final: Array) -> Array:
         s = self._instants
         return start + np.outer(s**3 * (10 - 15 * s + 6 * s**2), final - start)
 
-    def _path(self, rounds: Array, start: Array, final: Array, limits: MotionLimits) -> Array:
-        """Return shapes (N + 1, n) of loops, in half ranges, on the direct way."""
+    def _paths(self, rounds: Array, start: Array, final: Array, limits: MotionLimits) -> Array:
+        """Return shapes (K, N + 1, n) of loops, in half ranges, on the direct way."""
         direct = self._direct(start, final)
         middle, half = limits.span(start)
         # Within most of the joint limits, or as far out as the direct way is.
@@ -97,23 +100,41 @@ class InitialGuesses:
         largest = float((K * np.outer(half, half)).max())
         return math.sqrt(angle / (math.pi * largest)) if largest > 0 else 1.0
 
-    def _trajectory(self, shapes: Array, limits: MotionLimits) -> Trajectory:
-        u = np.gradient(shapes, axis=0)
-        u[0] = u[-1] = 0.0
-        speed = float((np.abs(u) / limits.velocity).max())
-        change = float((np.abs(np.diff(u, axis=0)) / limits.acceleration).max())
-        h = max(speed, math.sqrt(change), 1e-6)
-        return Trajectory(h, shapes, u / h, self._attitudes(shapes, u))
+    def _candidates(self, shapes: Array, limits: MotionLimits) -> list[Trajectory]:
+        """Return shapes (K, N + 1, n) as trajectories, as fast as the limits allow."""
+        u = np.gradient(shapes, axis=1)
+        u[:, 0] = u[:, -1] = 0.0
+        speed = (np.abs(u) / limits.velocity).max(axis=(1, 2))
+        change = (np.abs(np.diff(u, axis=1)) / limits.acceleration).max(axis=(1, 2))
+        steps = np.maximum(np.maximum(speed, np.sqrt(change)), 1e-6)
+        return [
+            Trajectory(float(h), q, step / h, X)
+            for h, q, step, X in zip(steps, shapes, u, self._attitudes(shapes, u), strict=True)
+        ]
 
     def _attitudes(self, shapes: Array, steps: Array) -> Array:
-        """Return the attitudes (N + 1, 4) that shapes and steps (N + 1, n) lead to."""
-        Omega = self._turn(shapes[:-1].T, steps[:-1].T, steps[1:].T).full().T
-        quaternions = [np.array([0.0, 0.0, 0.0, 1.0])]
-        for rotation in Omega:
-            quaternions.append(
-                quaternion_multiply(quaternions[-1], quaternion_from_rotvec(rotation))
+        """Return the attitudes (..., N + 1, 4) that shapes and steps (..., N + 1, n) lead to."""
+        parts = shapes[..., :-1, :], steps[..., :-1, :], steps[..., 1:, :]
+        Omega = self._turn(*(x.reshape(-1, x.shape[-1]).T for x in parts)).full().T
+        rotations = quaternions_from_rotvecs(Omega).reshape(*parts[0].shape[:-1], 4)
+        quaternions = np.empty((*shapes.shape[:-1], 4))
+        quaternions[..., 0, :] = [0.0, 0.0, 0.0, 1.0]
+        for k in range(rotations.shape[-2]):
+            quaternions[..., k + 1, :] = quaternion_multiply(
+                quaternions[..., k, :], rotations[..., k, :]
             )
-        return np.array(quaternions)
+        return quaternions
+
+    def refined(self, solution: Trajectory) -> Trajectory:
+        """Return a solution on another grid."""
+        intervals = len(self._instants) - 1
+        coarse = np.linspace(0.0, 1.0, len(solution.shapes))
+        shapes = solution.at_ticks(intervals)
+        velocities = np.column_stack(
+            [np.interp(self._instants, coarse, column) for column in solution.velocities.T]
+        )
+        step = solution.duration / intervals
+        return Trajectory(step, shapes, velocities, self._attitudes(shapes, step * velocities))
 
     def along(self, positions: Array, velocity: Array, period: float) -> Trajectory:
         """Return shapes (M + 1, n) at ticks that begin with a velocity (n,) and end at rest."""

@@ -79,9 +79,13 @@ class OptimalOptions:
     intervals: int = parameter(
         80, "steps of the optimal control problem", minimum=10, maximum=10000
     )
-    starts: int = parameter(12, "guesses that are tried at most", minimum=1, maximum=10000)
+    starts: int = parameter(32, "guesses that are tried at most", minimum=1, maximum=10000)
     answers: int = parameter(
-        3, "manoeuvres to find, of which the fastest is taken", minimum=1, maximum=10000
+        24,
+        "solutions to find, unless starts agree before; several are found on a coarse grid, and "
+        "the best of them is refined",
+        minimum=1,
+        maximum=10000,
     )
     iterations: int = parameter(
         300, "steps of the solver from one guess at most", minimum=1, maximum=100000

@@ -1,7 +1,12 @@
-"""The search for the fastest manoeuvre: guesses, solutions, held commands."""
+"""The search for the fastest manoeuvre: guesses, solutions, held commands.
+
+Many guesses are solved on a coarse grid, where a solution costs a small part of what it costs on
+the full one. The best of them, and the next if it is about as good, are guesses for the full grid.
+"""
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import time
@@ -30,6 +35,8 @@ from spacerobot_ros.planning.methods.optimal.transcription import Stages
 
 _LOG = logging.getLogger(__name__)
 
+_NOTHING = "the solver came to no way that keeps the limits"
+
 _FEWEST_TICKS = 2
 """A manoeuvre has at least as many: one begins to move, another one stops."""
 
@@ -43,6 +50,28 @@ _LAST_CALL = 5.0
 _UNHURRIED = 4.0
 """A gentle manoeuvre is the path of least effort in this many times the time of its guess, then as
 fast as the limits allow."""
+
+_COARSER = 4
+"""The coarse grid has so many times fewer intervals than the full one ..."""
+
+_FEWEST_INTERVALS = 10
+"""... and at least so many; otherwise there is no coarse grid."""
+
+_REFINED = 2
+"""Manoeuvres that are made of coarse solutions at most."""
+
+_FAR_BEHIND = 1.1
+"""A coarse solution that costs so many times more than the best is not refined beside it: a coarse
+grid overrates some solutions by more than others."""
+
+_SAME = 1e-3
+"""Solutions whose costs are this near, relative, are taken for one."""
+
+_AGREED = 3
+"""Solutions are enough when so many of them are the best one: other starts come to the same."""
+
+_FULL_STARTS = 3
+"""Guesses that are tried on the full grid where nothing came of the coarse one."""
 
 _ROOM_IN_GIVEN_TIME = 0.99
 """Share of velocities and accelerations that is planned with where the time cannot stretch."""
@@ -106,6 +135,65 @@ class Manoeuvre:
     cut_short: bool = False
 
 
+@dataclass
+class _Progress:
+    """One search: what is looked for, and how far it has come.
+
+    Attributes
+    ----------
+    boundary, limits, quaternion, budget, cancellation
+        As of :meth:`ManoeuvreSearch.search`.
+    starts, rejection
+        Guesses that were tried, and why the last candidate was none.
+    """
+
+    boundary: BoundaryConditions
+    limits: MotionLimits
+    quaternion: Array
+    budget: SearchBudget
+    cancellation: Cancellation
+    starts: int = 0
+    rejection: str = ""
+    _began: float = field(default_factory=time.monotonic)
+
+    def stop_rule(self, *, found: bool) -> StopRule:
+        """Return when the solver stops; until something is found it may go on for longer."""
+        deadline = last_call = math.inf
+        if self.budget.time_budget > 0:
+            deadline, last_call = (
+                self._began + x * self.budget.time_budget for x in (1.0, _LAST_CALL)
+            )
+        last = deadline if found else last_call
+        return StopRule(self.budget.iterations, self.cancellation, deadline, last)
+
+    def cut_short(self, *, found: bool) -> bool:
+        """Whether the wall time is used up."""
+        return self.stop_rule(found=found).expired(found=found)
+
+    def report(self, what: str, result: str, iterations: int) -> None:
+        """Log what came of a guess."""
+        _LOG.info(
+            "%s: %s after %.2f s, %d steps of the solver",
+            what,
+            result,
+            time.monotonic() - self._began,
+            iterations,
+        )
+
+    def agreed(self, solutions: list[Trajectory]) -> bool:
+        """Whether the best solution was found often enough."""
+        costs = np.array([self.cost(each) for each in solutions])
+        return int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _SAME))) >= _AGREED
+
+    def cost(self, trajectory: Trajectory) -> float:
+        """Return what is to be least: the duration, or in a given one the effort."""
+        if self.budget.duration == 0:
+            return trajectory.duration
+        scale = np.where(np.isfinite(self.limits.velocity), self.limits.velocity, 1.0)
+        change = np.diff(trajectory.velocities, axis=0) / trajectory.step / scale
+        return float(np.mean(np.sum(change**2, axis=1)))
+
+
 class ManoeuvreSearch:
     """Searches for manoeuvres of one robot.
 
@@ -130,6 +218,7 @@ class ManoeuvreSearch:
         self._robot, self._period = robot, control_period
         self._axes, self._constraints = axes, constraints
         self._holder = CommandHolder(robot, prediction, control_period, axes)
+        self._stages: dict[bool, Stages] = {}
         self._solvers: dict[tuple[int, bool], MultipleShooting] = {}
 
     def search(
@@ -150,69 +239,118 @@ class ManoeuvreSearch:
         PlanningCancelled
             The search was cancelled.
         """
-        began = time.monotonic()
-        deadline = last_call = math.inf
-        if budget.time_budget > 0:
-            deadline, last_call = (began + x * budget.time_budget for x in (1.0, _LAST_CALL))
-        solver = self.solver(intervals, boundary.center is not None)
-        curvature = self._robot.function("curvature", compile=False)
-        guesses = InitialGuesses(solver.turn, curvature, intervals)
+        progress = _Progress(boundary, limits, quaternion, budget, cancellation)
+        full = self.solver(intervals, boundary.center is not None)
+        coarser = intervals // _COARSER
         found: list[Manoeuvre] = []
-        starts, rejection = 0, ""
-        for guess in guesses.of(boundary, limits, boundary.likely):
-            # Until something is found the search may go on beyond its time.
-            last = deadline if found else last_call
-            stop = StopRule(budget.iterations, cancellation, deadline, last)
-            try:
-                solution = self._solution(solver, boundary, limits, guess, stop, budget)
-                cancellation.raise_if_requested()
-                manoeuvre = self._commanded(solution, boundary, limits, quaternion, budget)
-                result = f"{manoeuvre.duration:.6g} s"
-                found.append(manoeuvre)
-            except CandidateError as reason:
-                result = rejection = str(reason)
-            starts += 1
-            _LOG.info(
-                "start %d: %s after %.2f s, %d steps of the solver",
-                starts,
-                result,
-                time.monotonic() - began,
-                solver.iterations,
-            )
-            # What was cut short within its last start is no less so.
-            cut_short = stop.expired(found=bool(found))
-            if cut_short or len(found) >= budget.solutions or starts >= budget.starts:
-                break
+        # A single answer is had at less cost without a detour.
+        if budget.solutions > 1 and coarser >= _FEWEST_INTERVALS:
+            coarse = self.solver(coarser, boundary.center is not None)
+            found = self._manoeuvres(progress, coarse, full, budget.starts)
+            if not found and not progress.cut_short(found=False):
+                found = self._manoeuvres(progress, full, full, min(budget.starts, _FULL_STARTS))
+        else:
+            found = self._manoeuvres(progress, full, full, budget.starts)
+        cut_short = progress.cut_short(found=bool(found))
         if not found:
             within = f" within optimal.time_budget {budget.time_budget:g} s" if cut_short else ""
             longer = "A longer optimal.time_budget, more" if cut_short else "More"
             raise NotFoundError(
-                f"No manoeuvre to the goal was found from {starts} start(s){within}: {rejection}. "
-                f"{longer} optimal.starts, optimal.iterations or optimal.intervals, a longer "
-                "optimal.longest, or a smaller goal may help."
+                f"No manoeuvre to the goal was found from {progress.starts} start(s){within}: "
+                f"{progress.rejection}. {longer} optimal.starts, optimal.iterations or "
+                "optimal.intervals, a longer optimal.longest, or a smaller goal may help."
             )
         best = min(found, key=lambda one: one.duration)
         durations = [one.duration for one in found]
-        return replace(best, starts=starts, solutions=durations, cut_short=cut_short)
+        return replace(best, starts=progress.starts, solutions=durations, cut_short=cut_short)
+
+    def _manoeuvres(
+        self, progress: _Progress, grid: MultipleShooting, full: MultipleShooting, starts: int
+    ) -> list[Manoeuvre]:
+        """Return manoeuvres from at most ``starts`` guesses on a grid; none where none is found."""
+        guesses = self._guesses(full, grid.intervals)
+        of_boundary = guesses.of(progress.boundary, progress.limits, progress.boundary.likely)
+        solutions: list[Trajectory] = []
+        enough = progress.budget.solutions
+        for number, guess in enumerate(itertools.islice(of_boundary, starts), 1):
+            stop = progress.stop_rule(found=bool(solutions))
+            solution = self._solution(progress, grid, guess, stop)
+            progress.cancellation.raise_if_requested()
+            progress.starts += 1
+            result = _NOTHING if solution is None else f"{solution.duration:.6g} s"
+            progress.report(f"start {progress.starts}", result, grid.iterations)
+            if solution is None:
+                progress.rejection = _NOTHING
+            else:
+                solutions.append(solution)
+            # What was cut short within its last start is no less so.
+            cut_short = progress.cut_short(found=bool(solutions))
+            going_on = len(solutions) < enough and not progress.agreed(solutions)
+            if going_on and number < starts and not cut_short:
+                continue
+            found = self._refined(progress, solutions, grid, full)
+            if found or cut_short:
+                return found
+            # These are none; the next ones count one by one.
+            solutions, enough = [], 1
+        return []
+
+    def _refined(
+        self,
+        progress: _Progress,
+        solutions: list[Trajectory],
+        grid: MultipleShooting,
+        full: MultipleShooting,
+    ) -> list[Manoeuvre]:
+        """Return manoeuvres made of the best solutions on a grid, after a step to the full one."""
+        found: list[Manoeuvre] = []
+        costs: list[float] = []
+        for solution in sorted(solutions, key=progress.cost):
+            cost = progress.cost(solution)
+            if found and (len(found) == _REFINED or cost > _FAR_BEHIND * costs[0]):
+                break
+            if any(abs(cost - other) <= _SAME * other for other in costs):
+                continue
+            try:
+                refined: Trajectory | None = solution
+                if grid is not full:
+                    guess = self._guesses(full, full.intervals).refined(solution)
+                    stop = progress.stop_rule(found=bool(found))
+                    refined = self._solution(progress, full, guess, stop)
+                    progress.cancellation.raise_if_requested()
+                manoeuvre = self._commanded(progress, refined)
+                found.append(manoeuvre)
+                costs.append(cost)
+                result = f"{manoeuvre.duration:.6g} s"
+            except CandidateError as reason:
+                result = progress.rejection = str(reason)
+            progress.report("manoeuvre", result, full.iterations)
+        return found
+
+    def _guesses(self, solver: MultipleShooting, intervals: int) -> InitialGuesses:
+        curvature = self._robot.function("curvature", compile=False)
+        return InitialGuesses(solver.turn, curvature, intervals)
 
     def solver(self, intervals: int, position: bool) -> MultipleShooting:
         """Return what solves the problem on so many intervals, with or without a position."""
         key = intervals, position
         if key not in self._solvers:
-            stages = Stages.of(self._robot, self._axes, position, self._constraints)
-            self._solvers[key] = MultipleShooting(stages, intervals)
+            if position not in self._stages:
+                self._stages[position] = Stages.of(
+                    self._robot, self._axes, position, self._constraints
+                )
+            self._solvers[key] = MultipleShooting(self._stages[position], intervals)
         return self._solvers[key]
 
     def _solution(
         self,
+        progress: _Progress,
         solver: MultipleShooting,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
         guess: Trajectory,
         stop: StopRule,
-        budget: SearchBudget,
     ) -> Trajectory | None:
         """Return what the solver makes of a guess, None if nothing."""
+        boundary, limits, budget = progress.boundary, progress.limits, progress.budget
         shortest = _FEWEST_TICKS * self._period
         if budget.gentle:
             shortest = max(shortest, min(_GENTLE_TICKS * self._period, _GENTLE_TIME))
@@ -242,14 +380,7 @@ class ManoeuvreSearch:
             return solution
         return solution.hurried(limits, shortest)
 
-    def _commanded(
-        self,
-        trajectory: Trajectory | None,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-        quaternion: Array,
-        budget: SearchBudget,
-    ) -> Manoeuvre:
+    def _commanded(self, progress: _Progress, trajectory: Trajectory | None) -> Manoeuvre:
         """Return a solution as held commands.
 
         Raises
@@ -257,14 +388,15 @@ class ManoeuvreSearch:
         CandidateError
             There is no solution, or none that commands reach within the constraints.
         """
+        boundary, limits, quaternion = progress.boundary, progress.limits, progress.quaternion
         if trajectory is None:
-            raise CandidateError("the solver came to no way that keeps the limits")
+            raise CandidateError(_NOTHING)
         final = boundary.final
         if final is None:
             final = np.clip(trajectory.shapes[-1], limits.lower, limits.upper)
         if boundary.center is not None:
             final = nearest_for_center(self._robot, limits, final, boundary.center)
-        fixed = budget.duration > 0
+        fixed = progress.budget.duration > 0
         held = None
         if final is not None:
             held = self._holder.hold(trajectory, boundary, final, limits, fixed=fixed)

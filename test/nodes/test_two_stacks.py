@@ -1,0 +1,145 @@
+"""Two stacks in one domain, each in a namespace with a clock and a bag of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64
+from support.ros_harness import Harness, Probe, nanoseconds
+
+from spacerobot_ros.bag import RecordedRobot, read_bag
+from spacerobot_ros.nodes import PlannerNode, PlantNode, RecorderNode
+from spacerobot_ros.verification.comparison import verify_bag
+
+# Plants whose time and shape tell them apart.
+ROBOTS: dict[str, dict[str, Any]] = {
+    "one": {"robot": "sliding_masses", "tick_rate": 20.0},
+    "two": {"robot": "sliding_masses", "tick_rate": 8.0, "initial_position": [3.0, 0.0, 0.0]},
+}
+
+
+class NamedStack:
+    """Plant, planner and recorder of one namespace, in lockstep."""
+
+    def __init__(self, harness: Harness, name: str, bag: Path, *, own_clock: bool = True) -> None:
+        self.harness, self.name = harness, name
+        namespace = [] if not name else ["-r", f"__ns:=/{name}"]
+        moved = ["-r", "/clock:=clock"] if name and own_clock else []
+        words = {"cli_args": ["--ros-args", *namespace, *moved], "autostart": False}
+        values = ROBOTS[name or "one"]
+        robot = {key: values[key] for key in ("robot", "tick_rate")}
+        lockstep = {**values, "time_mode": "lockstep", "marker_period": 0.0}
+        self.plant = harness.make(PlantNode, lockstep, **words)
+        quick = {"method": "lie_bracket", "lie_bracket.t1": 1.0, "lie_bracket.cycles": 2}
+        tolerance = {"position_tolerance": 0.01, "attitude_tolerance": 0.01}
+        self.planner = harness.make(PlannerNode, {**robot, **quick, **tolerance}, **words)
+        self.recorder = harness.make(RecorderNode, {"bag": str(bag)}, **words)
+        self.bag = bag
+        self.probe: Probe = harness.probe({}, name="client", cli_args=words["cli_args"])
+        self.probe.watch("planner/status", DiagnosticStatus, latched=True)
+        self.goals = self.probe.create_publisher(PoseStamped, "goal_pose", 10)
+
+    def start(self) -> None:
+        for node in (self.plant, self.planner, self.recorder):
+            node.require(node.trigger_configure)
+        topics = {"odom", "joint_states", "joint_commands", "momentum", "goal_pose"}
+        wanted = {self.plant.resolve_topic_name(topic) for topic in ("/clock", *topics)}
+        self.harness.spin_until(lambda: wanted <= self.recorder.topics, "the recorder's topics")
+        self.harness.connect()
+        for node in (self.recorder, self.planner):
+            node.require(node.trigger_activate)
+
+    def fly(self) -> Callable[[], bool]:
+        """Begin a flight to a goal 1 cm ahead; return whether it is decided."""
+        goal = PoseStamped()
+        goal.header.frame_id = "world"
+        goal.pose.position.x = ROBOTS[self.name or "one"].get("initial_position", [0.0])[0] + 0.01
+        goal.pose.orientation.w = 1.0
+        self.goals.publish(goal)
+        self.plant.require(self.plant.trigger_activate)
+        return self.is_decided
+
+    def is_decided(self) -> bool:
+        states = [
+            pair.value
+            for status in self.probe.messages["planner/status"]
+            for pair in status.values
+            if pair.key == "state"
+        ]
+        return "reached" in states
+
+    def finish(self) -> None:
+        self.plant.trigger_deactivate()
+        self.harness.settle(self.probe)
+        self.harness.spin_until(self.parameters_are_there, "the plant's parameters")
+        self.recorder.trigger_deactivate()
+        self.recorder.trigger_cleanup()
+
+    def parameters_are_there(self) -> bool:
+        self.recorder.scan()
+        return not self.recorder.questions
+
+
+def test_two_stacks_side_by_side_have_each_a_bag_that_verifies(
+    harness: Harness, tmp_path: Path
+) -> None:
+    stacks = [NamedStack(harness, name, tmp_path / f"{name}.mcap") for name in ROBOTS]
+    outside = harness.probe({}).create_publisher(Float64, "/outside", 1)
+    for stack in stacks:
+        stack.start()
+    decided = [stack.fly() for stack in stacks]
+    harness.spin_until(lambda: all(each() for each in decided), "both goals", 60.0)
+    outside.publish(Float64(data=1.0))
+    for stack in stacks:
+        stack.finish()
+    for stack in stacks:
+        bag = read_bag(stack.bag)
+        others = {t for t in bag.topics if not t.startswith(f"/{stack.name}/")}
+        assert others <= {"/diagnostics", "/tf", "/tf_static"}
+        # One clock: it never jumps, and has the steps of its own plant.
+        times = bag[f"/{stack.name}/clock"].time_ns
+        period = round(1e9 / ROBOTS[stack.name]["tick_rate"])
+        assert set(np.diff(times)) == {period}
+        x = RecordedRobot(bag, f"/{stack.name}")["odom"].field("pose.pose.position.x")
+        assert abs(float(x[0]) - ROBOTS[stack.name].get("initial_position", [0.0])[0]) < 1e-12
+        result = verify_bag(stack.bag)
+        assert result.difference is None
+        assert result.ticks > 10
+
+
+def test_a_recorder_of_no_namespace_keeps_to_its_own_clock(
+    harness: Harness, tmp_path: Path
+) -> None:
+    stack = NamedStack(harness, "", tmp_path / "mine.mcap")
+    strange = harness.probe({}, name="strange").create_publisher(Clock, "/two/clock", 10)
+    stack.start()
+    message = Clock()
+    message.clock.sec = 1_000_000
+    harness.matched(strange, 0).publish(message)
+    decided = stack.fly()
+    harness.spin_until(lambda: strange.publish(message) or decided(), "the goal", 60.0)
+    stack.finish()
+    bag = read_bag(stack.bag)
+    assert "/two/clock" not in bag.topics
+    stamps = np.array([nanoseconds(clock.clock) for _, clock in bag["/clock"].messages()])
+    assert np.array_equal(stamps, bag["/clock"].time_ns)
+    assert verify_bag(stack.bag).difference is None
+
+
+def test_two_clocks_on_one_topic_are_reported(
+    harness: Harness, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    recorder = harness.make(RecorderNode, {"bag": str(tmp_path / "a.mcap")})
+    clocks = harness.probe({}, name="clocks")
+    for _ in range(2):
+        clocks.create_publisher(Clock, "/clock", 10)
+    harness.spin_until(lambda: recorder.count_publishers("/clock") == 2)
+    recorder.flush()
+    assert "2 clocks" in capfd.readouterr().err
