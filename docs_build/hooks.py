@@ -48,7 +48,7 @@ def prepared(markdown: str) -> str:
     ``{{ value KEY }}``
         A number of ``docs/figures.json``, with the digits that it has there.
     ``{{ parameters NODE }}``, ``{{ topics }}``, ``{{ state_fields }}``, ``{{ cli }}``,
-    ``{{ api PACKAGE }}``
+    ``{{ api PACKAGE }}``, ``{{ foreign_robots }}``
         Generated references.
 
     Raises
@@ -80,6 +80,8 @@ def _replacement(found: re.Match[str]) -> str:
             return reference.topics()
         case "state_fields":
             return reference.state_fields()
+        case "foreign_robots":
+            return reference.foreign_robots()
         case "cli":
             return reference.command_line()
         case "api":

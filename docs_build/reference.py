@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -80,6 +81,41 @@ def state_fields() -> str:
                 (f"`{topic.name}`", f"`{field.path}`", numbers or f"one for each of the {topic.of}")
             )
     return table(("topic", "field", "numbers"), rows)
+
+
+def foreign_robots() -> str:
+    """Return the table of random goals of robots that are in no paper: `make foreign-robots`."""
+    header = (
+        "robot",
+        "what it is like",
+        "joints",
+        "mass ratio",
+        "goals",
+        "reached",
+        "refused or missed",
+        "duration (s)",
+        "CPU (s)",
+    )
+    rows = json.loads((DOCS / "foreign_robots.json").read_text(encoding="utf-8"))
+    return table(header, [_foreign_row(row) for row in rows])
+
+
+def _foreign_row(row: dict[str, Any]) -> tuple[str, ...]:
+    """Return the cells of one robot."""
+    names = {"refused": "method"}
+    refused = ", ".join(f"{names.get(why, why)} {n}" for why, n in row["refused"].items())
+    others = ", ".join(f"{n} by `{name}`" for name, n in row["methods"].items())
+    return (
+        f"`{row['robot']}`",
+        row["what"],
+        str(row["joints"]),
+        f"{row['mass_ratio']:.2g}",
+        str(row["goals"]),
+        f"{row['met']} ({others})" if row["met"] else "0",
+        refused or "none",
+        f"{row['median_duration']:.3g}",
+        f"{row['median_cpu']:.2g}",
+    )
 
 
 def _row(declaration: Parameter) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """The exceptions of this package: every one carries a sentence that a user can act on."""
 
+from collections.abc import Iterable
 from enum import Enum
 
 _LONGEST_SENTENCE = 2000
@@ -62,6 +63,20 @@ class NotFoundError(PlanningError):
 
     The sentence says how hard it was tried, and what may help.
     """
+
+
+def refusal_of_all(sentence: str, refusals: Iterable[Exception]) -> PlanningError:
+    """Return what a goal is refused with where several methods have refused it.
+
+    A proof of one holds for all; where there is none, one that searched may search longer.
+    """
+    refusals = list(refusals)
+    for refusal in refusals:
+        if isinstance(refusal, UnreachableError):
+            return UnreachableError(sentence, refusal.proof)
+    if any(isinstance(refusal, NotFoundError) for refusal in refusals):
+        return NotFoundError(sentence)
+    return PlanningError(sentence)
 
 
 class GoalError(PlanningError):

@@ -227,6 +227,10 @@ def test_a_goal_a_little_beyond_the_reach_is_aimed_at_as_near_as_it_gets() -> No
             continue
         path = plan("sliding_masses", **asked).path
         assert path.position[-1] == pytest.approx([0.3125, 0.0, 0.0], abs=1e-6)
+        for option in ("cache", "starts", "answers"):
+            del asked[option]
+        path = plan("sliding_masses", method="lie_bracket", **asked).path
+        assert path.position[-1] == pytest.approx([0.3125, 0.0, 0.0], abs=1e-6)
 
 
 def test_the_shape_of_one_joint_that_turns_its_base_decides_the_attitude() -> None:

@@ -19,6 +19,9 @@ POSE: frozenset[Controlled] = frozenset({"position", "attitude"})
 """The parts of a goal that are the pose of the base."""
 
 
+ALMOST = 0.5
+"""Share of its tolerance by which a position that is out of reach may be missed by the plan."""
+
 _FARTHEST = 1e12
 """Beyond it a float64 does not resolve a millimetre, m or rad."""
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from spacerobot_ros.errors import (
-    NotFoundError,
     ParameterError,
     PlanningError,
     SpaceRobotError,
-    UnreachableError,
+    refusal_of_all,
 )
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
@@ -112,12 +111,7 @@ class AutoGait(GaitMethod):
         sentence = f"No method plans this goal of robot '{self.robot.description.name}'. {reasons}"
         # What a method has against a robot says nothing of a goal.
         of_goal = [refusals[name] for name in self._candidates if name not in self._unsuitable]
-        for refusal in of_goal:
-            if isinstance(refusal, UnreachableError):
-                return UnreachableError(sentence, refusal.proof)
-        if any(isinstance(refusal, NotFoundError) for refusal in of_goal):
-            return NotFoundError(sentence)
-        return PlanningError(sentence)
+        return refusal_of_all(sentence, of_goal)
 
     def _standing(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
         """Return the methods to compare; give the reason against the others.

@@ -36,7 +36,7 @@ from spacerobot_ros.planning.core.controllability import (
     sliding_masses,
     slot_matrix,
 )
-from spacerobot_ros.planning.core.goal import Goal, RobotState
+from spacerobot_ros.planning.core.goal import ALMOST, Goal, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
@@ -110,7 +110,7 @@ class LieBracketGait(GaitMethod):
         cancellation.raise_if_requested()
         state, goal = request.state, request.goal
         self._require_rest(state)
-        z_f = self.final_shape(state, goal)
+        z_f = self.final_shape(state, goal, ALMOST * request.tolerance.position)
         slide = self._slide(state.q, z_f)
         t1 = (len(slide) - 1) * self.control_period or self.options.t1
         attitudes = self._prediction.attitudes(slide, state.quaternion, state.angular_momentum)
@@ -123,8 +123,10 @@ class LieBracketGait(GaitMethod):
         }
         return self._schedule_of(goal, np.vstack([slide, turn]), path, symbols | notes)
 
-    def final_shape(self, state: RobotState, goal: Goal) -> Array:
+    def final_shape(self, state: RobotState, goal: Goal, enough: float = 0.0) -> Array:
         """Step 1: the shape ``zf`` (n,) that solves eq. (9), nearest to the present one.
+
+        Where strokes are too short for it, it may miss the position by ``enough``, m.
 
         Raises
         ------
@@ -143,13 +145,20 @@ class LieBracketGait(GaitMethod):
         z0, lower, upper = (x[self.sliders] for x in (state.q, robot.lower, robot.upper))
         dz: Array = np.linalg.lstsq(P, shift, rcond=None)[0].astype(float)
         if np.any(z0 + dz < lower) or np.any(z0 + dz > upper):
-            dz = self._within_strokes(P, shift, z0, dz, lower, upper)
+            dz = self._within_strokes(P, shift, z0, dz, lower, upper, enough)
         z_f = state.q.copy()
         z_f[self.sliders] = np.clip(z0 + dz, lower, upper)
         return z_f
 
     def _within_strokes(
-        self, P: Array, shift: Array, z0: Array, dz: Array, lower: Array, upper: Array
+        self,
+        P: Array,
+        shift: Array,
+        z0: Array,
+        dz: Array,
+        lower: Array,
+        upper: Array,
+        enough: float,
     ) -> Array:
         """Spread the displacement over more than three sliders, or name the stroke too short."""
         from scipy.optimize import lsq_linear  # Slow to import, and few goals need it.
@@ -157,7 +166,8 @@ class LieBracketGait(GaitMethod):
         # Bounds must differ for the solver; a slider at its end gets a hair of room.
         room = 1e-12 * (1.0 + np.abs(upper - lower))
         bounded = lsq_linear(P, shift, (lower - z0 - room, upper - z0 + room), method="bvls")
-        if np.linalg.norm(P @ bounded.x - shift) <= 1e-9 * max(1.0, float(np.linalg.norm(shift))):
+        gap = float(np.linalg.norm(P @ bounded.x - shift))
+        if gap <= max(enough, 1e-9 * max(1.0, float(np.linalg.norm(shift)))):
             return np.asarray(bounded.x, dtype=float)
         if len(self.sliders) == 3:
             z = z0 + dz
@@ -170,7 +180,7 @@ class LieBracketGait(GaitMethod):
         else:
             sentence = (
                 f"The goal is beyond stroke: {len(self.sliders)} sliders put the base no nearer "
-                f"than {np.linalg.norm(P @ bounded.x - shift):.3g} m to it."
+                f"than {gap:.3g} m to it."
             )
         # Other joints move the centre of mass too, but not by this method.
         if len(self.sliders) < self.robot.n:

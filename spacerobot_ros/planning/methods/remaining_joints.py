@@ -9,7 +9,15 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptionError
+from spacerobot_ros.errors import (
+    ParameterError,
+    PlanningError,
+    Proof,
+    RobotDescriptionError,
+    SpaceRobotError,
+    UnreachableError,
+    refusal_of_all,
+)
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.parameters import declared
@@ -80,7 +88,7 @@ class RemainingJointsGait(GaitMethod):
         except PlanningCancelled:
             raise
         except PlanningError as refusal:
-            raise PlanningError(f"{self._where()}; {refusal}") from None
+            raise refusal_of_all(f"{self._where()}; {refusal}", [refusal]) from None
 
     def _plan(self, request: PlanRequest, cancellation: Cancellation) -> GaitSchedule:
         moving, state, shape = ~self._is_stuck, request.state, request.goal.joint_positions
@@ -95,18 +103,19 @@ class RemainingJointsGait(GaitMethod):
             goal=replace(request.goal, joint_positions=None if shape is None else shape[moving]),
             previous=previous,
         )
-        reasons = []
+        reasons: list[SpaceRobotError] = []
         for name in names:
             try:
                 schedule = self._method(name).plan(inner, cancellation)
             except PlanningCancelled:
                 raise
             except (PlanningError, ParameterError, RobotDescriptionError) as refusal:
-                reasons.append(str(refusal))
+                reasons.append(refusal)
                 continue
             if lost := self._required - schedule.controls:
                 parts = " and ".join(sorted(lost))
-                reasons.append(f"{schedule.method} would leave the {parts} as it comes.")
+                left = f"{schedule.method} would leave the {parts} as it comes."
+                reasons.append(PlanningError(left))
                 continue
             if "shape" in schedule.controls and shape is not None:
                 self._require_shape(state, shape, request.tolerance.shape)
@@ -119,7 +128,8 @@ class RemainingJointsGait(GaitMethod):
                 goal=request.goal,
                 progress=_Progress(frozenset(self._stuck), name, schedule.progress),
             )
-        raise PlanningError(f"with the remaining joints: {' '.join(dict.fromkeys(reasons))}")
+        sentences = " ".join(dict.fromkeys(map(str, reasons)))
+        raise refusal_of_all(f"with the remaining joints: {sentences}", reasons)
 
     def _going_on(self, previous: GaitSchedule | None) -> tuple[list[str], GaitSchedule | None]:
         """Return the methods to try, and the previous schedule as theirs.
@@ -146,8 +156,9 @@ class RemainingJointsGait(GaitMethod):
         far = np.abs(shape - state.q) * self._is_stuck
         worst = int(np.argmax(far))
         if far[worst] > tolerance:
-            raise PlanningError(
-                f"the goal wants joint '{self.robot.joint_names[worst]}' at {shape[worst]:.4g}."
+            raise UnreachableError(
+                f"the goal wants joint '{self.robot.joint_names[worst]}' at {shape[worst]:.4g}.",
+                Proof.LIMITS,
             )
 
     def _where(self) -> str:

@@ -32,7 +32,7 @@ from spacerobot_ros.planning.core.controllability import (
     slot_matrix,
     tilted_goal,
 )
-from spacerobot_ros.planning.core.goal import Controlled
+from spacerobot_ros.planning.core.goal import ALMOST, Controlled
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.reach import CenterReach
 from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
@@ -57,10 +57,6 @@ _STEPS, _COARSE_INTEGRAL = 1000, 1e-5
 
 _BEYOND = 1e-9
 """Rounding that a joint may be beyond its limits by, m or rad."""
-
-_SHARE = 0.5
-"""Share of the tolerance of the position that the base is planned to miss it by, at most, where it
-cannot be on the spot: the rest is for what turns out otherwise."""
 
 _NODES = 48
 """Nodes of Gauss and Legendre along the way to a shape."""
@@ -200,7 +196,7 @@ class GoalSpecification:
                     Proof.MOMENTUM,
                 )
             return BoundaryConditions(state.q, turn, shape, shape, None, direction)
-        likely = shape_for_center(robot, limits, state.q, center, _SHARE * tolerance.position)
+        likely = shape_for_center(robot, limits, state.q, center, ALMOST * tolerance.position)
         center = robot.center_of_mass(likely)
         # Three coordinates have few shapes for one centre of mass, or one.
         if robot.n <= 3:
