@@ -192,8 +192,15 @@ def test_a_proof_and_a_search_in_vain_are_two_things() -> None:
     with pytest.raises(UnreachableError, match="centre of mass stays") as resting:
         plan("sliding_masses", position=(0.1, 0, 0), joint_positions=(0, 0, 0))
     assert resting.value.proof is Proof.MOMENTUM
-    with pytest.raises(NotFoundError, match=r"from 1 start\(s\)"):
-        plan("planar_chain", rotvec=(0, 0, 1.0), starts=1, iterations=1, cache=0)
+    for given_time, option in (({}, "longest"), ({"duration": 0.1}, "duration")):
+        with pytest.raises(NotFoundError, match=rf"from . start.*a longer optimal\.{option}, or"):
+            plan("planar_chain", rotvec=(0, 0, 1.0), starts=1, iterations=1, cache=0, **given_time)
+
+
+def test_a_longest_manoeuvre_below_two_control_periods_is_refused() -> None:
+    asked: dict[str, Any] = {"rotvec": (0, 0, 0.5), "longest": 1.0, "starts": 1, "cache": 0}
+    with pytest.raises(PlanningError, match=r"2 control periods of 1 s, .*longest = 1 s"):
+        plan("planar_chain", control_period=1.0, **asked)
 
 
 def test_auto_has_the_proof_of_any_method() -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from spacerobot_ros.errors import NotFoundError
+from spacerobot_ros.errors import NotFoundError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
@@ -236,9 +236,16 @@ class ManoeuvreSearch:
         ------
         NotFoundError
             None was found.
+        PlanningError
+            None is as short as is asked for.
         PlanningCancelled
             The search was cancelled.
         """
+        if budget.longest < _FEWEST_TICKS * self._period:
+            raise PlanningError(
+                f"Manoeuvres take at least {_FEWEST_TICKS} control periods of {self._period:g} s, "
+                f"more than optimal.longest = {budget.longest:g} s."
+            )
         progress = _Progress(boundary, limits, quaternion, budget, cancellation)
         full = self.solver(intervals, boundary.center is not None)
         coarser = intervals // _COARSER
@@ -254,11 +261,12 @@ class ManoeuvreSearch:
         cut_short = progress.cut_short(found=bool(found))
         if not found:
             within = f" within optimal.time_budget {budget.time_budget:g} s" if cut_short else ""
+            limit = "duration" if budget.duration > 0 else "longest"
             longer = "A longer optimal.time_budget, more" if cut_short else "More"
             raise NotFoundError(
                 f"No manoeuvre to the goal was found from {progress.starts} start(s){within}: "
                 f"{progress.rejection}. {longer} optimal.starts, optimal.iterations or "
-                "optimal.intervals, a longer optimal.longest, or a smaller goal may help."
+                f"optimal.intervals, a longer optimal.{limit}, or a smaller goal may help."
             )
         best = min(found, key=lambda one: one.duration)
         durations = [one.duration for one in found]
