@@ -10,6 +10,7 @@ from spacerobot_ros.errors import (
     ParameterError,
     PlanningError,
     SpaceRobotError,
+    UnreachableError,
     refusal_of_all,
 )
 from spacerobot_ros.model import SpaceRobot
@@ -106,11 +107,14 @@ class AutoGait(GaitMethod):
         return _noted(results[chosen].schedule, chosen, because, results, refusals)
 
     def _refusal(self, refusals: Mapping[str, SpaceRobotError]) -> PlanningError:
-        """Return the refusal of a goal that no method plans."""
-        reasons = " ".join(f"{name}: {refusals[name]}" for name in self._candidates)
-        sentence = f"No method plans this goal of robot '{self.robot.description.name}'. {reasons}"
+        """Return the refusal of a goal that no method plans: the proof of one, or all reasons."""
         # What a method has against a robot says nothing of a goal.
         of_goal = [refusals[name] for name in self._candidates if name not in self._unsuitable]
+        for refusal in of_goal:
+            if isinstance(refusal, UnreachableError):
+                return refusal
+        reasons = " ".join(f"{name}: {refusals[name]}" for name in self._candidates)
+        sentence = f"No method plans this goal of robot '{self.robot.description.name}'. {reasons}"
         return refusal_of_all(sentence, of_goal)
 
     def _standing(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
