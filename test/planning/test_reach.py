@@ -214,7 +214,7 @@ def test_auto_has_the_proof_of_any_method() -> None:
     with pytest.raises(NotFoundError, match="No method plans"):
         auto.plan(PlanRequest(state, turned, TOLERANCE))
     beyond = replace(turned, joint_positions=np.array([9.0, 0.0, 0.0]))
-    with pytest.raises(UnreachableError, match="^The goal shape is beyond limits") as refused:
+    with pytest.raises(UnreachableError, match=r"^The goal shape is beyond limits") as refused:
         auto.plan(PlanRequest(state, beyond, TOLERANCE))
     assert refused.value.proof is Proof.LIMITS
 
