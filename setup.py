@@ -81,6 +81,7 @@ setup(
         "rosbags",
         "scipy",
         "urdf-parser-py",
+        "xacro",
         "zstandard",
     ],
     extras_require={

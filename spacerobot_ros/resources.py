@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
+from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 
 _PACKAGE = "spacerobot_ros"
+
+_ROBOT_SUFFIXES = (".urdf", ".xacro", ".xml", ".sdf", ".world", ".mjcf")
+"""Suffixes of files that may be meant as a robot, also of those that are refused."""
 
 
 @lru_cache(maxsize=1)
@@ -44,21 +49,50 @@ def resource_names(folder: str, suffix: str) -> list[str]:
     return sorted(path.stem for path in (share_directory() / folder).glob(f"*{suffix}"))
 
 
-def robot_file(name: str) -> Path:
-    """Return the URDF file of a robot: a path, or the name of a robot of this package.
+def robot_file(name: str, beside: Path | None = None) -> Path:
+    """Return the file of a robot: a path, or the name of a robot of this package.
+
+    Parameters
+    ----------
+    name
+        A path to a URDF or xacro file, or the name of a robot of this package.
+    beside
+        A folder where relative paths are looked for before the current one.
 
     Raises
     ------
     ParameterError
         There is no such file or robot.
     """
-    path = Path(name)
-    if path.suffix != ".urdf":
+    if not is_path(name):
         path = share_directory() / "urdf" / f"{name}.urdf"
-    if not path.is_file():
-        known = ", ".join(resource_names("urdf", ".urdf"))
+        if path.is_file():
+            return path
+        known = resource_names("urdf", ".urdf")
         raise ParameterError(
             f"There is no robot '{name}': there is no such URDF file, nor a robot of that name "
-            f"(known: {known})."
+            f"(known: {', '.join(known)}).{suggestion(name, known)}"
         )
-    return path
+    folders = [Path()] if beside is None else [beside, Path()]
+    for folder in folders:
+        if (folder / name).is_file():
+            return folder / name
+    if any((folder / name).is_dir() for folder in folders):
+        raise ParameterError(f"'{name}' is a folder; name the URDF file in it.")
+    nearby = [path.name for path in Path(name).parent.glob("*") if is_path(path.name)]
+    nearby += resource_names("urdf", ".urdf")
+    raise ParameterError(
+        f"There is no robot '{name}': there is no such URDF file."
+        f"{suggestion(Path(name).name, nearby)}"
+    )
+
+
+def is_path(name: str) -> bool:
+    """Whether a name of a robot is that of a file, by its suffix or folder."""
+    return Path(name).suffix in _ROBOT_SUFFIXES or len(Path(name).parts) > 1
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Return a sentence, after a blank, that asks for the known name most like this one."""
+    found = get_close_matches(name, list(known), n=1)
+    return f" Did you mean '{found[0]}'?" if found else ""

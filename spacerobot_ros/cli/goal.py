@@ -5,16 +5,21 @@ from __future__ import annotations
 import click
 
 from spacerobot_ros.cli.errors import end_if_requested, fail
+from spacerobot_ros.cli.options import note_large_angles
 
 
 @click.command("goal", context_settings={"ignore_unknown_options": True})
 @click.argument("pose", nargs=-1, type=float, metavar="X Y Z [QX QY QZ QW]")
 @click.option("--rotvec", nargs=3, type=float, metavar="RX RY RZ", help="Attitude instead (rad).")
+@click.option(
+    "--rpy-deg", nargs=3, type=float, metavar="ROLL PITCH YAW", help="... about fixed axes (deg)."
+)
 @click.option("--namespace", default="", help="Of the stack.")
 @click.option("--timeout", default=0.0, help="Wall time to wait for the end, s; 0: for ever.")
 def command(
     pose: tuple[float, ...],
     rotvec: tuple[float, float, float] | None,
+    rpy_deg: tuple[float, float, float] | None,
     namespace: str,
     timeout: float,
 ) -> None:
@@ -25,12 +30,17 @@ def command(
     """
     if len(pose) not in (3, 7):
         raise click.UsageError("A goal is X Y Z, or X Y Z QX QY QZ QW.")
+    if rotvec and rpy_deg:
+        raise click.UsageError("The attitude is given twice, in radians and in degrees.")
     from spacerobot_ros.planning import Goal
-    from spacerobot_ros.session.scenario import goal_from_rotvec
+    from spacerobot_ros.session.scenario import goal_from_rotvec, goal_from_rpy
 
     wanted = Goal.checked(pose[:3], pose[3:] or (0.0, 0.0, 0.0, 1.0))
     if rotvec:
+        note_large_angles(rotvec, "--rpy-deg")
         wanted = goal_from_rotvec(pose[:3], rotvec)
+    if rpy_deg:
+        wanted = goal_from_rpy(pose[:3], rpy_deg)
     from spacerobot_ros.session.live import send_goal
     from spacerobot_ros.session.mission_client import Outcome
 

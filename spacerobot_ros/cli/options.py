@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from functools import cached_property
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, wraps
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
 if TYPE_CHECKING:
+    from spacerobot_ros.session.scenario import Scenario
+
     _Choice = click.Choice[str]
 else:  # Generic in new versions only.
     _Choice = click.Choice
@@ -19,16 +23,71 @@ else:  # Generic in new versions only.
 PATH = click.Path(path_type=Path)
 
 bag_argument = click.argument("bag", type=PATH)
-pose_option = click.option(
+_pose_option = click.option(
     "--goal", nargs=7, type=float, metavar="X Y Z QX QY QZ QW", help="Goal pose (m, quaternion)."
 )
-rotvec_option = click.option(
+_rotvec_option = click.option(
     "--goal-rotvec",
     nargs=3,
     type=float,
     metavar="RX RY RZ",
     help="Attitude of the goal as exponential coordinates (rad).",
 )
+_rpy_option = click.option(
+    "--goal-rpy-deg",
+    nargs=3,
+    type=float,
+    metavar="ROLL PITCH YAW",
+    help="... or about the fixed axes x, y, z in this order (deg).",
+)
+
+
+@dataclass(frozen=True)
+class GoalOptions:
+    """A goal as the command line gives it.
+
+    Attributes
+    ----------
+    pose
+        (7,) position (m) and quaternion, if given.
+    rotvec, rpy_deg
+        (3,) attitude in radians or in degrees, if given.
+    """
+
+    pose: tuple[float, ...] | None
+    rotvec: tuple[float, ...] | None
+    rpy_deg: tuple[float, ...] | None
+
+    def of(self, scenario: Scenario) -> Scenario:
+        """Return a scenario with this goal; a rotation that looks like degrees is reported."""
+        if self.rotvec is not None:
+            note_large_angles(self.rotvec, "--goal-rpy-deg")
+        return scenario.with_goal(self.pose, self.rotvec, self.rpy_deg)
+
+
+def goal_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of a goal, as its argument ``goal``."""
+
+    @wraps(command)
+    def with_goal(
+        *words: Any, goal: Any, goal_rotvec: Any, goal_rpy_deg: Any, **options: Any
+    ) -> None:
+        command(*words, goal=GoalOptions(goal, goal_rotvec, goal_rpy_deg), **options)
+
+    return cast("Callable[..., None]", _pose_option(_rotvec_option(_rpy_option(with_goal))))
+
+
+def note_large_angles(rotvec: Sequence[float], other: str) -> None:
+    """Report a rotation of more than a turn, which may have been meant in degrees."""
+    angle = math.hypot(*rotvec)
+    if 2 * math.pi < angle < math.inf:
+        click.echo(
+            f"The goal turns by {angle:.5g} rad, which is {angle / (2 * math.pi):.3g} turns: only "
+            f"the attitude at their end counts. For degrees there is {other}.",
+            err=True,
+        )
+
+
 settings_option = click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE")
 
 

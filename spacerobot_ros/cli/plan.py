@@ -17,10 +17,10 @@ from spacerobot_ros.cli.errors import fail
 from spacerobot_ros.cli.options import (
     METHODS,
     PATH,
+    GoalOptions,
     Registered,
+    goal_options,
     json_option,
-    pose_option,
-    rotvec_option,
     settings_option,
     write,
     write_json,
@@ -31,10 +31,12 @@ if TYPE_CHECKING:
     from spacerobot_ros.simulation.trials import Problem, Record, Trial
 
 
+_NO_GOAL = GoalOptions(None, None, None)
+
+
 @click.command("plan")
 @click.argument("scenario", metavar="SCENARIO|ROBOT")
-@pose_option
-@rotvec_option
+@goal_options
 @click.option(
     "--method",
     type=Registered(METHODS),
@@ -59,8 +61,7 @@ if TYPE_CHECKING:
 @click.option("--beside", type=Registered(METHODS), help="... by this method too.")
 def command(
     scenario: str,
-    goal: tuple[float, ...] | None,
-    goal_rotvec: tuple[float, ...] | None,
+    goal: GoalOptions,
     method: str,
     settings: tuple[str, ...],
     json_file: Path | None,
@@ -77,15 +78,15 @@ def command(
     """
     from spacerobot_ros.simulation.trials import Trial, compare, try_method
 
-    problem = problem_of(scenario, goal, goal_rotvec, settings)
+    problem = problem_of(scenario, goal, settings)
     if count is not None:
         _try_random(problem, [method] if beside is None else [method, beside], count, within)
         return
     found: Mapping[str, Trial | SpaceRobotError]
-    with _progress():
+    with progress():
         found = compare(problem) if comparing else {method: try_method(problem, method)}
     if comparing:
-        for line in _table(found):
+        for line in table(found):
             click.echo(line)
     trial = found.get(method)
     if not isinstance(trial, Trial):
@@ -114,14 +115,13 @@ def command(
 
 def problem_of(
     name: str,
-    goal: Sequence[float] | None = None,
-    goal_rotvec: Sequence[float] | None = None,
+    goal: GoalOptions = _NO_GOAL,
     settings: Sequence[str] = (),
 ) -> Problem:
     """Return the planning problem of a scenario, or of a robot (a name or a URDF file) at rest.
 
-    ``goal`` (7,) and ``goal_rotvec`` (3,) replace the scenario's, ``settings`` are
-    ``planner.parameter=value`` and ``plant.parameter=value``.
+    ``goal`` replaces the scenario's, ``settings`` are ``planner.parameter=value`` and
+    ``plant.parameter=value``.
 
     Raises
     ------
@@ -136,8 +136,7 @@ def problem_of(
         node, _, _ = parse_setting(text)
         if node not in ("plant", "planner"):
             raise ParameterError(f"'{text}' sets a parameter of {node}, which plans nothing.")
-    scenario = scenario_or_robot(name).with_settings(settings).with_goal(goal, goal_rotvec)
-    return scenario.problem()
+    return goal.of(scenario_or_robot(name).with_settings(settings)).problem()
 
 
 def json_of(problem: Problem, trial: Trial) -> dict[str, Any]:
@@ -171,7 +170,7 @@ def json_of(problem: Problem, trial: Trial) -> dict[str, Any]:
     }
 
 
-def _table(found: Mapping[str, Trial | SpaceRobotError]) -> Iterator[str]:
+def table(found: Mapping[str, Trial | SpaceRobotError]) -> Iterator[str]:
     """Yield the lines of a comparison; errors that a method does not control are in brackets."""
     yield f"{'method':<14}{'manoeuvre':>12}{'planned in':>12}{'attitude':>14}{'position':>14}"
     yield f"{'':<14}{'s':>12}{'s':>12}{'rad off':>14}{'m off':>14}"
@@ -225,7 +224,7 @@ def _row(record: Record) -> str:
 
 
 @contextmanager
-def _progress() -> Iterator[None]:
+def progress() -> Iterator[None]:
     """Show what the methods log of their search, where somebody is looking."""
     log, handler = logging.getLogger("spacerobot_ros.planning"), logging.StreamHandler(sys.stderr)
     if not sys.stderr.isatty():

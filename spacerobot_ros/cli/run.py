@@ -16,23 +16,23 @@ from spacerobot_ros.cli.options import (
     LAWS,
     METHODS,
     PATH,
+    GoalOptions,
     Registered,
+    goal_options,
     json_option,
     numbers,
-    pose_option,
-    rotvec_option,
     settings_option,
     write_json,
 )
+from spacerobot_ros.errors import ParameterError
 
 if TYPE_CHECKING:
     from spacerobot_ros.session.scenario import Scenario
 
 
 @click.command("run")
-@click.argument("scenario")
-@pose_option
-@rotvec_option
+@click.argument("scenario", metavar="SCENARIO|ROBOT")
+@goal_options
 @click.option("--method", type=Registered(METHODS, LAWS), help="Gait method, or control law.")
 @settings_option
 @click.option("--bag", type=PATH, help="New bag to write [out/SCENARIO.mcap, or the next free].")
@@ -49,8 +49,7 @@ if TYPE_CHECKING:
 @click.option("--processes", is_flag=True, help="Give each node a process of its own.")
 def command(
     scenario: str,
-    goal: tuple[float, ...] | None,
-    goal_rotvec: tuple[float, ...] | None,
+    goal: GoalOptions,
     method: str | None,
     settings: tuple[str, ...],
     bag: Path | None,
@@ -59,13 +58,13 @@ def command(
     realtime: float | None,
     processes: bool,
 ) -> None:
-    """Fly SCENARIO (a name or a parameter file) to its goal and record it.
+    """Fly SCENARIO (a name or a parameter file), or a ROBOT (a name or a URDF file), to its goal.
 
     Exit code 0: the goal was reached within tolerance; 1: it was not; 2: bad input. A signal ends
     the flight early; what was flown is recorded and summed up, and the exit code is 128 plus the
     number of the signal: 130 after Ctrl-C.
     """
-    chosen = _chosen(scenario, goal, goal_rotvec, method, settings, realtime)
+    chosen = _chosen(scenario, goal, method, settings, realtime)
     from spacerobot_ros.bag import free_name
     from spacerobot_ros.session.run import run_scenario
 
@@ -89,33 +88,40 @@ def command(
 
 def _chosen(
     name: str,
-    goal: tuple[float, ...] | None,
-    goal_rotvec: tuple[float, ...] | None,
+    goal: GoalOptions,
     method: str | None,
     settings: tuple[str, ...],
     realtime: float | None,
 ) -> Scenario:
     """Return the scenario with what the command line changes."""
     from spacerobot_ros.control.laws.registry import LAWS
-    from spacerobot_ros.session.scenario import load_scenario
+    from spacerobot_ros.session.scenario import scenario_or_robot
 
-    scenario = load_scenario(name).with_goal(goal, goal_rotvec)
+    scenario = goal.of(scenario_or_robot(name))
+    scenario.require_goal()
     if realtime is not None:
         scenario = scenario.in_real_time(realtime)
     scenario = scenario.with_settings(settings)
     if method is not None:
+        kind, node, parameter = "gait method", "planner", "method"
         if method in LAWS:
-            return scenario.with_overrides("coordinated_control", {"law": method})
-        return scenario.with_overrides("planner", {"method": method})
+            kind, node, parameter = "control law", "coordinated_control", "law"
+        if node not in scenario.commanders:
+            raise ParameterError(
+                f"'{method}' is a {kind}, and the scenario '{scenario.name}' has no section "
+                f"'{node}' that could use it: it flies with {' and '.join(scenario.commanders)}."
+            )
+        return scenario.with_overrides(node, {parameter: method})
     return scenario
 
 
 @contextmanager
 def _progress(label: str) -> Iterator[Callable[[float, float], None]]:
     """Show simulated time against the end of the schedule, where somebody is looking."""
-    with click.progressbar(
-        length=1000, label=label, file=sys.stderr, hidden=not sys.stderr.isatty()
-    ) as bar:
+    if not sys.stderr.isatty():
+        yield lambda now, end: None
+        return
+    with click.progressbar(length=1000, label=label, file=sys.stderr) as bar:
 
         def show(now: float, end: float) -> None:
             share = min(now / end, 1.0) if end > 0 else 0.0

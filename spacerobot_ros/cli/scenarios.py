@@ -11,4 +11,4 @@ def command() -> None:
     from spacerobot_ros.session.scenario import load_scenario, scenario_names
 
     for name in scenario_names():
-        click.echo(f"{name:<22}{load_scenario(name).description}")
+        click.echo(f"{name:<26}{load_scenario(name).description}")

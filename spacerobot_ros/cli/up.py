@@ -10,7 +10,7 @@ from spacerobot_ros.cli.options import PATH, settings_option
 
 
 @click.command("up")
-@click.argument("scenario")
+@click.argument("scenario", metavar="SCENARIO|ROBOT")
 @settings_option
 @click.option("--bag", type=PATH, help="Record into this bag.")
 @click.option(
@@ -24,10 +24,13 @@ from spacerobot_ros.cli.options import PATH, settings_option
 def command(
     scenario: str, settings: tuple[str, ...], bag: Path | None, rate: float, processes: bool
 ) -> None:
-    """Run the nodes of SCENARIO in real time until Ctrl-C, SIGTERM or SIGHUP; goals by topic."""
-    from spacerobot_ros.session.scenario import load_scenario
+    """Run the nodes of SCENARIO, or of a ROBOT (a name or a URDF file), in real time.
 
-    chosen = load_scenario(scenario).in_real_time(rate).with_settings(settings)
+    They end at Ctrl-C, SIGTERM or SIGHUP; goals come by topic.
+    """
+    from spacerobot_ros.session.scenario import scenario_or_robot
+
+    chosen = scenario_or_robot(scenario).in_real_time(rate).with_settings(settings)
     from spacerobot_ros.session.live import keep_up
 
     recorded = keep_up(chosen, bag, click.echo, processes=processes)

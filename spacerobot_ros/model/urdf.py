@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import re
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from urdf_parser_py.urdf import URDF
@@ -25,29 +27,96 @@ from spacerobot_ros.model.description import (
     weld,
 )
 from spacerobot_ros.model.rotations import matrix_from_rpy
+from spacerobot_ros.resources import suggestion
 
 _LARGEST = 1e12
 """Larger numbers (kg, m, kg m^2) are slips, and their squares soon overflow."""
 
 _MOST_LINKS = 200
 
+_XACRO = re.compile(r"<xacro:|\$\{")
+_MESH = re.compile(
+    r"""(?P<before><mesh\b[^>]*?\bfilename\s*=\s*["'])(?P<file>[^"']+)(?P<after>["'])"""
+)
+
+_OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model", "COLLADA": "a COLLADA file"}
+"""What files with another root element than <robot> are."""
+
+_TRIANGLE_SLACK = 0.01
+"""Share by which rounded principal moments may break the triangle inequality."""
+
 
 def load_robot(path: str | Path) -> RobotDescription:
-    """Read the robot of a URDF file.
+    """Read the robot of a URDF file, or of a xacro file, which is expanded.
+
+    Paths of meshes that are relative to the file, or in a package that is a folder around it,
+    become absolute in the text that the robot keeps.
 
     Raises
     ------
     RobotDescriptionError
         The file cannot be read, is not URDF, or does not describe a free-floating tree.
     """
+    path = Path(path)
     try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
         raise RobotDescriptionError(f"The URDF {path} cannot be read: {error}.") from error
+    except UnicodeDecodeError as error:
+        raise RobotDescriptionError(
+            f"The URDF {path} cannot be read: it is no text ({error})."
+        ) from error
+    if path.suffix == ".xacro" or _XACRO.search(text):
+        text = _expanded(path)
     try:
-        return parse_robot(text)
+        return parse_robot(with_mesh_files(text, path.resolve().parent))
     except RobotDescriptionError as error:
         raise RobotDescriptionError(f"{path}: {error}") from error
+
+
+def _expanded(path: Path) -> str:
+    """Return the URDF text that a xacro file stands for."""
+    try:
+        import xacro
+    except ImportError:
+        raise RobotDescriptionError(
+            f"{path} is a xacro file, and the package xacro is not installed: `pip install xacro`, "
+            f"or expand it where it is: `xacro {path.name} > {path.name.split('.')[0]}.urdf`."
+        ) from None
+    # xacro reports on standard error where it was when it failed: the sentence says it.
+    with contextlib.redirect_stderr(io.StringIO()):
+        try:
+            return str(xacro.process_file(str(path)).toxml())
+        except Exception as error:  # Of xacro, its expressions, the XML parser
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise RobotDescriptionError(
+                f"The xacro file {path} cannot be expanded: {reason}."
+            ) from error
+
+
+def with_mesh_files(text: str, folder: Path) -> str:
+    """Return a URDF text whose meshes are found from anywhere: see :func:`load_robot`."""
+
+    def absolute(match: re.Match[str]) -> str:
+        found = _mesh_beside(match["file"], folder)
+        return match[0] if found is None else f"{match['before']}file://{found}{match['after']}"
+
+    return _MESH.sub(absolute, text)
+
+
+def _mesh_beside(resource: str, folder: Path) -> Path | None:
+    """Return the file of a mesh next to the URDF's folder, None where its URI says all."""
+    scheme, mark, rest = resource.partition("://")
+    if not mark:
+        found = folder / resource
+        return found.resolve() if found.is_file() else None
+    if scheme != "package":
+        return None
+    package, _, inside = rest.partition("/")
+    for parent in (folder, *folder.parents):
+        if parent.name == package and (parent / inside).is_file():
+            return parent / inside
+    return None
 
 
 def parse_robot(text: str) -> RobotDescription:
@@ -95,6 +164,18 @@ def parse_robot(text: str) -> RobotDescription:
 
 
 def _parse_xml(text: str) -> Any:
+    try:
+        root = ElementTree.fromstring(text).tag
+    except ElementTree.ParseError as error:
+        raise RobotDescriptionError(
+            f"The robot description is not valid URDF: it is no XML ({error})."
+        ) from error
+    if root != "robot":
+        found = _OTHER_FORMATS.get(root, "something else")
+        raise RobotDescriptionError(
+            f"The robot description is not valid URDF but {found}: its root element is <{root}>, "
+            "and that of a URDF is <robot>. Export or convert it to URDF."
+        )
     # The parser reports elements it does not know (ros2_control, gazebo plugins) on standard
     # error; they are none of ours.
     with contextlib.redirect_stderr(io.StringIO()):
@@ -141,12 +222,24 @@ def _link(link: Any, colours: dict[str, Any]) -> Link:
             about = _finite(link.inertial.inertia.to_matrix(), where)
         if mass < 0:
             raise RobotDescriptionError(f"The mass of {where} is negative ({mass} kg).")
-        if np.linalg.eigvalsh(about)[0] < -1e-12 * max(1.0, float(np.abs(about).max())):
-            raise RobotDescriptionError(
-                f"The inertia of {where} has a negative principal moment; check its signs."
-            )
+        _require_possible(about, where)
         inertia = Inertia(mass, np.zeros(3), about).moved(pose)
     return Link(link.name, inertia, tuple(_shapes(link, colours, where)))
+
+
+def _require_possible(about: Array, where: str) -> None:
+    """Refuse moments of inertia (3, 3), kg m^2, that no body has."""
+    low, middle, high = np.linalg.eigvalsh(about)
+    if low < -1e-12 * max(1.0, float(np.abs(about).max())):
+        raise RobotDescriptionError(
+            f"The inertia of {where} has a negative principal moment; check its signs."
+        )
+    if high > (1 + _TRIANGLE_SLACK) * (low + middle) + 1e-12:
+        raise RobotDescriptionError(
+            f"The inertia of {where} is that of no body: its principal moments are {low:.4g}, "
+            f"{middle:.4g} and {high:.4g} kg m^2, and none can be larger than the sum of the other "
+            "two. Check units and digits of <inertia>."
+        )
 
 
 def _shapes(link: Any, colours: dict[str, Any], where: str) -> list[Shape]:
@@ -184,6 +277,7 @@ def _joint(joint: Any, links: dict[str, Link]) -> Joint:
         if name not in links:
             raise RobotDescriptionError(
                 f"The {role} of {where} is '{name}', but there is no such link."
+                f"{suggestion(name, links)}"
             )
     try:
         kind = JointKind(joint.type)
@@ -255,7 +349,9 @@ def _require_mass(robot: RobotDescription) -> None:
     if base.mass <= 0:
         raise RobotDescriptionError(
             f"The base link '{robot.base_link}' has no mass; a free-floating base needs an "
-            "<inertial> with mass and inertia."
+            "<inertial> with mass and inertia. Give it those of the spacecraft that carries the "
+            'robot, for instance <inertial><mass value="100"/><inertia ixx="10" iyy="10" '
+            'izz="10" ixy="0" ixz="0" iyz="0"/></inertial>.'
         )
     outboard_mass = [body.inertia.mass for body in robot.bodies]
     outboard_moment = [float(np.trace(body.inertia.about_com)) for body in robot.bodies]

@@ -140,7 +140,7 @@ class MultiProcessStack(Stack):
 
     def launch(self, name: str, **parameters: Any) -> None:
         """Start one node of the scenario, for the first time or again, with more parameters."""
-        overrides: dict[str, Any] = self.scenario.checked_overrides(name)
+        overrides: dict[str, Any] = self.scenario.parameters(name)
         if name == "recorder":
             overrides |= {"bag": str(self.bag), "when_exists": self.when_exists}
             record = Path(self._folder.name, "scenario.json")
@@ -160,7 +160,7 @@ class MultiProcessStack(Stack):
                 [
                     *(sys.executable, "-m", _CHILD, NODE_TYPES[name].__module__),
                     *("--ros-args", "-r", f"__node:={name}"),
-                    *("--params-file", str(self.scenario.path), "--params-file", str(file)),
+                    *("--params-file", str(file)),
                 ],
                 **child_options(self._environment()),
                 stdout=log,

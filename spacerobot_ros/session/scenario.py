@@ -15,12 +15,22 @@ import yaml
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import GoalError, ParameterError
-from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.rotations import quaternion_from_rotvec
+from spacerobot_ros.model import SpaceRobot, load_robot
+from spacerobot_ros.model.rotations import (
+    matrix_from_rpy,
+    quaternion_from_matrix,
+    quaternion_from_rotvec,
+)
 from spacerobot_ros.parameters import Value, configured, declared, values_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.resources import resource_names, robot_file, share_directory
+from spacerobot_ros.resources import (
+    is_path,
+    resource_names,
+    robot_file,
+    share_directory,
+    suggestion,
+)
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.trials import Problem
@@ -100,6 +110,8 @@ class Scenario:
         The nodes that end on the way, by time.
     in_file, overrides
         Parameters by node and full name; the overrides go before those of the file.
+    has_goal
+        Whether ``goal`` was given; the start, where it was not.
     """
 
     name: str
@@ -113,6 +125,7 @@ class Scenario:
     kills: tuple[Kill, ...]
     in_file: Mapping[str, Mapping[str, Any]]
     overrides: Mapping[str, Mapping[str, Any]]
+    has_goal: bool = True
 
     def config(self, node: str) -> Any:
         """Return the configuration of a node: defaults, the file's parameters, the overrides.
@@ -160,16 +173,21 @@ class Scenario:
         """The published figures, where the method that they are of is flown."""
         return self.published if self.published_method in ("", self.planner.method) else ()
 
-    def checked_overrides(self, node: str) -> dict[str, Value]:
-        """Return the overrides of a node in the types that it declares.
+    def parameters(self, node: str) -> dict[str, Value]:
+        """Return what the file and the overrides set of a node, in the types that it declares.
 
         Raises
         ------
         ParameterError
-            A parameter of the node is refused, of the overrides or of the file.
+            A parameter of the node is refused.
         """
         values = values_of(self.config(node))
-        return {name: values[name] for name in self.overrides.get(node, {}) if name in values}
+        given = {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
+        # An empty list is every list's default, and has no type that ROS could know it by.
+        found = {name: values[name] for name in given if name in values and values[name] != ()}
+        if "use_sim_time" in given:
+            found["use_sim_time"] = bool(given["use_sim_time"])
+        return found
 
     def records(self, nodes: Sequence[str]) -> dict[str, dict[str, str]]:
         """Return what a bag keeps of the flight: metadata records by name.
@@ -253,25 +271,50 @@ class Scenario:
         return scenario
 
     def with_goal(
-        self, pose: Sequence[float] | None = None, rotvec: Sequence[float] | None = None
+        self,
+        pose: Sequence[float] | None = None,
+        rotvec: Sequence[float] | None = None,
+        rpy_deg: Sequence[float] | None = None,
     ) -> Scenario:
         """Return the scenario with another pose (7,), and then another attitude (3,), if given.
 
-        The published figures, which belong to the published goal, go.
+        The attitude is a rotation vector (rad), or roll, pitch and yaw about fixed axes (deg). The
+        published figures, which belong to the published goal, go.
 
         Raises
         ------
         GoalError
-            The pose or the rotation vector is not finite.
+            The pose or the attitude is not finite, or the attitude is given twice.
         """
         goal = self.goal
         if pose is not None:
             given = Goal.checked(pose[:3], pose[3:])
             goal = replace(goal, position=given.position, quaternion=given.quaternion)
+        if rotvec is not None and rpy_deg is not None:
+            raise GoalError("The attitude of the goal is given twice, in radians and in degrees.")
         if rotvec is not None:
             given = goal_from_rotvec(goal.position.tolist(), rotvec)
             goal = replace(goal, quaternion=given.quaternion)
-        return self if goal is self.goal else replace(self, goal=goal, published=())
+        if rpy_deg is not None:
+            given = goal_from_rpy(goal.position.tolist(), rpy_deg)
+            goal = replace(goal, quaternion=given.quaternion)
+        if goal is self.goal:
+            return self
+        return replace(self, goal=goal, published=(), has_goal=True)
+
+    def require_goal(self) -> None:
+        """Refuse to fly a robot alone, to nowhere.
+
+        Raises
+        ------
+        ParameterError
+            There is no goal.
+        """
+        if not self.has_goal:
+            raise ParameterError(
+                f"'{self.name}' is a robot, and no scenario with a goal: give one, for instance "
+                "--goal-rpy-deg 0 0 10, or make a scenario of it with `spacerobot new`."
+            )
 
 
 def load_scenario(name: str) -> Scenario:
@@ -286,9 +329,10 @@ def load_scenario(name: str) -> Scenario:
     if path.suffix not in (".yaml", ".yml"):
         path = share_directory() / "config" / f"{name}.yaml"
     if not path.is_file():
-        known = ", ".join(scenario_names())
+        known, robots = scenario_names(), resource_names("urdf", ".urdf")
         raise ParameterError(
-            f"There is no scenario '{name}'; there are: {known}, or any YAML file."
+            f"There is no scenario '{name}'; there are: {', '.join(known)}, or any YAML file."
+            f"{suggestion(name, [*known, *robots])}"
         )
     content = _content(path)
     section = content.get("scenario")
@@ -304,6 +348,9 @@ def load_scenario(name: str) -> Scenario:
             f"The scenario file {path} has an unknown key '{unknown[0]}' in its scenario section; "
             f"it takes {', '.join(_KEYS)}."
         )
+    in_file = {
+        node: _flat(content[node].get("ros__parameters", {})) for node in NODES if content.get(node)
+    }
     return Scenario(
         name=path.stem,
         path=path.resolve(),
@@ -318,7 +365,7 @@ def load_scenario(name: str) -> Scenario:
         published=_published(values.get("published", {}), path),
         published_method=str(values.get("published_method", "")),
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
-        in_file=in_file,
+        in_file={node: _with_robot_beside(path, values) for node, values in in_file.items()},
         overrides=_LOCKSTEP,
     )
 
@@ -338,36 +385,55 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
     return _sections(_content(path), path)
 
 
+def _with_robot_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
+    """Return parameters of a scenario file, with a robot that is a file beside it by its path."""
+    robot = values.get("robot")
+    if isinstance(robot, str) and is_path(robot) and (path.parent / robot).is_file():
+        return {**values, "robot": str((path.parent / robot).resolve())}
+    return values
+
+
 def scenario_or_robot(name: str) -> Scenario:
-    """Return a scenario, or one without goal and nodes of a robot alone (a name or a URDF file).
+    """Return a scenario, or one without a goal of a robot alone (a name or a URDF file).
+
+    The planner of a robot alone chooses its method.
 
     Raises
     ------
     ParameterError
         There is no such scenario or robot, or its file is broken.
+    RobotDescriptionError
+        The robot is refused.
     """
-    if name in scenario_names() or not (
-        name.endswith(".urdf") or name in resource_names("urdf", ".urdf")
-    ):
+    path = Path(name)
+    is_robot = path.suffix not in (".yaml", ".yml") and (
+        path.is_file() or is_path(path.name) or name in resource_names("urdf", ".urdf")
+    )
+    if name in scenario_names() or not is_robot:
         return load_scenario(name)
+    path = path if path.is_file() else robot_file(name)
+    load_robot(path)  # What is no robot is refused before a goal is asked for.
+    robot = {"robot": str(path.resolve()) if path == Path(name) else name}
     return Scenario(
-        name=name,
-        path=robot_file(name),
+        name=path.name.split(".")[0],
+        path=path,
         description="",
         goal=Goal.checked([0, 0, 0], [0, 0, 0, 1]),
         end_effector_goal=None,
-        commanders=(),
+        commanders=("planner",),
         published=(),
         published_method="",
         kills=(),
-        in_file={"plant": {"robot": name}},
+        in_file={"plant": robot, "planner": robot},
         overrides=_LOCKSTEP,
+        has_goal=False,
     )
 
 
 def scenario_names() -> list[str]:
-    """Return the names of the scenarios that come with the package."""
-    return resource_names("config", ".yaml")
+    """Return the names of the scenarios that come with the package, those with faults last."""
+    faults = resource_names("config/faults", ".yaml")
+    return [*resource_names("config", ".yaml"), *(f"faults/{name}" for name in faults)]
 
 
 def goal_from_rotvec(position: Sequence[float], rotvec: Sequence[float]) -> Goal:
@@ -388,6 +454,20 @@ def goal_from_rotvec(position: Sequence[float], rotvec: Sequence[float]) -> Goal
             f"{_LARGEST_ANGLE:.2g} rad."
         )
     return Goal.checked(position, quaternion_from_rotvec(vector))
+
+
+def goal_from_rpy(position: Sequence[float], rpy_deg: Sequence[float]) -> Goal:
+    """Return the goal at a position (m) after roll, pitch and yaw about fixed axes (deg).
+
+    Raises
+    ------
+    GoalError
+        It is no goal, or the angles are not finite.
+    """
+    angles = np.asarray(rpy_deg, dtype=float)
+    if angles.shape != (3,) or not np.all(np.abs(angles) <= np.degrees(_LARGEST_ANGLE)):
+        raise GoalError(f"The angles {rpy_deg} are not three finite numbers of degrees.")
+    return Goal.checked(position, quaternion_from_matrix(matrix_from_rpy(np.radians(angles))))
 
 
 def parse_setting(text: str) -> tuple[str, str, Any]:

@@ -62,7 +62,7 @@ class Stack(ABC):
                 "and --realtime."
             )
         self.scenario = scenario
-        self.when_exists = scenario.checked_overrides("recorder").get("when_exists", "refuse")
+        self.when_exists = scenario.parameters("recorder").get("when_exists", "refuse")
         """Somebody who names a bag wants that one: by default it is refused where it is there."""
         self.bag = free_name(bag) if bag is not None and self.when_exists == "next" else bag
         recorder = () if bag is None else ("recorder",)
@@ -253,7 +253,7 @@ class InProcessStack(Stack):
         self.executor.shutdown()
 
     def _make(self, name: str, context: rclpy.Context | None) -> FlightNode:
-        overrides = self.scenario.checked_overrides(name)
+        overrides = self.scenario.parameters(name)
         if name == "recorder":
             overrides |= {"bag": str(self.bag), "when_exists": self.when_exists}
         try:
@@ -261,7 +261,6 @@ class InProcessStack(Stack):
                 name,
                 autostart=False,
                 context=context,
-                cli_args=["--ros-args", "--params-file", str(self.scenario.path)],
                 use_global_arguments=False,
                 parameter_overrides=[
                     Parameter(key, value=list(value) if isinstance(value, tuple) else value)

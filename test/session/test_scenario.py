@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.resources import share_directory
+from spacerobot_ros.resources import robot_file
 from spacerobot_ros.session.scenario import (
     CONFIGS,
     NODES,
@@ -18,6 +21,7 @@ from spacerobot_ros.session.scenario import (
     load_scenario,
     parse_kills,
     scenario_names,
+    scenario_or_robot,
 )
 
 
@@ -55,13 +59,18 @@ def test_overrides_go_before_the_file_and_have_the_declared_types() -> None:
     scenario = load_scenario("sliding_masses").with_settings(
         ["plant.tick_rate=10", "plant.initial_position=[1, 2.5, 0]"]
     )
-    assert scenario.checked_overrides("plant") == {
+    assert scenario.parameters("plant") == {
+        "robot": "sliding_masses",
+        "actuation": "velocity",
+        "base_pose_period": 1.0,
+        "marker_period": 10.0,
+        "diagnostics_period": 20.0,
         "time_mode": "lockstep",
         "tick_rate": 10.0,
         "initial_position": (1.0, 2.5, 0.0),
     }
     with pytest.raises(ParameterError, match="Node 'plant' has no parameter 'tick_rte'"):
-        scenario.with_settings(["plant.tick_rte=10"]).checked_overrides("plant")
+        scenario.with_settings(["plant.tick_rte=10"]).parameters("plant")
 
 
 def test_another_goal_has_no_published_figures() -> None:
@@ -143,3 +152,56 @@ scenario: {{ros__parameters: {{}}}}
 def test_nodes_of_any_namespace_take_the_parameters_of_a_file(name: str) -> None:
     content = yaml.safe_load((share_directory() / "config" / f"{name}.yaml").read_text("utf-8"))
     assert {key for key in content if key != "scenario"} <= {f"/**/{node}" for node in CONFIGS}
+
+
+def test_a_robot_beside_its_scenario_is_found_and_integers_go_with_floats(tmp_path: Path) -> None:
+    (tmp_path / "mine.urdf").write_text(robot_file("planar_chain").read_text("utf-8"), "utf-8")
+    file = tmp_path / "mine.yaml"
+    file.write_text(
+        "scenario: {ros__parameters: {goal_rotvec: [0, 0, 0.1]}}\n"
+        "plant: {ros__parameters: {robot: mine.urdf, initial_joint_positions: [0, 0.5]}}\n",
+        "utf-8",
+    )
+    scenario = load_scenario(str(file))
+    assert scenario.problem().robot.n == 2
+    given = scenario.parameters("plant")
+    assert given["robot"] == str(tmp_path / "mine.urdf")
+    assert given["initial_joint_positions"] == (0.0, 0.5)
+
+
+def test_a_robot_alone_is_a_scenario_without_a_goal() -> None:
+    alone = scenario_or_robot("three_joint_arm")
+    with pytest.raises(ParameterError, match="'three_joint_arm' is a robot, and no scenario"):
+        alone.require_goal()
+    there = alone.with_goal(rpy_deg=(0.0, 0.0, 90.0))
+    there.require_goal()
+    half = np.sqrt(0.5)
+    assert there.goal.quaternion == pytest.approx([0.0, 0.0, half, half])
+    assert there.commanders == ("planner",)
+
+
+def test_degrees_are_roll_pitch_and_yaw_about_fixed_axes() -> None:
+    """Against scipy's rotations, lower case: about the axes of the world, x first."""
+    angles = (30.0, -50.0, 100.0)
+    goal = load_scenario("arm_attitude").with_goal(rpy_deg=angles).goal
+    expected = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+    assert np.allclose(Rotation.from_quat(goal.quaternion).as_matrix(), expected, atol=1e-14)
+
+
+def test_an_attitude_given_twice_is_refused() -> None:
+    with pytest.raises(GoalError, match="given twice"):
+        load_scenario("arm_attitude").with_goal(rotvec=(0, 0, 1), rpy_deg=(0, 0, 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "suggested"),
+    [
+        ("servicr", "servicer"),
+        ("stuck_elbow", "faults/stuck_elbow"),
+        ("planar_chains.urdf", "planar_chain"),
+    ],
+)
+def test_a_misspelt_name_gets_a_suggestion(name: str, suggested: str) -> None:
+    with pytest.raises(ParameterError) as refusal:
+        scenario_or_robot(name)
+    assert f"Did you mean '{suggested}'?" in str(refusal.value)
