@@ -301,11 +301,12 @@ class RecorderNode(FlightNode):
         self._recorded.add(topic)
         self._ask_for_parameters(topic, publishers)
         take = _take(recording, self._stamps, topic, kind, channel, self._clock)
-        if self._taps.tap(topic, take, len(offered)):
-            return
-        events, qos = loss_events(recording, topic), _subscribed_qos(offered)
+        qos = _subscribed_qos(offered)
         if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
             recording.latched[channel] = None
+        if self._taps.tap(topic, take, len(offered)):
+            return
+        events = loss_events(recording, topic)
         self.create_subscription(kind, topic, take, qos, event_callbacks=events, raw=True)
 
     # -- what the recorder reports ------------------------------------------------------------

@@ -155,7 +155,7 @@ def scenario_text(problem: Problem, method: str, robot_path: str) -> str:
         "    # goal_position: [0.0, 0.0, 0.0]         # m",
         f"    # goal_joint_positions: [{shape}]   # the shape to end in",
         "",
-        "plant:",
+        "/**/plant:",
         "  ros__parameters:",
         f"    robot: {robot_path}",
         f"    tick_rate: {rate!r}",
@@ -164,7 +164,7 @@ def scenario_text(problem: Problem, method: str, robot_path: str) -> str:
         lines.append(f"    initial_joint_positions: [{shape}]   # {joints}")
     lines += [
         "",
-        "planner:",
+        "/**/planner:",
         "  ros__parameters:",
         f"    robot: {robot_path}",
         f"    tick_rate: {rate!r}",

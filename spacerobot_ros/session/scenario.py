@@ -348,9 +348,6 @@ def load_scenario(name: str) -> Scenario:
             f"The scenario file {path} has an unknown key '{unknown[0]}' in its scenario section; "
             f"it takes {', '.join(_KEYS)}."
         )
-    in_file = {
-        node: _flat(content[node].get("ros__parameters", {})) for node in NODES if content.get(node)
-    }
     return Scenario(
         name=path.stem,
         path=path.resolve(),

@@ -12,6 +12,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.experimental import EventsExecutor
+from rclpy.serialization import serialize_message
 from rclpy.timer import Timer
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -109,7 +110,7 @@ class PlantNode(FlightNode):
 
     def prepare(self) -> None:
         """Publish the status from the beginning: an unconfigured plant is inactive."""
-        self._status = self.create_publisher(DiagnosticStatus, "plant/status", LATCHED)
+        self._status = self.send_raw(DiagnosticStatus, "plant/status", LATCHED)
         self._publish_status(PlantStatus(PlantState.INACTIVE, "The plant is not configured."))
 
     def configure(self) -> None:
@@ -242,7 +243,8 @@ class PlantNode(FlightNode):
     def _publish_status(self, status: PlantStatus) -> None:
         self.status = status
         name, level = self.get_fully_qualified_name(), bytes([status.level])
-        self._status.publish(diagnostic_status(name, level, status.sentence, status.to_values()))
+        message = diagnostic_status(name, level, status.sentence, status.to_values())
+        self._status.take(serialize_message(message))
 
     def _resumed(self, robot: SpaceRobot) -> tuple[InitialState | None, int]:
         """Return the state to start from (None: the configuration's) and its tick.
