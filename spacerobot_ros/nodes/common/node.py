@@ -165,7 +165,8 @@ class FlightNode(LifecycleNode):
 
     def send_raw(self, kind: type[Any], topic: str, qos: QoSProfile = STREAM) -> RawOutput:
         """Return a new stream whose ``take`` publishes serialised messages."""
-        stream = RawOutput(self.create_publisher(kind, topic, qos))
+        latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        stream = RawOutput(self.create_publisher(kind, topic, qos), latched=latched)
         self.raw_streams.append(stream)
         return stream
 

@@ -51,14 +51,37 @@ class RawStream:
 
 
 class RawOutput(RawStream):
-    """What one publisher publishes: ``take`` sends a message on its way."""
+    """What one publisher publishes: ``take`` sends a message on its way.
 
-    def __init__(self, publisher: Publisher) -> None:
-        super().__init__(publisher.topic_name, raw_publish(publisher))
+    A new listener is shown the last message of a latched topic first, as a subscription is.
+
+    Parameters
+    ----------
+    publisher
+        Where messages go.
+    latched
+        Whether its topic is.
+    """
+
+    def __init__(self, publisher: Publisher, *, latched: bool = False) -> None:
+        self._last: bytes | None = None
+        publish = raw_publish(publisher)
+
+        def keep_and_publish(raw: bytes) -> None:
+            self._last = raw
+            publish(raw)
+
+        super().__init__(publisher.topic_name, keep_and_publish if latched else publish)
         self.readers: Callable[[], int] = publisher.get_subscription_count
         """Returns how many subscriptions it is matched with."""
         self.await_readers: Callable[[Duration], bool] = publisher.wait_for_all_acked
         """Waits until they have received everything; returns whether they have, in time."""
+
+    def listen(self, listener: Take) -> None:
+        """Have every message shown to a listener, the last one of a latched topic at once."""
+        super().listen(listener)
+        if self._last is not None:
+            listener(self._last)
 
 
 class RawInput(RawStream):
