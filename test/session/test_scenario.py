@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.nodes import NODE_TYPES
-from spacerobot_ros.resources import share_directory
-from spacerobot_ros.resources import robot_file
+from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.session.scenario import (
     CONFIGS,
     NODES,
