@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from support.hostile_bags import CASES, QUICK, Part, bag, message, string, zstd_zeros
+from support.hostile.records import CASES, Part, bag, message, string, zstd_zeros
+from support.hostile_bags import QUICK
 
 import spacerobot_ros
 from spacerobot_ros.bag import BagWriter, RecordingError, iterate_raw, read_bag

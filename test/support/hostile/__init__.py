@@ -1,0 +1,1 @@
+"""Bags that were made to harm their reader."""
