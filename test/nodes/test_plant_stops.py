@@ -35,6 +35,20 @@ def place(flight: Flight) -> list[float]:
     return list(flight.probe.last("joint_states").position)
 
 
+def stays(flight: Flight) -> None:
+    """Check that nothing moves, as long as any watch for joints that do not follow could take."""
+    rest = place(flight)
+    flight.ticks(60)
+    assert place(flight) == rest
+
+
+def flies_again(flight: Flight, *states: str) -> None:
+    """Check which states there have been, and that the next goal is reached."""
+    assert flight.states == list(states)
+    flight.decide(NEAR)
+    assert flight.states[-1] == "reached"
+
+
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
 def test_an_abort_of_the_plant_ends_the_goal_until_there_is_another(
     harness: Harness, tmp_path: Path, mode: str
@@ -51,18 +65,15 @@ def test_an_abort_of_the_plant_ends_the_goal_until_there_is_another(
     status = flight.wait("aborted")
     assert_one_sentence(status.message, "aborted on request", "'~/rearm'")
     assert not file.exists()
-    # As long as any watch for joints that do not follow could take.
     flight.ticks(60)
     rest = place(flight)
     flight.send(OTHER)
     refused = flight.wait("refused")
     assert_one_sentence(refused.message, "latched", "/plant/rearm")
     call(flight, "rearm")
-    flight.ticks(60)
+    stays(flight)
     assert place(flight) == rest
-    assert flight.states == ["idle", "executing", "aborted", "refused"]
-    flight.decide(NEAR)
-    assert flight.states[-1] == "reached"
+    flies_again(flight, "idle", "executing", "aborted", "refused")
 
 
 def test_a_planner_that_stood_still_ends_its_goal_with_the_true_reason(harness: Harness) -> None:
@@ -77,31 +88,36 @@ def test_a_planner_that_stood_still_ends_its_goal_with_the_true_reason(harness: 
     status = flight.wait("aborted")
     assert_one_sentence(status.message, "too old")
     flight.ticks(10)  # Commands that were on their way.
-    rest = place(flight)
-    flight.ticks(60)
-    assert place(flight) == rest
-    assert flight.states == ["idle", "executing", "aborted"]
-    flight.decide(NEAR)
-    assert flight.states[-1] == "reached"
+    stays(flight)
+    flies_again(flight, "idle", "executing", "aborted")
 
 
-def test_only_the_last_of_the_states_that_wait_is_answered(harness: Harness) -> None:
+def test_only_the_last_of_the_states_that_wait_is_answered(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # On a loaded machine the plant makes up for late ticks: that is no jump of its time here.
+    monkeypatch.setattr("spacerobot_ros.nodes.common.state_times._PACE_SLACK", 1000.0)
     flight = Flight(harness, {**SLOW, **BACKGROUND}, REAL_TIME)
     flight.start()
     flight.send(NEAR)
     flight.wait("executing")
     flight.ticks(10)
+    seen = stamp_of(flight.probe.last("joint_states"))
     harness.executor.remove_node(flight.planner)
-    flight.ticks(6)
-    waiting = stamp_of(flight.probe.last("joint_states"))
+    flight.ticks(12)
     before = flight.probe.count("joint_commands")
     harness.executor.add_node(flight.planner)
-    harness.spin_until(
-        lambda: flight.probe.count("joint_commands") > before + 2, "commands after a standstill"
-    )
-    answered = [stamp_of(m) for m in flight.probe.messages["joint_commands"][before:]]
-    assert min(answered) >= waiting
-    assert answered == sorted(set(answered))
+
+    def answered() -> list[int]:
+        stamps = [stamp_of(m) for m in flight.probe.messages["joint_commands"][before:]]
+        # Answers to earlier states were on their way.
+        return [stamp for stamp in stamps if stamp > seen]
+
+    harness.spin_until(lambda: len(answered()) > 2, "commands after a standstill")
+    # The last ones may be on their way to the planner still.
+    waiting = [s for s in map(stamp_of, flight.probe.messages["joint_states"]) if s > seen]
+    assert min(answered()) >= waiting[6]
+    assert answered() == sorted(set(answered()))
 
 
 def test_a_pause_ends_nothing_and_a_goal_may_come_in_it(harness: Harness) -> None:

@@ -277,12 +277,12 @@ def test_a_reset_is_refused_with_the_time_of_its_state(tmp_path: Path, at: int) 
         def again(topic: str, message: Any, time: float) -> None:
             say(topic, message, time)
             if topic == "/joint_states" and round(time / TICK) == at:
-                say(topic, stamped(start, time - TICK, "base_link"), time)
+                say(topic, stamped(start, time - 2 * TICK, "base_link"), time)
 
         made.add(bag, again)
     with pytest.raises(RecordingError) as refusal:
         verify_bag(path)
-    assert f"the plant was reset at {(at - 1) * TICK:.9g} s; only flights" in str(refusal.value)
+    assert f"the plant was reset at {(at - 2) * TICK:.9g} s; only flights" in str(refusal.value)
 
 
 def test_a_message_between_two_ticks_is_refused_with_its_time(tmp_path: Path) -> None:
