@@ -9,14 +9,17 @@ import struct
 import zlib
 from collections.abc import Callable
 from io import BytesIO
+from pathlib import Path
 
 import lz4.frame
 import numpy as np
 import pytest
 import zstandard
 from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC
 from rosbags.interfaces import Nodetype
 
+from spacerobot_ros.bag import RecordingError, read_bag
 from spacerobot_ros.bag.definitions import MessageTypes, _Sizes
 from spacerobot_ros.bag.mcap_reading import _check_entries
 from spacerobot_ros.bag.mcap_records import (
@@ -239,3 +242,15 @@ def test_a_text_may_have_so_many_bytes_and_lines() -> None:
     assert "longer than 262144 bytes or 5000 lines" in refused("float64 x\n" + "#" * 262_135)
     accepted("float64 x\n" + "\n" * 4_999)
     assert "longer than 262144 bytes or 5000 lines" in refused("float64 x\n" + "\n" * 5_000)
+
+
+@pytest.mark.parametrize("length", [0, 20, 21, 28])
+def test_a_file_that_is_too_short_for_a_footer_is_damaged_at_its_begin(
+    tmp_path: Path, length: int
+) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(MCAP0_MAGIC + bytes([1] * length) + MCAP0_MAGIC)
+    # The footer takes 29 bytes, and what the file ends with 8.
+    place = max(8 + length - 29, 0)
+    with pytest.raises(RecordingError, match=f"is damaged: the record at byte {place} claims"):
+        read_bag(path)

@@ -116,3 +116,18 @@ def test_wrist_singularity_of_the_spatial_arm(name: str) -> None:
     assert law.status.singular
     assert law.status.smallest_singular_value < 1e-12
     assert np.abs(np.concatenate([actuation.wrench_B, actuation.tau])).max() < 500.0
+
+
+def test_far_from_singularities_the_command_takes_one_evaluation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    law = law_of("model_based", load("planar_manipulator"), PLANAR_GAINS)
+
+    def damped(*_: object) -> None:
+        raise AssertionError("the singular values are computed for every command")
+
+    monkeypatch.setattr(type(law), "_damped_actuation", damped)
+    law.command(stretched(1.5), GOAL)
+    assert not law.status.singular
+    with pytest.raises(AssertionError, match="singular values"):
+        law.command(stretched(0.01), GOAL)

@@ -205,3 +205,18 @@ def test_brackets_count_by_their_directions_and_not_by_their_size() -> None:
         )
         flat = SpaceRobot.from_urdf(replace(robot, sliders=sliders).urdf)
         assert brackets_at(flat, q).rank == rank, tilt
+
+
+@pytest.mark.parametrize("joints", [3, 4, 6])
+def test_the_best_three_of_any_curvature_have_the_smallest_condition_number(joints: int) -> None:
+    rng = np.random.default_rng(joints)
+    for _ in range(20):
+        K = rng.normal(size=(3, joints, joints))
+        K -= K.transpose(0, 2, 1)
+        triple, M = best_triple(K, range(joints))
+        conditions = [
+            np.linalg.cond(np.column_stack([K[:, i, j], K[:, j, k], K[:, k, i]]))
+            for i, j, k in itertools.combinations(range(joints), 3)
+        ]
+        assert np.linalg.cond(M) == pytest.approx(min(conditions))
+        assert triple in set(itertools.combinations(range(joints), 3))

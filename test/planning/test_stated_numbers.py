@@ -24,7 +24,11 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.state_machine import Phase
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
-from spacerobot_ros.planning.methods.geometric_phase import planar_chain
+from spacerobot_ros.planning.methods.geometric_phase import (
+    PlanarPhase,
+    curvature_peaks,
+    planar_chain,
+)
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 FOLDER = Path(__file__).parents[2] / "urdf"
@@ -157,3 +161,15 @@ def test_plan_and_execution_are_reported_with_the_duration_of_the_gait() -> None
     assert status.sentence == "Executing a stub gait of 0.65 s."
     reported = [output.sentence for output in loop.outputs if isinstance(output, Event)]
     assert "The plan is a stub gait of 0.65 s." in reported
+
+
+def test_a_box_without_width_has_its_largest_curvature_in_it() -> None:
+    """As for the largest square that the limits of one joint leave room for."""
+    plane = PlanarPhase(SpaceRobot.from_file(FOLDER / "planar_chain.urdf")).plane(np.zeros(2), 0, 1)
+    boxes = np.array([[[0.4, -2.0], [0.4, 2.0]], [[-0.3, 0.7], [-0.3, 0.7]]])
+    line, point = curvature_peaks(plane, np.array([0.4, 0.1]), boxes)
+    assert point.tolist() == [-0.3, 0.7]
+    assert line[0] == 0.4
+    along = np.column_stack([np.full(801, 0.4), np.linspace(-2.0, 2.0, 801)])
+    top = np.abs(phase_density(along)).max()
+    assert abs(phase_density(line)) == pytest.approx(top, rel=1e-4)

@@ -22,6 +22,7 @@ from spacerobot_ros.simulation.building import build_plant
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import (
     KINDS,
+    Fault,
     FaultTimeline,
     FaultyPlant,
     Targets,
@@ -454,3 +455,9 @@ def test_nozzles_stay_open_closed_and_weak() -> None:
     plant.inject("clear")
     plant.step(np.zeros(robot.n), np.zeros(6))
     assert thrusters.thrust[opened] == 0.0
+
+
+def test_a_fault_begins_at_the_start_and_never_ends_unless_it_says_so() -> None:
+    fault = Fault("joint_stuck", "elbow_pitch")
+    assert (fault.value, fault.start, fault.end) == (0.0, 0.0, np.inf)
+    assert str(fault) == "joint_stuck elbow_pitch at 0"

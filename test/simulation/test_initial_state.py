@@ -14,6 +14,7 @@ from support.random_robots import random_robot_urdf
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
+from spacerobot_ros.simulation.config import PlantConfig
 
 URDF = random_robot_urdf(np.random.default_rng(0), joints=3)
 PLANTS = (EffortPlant, VelocityPlant)
@@ -73,3 +74,16 @@ def test_joints_under_velocity_commands_start_at_rest() -> None:
 def test_refusals(plant: Any, given: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
         plant(robot(), 0.01, InitialState(**given))
+
+
+def test_what_a_configuration_leaves_open_is_zero_and_the_identity() -> None:
+    nothing = dict.fromkeys(
+        ("initial_position", "initial_orientation", "linear_momentum", "angular_momentum"), ()
+    )
+    for config in (PlantConfig(), PlantConfig(**nothing)):  # type: ignore[arg-type]
+        start = InitialState.of(config)
+        assert start.position.tolist() == [0.0, 0.0, 0.0]
+        assert start.quaternion.tolist() == [0.0, 0.0, 0.0, 1.0]
+        assert start.linear_momentum.tolist() == [0.0, 0.0, 0.0]
+        assert start.angular_momentum.tolist() == [0.0, 0.0, 0.0]
+        assert start.joint_positions is start.joint_velocities is start.center_of_mass is None

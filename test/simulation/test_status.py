@@ -167,3 +167,17 @@ def test_an_event_survives_its_message() -> None:
     assert Event(EventKind.NODE_SILENT, "").to_values(None) == {"event": "node_silent"}
     with pytest.raises(SpaceRobotError, match="no event"):
         Event.from_values({"event": "lunch"})
+
+
+def test_the_stamp_of_the_last_command_is_exact_also_after_a_long_time() -> None:
+    rig = Rig()
+    rig.now = 4_000_000 * SECOND + 50_000_000
+    rig.events()
+    rig.command()
+    assert rig.monitor.status.last_command_s is None
+    rig.now += SECOND
+    rig.commands.drop_old(rig.now)
+    rig.events()
+    assert rig.monitor.status.last_command_s == 4_000_000.05
+    assert rig.monitor.status.timeouts == 1
+    assert rig.monitor.status.time_s == 4_000_001.05
