@@ -68,7 +68,7 @@ class Problem:
     def method(self, name: str) -> GaitMethod:
         """Build a gait method with its options."""
         step = self.config.integration_step
-        return build_method(name, self.robot, self.control_period, step, self.config.options)
+        return build_method(name, self.robot, self.control_period, step, self.config.method_options)
 
     def plant(self) -> VelocityPlant:
         """Return the robot at the start."""

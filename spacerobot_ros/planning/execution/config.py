@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from spacerobot_ros.model.shared_parameters import CommanderConfig
 from spacerobot_ros.parameters import parameter, registered
 from spacerobot_ros.planning.core.goal import Tolerance
+from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS
 
 _REPLAN_PERIOD = 2.0
@@ -97,6 +98,17 @@ class PlannerConfig(CommanderConfig):
         if self.replan_period >= 0:
             return self.replan_period
         return _REPLAN_PERIOD if self.plan_in_background else 0.0
+
+    @property
+    def method_options(self) -> Mapping[str, Any]:
+        """The options of the methods, by name, where the output decides what they leave open.
+
+        A controller that is given a reference drives the joints by efforts, which are limited.
+        """
+        optimal = self.options.get(OptimalGait.name, OptimalGait.Options())
+        if self.output == "commands" or optimal.effort_limits != 0:
+            return self.options
+        return {**self.options, OptimalGait.name: replace(optimal, effort_limits=1)}
 
     @property
     def tolerance(self) -> Tolerance:

@@ -111,7 +111,11 @@ class PlanningWorker:
     ) -> None:
         self._robot, self._config, self._long_work = robot, config, long_work
         self._method = method or build_method(
-            config.method, robot, config.control_period, config.integration_step, config.options
+            config.method,
+            robot,
+            config.control_period,
+            config.integration_step,
+            config.method_options,
         )
         self._remaining: tuple[PlanningTask, GaitMethod] | None = None
         """The method without some joints that was built last, and the task that needed it."""
@@ -199,7 +203,7 @@ class PlanningWorker:
             config.integration_step,
             stuck=task.stuck,
             method=config.method,
-            options=config.options,
+            options=config.method_options,
             required=task.required,
         )
         self._remaining = task, method

@@ -27,6 +27,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import attitude_error, matrix_from_quaternion
 from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -71,15 +72,21 @@ class HeldCommands:
 class CommandHolder:
     """Turns trajectories of one robot into held commands.
 
-    ``axes`` (m, 3) are the directions in the base along which the attitude is reached.
+    ``axes`` (m, 3) are the directions in the base along which the attitude is reached, ``efforts``
+    those of the joints, within limits; None: any.
     """
 
     def __init__(
-        self, robot: SpaceRobot, prediction: BasePrediction, control_period: float, axes: Array
+        self,
+        robot: SpaceRobot,
+        prediction: BasePrediction,
+        control_period: float,
+        axes: Array,
+        efforts: JointEfforts | None = None,
     ) -> None:
         self._prediction = prediction
         self._period = control_period
-        self._axes = axes
+        self._axes, self._efforts = axes, efforts
         self._curvature = robot.function("curvature", compile=False)
         self._connection = robot.connection
         self._n = robot.n
@@ -112,6 +119,8 @@ class CommandHolder:
                 if held is None:
                     continue
                 needed, overrun = limits.excess(held.positions, self._period, before)
+                if self._efforts is not None:
+                    needed = max(needed, self._efforts.excess(held.positions, before))
                 if overrun <= _WITHIN:
                     if needed <= 1 + _WITHIN:
                         return held

@@ -24,6 +24,7 @@ from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
 from spacerobot_ros.planning.methods.optimal.held_commands import CommandHolder, HeldCommands
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
+from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import MultipleShooting, StopRule
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -86,8 +87,8 @@ class MotionSearch:
         The model, the base motion that commands cause, and how long each is held, s.
     axes
         (m, 3) directions in the base along which the attitude is reached.
-    constraints
-        What the path must keep.
+    constraints, efforts
+        What the path must keep; no efforts: any.
     solver
         Returns what solves the problem on so many intervals, with or without a position.
     """
@@ -99,10 +100,11 @@ class MotionSearch:
         control_period: float,
         axes: Array,
         constraints: PathConstraints,
+        efforts: JointEfforts | None,
         solver: Callable[[int, bool], MultipleShooting],
     ) -> None:
         self._robot, self._period, self._constraints = robot, control_period, constraints
-        self._holder = CommandHolder(robot, prediction, control_period, axes)
+        self._holder = CommandHolder(robot, prediction, control_period, axes, efforts)
         self._solver = solver
 
     def search(

@@ -33,6 +33,7 @@ from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
 from spacerobot_ros.planning.methods.optimal.in_motion import MotionBudget, MotionSearch
+from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
 from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -54,6 +55,9 @@ _NOTHING_LEFT = 1e-10
 
 _EQUAL = 1e-7
 """What a manoeuvre that was kept may miss its ends by, rad, m and joint coordinates."""
+
+_NEAR_LIMIT = 0.95
+"""Share of a limit beyond which a manoeuvre counts as limited by it."""
 
 _LONGER, _MORE_TICKS = 1.25, 20
 """What held commands take at most in place of optimal.longest: times it, and ticks more."""
@@ -85,10 +89,11 @@ class OptimalGait(GaitMethod):
         if chosen.joint_margin:
             self._margin = per_joint(robot, "joint_margin", chosen.joint_margin)
         self._constraints = PathConstraints.of(robot, chosen)
+        self._efforts = JointEfforts.of(robot, chosen, self.control_period)
         self._prediction = BasePrediction(robot, self.control_period, self.integration_step)
         problem = (
             *(robot, self._prediction, self.control_period),
-            *(self._specification.axes, self._constraints),
+            *(self._specification.axes, self._constraints, self._efforts),
         )
         self._search = ManoeuvreSearch(*problem)
         self._motion_search = MotionSearch(*problem, self._search.solver)
@@ -199,7 +204,9 @@ class OptimalGait(GaitMethod):
             cancellation,
         )
         notes: Notes = {"starts": float(found.starts), "durations": list(found.durations)}
-        return self._schedule(request.state, request.goal, found.held.positions, notes)
+        return self._schedule(
+            request.state, request.goal, found.held.positions, notes, motion.velocity
+        )
 
     def _intervals(self, correction: bool) -> int:
         intervals = self.options.intervals
@@ -223,7 +230,12 @@ class OptimalGait(GaitMethod):
         return nothing.admits(error, self.controls)
 
     def _schedule(
-        self, state: RobotState, goal: Goal, positions: Array, notes: Notes
+        self,
+        state: RobotState,
+        goal: Goal,
+        positions: Array,
+        notes: Notes,
+        velocity: Array | float = 0.0,
     ) -> GaitSchedule:
         path = self._prediction.path(state, positions)
         left = PoseError.between(path.position[-1], path.quaternion[-1], goal)
@@ -233,8 +245,24 @@ class OptimalGait(GaitMethod):
             "final_position": path.position[-1].tolist(),
             "predicted_attitude_error": left.angle,
             "predicted_position_error": left.distance,
+            "limited_by": self._limited_by(positions, velocity),
         }
         return self._schedule_of(goal, positions, path, notes)
+
+    def _limited_by(self, positions: Array, velocity: Array | float) -> str:
+        """Return which limits of which joints held commands come near to."""
+        if len(positions) < 2:
+            return "nothing"
+        speed, change = self._limits.shares(positions, self.control_period, velocity)
+        shares = {"velocity": speed, "acceleration": change}
+        if self._efforts is not None:
+            shares["effort"] = np.abs(self._efforts.shares(positions, velocity))
+        names = np.array(self.robot.joint_names)
+        active = {
+            what: names[share.max(axis=0) > _NEAR_LIMIT].tolist() for what, share in shares.items()
+        }
+        sentences = (f"{what} of {' '.join(joints)}" for what, joints in active.items() if joints)
+        return ", ".join(sentences) or "nothing"
 
     def _key(self, request: PlanRequest) -> str:
         state, goal, tolerance = request.state, request.goal, request.tolerance
@@ -247,6 +275,8 @@ class OptimalGait(GaitMethod):
             "tolerance": np.array([tolerance.position, tolerance.attitude]),
             **vars(self._limits),
         }
+        if self._efforts is not None:
+            numbers["effort"] = self._efforts.limit
         return plan_key(self.robot, numbers, values_of(self.options))
 
     def _loaded(
@@ -304,6 +334,8 @@ class OptimalGait(GaitMethod):
             if np.linalg.norm(beside) > _EQUAL:
                 raise CandidateError("it ends in another position")
         factor, overrun = limits.excess(positions, period)
+        if self._efforts is not None:
+            factor = max(factor, self._efforts.excess(positions))
         if factor > 1 + _ROUNDING or overrun > _ROUNDING:
             raise CandidateError("it exceeds a limit of the joints")
         attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
@@ -360,7 +392,8 @@ def _is_note(value: object) -> bool:
 def plan_key(robot: SpaceRobot, numbers: Mapping[str, Array], options: Mapping[str, object]) -> str:
     """Return the name of a plan: a hash of the robot's equations and of the request."""
     digest = hashlib.sha256()
-    for name in ("locked_inertia", "center_of_mass"):
+    efforts = ["joint_efforts"] if "effort" in numbers else []
+    for name in ("locked_inertia", "center_of_mass", *efforts):
         digest.update(robot.function(name, compile=False).serialize().encode())
     facts = {
         "format": 2,

@@ -42,6 +42,27 @@ class OptimalOptions:
         minimum=1e-6,
         maximum=1e9,
     )
+    effort_limits: int = parameter(
+        0,
+        "efforts of the joints within their limits: 0: where the planner's output is a reference "
+        "for a controller, 1: always, 2: never",
+        minimum=0,
+        maximum=2,
+    )
+    max_effort: tuple[float, ...] = parameter(
+        (),
+        "effort limit of every joint, below the URDF's; []: the URDF's",
+        unit="N or N m",
+        minimum=0.0,
+        maximum=1e12,
+        of_joints=True,
+    )
+    effort_reserve: float = parameter(
+        0.1,
+        "share of the effort limits that is left to the feedback of the controller",
+        minimum=0.0,
+        maximum=0.95,
+    )
     joint_margin: tuple[float, ...] = parameter(
         (),
         "distance of every joint to its limits, not in corrections; []: none",

@@ -135,14 +135,23 @@ class MotionLimits:
         accelerations keep their limits; the overrun is the farthest that a joint is beyond its
         limits, m or rad.
         """
-        ends = np.zeros((2, positions.shape[1]))
-        ends[0] = velocity
-        rates = np.vstack([ends[:1], np.diff(positions, axis=0) / period, ends[1:]])
-        speed = np.abs(rates) / self.velocity
-        change = np.abs(np.diff(rates, axis=0)) / period / self.acceleration
+        speed, change = self.shares(positions, period, velocity)
         beyond = np.maximum(self.lower - positions, positions - self.upper)
         factor = max(float(speed.max(initial=0.0)), float(np.sqrt(change.max(initial=0.0))))
         return factor, float(beyond.max(initial=0.0))
+
+    def shares(
+        self, positions: Array, period: float, velocity: Array | float = 0.0
+    ) -> tuple[Array, Array]:
+        """Return what share of their limits velocities (N + 2, n) and accelerations (N + 1, n) are.
+
+        Arguments are those of :meth:`excess`.
+        """
+        ends = np.zeros((2, positions.shape[1]))
+        ends[0] = velocity
+        rates = np.vstack([ends[:1], np.diff(positions, axis=0) / period, ends[1:]])
+        change = np.abs(np.diff(rates, axis=0)) / period
+        return np.abs(rates) / self.velocity, change / self.acceleration
 
 
 @dataclass(frozen=True)

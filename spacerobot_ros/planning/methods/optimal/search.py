@@ -10,7 +10,9 @@ import itertools
 import logging
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -23,6 +25,10 @@ from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
 from spacerobot_ros.planning.methods.optimal.held_commands import CommandHolder, HeldCommands
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
+from spacerobot_ros.planning.methods.optimal.joint_efforts import (
+    EffortLimitedShooting,
+    JointEfforts,
+)
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import MultipleShooting, StopRule
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -31,7 +37,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     PathConstraints,
     Trajectory,
 )
-from spacerobot_ros.planning.methods.optimal.transcription import Stages
+from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages
 
 _LOG = logging.getLogger(__name__)
 
@@ -203,8 +209,8 @@ class ManoeuvreSearch:
         The model, the base motion that commands cause, and how long each is held, s.
     axes
         (m, 3) directions in the base along which the attitude is reached.
-    constraints
-        What the path must keep.
+    constraints, efforts
+        What the path must keep; no efforts: any.
     """
 
     def __init__(
@@ -214,11 +220,12 @@ class ManoeuvreSearch:
         control_period: float,
         axes: Array,
         constraints: PathConstraints,
+        efforts: JointEfforts | None = None,
     ) -> None:
         self._robot, self._period = robot, control_period
-        self._axes, self._constraints = axes, constraints
-        self._holder = CommandHolder(robot, prediction, control_period, axes)
-        self._stages: dict[bool, Stages] = {}
+        self._axes, self._constraints, self._efforts = axes, constraints, efforts
+        self._holder = CommandHolder(robot, prediction, control_period, axes, efforts)
+        self._stages: dict[tuple[bool, bool], Stages] = {}
         self._solvers: dict[tuple[int, bool], MultipleShooting] = {}
 
     def search(
@@ -343,12 +350,21 @@ class ManoeuvreSearch:
         """Return what solves the problem on so many intervals, with or without a position."""
         key = intervals, position
         if key not in self._solvers:
-            if position not in self._stages:
-                self._stages[position] = Stages.of(
-                    self._robot, self._axes, position, self._constraints
-                )
-            self._solvers[key] = MultipleShooting(self._stages[position], intervals)
+            of = partial(self._stages_of, position)
+            self._solvers[key] = (
+                MultipleShooting(of(), intervals)
+                if self._efforts is None
+                else EffortLimitedShooting(of, intervals, self._efforts)
+            )
         return self._solvers[key]
+
+    def _stages_of(self, position: bool, inequalities: Sequence[PathInequality] = ()) -> Stages:
+        key = position, bool(inequalities)
+        if key not in self._stages:
+            self._stages[key] = Stages.of(
+                self._robot, self._axes, position, self._constraints, inequalities
+            )
+        return self._stages[key]
 
     def _solution(
         self,
@@ -371,6 +387,7 @@ class ManoeuvreSearch:
             )
             T = max(round(budget.duration / self._period), 1) * self._period
         elif budget.gentle:
+            guess = self._slowed(guess)
             T = max(_UNHURRIED * guess.duration, shortest)
         else:
             solution = solver.solve(
@@ -379,14 +396,18 @@ class ManoeuvreSearch:
             if solution is None or solver.converged or self._constraints.base_rate > 0:
                 return solution
             # What was cut short has time to spare.
-            return solution.hurried(limits, shortest)
+            return self._slowed(solution.hurried(limits, shortest))
         guess = guess.retimed(T / guess.duration)
         solution = solver.solve(
             boundary, limits, guess, stop, shortest=T, longest=T, least_effort=True
         )
         if solution is None or not budget.gentle:
             return solution
-        return solution.hurried(limits, shortest)
+        return self._slowed(solution.hurried(limits, shortest))
+
+    def _slowed(self, trajectory: Trajectory) -> Trajectory:
+        """Return the same path, slow enough for the efforts of the joints."""
+        return trajectory if self._efforts is None else self._efforts.slowed(trajectory)
 
     def _commanded(self, progress: _Progress, trajectory: Trajectory | None) -> Manoeuvre:
         """Return a solution as held commands.

@@ -1,0 +1,193 @@
+"""Joint efforts of a motion at zero momentum, and their limits.
+
+Where the plant is driven by efforts, a controller tracks the held commands. Between two of them the
+reference has the mean of their velocities and the acceleration that leads from one to the other in
+a control period; the efforts of that motion, by inverse dynamics (:func:`.joint_efforts` of the
+model), are what the controller asks for beside its feedback. Efforts are quadratic in the speed: so
+a motion whose efforts are f^2 times what they may be keeps the limits in f times its time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.methods.optimal.multiple_shooting import MultipleShooting, StopRule
+from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
+from spacerobot_ros.planning.methods.optimal.problem import (
+    BoundaryConditions,
+    MotionLimits,
+    Trajectory,
+    per_joint,
+)
+from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages
+
+_ROOM = 0.98
+"""Share of the limits that a solution uses: bends of its path take the rest."""
+
+_AT_LIMITS, _WITHIN = 0.9, 0.1
+"""Shares of the limits at which guesses count as made for them, below and beyond one."""
+
+
+class JointEfforts:
+    """The efforts of one robot, within limits.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    limit
+        (n,) largest effort of every joint in a motion, N or N m; infinite: any.
+    control_period
+        How long a command is held, s.
+
+    Raises
+    ------
+    ParameterError
+        A joint has no effort at all.
+    """
+
+    def __init__(self, robot: SpaceRobot, limit: Array, control_period: float) -> None:
+        for name, value in zip(robot.joint_names, limit, strict=True):
+            if not value > 0:
+                raise ParameterError(
+                    f"Joint '{name}' is limited to an effort of {value:g}, which moves nothing; "
+                    "with optimal.effort_limits 2 efforts are not limited."
+                )
+        self._period = control_period
+        self.limit = limit
+        self._names = robot.joint_names
+        self._function = robot.function("joint_efforts", compile=False)
+
+    @classmethod
+    def of(
+        cls, robot: SpaceRobot, options: OptimalOptions, control_period: float
+    ) -> JointEfforts | None:
+        """Return those that the options limit; None: none."""
+        if options.effort_limits != 1:
+            return None
+        limit = robot.effort_limit.copy()
+        if options.max_effort:
+            limit = np.minimum(limit, per_joint(robot, "max_effort", options.max_effort))
+        limit *= 1 - options.effort_reserve
+        return cls(robot, limit, control_period) if np.any(np.isfinite(limit)) else None
+
+    def shares(self, positions: Array, velocity: Array | float = 0.0) -> Array:
+        """Return the efforts of held commands over their limits (N + 1, n), at the ticks.
+
+        ``positions`` (N + 1, n) are the shapes at the ticks, at rest after; ``velocity`` (n,) is
+        held before.
+        """
+        rates = np.diff(positions, axis=0) / self._period
+        before = np.vstack([np.broadcast_to(velocity, (1, rates.shape[1])), rates])
+        after = np.vstack([rates, np.zeros((1, rates.shape[1]))])
+        return self._shares(positions, (before + after) / 2, (after - before) / self._period)
+
+    def excess(self, positions: Array, velocity: Array | float = 0.0) -> float:
+        """Return by what factor held commands would have to be slower; at most 1: they need not.
+
+        Arguments are those of :meth:`shares`.
+        """
+        return math.sqrt(float(np.abs(self.shares(positions, velocity)).max(initial=0.0)))
+
+    def peak(self, trajectory: Trajectory) -> float:
+        """Return the largest effort on a trajectory over what a solution may use."""
+        q, v = trajectory.shapes, trajectory.velocities
+        a = np.diff(v, axis=0) / trajectory.step
+        ends = np.vstack([self._shares(q[:-1], v[:-1], a), self._shares(q[1:], v[1:], a)])
+        return float(np.abs(ends).max()) / _ROOM
+
+    def slowed(self, trajectory: Trajectory) -> Trajectory:
+        """Return the same path, in so much more time that its efforts keep the limits."""
+        peak = self.peak(trajectory)
+        return trajectory if peak <= 1 else trajectory.retimed(math.sqrt(peak))
+
+    @property
+    def inequality(self) -> PathInequality:
+        """The limits as a constraint on the way, at both ends of every interval."""
+        n = len(self._names)
+        q, qdot, qddot = (ca.SX.sym(name, n) for name in ("q", "qdot", "qddot"))
+        limited = np.flatnonzero(np.isfinite(self.limit))
+        tau = self._function(q, qdot, qddot)[limited.tolist()]
+        share = tau / (_ROOM * self.limit[limited])
+        function = ca.Function("efforts", [q, qdot, qddot], [ca.vertcat(1 - share, 1 + share)])
+        return PathInequality(function)
+
+    def _shares(self, q: Array, qdot: Array, qddot: Array) -> Array:
+        tau = self._function(q.T, qdot.T, qddot.T).full().T
+        return np.asarray(tau / self.limit)
+
+
+class EffortLimitedShooting(MultipleShooting):
+    """Keeps efforts within limits, too.
+
+    The problem is solved without them first: they cost time, and for most motions of most robots
+    do not matter. Where the solution exceeds them, the problem with them is solved from there.
+
+    Parameters
+    ----------
+    stages
+        Returns the functions of the problem with these path inequalities.
+    intervals
+        The number of intervals N.
+    efforts
+        The limits.
+    """
+
+    def __init__(
+        self,
+        stages: Callable[[Sequence[PathInequality]], Stages],
+        intervals: int,
+        efforts: JointEfforts,
+    ) -> None:
+        super().__init__(stages(()), intervals)
+        self._stages, self._efforts = stages, efforts
+        self._limited: MultipleShooting | None = None
+        self._last: MultipleShooting | None = None
+
+    @property
+    def iterations(self) -> int:
+        """Steps that the last solution took."""
+        return super().iterations if self._last is None else self._last.iterations
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last solution is one, and not what the search was cut short at."""
+        return super().converged if self._last is None else self._last.converged
+
+    def solve(
+        self,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        guess: Trajectory,
+        stop: StopRule,
+        *,
+        shortest: float,
+        longest: float,
+        least_effort: bool = False,
+    ) -> Trajectory | None:
+        """Solve as :class:`MultipleShooting` does, within the limits of the efforts."""
+        asked: dict[str, Any] = {
+            "shortest": shortest,
+            "longest": longest,
+            "least_effort": least_effort,
+        }
+        self._last = None
+        # A guess that uses the efforts just up to their limits was made for them.
+        if not _AT_LIMITS <= self._efforts.peak(guess) <= 1 + _WITHIN:
+            solution = super().solve(boundary, limits, guess, stop, **asked)
+            if solution is None or self._efforts.peak(solution) <= 1:
+                return solution
+            guess = solution if shortest == longest else self._efforts.slowed(solution)
+        if self._limited is None:
+            stages = self._stages((self._efforts.inequality,))
+            self._limited = MultipleShooting(stages, self.intervals)
+        self._last = self._limited
+        return self._limited.solve(boundary, limits, guess, stop, **asked)

@@ -1,0 +1,175 @@
+"""Joint efforts within limits: flown in the plant under efforts, tracked by computed torque."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from planning.test_optimal import FOLDER
+from scipy.spatial.transform import Rotation
+from support.planners import planner_of
+from support.tracked_flight import TrackedFlight, track, with_effort_limits
+from support.urdf_text import link
+
+from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.parameters import configured
+from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, plan
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
+from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
+
+Array = npt.NDArray[np.float64]
+
+PERIOD = 0.01
+QUICK: dict[str, Any] = {"cache": 0, "answers": 1, "intervals": 20, "control_period": PERIOD}
+CHAIN = (FOLDER / "planar_chain.urdf").read_text(encoding="utf-8")
+CHAIN_START, CHAIN_TURN = [np.pi, -np.pi], [0.0, 0.0, 0.3]
+
+
+def seven_joints() -> str:
+    """Return an arm of seven joints on a base of 100 kg, as URDF."""
+    parts = [link("base", 100.0, np.diag([9.0, 8.0, 10.0]), np.zeros(3))]
+    lengths, masses = [0.15, 0.2, 0.2, 0.2, 0.2, 0.1, 0.1], [4.0, 4.0, 3.0, 3.0, 2.0, 2.0, 1.0]
+    parent, origin = "base", "0.3 0.1 0.4"
+    for k, (length, mass) in enumerate(zip(lengths, masses, strict=True)):
+        across = mass * length**2 / 12 + 0.01
+        moments = np.diag([across, 1.1 * across, 0.01])
+        parts.append(link(f"l{k}", mass, moments, np.array([0.02, 0.01, length / 2])))
+        parts.append(
+            f'<joint name="j{k}" type="revolute"><parent link="{parent}"/><child link="l{k}"/>'
+            f'<origin xyz="{origin}"/><axis xyz="{"0 1 0" if k % 2 else "0 0 1"}"/>'
+            '<limit lower="-2.7" upper="2.7" velocity="1.2" effort="87"/></joint>'
+        )
+        parent, origin = f"l{k}", f"0 0 {length}"
+    return f'<robot name="seven">{"".join(parts)}</robot>'
+
+
+def tenth(urdf: str, peak: Array) -> SpaceRobot:
+    """Return the robot with limits of a tenth of these efforts (n,)."""
+    names = SpaceRobot.from_urdf(urdf).joint_names
+    limits = dict(zip(names, (0.1 * peak).tolist(), strict=True))
+    robot = SpaceRobot.from_urdf(with_effort_limits(urdf, limits))
+    np.testing.assert_allclose(robot.effort_limit, 0.1 * peak)
+    return robot
+
+
+def assert_flies(
+    robot: SpaceRobot, schedule: GaitSchedule, turn: npt.ArrayLike, within: float
+) -> TrackedFlight:
+    flight = track(robot, schedule)
+    assert np.all(np.abs(flight.realised) <= robot.effort_limit)
+    # Feedback may ask for a little more where accelerations jump from one limit to the other.
+    beyond = np.any(np.abs(flight.asked) > robot.effort_limit, axis=1)
+    assert beyond.mean() <= 0.01
+    left = Rotation.from_quat(flight.quaternion).inv() * Rotation.from_rotvec(turn)
+    assert left.magnitude() <= within
+    return flight
+
+
+def test_a_chain_keeps_a_tenth_of_its_efforts() -> None:
+    free = SpaceRobot.from_urdf(CHAIN)
+    asked: dict[str, Any] = {"rotvec": CHAIN_TURN, "start": CHAIN_START, **QUICK}
+    fast = plan(free, **asked)
+    peak = np.abs(track(free, fast).asked).max(axis=0)
+    assert "effort" not in str(fast.notes["limited_by"])
+    # What the controller asks for is what the planner predicts, but for feedback.
+    shares = JointEfforts(free, np.ones(2), PERIOD).shares(fast.positions)
+    np.testing.assert_allclose(np.abs(shares).max(axis=0), peak, rtol=0.1)
+    # Limits that are not reached change nothing, and neither do those that are not to be kept.
+    for unlimited in ({"effort_limits": 1}, {"max_effort": [1.0, 1.0]}):
+        same = plan(free, **asked, **unlimited)
+        assert same.positions.tobytes() == fast.positions.tobytes()
+    robot = tenth(CHAIN, peak)
+    slow = plan(robot, **asked, effort_limits=1)
+    assert_flies(robot, slow, CHAIN_TURN, 1e-5)
+    assert "effort of pin_" in str(slow.notes["limited_by"])
+    # The same path would take the root of 10 times as long, and of 1 / 0.9 for the reserve.
+    assert fast.duration * 1.5 < slow.duration < fast.duration * 3.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "start", "turn"),
+    [
+        ("three_joint_arm", [0.0, -np.pi / 4, np.pi / 2], [0.2, -0.3, 0.25]),
+        ("sliding_masses", [0.0, 0.0, 0.0], [0.2, -0.1, 0.1]),
+        ("servicer", [0.0, -1.2, 2.0, 0.0, 0.8, 0.0], [0.1, -0.2, 0.5]),
+        ("seven", [0.0, 0.5, 0.0, -1.2, 0.0, 0.8, 0.0], [0.05, -0.03, 0.04]),
+    ],
+)
+def test_a_tenth_of_the_efforts(name: str, start: list[float], turn: list[float]) -> None:
+    urdf = seven_joints()
+    if name != "seven":
+        urdf = (FOLDER / f"{name}.urdf").read_text(encoding="utf-8")
+    free = SpaceRobot.from_urdf(urdf)
+    asked: dict[str, Any] = {"rotvec": turn, "start": start, **QUICK, "intervals": 80}
+    fast = plan(free, **asked)
+    robot = tenth(urdf, np.abs(track(free, fast).asked).max(axis=0))
+    slow = plan(robot, **asked, effort_limits=1)
+    assert_flies(robot, slow, turn, 1e-4)
+    assert slow.duration < fast.duration * 3.3
+
+
+def test_efforts_are_limited_where_a_controller_is_given_a_reference(chain: SpaceRobot) -> None:
+    def limits(settings: dict[str, Any]) -> int:
+        config: PlannerConfig = configured(PlannerConfig, settings)
+        return int(config.method_options["optimal"].effort_limits)
+
+    assert limits({}) == 0
+    assert limits({"output": "reference"}) == 1
+    assert limits({"output": "reference", "optimal.effort_limits": 2}) == 2
+    assert limits({"optimal.effort_limits": 1}) == 1
+
+
+def test_a_correction_keeps_them(chain: SpaceRobot) -> None:
+    chosen: dict[str, Any] = {"cache": 0, "intervals": 20, "effort_limits": 1}
+    chosen["max_effort"] = [0.05, 0.04]
+    tolerance = Tolerance(1e-3, 1e-3, 1e-3)
+    planner = planner_of("optimal", chain, PERIOD, tolerance, **chosen)
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.4, -0.3]))
+    goal = Goal.checked(np.zeros(3), Rotation.from_rotvec([0, 0, 0.02]).as_quat())
+    schedule = planner.plan(state, goal, correction=True)
+    shares = JointEfforts(chain, np.array([0.05, 0.04]), PERIOD).shares(schedule.positions)
+    assert 0.5 < np.abs(shares).max() <= 0.9
+
+
+@pytest.mark.slow
+def test_a_given_duration_is_long_enough_or_refused(chain: SpaceRobot) -> None:
+    asked: dict[str, Any] = {"rotvec": CHAIN_TURN, "start": CHAIN_START, **QUICK, "starts": 2}
+    limited: dict[str, Any] = {"effort_limits": 1, "max_effort": [3.4, 1.6]}
+    schedule = plan(chain, **asked, **limited, duration=4.0)
+    assert schedule.duration == pytest.approx(4.0)
+    shares = JointEfforts(chain, np.array([3.4, 1.6]), PERIOD).shares(schedule.positions)
+    assert np.abs(shares).max() <= 0.9 + 1e-9
+    with pytest.raises(PlanningError, match="the solver came to no way that keeps the limits"):
+        plan(chain, **asked, **limited, duration=1.5)
+
+
+def test_a_motor_without_effort_is_refused(chain: SpaceRobot) -> None:
+    with pytest.raises(ParameterError, match="'pin_2' is limited to an effort of 0"):
+        plan(chain, rotvec=[0, 0, 0.1], **QUICK, effort_limits=1, max_effort=[1.0, 0.0])
+
+
+def test_a_plan_for_stronger_motors_is_not_taken_from_the_cache(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
+    asked: dict[str, Any] = {"rotvec": CHAIN_TURN, "start": CHAIN_START, **QUICK, "cache": 1}
+    strong, weak = (
+        SpaceRobot.from_urdf(with_effort_limits(CHAIN, {"pin_1": limit, "pin_2": 50.0}))
+        for limit in (90.0, 30.0)
+    )
+    plan(strong, **asked, effort_limits=1)
+
+    def searching(*arguments: Any, **options: Any) -> None:
+        raise PlanningError("searched")
+
+    monkeypatch.setattr(ManoeuvreSearch, "search", searching)
+    assert "from_cache" in plan(strong, **asked, effort_limits=1).notes
+    for robot, limits in ((weak, 1), (strong, 2)):
+        with pytest.raises(PlanningError, match="searched"):
+            plan(robot, **asked, effort_limits=limits)
