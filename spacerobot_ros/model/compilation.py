@@ -23,7 +23,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -37,7 +37,16 @@ from spacerobot_ros.private_files import Cache, warn_once
 from spacerobot_ros.termination import tool
 
 # Contraction into fused multiply-adds would make the numbers depend on the processor.
-_FLAGS = ("-O2", "-fPIC", "-shared", "-ffp-contract=off")
+_COMMON_FLAGS = ("-fPIC", "-shared", "-ffp-contract=off")
+
+_FLAGS = ("-O2", *_COMMON_FLAGS)
+
+_LONG_FLAGS = ("-O0", *_COMMON_FLAGS)
+"""For functions of ten thousands of operations: a tenth of the time to compile, half the speed,
+still seven times that of the virtual machine."""
+
+_WORTH_KEEPING = 20_000
+"""Operations from which on it takes longer to derive a function than to read it."""
 
 _COMPILE_TIMEOUT = 120.0
 """Time that the compiler has for one function, s: ten times what the largest takes."""
@@ -135,13 +144,75 @@ def compiled(function: ca.Function) -> ca.Function:
     try:
         if compiler is None:
             raise _CompilationError("no C compiler (cc, gcc, clang or $CC) was found")
-        return _external(function, compiler, limit)
+        key = _hash(f"{_built_for(compiler, _FLAGS)}\n{_source(function)}")
+        if found := _loaded(Cache(cache_directory()), function.name(), key):
+            return found
+        return _compiled(function, key, _FLAGS, compiler, limit)
     except _CompilationError as reason:
-        warn_once(
-            "Functions run in CasADi's virtual machine, slower and with the same formulas "
-            f"(SPACEROBOT_COMPILE=0 asks for it): {reason}."
-        )
+        _warn_of_virtual_machine(reason)
         return function
+
+
+@lru_cache
+def source_of(*names: str) -> str:
+    """Return a hash of modules of this package, and of CasADi's version, for keys of functions."""
+    texts = [Path(str(sys.modules[name].__file__)).read_text("utf-8") for name in names]
+    return _hash("\n".join([ca.__version__, *texts]))
+
+
+def _warn_of_virtual_machine(reason: _CompilationError) -> None:
+    warn_once(
+        "Functions run in CasADi's virtual machine, slower and with the same formulas "
+        f"(SPACEROBOT_COMPILE=0 asks for it): {reason}."
+    )
+
+
+def kept_function(
+    name: str, key: str, build: Callable[[], ca.Function], *, compiling: bool
+) -> ca.Function:
+    """Return a function that takes long to derive, from the cache if it was derived before.
+
+    The same numbers come out whether it is compiled, read or derived: it is compiled without
+    optimisation, operation by operation.
+
+    Parameters
+    ----------
+    name
+        The function's own.
+    key
+        What tells it from all others: a hash of everything that it is derived from.
+    build
+        Derives it.
+    compiling
+        Whether it is evaluated so often that compiling it pays. If not, a compiled one from the
+        cache is used all the same.
+
+    Raises
+    ------
+    ParameterError
+        ``SPACEROBOT_COMPILE_TIMEOUT`` is not a number of seconds.
+    """
+    cache, compiler = Cache(cache_directory()), c_compiler()
+    compiled_key = ""
+    if compiler is not None:
+        compiled_key = _hash(f"{_built_for(compiler, _LONG_FLAGS)}\n{name}\n{key}")
+        if found := _loaded(cache, name, compiled_key):
+            return found
+    serialised = f"{name}-{key[:32]}.casadi"
+    if (kept := cache.load(serialised, key)) and not (compiling and compiler):
+        try:
+            return ca.Function.deserialize(kept[1].decode())
+        except (RuntimeError, ValueError) as error:
+            cache.discard(serialised, str(error))
+    function = build()
+    if compiling and compiler is not None:
+        try:
+            return _compiled(function, compiled_key, _LONG_FLAGS, compiler, _time_limit())
+        except _CompilationError as reason:
+            _warn_of_virtual_machine(reason)
+    if function.n_instructions() >= _WORTH_KEEPING:
+        cache.store(serialised, key, function.serialize().encode())
+    return function
 
 
 def c_compiler() -> str | None:
@@ -184,22 +255,27 @@ def _time_limit() -> float:
     return limit
 
 
-def _external(function: ca.Function, compiler: str, limit: float) -> ca.Function:
-    """Return the function from the cache, or newly compiled.
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
-    Raises
-    ------
-    _CompilationError
-        It cannot be compiled.
-    """
-    name = function.name()
-    generator = ca.CodeGenerator(name, {"with_header": False})
+
+def _built_for(compiler: str, flags: Sequence[str]) -> str:
+    return f"{sysconfig.get_platform()} {_c_library()} {compiler} {' '.join(flags)}"
+
+
+def _source(function: ca.Function) -> str:
+    generator = ca.CodeGenerator(function.name(), {"with_header": False})
     generator.add(function)
-    source = generator.dump()
-    built_for = f"{sysconfig.get_platform()} {_c_library()} {compiler} {' '.join(_FLAGS)}"
-    key = hashlib.sha256(f"{built_for}\n{source}".encode()).hexdigest()
-    cache, file = Cache(cache_directory()), f"{name}-{key[:32]}.so"
-    if kept := cache.load(file, key):
+    return str(generator.dump())
+
+
+def _file(name: str, key: str) -> str:
+    return f"{name}-{key[:32]}.so"
+
+
+def _loaded(cache: Cache, name: str, key: str) -> ca.Function | None:
+    """Return a compiled function from the cache, None if it is not there."""
+    if kept := cache.load(_file(name, key), key):
         try:
             return ca.external(name, str(kept[0]))
         except RuntimeError:
@@ -207,13 +283,27 @@ def _external(function: ca.Function, compiler: str, limit: float) -> ca.Function
                 f"The compiled functions in '{kept[0].parent}' are whole but cannot be loaded, as "
                 "on a file system that forbids execution; they are compiled at each start."
             )
+    return None
+
+
+def _compiled(
+    function: ca.Function, key: str, flags: Sequence[str], compiler: str, limit: float
+) -> ca.Function:
+    """Return the function newly compiled, and keep it in the cache.
+
+    Raises
+    ------
+    _CompilationError
+        It cannot be compiled.
+    """
+    name, cache = function.name(), Cache(cache_directory())
     if compiler in _hung:
         raise _CompilationError(f"{compiler} did not end before, and is not called again")
     try:
         with tempfile.TemporaryDirectory(prefix="spacerobot_ros_") as folder:
-            built = _built(source, compiler, Path(folder), limit)
+            built = _built(_source(function), compiler, flags, Path(folder), limit)
             _try(function, built)
-            kept_at = cache.store(file, key, built.read_bytes())
+            kept_at = cache.store(_file(name, key), key, built.read_bytes())
             for path in (kept_at, built):
                 # A folder may forbid execution; what is loaded stays when its file is deleted.
                 with suppress(RuntimeError):
@@ -232,11 +322,11 @@ def _c_library() -> str:
     return ""
 
 
-def _built(source: str, compiler: str, folder: Path, limit: float) -> Path:
+def _built(source: str, compiler: str, flags: Sequence[str], folder: Path, limit: float) -> Path:
     """Return the object that the compiler makes of a source in a folder."""
     c_file, built, output = (folder / name for name in ("function.c", "function.so", "output"))
     c_file.write_text(source, encoding="utf-8")
-    command = [compiler, *_FLAGS, "-o", str(built), str(c_file), "-lm"]
+    command = [compiler, *flags, "-o", str(built), str(c_file), "-lm"]
     code = _run(command, output, limit)
     if code is None:
         _hung.add(compiler)

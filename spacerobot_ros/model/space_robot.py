@@ -7,6 +7,7 @@ takes a :class:`BufferedFunction` from :meth:`SpaceRobot.buffered` and works in 
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import RobotDescriptionError
-from spacerobot_ros.model.compilation import BufferedFunction, compiled, dense_function
+from spacerobot_ros.model.compilation import (
+    BufferedFunction,
+    compiled,
+    dense_function,
+    kept_function,
+    source_of,
+)
 from spacerobot_ros.model.composite_rigid_body import (
     composite_dynamics,
     composites,
@@ -226,6 +233,14 @@ class SpaceRobot:
         return self.buffered(f"velocity_step:{substeps}")
 
     @cached_property
+    def equations_key(self) -> str:
+        """A hash of the equations at zero momentum: equal for robots that move alike."""
+        digest = hashlib.sha256()
+        for name in ("locked_inertia", "center_of_mass"):
+            digest.update(self.function(name, compile=False).serialize().encode())
+        return digest.hexdigest()
+
+    @cached_property
     def _builders(self) -> dict[str, Callable[..., ca.Function]]:
         return {
             "center_of_mass": lambda: self._shape_function("center_of_mass", self._kin.r_BC_B),
@@ -313,10 +328,15 @@ class SpaceRobot:
         return self._shape_function(f"jacobian_{index}", point_jacobian(self._kin, link))
 
     def _curvature(self) -> ca.Function:
-        K = curvature(self._A, self._kin.q)
-        # Columns run over i fastest: reshaped in Fortran order this is (6, i, j).
-        stacked = ca.horzcat(*(K[i][j] for j in range(self.n) for i in range(self.n)))
-        return self._shape_function("curvature", stacked)
+        def derived() -> ca.Function:
+            K = curvature(self._A, self._kin.q)
+            # Columns run over i fastest: reshaped in Fortran order this is (6, i, j).
+            stacked = ca.horzcat(*(K[i][j] for j in range(self.n) for i in range(self.n)))
+            return self._shape_function("curvature", stacked)
+
+        facts = f"{source_of(curvature.__module__)} {self.equations_key}"
+        key = hashlib.sha256(facts.encode()).hexdigest()
+        return kept_function("curvature", key, derived, compiling=False)
 
     def _momentum(self) -> ca.Function:
         state = self._state("v_WB_B", quaternion=True)

@@ -141,6 +141,17 @@ def test_a_plan_is_the_same_on_a_busy_machine(
     assert "cut_short" not in quiet.notes
 
 
+def test_a_plan_is_the_same_with_compiled_functions_and_without(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """From an empty cache, from one that is filled, and in the virtual machine."""
+    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
+    asked: dict[str, Any] = {"rotvec": [0, 0, 2.5], "cache": 0, "intervals": 40}
+    plans = [plan("planar_chain", **asked).positions.tobytes() for _ in range(2)]
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    assert plan("planar_chain", **asked).positions.tobytes() == plans[0] == plans[1]
+
+
 def test_a_plan_that_was_cut_short_is_not_kept(
     arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -95,7 +95,7 @@ class OptimalGait(GaitMethod):
             *(robot, self._prediction, self.control_period),
             *(self._specification.axes, self._constraints, self._efforts),
         )
-        self._search = ManoeuvreSearch(*problem)
+        self._search = ManoeuvreSearch(*problem, compiling=chosen.answers > 1)
         self._motion_search = MotionSearch(*problem, self._search.solver)
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
 
@@ -391,10 +391,9 @@ def _is_note(value: object) -> bool:
 
 def plan_key(robot: SpaceRobot, numbers: Mapping[str, Array], options: Mapping[str, object]) -> str:
     """Return the name of a plan: a hash of the robot's equations and of the request."""
-    digest = hashlib.sha256()
-    efforts = ["joint_efforts"] if "effort" in numbers else []
-    for name in ("locked_inertia", "center_of_mass", *efforts):
-        digest.update(robot.function(name, compile=False).serialize().encode())
+    digest = hashlib.sha256(robot.equations_key.encode())
+    if "effort" in numbers:
+        digest.update(robot.function("joint_efforts", compile=False).serialize().encode())
     facts = {
         "format": 2,
         "versions": [__version__, ca.__version__, np.__version__],

@@ -24,6 +24,9 @@ _FEASIBLE = 1e-4
 
 _OPTIONS = {
     "print_time": False,
+    # Compiled functions have no derivatives beyond those that they are.
+    "no_nlp_grad": True,
+    "calc_lam_p": False,
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
     "ipopt.linear_solver": "mumps",

@@ -211,6 +211,8 @@ class ManoeuvreSearch:
         (m, 3) directions in the base along which the attitude is reached.
     constraints, efforts
         What the path must keep; no efforts: any.
+    compiling
+        Whether searches are long enough for compiled functions to pay.
     """
 
     def __init__(
@@ -221,7 +223,10 @@ class ManoeuvreSearch:
         axes: Array,
         constraints: PathConstraints,
         efforts: JointEfforts | None = None,
+        *,
+        compiling: bool = True,
     ) -> None:
+        self._compiling = compiling
         self._robot, self._period = robot, control_period
         self._axes, self._constraints, self._efforts = axes, constraints, efforts
         self._holder = CommandHolder(robot, prediction, control_period, axes, efforts)
@@ -362,7 +367,12 @@ class ManoeuvreSearch:
         key = position, bool(inequalities)
         if key not in self._stages:
             self._stages[key] = Stages.of(
-                self._robot, self._axes, position, self._constraints, inequalities
+                self._robot,
+                self._axes,
+                position,
+                self._constraints,
+                inequalities,
+                compiling=self._compiling,
             )
         return self._stages[key]
 

@@ -22,9 +22,11 @@ control problems", IFAC World Congress, 1984.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 
 import casadi as ca
@@ -32,6 +34,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import kept_function, source_of
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.symbolic_rotations import (
@@ -79,11 +82,6 @@ class Block:
     def rows(self) -> int:
         """How many."""
         return int(self.values.size1_out(0))
-
-    @property
-    def functions(self) -> tuple[ca.Function, ca.Function, ca.Function]:
-        """All three."""
-        return self.values, self.jacobian, self.hessian
 
     @classmethod
     def of(cls, name: str, z: ca.SX, p: ca.SX, g: ca.SX) -> Block:
@@ -136,8 +134,10 @@ class Stages:
         position: bool,
         constraints: PathConstraints,
         inequalities: Sequence[PathInequality] = (),
+        *,
+        compiling: bool = False,
     ) -> Stages:
-        """Derive them.
+        """Derive them, or take from the cache what was derived before.
 
         Parameters
         ----------
@@ -149,6 +149,8 @@ class Stages:
             Whether the centre of mass is to end at ``center`` in the base.
         constraints, inequalities
             What the path must keep.
+        compiling
+            Whether they are evaluated so often that compiling them pays.
         """
         n = robot.n
         X, s, v = ca.SX.sym("X", 4), ca.SX.sym("s", n), ca.SX.sym("v", n)
@@ -160,14 +162,50 @@ class Stages:
             center_of_mass = robot.function("center_of_mass", compile=False)
             reached.append(center_of_mass(s) - center)
         ends = Block.of("end", ca.vertcat(X, s), ca.vertcat(turn, center), ca.vertcat(*reached))
-        interval, path = _interval(robot, constraints, inequalities)
+        interval = _kept_interval(robot, constraints, inequalities, compiling=compiling)
+        path = interval.rows - _dynamics(n)
         return cls(n, begins, interval, ends, path, turn_function(robot))
+
+
+def _dynamics(joints: int) -> int:
+    """Return how many rows of an interval are its dynamics."""
+    return 2 * joints + 4
+
+
+def _kept_interval(
+    robot: SpaceRobot,
+    constraints: PathConstraints,
+    inequalities: Sequence[PathInequality],
+    *,
+    compiling: bool,
+) -> Block:
+    """Return the functions of an interval from the cache, or derive them."""
+    q, X, direction = ca.SX.sym("q", robot.n), ca.SX.sym("X", 4), ca.SX.sym("d", 3)
+    on_knots = constraints.symbolic(q, X, direction)
+    facts = [
+        source_of(__name__, solve_positive_definite.__module__, quaternion_multiply.__module__),
+        robot.equations_key,
+        float(constraints.imposed_base_rate).hex(),
+        ca.Function("on_knots", [q, X, direction], [on_knots]).serialize(),
+        *(f"{each.instants} {each.function.serialize()}" for each in inequalities),
+    ]
+    key = hashlib.sha256("\n".join(facts).encode()).hexdigest()
+
+    @cache
+    def derived() -> Block:
+        return _interval(robot, constraints, inequalities)
+
+    return Block(
+        kept_function("interval", key, lambda: derived().values, compiling=compiling),
+        kept_function("interval_jac", key, lambda: derived().jacobian, compiling=compiling),
+        kept_function("interval_hess", key, lambda: derived().hessian, compiling=compiling),
+    )
 
 
 def _interval(
     robot: SpaceRobot, constraints: PathConstraints, inequalities: Sequence[PathInequality]
-) -> tuple[Block, int]:
-    """Return the dynamics of an interval, then its path constraints, and how many these are."""
+) -> Block:
+    """Return the dynamics of an interval, then its path constraints."""
     n = robot.n
     X, s, v, a = (ca.SX.sym(name, size) for name, size in zip("Xsva", (4, n, n, n), strict=True))
     X_next, s_next, v_next = ca.SX.sym("X+", 4), ca.SX.sym("s+", n), ca.SX.sym("v+", n)
@@ -204,7 +242,7 @@ def _interval(
     kept = _path(n, constraints, inequalities, z, rates, direction)
     by_motion, by_path = ca.SX.sym("lambda_v", 2 * n), ca.SX.sym("lambda_g", kept.shape[0])
     plain = ca.dot(by_motion, motion) + ca.dot(by_path, kept)
-    block = Block.with_derivatives(
+    return Block.with_derivatives(
         "interval",
         z,
         direction,
@@ -213,7 +251,6 @@ def _interval(
         ca.vertcat(ca.jacobian(motion, z), attitude_jac, ca.jacobian(kept, z)),
         ca.hessian(plain, z)[0] + attitude_hess,
     )
-    return block, int(kept.shape[0])
 
 
 def _path(
