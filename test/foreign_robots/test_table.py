@@ -80,3 +80,16 @@ def test_the_second_integration_notices_what_is_wrong() -> None:
     assert worst_error(off, schedule.goal, schedule) == pytest.approx(
         1.5e-3 / TOLERANCE.attitude, rel=0.02
     )
+
+
+@pytest.mark.slow
+def test_commands_near_the_ends_of_joints_are_bent_within_them() -> None:
+    """Fast legs move far within a tick: what makes up for chords must not leave the limits."""
+    trials = Trials("quadruped")
+    task = list(tasks(trials.robot, 3))[2]
+    schedule = plan(trials.robot, task.goal, start=task.state, base_position=1, starts=2, cache=0)
+    assert schedule.duration < 3.0
+    assert np.all(schedule.positions >= trials.robot.lower - 1e-9)
+    assert np.all(schedule.positions <= trials.robot.upper + 1e-9)
+    end = integrated(trials._oracle, task.state, schedule)
+    assert worst_error(end, task.goal, schedule) <= 1.0

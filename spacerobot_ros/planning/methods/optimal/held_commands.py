@@ -119,6 +119,13 @@ class CommandHolder:
                 if held is None:
                     continue
                 needed, overrun = limits.excess(held.positions, self._period, before)
+                if overrun > _WITHIN:
+                    held = self._bent(
+                        positions, boundary, final, limits, moves_end=moves_end, clipped=True
+                    )
+                    if held is None:
+                        continue
+                    needed, overrun = limits.excess(held.positions, self._period, before)
                 if self._efforts is not None:
                     needed = max(needed, self._efforts.excess(held.positions, before))
                 if overrun <= _WITHIN:
@@ -145,10 +152,12 @@ class CommandHolder:
         limits: MotionLimits,
         *,
         moves_end: bool,
+        clipped: bool = False,
     ) -> HeldCommands | None:
         """Bend shapes (N + 1, n) until they end in the goal attitude; None if they do not.
 
-        ``moves_end``: the last shape is bent, too.
+        ``moves_end``: the last shape is bent, too. ``clipped``: after every step, shapes beyond the
+        joint limits are put on them, and the others take over what that changes.
         """
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         # The solver's last shape is the wanted one to its own precision.
@@ -172,6 +181,11 @@ class CommandHolder:
             J = self._axes @ self._first_variation(positions, quaternions, waves)
             amplitudes = np.linalg.lstsq(J, error, rcond=1e-10)[0]
             positions = positions + np.einsum("kin,i->kn", waves, amplitudes)
+            if clipped:
+                positions = np.clip(positions, limits.lower, limits.upper)
+                waves = self._waves(positions, limits)
+                if moves_end:
+                    waves = np.hstack([waves, self._ramps(s, limits)])
         return None
 
     def _waves(self, positions: Array, limits: MotionLimits) -> Array:
