@@ -110,7 +110,7 @@ def json_of(found: Analysis) -> dict[str, Any]:
 def _joint_rows(robot: SpaceRobot) -> list[str]:
     from spacerobot_ros.model.description import JointKind
 
-    joints, bodies = robot.description.movable_joints, robot.description.bodies[1:]
+    joints, bodies = robot.description.moving_joints, robot.description.bodies[1:]
     width = max([5, *(len(joint.name) for joint in joints[:_MOST_ROWS])])
     head = f"{'joint':<{width}}  {'kind':<11}{'on':<16}{'limits':>19}{'speed':>12}{'effort':>10}"
     rows = [f"{head}{'mass':>12}"]
@@ -121,9 +121,11 @@ def _joint_rows(robot: SpaceRobot) -> list[str]:
         if math.isinf(limits.lower):
             room = "free"
         speed, effort = f"{limits.velocity:.3g} {unit}/s", f"{limits.effort:.4g} {of_effort}"
+        follows = joint.mimic
         rows.append(
             f"{joint.name:<{width}}  {joint.kind.value:<11}{joint.parent[:15]:<16}{room:>19}"
             f"{speed:>12}{effort:>10}{body.inertia.mass:>9.4g} kg"
+            + (f"  follows {follows.joint}" if follows is not None else "")
         )
     if len(joints) > _MOST_ROWS:
         rows.append(f"and {len(joints) - _MOST_ROWS} more")

@@ -133,20 +133,20 @@ class Composites:
         The momentum about the centre of mass does not depend on how that centre moves, so the
         composites' momenta at the common point are it.
         """
-        return ca.horzcat(ca.SX(3, 0), *(P[:3] for P in self.P[1:]))
+        return self.kin.gather(ca.horzcat(ca.SX(3, 0), *(P[:3] for P in self.P[1:])).T).T
 
     @property
     def D_qq(self) -> ca.SX:
         """Inertia matrix (n, n) of the joint rates where base and centre rest (eq. 16b)."""
-        n = self.kin.n
-        D_qq = ca.SX(n, n)
-        for j in range(1, n + 1):
+        m = self.kin.moving
+        D_qq = ca.SX(m, m)
+        for j in range(1, m + 1):
             carriers = self.kin.ancestors(j)
             for i in range(1, j + 1):
                 carried = ca.dot(self.S[i], self.P[j]) if i in carriers else 0
                 shared = ca.dot(self.P[i][3:], self.P[j][3:]) / self.mass
                 D_qq[i - 1, j - 1] = D_qq[j - 1, i - 1] = carried - shared
-        return D_qq
+        return self.kin.gather(self.kin.gather(D_qq).T)
 
     @property
     def H_plus(self) -> ca.SX:
@@ -156,7 +156,7 @@ class Composites:
 
 def composites(kin: TreeKinematics) -> Composites:
     """Add up the bodies inward (Featherstone, table 6.2)."""
-    n, c = kin.n, kin.r_BC_B
+    n, c = kin.moving, kin.r_BC_B
     J = tuple(_second_moment(kin, k) for k in range(n + 1))
     composite = []
     for k in range(n + 1):
@@ -193,6 +193,7 @@ class ShapeSystem:
         return self.D.solve(moment) - self._reaction(qddot)
 
     def _reaction(self, rates: ca.SX) -> ca.SX:
+        rates = self.parts.kin.spread(rates)
         terms = (B[:3] * rates[j] for j, B in enumerate(self.B[1:]))
         return sum(terms, ca.SX(3, 1))
 
@@ -200,7 +201,7 @@ class ShapeSystem:
 def shape_system(kin: TreeKinematics) -> ShapeSystem:
     """Eliminate the base from the composites."""
     parts = composites(kin)
-    S, P, n = parts.S, parts.P, kin.n
+    S, P, n = parts.S, parts.P, kin.moving
     D = Factor(parts.rotational)
     B = [ca.vertcat(D.solve(p[:3]), p[3:] * (1 / parts.mass)) for p in P]
     K = ca.SX(n, n)
@@ -209,7 +210,7 @@ def shape_system(kin: TreeKinematics) -> ShapeSystem:
         for i in range(1, j + 1):
             motion = S[i] - B[i] if i in carriers else -B[i]
             K[i - 1, j - 1] = K[j - 1, i - 1] = ca.dot(motion, P[j])
-    return ShapeSystem(parts, tuple(B), D, K)
+    return ShapeSystem(parts, tuple(B), D, kin.gather(kin.gather(K).T))
 
 
 def motion_forces(
@@ -224,10 +225,11 @@ def motion_forces(
     body's origin. The base's origin is taken as unaccelerated: what a common acceleration adds to
     ``S_j' f_j``, ``B_j' f_0`` takes off in ``Q_j``.
     """
-    kin = parts.kin
+    kin, qdot = parts.kin, parts.kin.spread(qdot)
+    qddot = None if qddot is None else kin.spread(qddot)
     omegas, alphas = [omega], [ca.SX(3, 1)]
     A, accelerations = [_turning(omega, ca.SX(3, 1))], [ca.SX(3, 1)]
-    for k in range(1, kin.n + 1):
+    for k in range(1, kin.moving + 1):
         i = kin.parent(k)
         rate = kin.axis[k] * qdot[k - 1]
         push = ca.SX(3, 1) if qddot is None else kin.axis[k] * qddot[k - 1]
@@ -239,7 +241,7 @@ def motion_forces(
             alphas.append(alphas[i] + ca.cross(omegas[i], rate) + push)
             A.append(_turning(omegas[k], alphas[k]))
         else:
-            arm = arm + kin.axis[k] * kin.q[k - 1]
+            arm = arm + kin.axis[k] * kin.theta[k - 1]
             accelerations.append(
                 accelerations[i] + A[i] @ arm + 2 * ca.cross(omegas[i], rate) + push
             )
@@ -248,14 +250,14 @@ def motion_forces(
             A.append(A[i])
 
     forces = []
-    for k in range(kin.n + 1):
+    for k in range(kin.moving + 1):
         arm = kin.R[k] @ _constant(kin.robot.bodies[k].inertia.com)
         force = kin.mass(k) * (accelerations[k] + A[k] @ arm)
         # The moment is the integral of rho x A rho over the body: the axial vector of A J.
         AJ = A[k] @ parts.J[k]
         spin = ca.vertcat(AJ[2, 1] - AJ[1, 2], AJ[0, 2] - AJ[2, 0], AJ[1, 0] - AJ[0, 1])
         forces.append(ca.vertcat(ca.cross(kin.com[k] - kin.r_BC_B, force) + spin, force))
-    for k in range(kin.n, 0, -1):
+    for k in range(kin.moving, 0, -1):
         forces[kin.parent(k)] += forces[k]
     return tuple(forces)
 
@@ -270,9 +272,16 @@ def shape_forces(
     """
     f = motion_forces(system.parts, omega, qdot)
     excess = f[0] - external
+    kin = system.parts.kin
+    if kin.robot.coupled:
+        along = [
+            ca.dot(system.B[k], excess) - ca.dot(system.parts.S[k], f[k])
+            for k in range(1, kin.moving + 1)
+        ]
+        return tau + kin.gather(ca.vertcat(*along)), -excess[:3]
     Q = [
         tau[k - 1] - ca.dot(system.parts.S[k], f[k]) + ca.dot(system.B[k], excess)
-        for k in range(1, system.parts.kin.n + 1)
+        for k in range(1, kin.n + 1)
     ]
     return ca.vertcat(*Q), -excess[:3]
 
@@ -290,12 +299,11 @@ def joint_efforts(kin: TreeKinematics, qdot: ca.SX, qddot: ca.SX) -> ca.SX:
     D = Factor(parts.rotational)
     f = motion_forces(parts, -D.solve(parts.D_q @ qdot), qdot, qddot)
     base = ca.vertcat(D.solve(f[0][:3]), f[0][3:] * (1 / parts.mass))
-    return ca.vertcat(
-        *(
-            ca.dot(S, force) - ca.dot(P, base)
-            for S, P, force in zip(parts.S[1:], parts.P[1:], f[1:], strict=True)
-        )
+    along = (
+        ca.dot(S, force) - ca.dot(P, base)
+        for S, P, force in zip(parts.S[1:], parts.P[1:], f[1:], strict=True)
     )
+    return kin.gather(ca.vertcat(*along))
 
 
 def external_force(kin: TreeKinematics, wrench_B: ca.SX) -> ca.SX:

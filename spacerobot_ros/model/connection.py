@@ -23,8 +23,9 @@ def momentum_of_bodies(
     This does not go through ``H+``: it is the momentum balance that the motion is held against.
     """
     linear, angular, energy = ca.SX(3, 1), ca.SX(3, 1), ca.SX(0)
+    qdot = kin.spread(qdot)
     omegas, origin_velocities = [omega_WB_B], [v_WB_B]
-    for k in range(1, kin.n + 1):
+    for k in range(1, kin.moving + 1):
         parent = kin.parent(k)
         v = origin_velocities[parent] + ca.cross(omegas[parent], kin.p[k] - kin.p[parent])
         omega = omegas[parent]

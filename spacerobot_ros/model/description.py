@@ -96,8 +96,20 @@ class Link:
 
 
 @dataclass(frozen=True)
+class Mimic:
+    """What a coupled joint follows: it is at ``multiplier`` times that joint plus ``offset``."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
 class Joint:
-    """A joint between two links; ``origin``: the child's pose at zero, ``axis``: a unit vector."""
+    """A joint between two links; ``origin``: the child's pose at zero, ``axis``: a unit vector.
+
+    A joint with ``mimic`` follows another, which follows none: it is no coordinate of its own.
+    """
 
     name: str
     kind: JointKind
@@ -106,6 +118,7 @@ class Joint:
     origin: Pose
     axis: Array
     limits: JointLimits
+    mimic: Mimic | None = None
 
     @property
     def unit(self) -> str:
@@ -117,7 +130,13 @@ class Joint:
         moved = Pose(r=position * self.axis)
         if self.kind is not JointKind.PRISMATIC:
             moved = Pose(matrix_about_axis(self.axis, position))
-        return replace(self, kind=JointKind.FIXED, origin=self.origin @ moved, limits=JointLimits())
+        return replace(
+            self,
+            kind=JointKind.FIXED,
+            origin=self.origin @ moved,
+            limits=JointLimits(),
+            mimic=None,
+        )
 
 
 @dataclass(frozen=True)
@@ -140,7 +159,8 @@ class RobotDescription:
     """A free-floating tree of links; the root link is the base body (the spacecraft).
 
     ``bodies`` are in topological order, the base first; the movable joints are those of
-    ``bodies[1:]``, in that order. ``frames`` maps every link to its body and its pose in it.
+    ``bodies[1:]`` that follow no other, in that order. ``frames`` maps every link to its body and
+    its pose in it.
     """
 
     name: str
@@ -157,8 +177,31 @@ class RobotDescription:
 
     @property
     def movable_joints(self) -> tuple[Joint, ...]:
-        """The joints that are not fixed, in the order of the coordinates q."""
+        """The joints that are not fixed and follow no other, in the order of the coordinates q."""
+        return tuple(joint for joint in self.moving_joints if joint.mimic is None)
+
+    @property
+    def moving_joints(self) -> tuple[Joint, ...]:
+        """The joints of ``bodies[1:]``, those that follow others among them."""
         return tuple(body.joint for body in self.bodies[1:] if body.joint is not None)
+
+    @property
+    def coupled(self) -> bool:
+        """Whether joints follow others."""
+        return any(joint.mimic is not None for joint in self.moving_joints)
+
+    @property
+    def coupling(self) -> tuple[Array, Array]:
+        """``G`` (m, n) and ``b`` (m,): the moving joints are at ``G q + b``, m or rad."""
+        names, moving = self.joint_names, self.moving_joints
+        G, b = np.zeros((len(moving), len(names))), np.zeros(len(moving))
+        for row, joint in enumerate(moving):
+            if joint.mimic is None:
+                G[row, names.index(joint.name)] = 1.0
+            else:
+                G[row, names.index(joint.mimic.joint)] = joint.mimic.multiplier
+                b[row] = joint.mimic.offset
+        return G, b
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -171,8 +214,16 @@ class RobotDescription:
         return float(sum(body.inertia.mass for body in self.bodies))
 
     def limits(self, what: str) -> Array:
-        """Return one limit (n,) of the movable joints: lower, upper, velocity or effort."""
+        """Return one limit (n,) of the movable joints: lower, upper, velocity or effort.
+
+        Those of the joints that follow one count too, except for effort.
+        """
         values: list[Any] = [getattr(joint.limits, what) for joint in self.movable_joints]
+        for joint in self.moving_joints:
+            if joint.mimic is not None and what != "effort":
+                i = self.joint_names.index(joint.mimic.joint)
+                bound = _leading_limit(joint.limits, joint.mimic, what)
+                values[i] = (max if what == "lower" else min)(values[i], bound)
         return np.array(values, dtype=float)
 
     def end_effector(self, link: str = "") -> str:
@@ -200,11 +251,17 @@ class RobotDescription:
         unknown = set(positions) - set(self.joint_names)
         if unknown:
             raise KeyError(f"robot '{self.name}' has no movable joint '{min(unknown)}'")
-        joints = tuple(
-            joint.locked(positions[joint.name]) if joint.name in positions else joint
-            for joint in self.joints
-        )
-        return self._rebuilt(self.links, joints)
+        joints = []
+        for joint in self.joints:
+            follows = joint.mimic
+            if joint.name in positions:
+                joints.append(joint.locked(positions[joint.name]))
+            elif follows is not None and follows.joint in positions:
+                at = follows.multiplier * positions[follows.joint] + follows.offset
+                joints.append(joint.locked(at))
+            else:
+                joints.append(joint)
+        return self._rebuilt(self.links, tuple(joints))
 
     def with_model_error(self, error: float, seed: int) -> RobotDescription:
         """Return the robot with every mass and every inertia off by a factor of its own.
@@ -231,6 +288,15 @@ class RobotDescription:
     def _rebuilt(self, links: tuple[Link, ...], joints: tuple[Joint, ...]) -> RobotDescription:
         bodies, frames = weld({link.name: link for link in links}, joints)
         return replace(self, links=links, joints=joints, bodies=tuple(bodies), frames=frames)
+
+
+def _leading_limit(limits: JointLimits, mimic: Mimic, what: str) -> float:
+    """Return what a limit of a joint that follows demands of the one that leads."""
+    k = mimic.multiplier
+    if what == "velocity":
+        return limits.velocity / abs(k)
+    bounds = sorted(((limits.lower - mimic.offset) / k, (limits.upper - mimic.offset) / k))
+    return bounds[0] if what == "lower" else bounds[1]
 
 
 def weld(

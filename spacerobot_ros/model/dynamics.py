@@ -55,7 +55,7 @@ def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:
     """Return ``v[i][k]``, eqs (3a) and (3b): ``rho_k = sum_i v[i][k]`` is the mass centre of body k
     from that of the system, base components.
     """
-    bodies = range(kin.n + 1)
+    bodies = range(kin.moving + 1)
     M = kin.robot.total_mass
     outboard = [set(kin.outboard(k)) for k in bodies]
     # towards[i][j]: from the mass centre of i to the joint it shares with its neighbour j,
@@ -81,7 +81,7 @@ def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:
 
 def barycentric_inertia(kin: TreeKinematics) -> BarycentricInertia:
     """Return the blocks of ``H+`` (eqs 14-17), with the slide terms of prismatic joints."""
-    n, M = kin.n, kin.robot.total_mass
+    n, M = kin.moving, kin.robot.total_mass
     bodies = range(n + 1)
     v = barycentric_vectors(kin)
     one = ca.SX.eye(3)
@@ -132,6 +132,7 @@ def barycentric_inertia(kin: TreeKinematics) -> BarycentricInertia:
             shared = sum(kin.mass(k) for k in set(outboard[a]) & set(outboard[b]))
             reduced = shared - carried[0] * carried[1] / M
             D_qq[a - 1, b - 1] = reduced * ca.dot(kin.axis[a], kin.axis[b])
+    D_q, D_qq = kin.gather(D_q.T).T, kin.gather(kin.gather(D_qq).T)
     return BarycentricInertia(M, D, D_q, D_qq, v)
 
 
@@ -156,9 +157,9 @@ def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
     Outward recursion of the velocity-product accelerations, inward sum of their inertia forces.
     Accelerations are taken relative to the system's centre of mass, whose own is ``omega x v_cm``.
     """
-    M = kin.robot.total_mass
+    M, qdot = kin.robot.total_mass, kin.spread(qdot)
     omegas, alphas, accelerations = [omega], [ca.SX(3, 1)], [ca.SX(3, 1)]
-    for k in range(1, kin.n + 1):
+    for k in range(1, kin.moving + 1):
         i = kin.parent(k)
         arm = kin.p[k] - kin.p[i]
         rate = kin.axis[k] * qdot[k - 1]
@@ -177,7 +178,7 @@ def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
         accelerations.append(acceleration)
 
     com_accelerations = []
-    for k in range(kin.n + 1):
+    for k in range(kin.moving + 1):
         arm = kin.com[k] - kin.p[k]
         com_accelerations.append(
             accelerations[k]
@@ -197,8 +198,8 @@ def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
             + kin.inertia[k] @ alphas[k]
             + ca.cross(omegas[k], spin)
         )
-    joint_rows = [ca.SX(1, 1) for _ in range(kin.n)]
-    for k in range(kin.n, 0, -1):
+    joint_rows = [ca.SX(1, 1) for _ in range(kin.moving)]
+    for k in range(kin.moving, 0, -1):
         if kin.is_revolute(k):
             about_joint = moments[k] - ca.cross(kin.p[k] - kin.r_BC_B, forces[k])
             joint_rows[k - 1] = ca.dot(kin.axis[k], about_joint)
@@ -207,7 +208,8 @@ def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
         i = kin.parent(k)
         forces[i] = forces[i] + forces[k]
         moments[i] = moments[i] + moments[k]
-    return ca.vertcat(M * ca.cross(omega, v_cm), moments[0], *joint_rows)
+    rows = kin.gather(ca.vertcat(*joint_rows))
+    return ca.vertcat(M * ca.cross(omega, v_cm), moments[0], rows)
 
 
 def generalised_forces(kin: TreeKinematics, wrench_B: ca.SX, tau: ca.SX) -> ca.SX:

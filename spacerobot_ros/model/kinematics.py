@@ -21,11 +21,13 @@ class TreeKinematics:
 
     For body k, in base components: ``R[k]`` attitude ``R_BBk`` (paper 4: ``0T_k``), ``p[k]``
     origin, ``com[k]`` centre of mass, ``inertia[k]`` inertia about that centre, ``axis[k]`` the
-    unit vector of the joint that carries it (None for the base).
+    unit vector of the joint that carries it (None for the base). ``theta`` (m,) are the positions
+    of the joints that carry ``bodies[1:]``: q, unless joints follow others (URDF's mimic).
     """
 
     robot: RobotDescription
     q: ca.SX
+    theta: ca.SX
     R: tuple[ca.SX, ...]
     p: tuple[ca.SX, ...]
     com: tuple[ca.SX, ...]
@@ -36,7 +38,24 @@ class TreeKinematics:
     @property
     def n(self) -> int:
         """Number of joint coordinates."""
+        return len(self.robot.joint_names)
+
+    @property
+    def moving(self) -> int:
+        """Number of bodies that joints carry; more than ``n`` where joints follow others."""
         return len(self.robot.bodies) - 1
+
+    def spread(self, rates: ca.SX) -> ca.SX:
+        """Return what rates (n, ...) of the coordinates are of the joints (m, ...): ``G rates``."""
+        return self._coupling @ rates if self.robot.coupled else rates
+
+    def gather(self, forces: ca.SX) -> ca.SX:
+        """Return what forces (m, ...) along the joints are of the coordinates: ``G' forces``."""
+        return self._coupling.T @ forces if self.robot.coupled else forces
+
+    @property
+    def _coupling(self) -> ca.DM:
+        return ca.sparsify(ca.DM(self.robot.coupling[0]))
 
     def mass(self, k: int) -> float:
         """Mass of body k, kg."""
@@ -71,21 +90,29 @@ class TreeKinematics:
 
     def angular_jacobian(self, k: int) -> ca.SX:
         """Return ``0F_k`` (3, n): what the joint rates add to the angular velocity of k (eq. 6)."""
-        F = ca.SX(3, self.n)
+        F = ca.SX(3, self.moving)
         for j in self.ancestors(k):
             if self.is_revolute(j):
                 F[:, j - 1] = self.axis[j]
-        return F
+        return self.gather(F.T).T
 
 
 def _chain(R: ca.SX, p: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
     return R @ ca.sparsify(ca.DM(pose.R)), p + R @ ca.sparsify(ca.DM(pose.r))
 
 
+def joint_positions(robot: RobotDescription, q: ca.SX) -> ca.SX:
+    """Return the positions (m,) of the joints that carry ``bodies[1:]`` at coordinates q (n,)."""
+    if not robot.coupled:
+        return q
+    G, b = robot.coupling
+    return ca.sparsify(ca.DM(G)) @ q + ca.sparsify(ca.DM(b))
+
+
 def tree_kinematics(robot: RobotDescription) -> TreeKinematics:
     """Build the symbolic kinematics of a robot."""
-    n = len(robot.bodies) - 1
-    q = ca.SX.sym("q", n)
+    q = ca.SX.sym("q", len(robot.joint_names))
+    theta = joint_positions(robot, q)
     R: list[ca.SX] = [ca.SX.eye(3)]
     p: list[ca.SX] = [ca.SX(3, 1)]
     axis: list[ca.SX | None] = [None]
@@ -96,9 +123,9 @@ def tree_kinematics(robot: RobotDescription) -> TreeKinematics:
         direction = R_joint @ ca.sparsify(ca.DM(joint.axis))
         if joint.kind is JointKind.PRISMATIC:
             R.append(R_joint)
-            p.append(p_joint + direction * q[k - 1])
+            p.append(p_joint + direction * theta[k - 1])
         else:
-            R.append(R_joint @ matrix_about_axis(joint.axis, q[k - 1]))
+            R.append(R_joint @ matrix_about_axis(joint.axis, theta[k - 1]))
             p.append(p_joint)
         axis.append(direction)
     com, inertia = [], []
@@ -108,19 +135,19 @@ def tree_kinematics(robot: RobotDescription) -> TreeKinematics:
     r_BC_B = sum((b.inertia.mass * c for b, c in zip(robot.bodies, com, strict=True)), ca.SX(3, 1))
     r_BC_B = r_BC_B / robot.total_mass
     return TreeKinematics(
-        robot, q, tuple(R), tuple(p), tuple(com), tuple(inertia), tuple(axis), r_BC_B
+        robot, q, theta, tuple(R), tuple(p), tuple(com), tuple(inertia), tuple(axis), r_BC_B
     )
 
 
 def link_quaternion(description: RobotDescription, link: str, q: ca.SX) -> ca.SX:
     """Return the quaternion (4,) of ``R_BL``, smooth in q: no matrix is turned into it."""
     index, pose = description.frames[link]
-    quaternion = _constant(pose.R)
+    quaternion, theta = _constant(pose.R), joint_positions(description, q)
     while index > 0:
         body = description.bodies[index]
         assert body.joint is not None
         if body.joint.kind is not JointKind.PRISMATIC:
-            half = q[index - 1] / 2
+            half = theta[index - 1] / 2
             turn = ca.vertcat(ca.sin(half) * ca.DM(body.joint.axis), ca.cos(half))
             quaternion = quaternion_multiply(turn, quaternion)
         quaternion = quaternion_multiply(_constant(body.origin.R), quaternion)

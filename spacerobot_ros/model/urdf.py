@@ -6,6 +6,7 @@ import contextlib
 import io
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -21,6 +22,7 @@ from spacerobot_ros.model.description import (
     JointKind,
     JointLimits,
     Link,
+    Mimic,
     Pose,
     RobotDescription,
     Shape,
@@ -150,6 +152,7 @@ def parse_robot(text: str) -> RobotDescription:
             raise RobotDescriptionError(
                 f"The {kind} name '{twice[0]}' is used twice; names are unique."
             )
+    joints = _with_leaders(joints)
     bodies, frames = weld(links, joints)
     description = RobotDescription(
         name=tree.name or "robot",
@@ -160,6 +163,7 @@ def parse_robot(text: str) -> RobotDescription:
         urdf=text,
     )
     _require_mass(description)
+    _require_common_range(description)
     return description
 
 
@@ -286,11 +290,6 @@ def _joint(joint: Any, links: dict[str, Link]) -> Joint:
             f"The type of {where} is '{joint.type}'; a free-floating tree has "
             "prismatic, revolute, continuous and fixed joints (the base floats by itself)."
         ) from None
-    if joint.mimic is not None:
-        raise RobotDescriptionError(
-            f"The {where} mimics '{joint.mimic.joint}'; coupled joints are not supported: "
-            "remove <mimic> or make the joint fixed."
-        )
     axis = np.array([1.0, 0.0, 0.0])
     if joint.axis is not None:
         axis = _finite(joint.axis, where)
@@ -307,7 +306,65 @@ def _joint(joint: Any, links: dict[str, Link]) -> Joint:
         _pose(joint.origin, where),
         axis,
         _limits(joint, kind, where),
+        None if kind is JointKind.FIXED else _mimic(joint, where),
     )
+
+
+def _mimic(joint: Any, where: str) -> Mimic | None:
+    if joint.mimic is None:
+        return None
+    given = (1.0 if joint.mimic.multiplier is None else joint.mimic.multiplier, joint.mimic.offset)
+    multiplier, offset = _finite([given[0], given[1] or 0.0], f"<mimic> of {where}")
+    if multiplier == 0:
+        raise RobotDescriptionError(
+            f"The {where} mimics '{joint.mimic.joint}' with the multiplier 0: it does not move; "
+            "make it fixed."
+        )
+    return Mimic(joint.mimic.joint, float(multiplier), float(offset))
+
+
+def _with_leaders(joints: list[Joint]) -> list[Joint]:
+    """Return the joints, each that follows another with the joint at the end of its chain."""
+    by_name = {joint.name: joint for joint in joints}
+    found = []
+    for joint in joints:
+        multiplier, offset, leader, passed = 1.0, 0.0, joint, [joint.name]
+        while leader.mimic is not None:
+            follows = leader.mimic
+            if follows.joint not in by_name:
+                raise RobotDescriptionError(
+                    f"The joint '{leader.name}' mimics '{follows.joint}', but there is no such "
+                    f"joint.{suggestion(follows.joint, by_name)}"
+                )
+            if follows.joint in passed:
+                raise RobotDescriptionError(
+                    f"The joint '{joint.name}' mimics itself, by way of {', '.join(passed[1:])}."
+                    if passed[1:]
+                    else f"The joint '{joint.name}' mimics itself."
+                )
+            # theta = k (k' q + b') + b
+            offset += multiplier * follows.offset
+            multiplier *= follows.multiplier
+            leader = by_name[follows.joint]
+            passed.append(leader.name)
+        if joint.mimic is None:
+            found.append(joint)
+        elif leader.kind is JointKind.FIXED:
+            found.append(joint.locked(offset))
+        else:
+            found.append(replace(joint, mimic=Mimic(leader.name, multiplier, offset)))
+    return found
+
+
+def _require_common_range(robot: RobotDescription) -> None:
+    """Refuse joints whose followers leave them no range."""
+    lower, upper = robot.limits("lower"), robot.limits("upper")
+    for name, low, high in zip(robot.joint_names, lower, upper, strict=True):
+        if low >= high:
+            raise RobotDescriptionError(
+                f"The joint '{name}' and those that mimic it have no position in common: their "
+                f"limits leave it [{low:.4g}, {high:.4g}]. Check multiplier, offset and limits."
+            )
 
 
 def _limits(joint: Any, kind: JointKind, where: str) -> JointLimits:

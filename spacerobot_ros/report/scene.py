@@ -213,7 +213,9 @@ def _motion(flight: Flight, robot: RobotDescription, indices: Indices) -> Comman
     time, paths = flight.position.time[indices], _link_paths(robot)
     base = {"position": flight.position.values[indices], "quaternion": flight.quaternion[indices]}
     clips = [clip(ROBOT, time, base)]
-    for joint, q in zip(robot.movable_joints, flight.joints[indices].T, strict=True):
+    G, offsets = robot.coupling
+    positions = flight.joints[indices] @ G.T + offsets
+    for joint, q in zip(robot.moving_joints, positions.T, strict=True):
         R, r = joint.origin.R, joint.origin.r
         if joint.kind is JointKind.PRISMATIC:
             moved = {"position": r + np.outer(q, R @ joint.axis)}

@@ -47,6 +47,12 @@ def elbow_with(content: str, kind: str = "revolute") -> str:
     return robot(HULL, ARM, joint("Elbow", kind, "Hull", "Arm", content))
 
 
+def coupled(mimic: str) -> str:
+    """Return a robot whose wrist follows."""
+    wrist = joint("Wrist", "revolute", "Arm", "Hand", f"{mimic}{LIMIT}")
+    return robot(HULL, ARM, HAND, ELBOW, wrist)
+
+
 def moments(**changes: str) -> str:
     """Return a unit inertia with some entries replaced."""
     values = {"ixx": "1", "ixy": "0", "ixz": "0", "iyy": "1", "iyz": "0", "izz": "1"} | changes
@@ -109,15 +115,15 @@ REFUSED = {
     # Not a joint that a floating tree can have.
     "floating joint": (elbow_with("", "floating"), r"type of joint 'Elbow' is 'floating'"),
     "planar joint": (elbow_with('<axis xyz="0 0 1"/>', "planar"), r"'Elbow' is 'planar'"),
-    "mimic": (
-        robot(
-            HULL,
-            ARM,
-            HAND,
-            ELBOW,
-            joint("Wrist", "revolute", "Arm", "Hand", f'<mimic joint="Elbow"/>{LIMIT}'),
-        ),
-        r"joint 'Wrist' mimics 'Elbow'",
+    "mimics nobody": (coupled('<mimic joint="Elbo"/>'), r"mimics 'Elbo', but .*mean 'Elbow'\?"),
+    "mimics itself": (coupled('<mimic joint="Wrist"/>'), r"joint 'Wrist' mimics itself"),
+    "mimics nothing": (
+        coupled('<mimic joint="Elbow" multiplier="0"/>'),
+        r"joint 'Wrist' mimics 'Elbow' with the multiplier 0",
+    ),
+    "mimics out of reach": (
+        coupled('<mimic joint="Elbow" offset="5"/>'),
+        r"joint 'Elbow' and those that mimic it have no position in common",
     ),
     "zero axis": (elbow_with(f'<axis xyz="0 0 0"/>{LIMIT}'), r"axis of joint 'Elbow' is zero"),
     "axis not finite": (

@@ -46,9 +46,11 @@ class CenterReach:
     def of(cls, robot: SpaceRobot, lower: Array, upper: Array) -> CenterReach:
         """Return the set of a robot whose joints keep to ``lower`` and ``upper`` (n,)."""
         bodies = robot.description.bodies
+        if robot.description.coupled:
+            lower, upper = _of_moving_joints(robot, lower, upper)
         base = bodies[0].inertia
         origin, radius = base.mass * base.com, 0.0
-        slots = np.zeros((3, robot.n))
+        slots = np.zeros((3, len(lower)))
         places = [_Place(np.zeros(3), np.eye(3), (), 0.0)]
         for joint, body in enumerate(bodies[1:]):
             place = places[body.parent].next(joint, body, lower[joint], upper[joint])
@@ -77,6 +79,15 @@ class CenterReach:
             bounds = self.lower - _ROOM, self.upper + _ROOM
             beside = beside - self.slots @ lsq_linear(self.slots, beside, bounds, method="bvls").x
         return max(0.0, float(np.linalg.norm(beside)) - self.radius)
+
+
+def _of_moving_joints(robot: SpaceRobot, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return ranges (m,) of all moving joints, each by itself: a larger set than that of (n,)."""
+    G, offsets = robot.description.coupling
+    leaders = np.argmax(np.abs(G), axis=1)
+    factors = G[np.arange(len(G)), leaders]
+    ends = factors * lower[leaders] + offsets, factors * upper[leaders] + offsets
+    return np.minimum(*ends), np.maximum(*ends)
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ def planar_axis(robot: SpaceRobot) -> Array:
         )
     axes: list[Array] = []
     rotations = [np.eye(3)]
-    for body, joint in zip(bodies[1:], robot.description.movable_joints, strict=True):
+    for body, joint in zip(bodies[1:], robot.description.moving_joints, strict=True):
         if joint.kind is JointKind.PRISMATIC:
             raise PlanningError(
                 f"Robot '{name}' is not planar in the sense of paper 3: joint '{joint.name}' "
