@@ -32,6 +32,10 @@ _BRAKE_RATE = 2.0
 """Rate at which joints are brought to rest when the base is no longer known, 1/s."""
 
 
+_MOST_PERIODS = 20
+"""Control periods between two commands beyond which time has jumped."""
+
+
 class Mode(str, Enum):
     """How the controller knows the state of the base."""
 
@@ -82,6 +86,8 @@ class CoordinatedController:
         self._began = 0.0
         self._followed = Reference()
         self._sent: Actuation | None = None
+        self._commanded_at = -math.inf
+        """Time of the last command, s."""
         self._estimator: DeadReckoning | None = None
         self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
         self.coming_to_rest = False
@@ -131,6 +137,11 @@ class CoordinatedController:
         joints = None if goal.joints is None else goal.joints.q
         self.set_goals(time, state, base=goal.base, end_effector=goal.end_effector, joints=joints)
 
+    def hold_here(self, time: float, state: ControlState) -> None:
+        """Hold everything where it is: the reference does not come from where it was before."""
+        self._profile = None
+        self.set_goals(time, state)
+
     def come_to_rest(self) -> None:
         """Bring the whole robot to rest, wherever that is, until there is something to follow."""
         self.coming_to_rest = True
@@ -172,7 +183,8 @@ class CoordinatedController:
                 commanded = self._rates.to_rest(state)
         result = self._limits.apply(commanded)
         if state is not None:
-            kept = self._rates.apply(state, result.realised, self._limits.effort)
+            held = self._periods_held(time)
+            kept = self._rates.apply(state, result.realised, self._limits.effort, held)
             if kept is not result.realised:
                 result = Saturated.of(commanded, kept)
         self._sent = result.realised
@@ -187,6 +199,10 @@ class CoordinatedController:
     def joint_rates(self) -> Array:
         """The rates (n,) that joints are kept within, m/s or rad/s; infinite: none."""
         return self._rates.rates
+
+    def largest_rate_share(self, qdot: Array) -> float:
+        """Return the largest of rates (n,) in parts of what joints are kept within."""
+        return self._rates.largest_share(qdot)
 
     @property
     def estimated_for(self) -> float:
@@ -229,6 +245,14 @@ class CoordinatedController:
         return bounds
 
     # -- parts --------------------------------------------------------------------------------
+
+    def _periods_held(self, time: float) -> int:
+        """Return how many control periods the last command was held, as this one probably will be:
+        on a machine that is too busy not every state is answered.
+        """
+        before, self._commanded_at = self._commanded_at, time
+        periods = (time - before) / self._control_period
+        return round(periods) if 1.0 < periods < _MOST_PERIODS else 1
 
     def _present(self, time: float, state: ControlState) -> Reference:
         """Where the reference is now; at first, where the robot is."""

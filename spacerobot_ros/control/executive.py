@@ -301,7 +301,7 @@ class ControlExecutive:
     def _watch_rates(self, qdot: Array) -> None:
         """Give up where a joint stays far beyond its rate: its motor does not master it."""
         rates = self.controller.joint_rates
-        too_fast = bool((np.abs(qdot) > _LOST_RATE * rates).any())
+        too_fast = self.controller.largest_rate_share(qdot) > _LOST_RATE
         self._lost_rates = self._lost_rates + 1 if too_fast else 0
         if self._lost_rates < _LOST_STATES or self._not_in_charge:
             return
@@ -316,8 +316,8 @@ class ControlExecutive:
         if self._error_bounds is None:
             margins = self._config.error_margin
             self._error_bounds = self.controller.error_bounds(margins.as_errors())
-        lost = bool((np.abs(self.controller.law.error) > self._error_bounds).any())
-        self._lost_errors = self._lost_errors + 1 if lost else 0
+        share = self.controller.law.largest_error_share(self._error_bounds)
+        self._lost_errors = self._lost_errors + 1 if share > 1.0 else 0
         if self._lost_errors >= _LOST_STATES:
             errors = self.controller.errors()
             away = f"{errors.position:.3g} m, {errors.attitude:.3g} rad"
@@ -345,11 +345,7 @@ class ControlExecutive:
 
     def _hold(self, time: float, state: ControlState) -> None:
         """Hold everything where it is, after an abort or when the plant obeys again."""
-        law = self.controller.law
-        here = Reference.present(law.robot, state, law.outputs.selection.end_effector_link)
-        self.controller.set_goals(
-            time, state, base=here.base, end_effector=here.end_effector, joints=state.q.copy()
-        )
+        self.controller.hold_here(time, state)
         if self._abort_requested:
             self._goal_state = self._reported_state = ControllerState.ABORTED
             self._publish(ControllerState.ABORTED, self._sentence(ControllerState.ABORTED))

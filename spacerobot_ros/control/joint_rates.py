@@ -56,31 +56,44 @@ class JointRateLimits:
         self.rates = np.where(limited, rates, np.inf)
         """Largest rates (n,), infinite where there is none."""
         self._robot = robot
-        self._time = _PERIODS * control_period
+        self._control_period = control_period
         self._rest_rate = min(_REST_RATE, _REST_RATE_PER_PERIOD / control_period)
         self._dynamics = BufferedFunction(_joint_dynamics(robot))
         self._per_rate = 1 / (_FREE * self.rates)
+        self._inverse = (1 / self.rates).tolist()
         self._per_effort = self._mobilities() * control_period * self._per_rate
 
-    def apply(self, state: ControlState, given: Actuation, effort: Array) -> Actuation:
+    def apply(
+        self, state: ControlState, given: Actuation, effort: Array, periods: int = 1
+    ) -> Actuation:
         """Return a command that keeps the rates; the given one itself if that does.
 
-        ``effort`` (n,) are the largest joint efforts, N m or N, which ``given`` keeps.
+        ``effort`` (n,) are the largest joint efforts, N m or N, which ``given`` keeps; ``periods``
+        is for how many control periods it will probably be held.
         """
-        after = np.abs(state.qdot) * self._per_rate + np.abs(given.tau) * self._per_effort
-        if not after.max(initial=0.0) > 1.0:
+        gained = np.abs(given.tau) * (periods * self._per_effort)
+        if not (np.abs(state.qdot) * self._per_rate + gained).max(initial=0.0) > 1.0:
             return given
         Js, Fs, G = self._at(state)
         pushed = G @ given.wrench_B
         qddot = np.linalg.solve(Js, given.tau + pushed - Fs)
-        lowest = (-self.rates - state.qdot) / self._time
-        highest = (self.rates - state.qdot) / self._time
+        soonest = _PERIODS * periods * self._control_period
+        lowest = (-self.rates - state.qdot) / soonest
+        highest = (self.rates - state.qdot) / soonest
         if np.all((lowest <= qddot) & (qddot <= highest)):
             return given
         wanted = Js @ np.clip(qddot, lowest, highest) + Fs
         share = _largest_share(wanted, pushed, effort)
         tau = np.clip(wanted - share * pushed, -effort, effort)
         return Actuation(share * given.wrench_B, tau)
+
+    def largest_share(self, qdot: Array) -> float:
+        """Return the largest of rates (n,) in parts of their limits."""
+        # Numbers of Python: arrays of a few joints take longer, and this is asked at every state.
+        share = 0.0
+        for rate, inverse in zip(qdot.tolist(), self._inverse, strict=True):
+            share = max(share, abs(rate * inverse))
+        return share
 
     def to_rest(self, state: ControlState) -> Actuation:
         """Return the command under which joint rates and momenta of the robot decay, not limited.

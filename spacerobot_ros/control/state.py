@@ -127,8 +127,9 @@ class Reference:
             R_WB = matrix_from_quaternion(state.quaternion_WB)
             R_BE, r_BE_B = robot.link_pose(end_effector, state.q)
             pose = PoseReference(state.r_WB + R_WB @ r_BE_B, quaternion_from_matrix(R_WB @ R_BE))
-        base = PoseReference(state.r_WB, state.quaternion_WB)
-        return cls(base, pose, JointReference.at_rest(state.q))
+        # The arrays of a state may be used again for the next one.
+        base = PoseReference(state.r_WB.copy(), state.quaternion_WB.copy())
+        return cls(base, pose, JointReference.at_rest(state.q.copy()))
 
 
 @dataclass(frozen=True)

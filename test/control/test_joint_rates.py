@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from control.flights import load, planar_start, plant_of, random_state
 from control.pinocchio_plant import PinocchioPlant
-from support.executive_loop import KP, TIP, ExecutiveLoop, goal_at
+from support.executive_loop import KP, SHAPE, TIP, ExecutiveLoop, goal_at
 from support.executive_loop import PERIOD as LOOP_PERIOD
 from support.random_robots import random_robot_urdf
 
@@ -69,6 +69,23 @@ def test_accelerations_are_those_that_lead_to_the_rates_and_others_stay(seed: in
     after_two = np.clip(state.qdot + without * 2 * PERIOD, -rates, rates)
     np.testing.assert_allclose(state.qdot + qddot * 2 * PERIOD, after_two, atol=1e-7)
     assert np.any(np.abs(without - qddot) > 1.0), "nothing was to be limited"
+
+
+@pytest.mark.parametrize("periods", [1, 3])
+def test_commands_that_are_held_longer_lead_to_the_rates_more_slowly(periods: int) -> None:
+    """Where only every third state is answered, each command is expected to last as long."""
+    loop = ExecutiveLoop(joint_rates=0.5, max_force=1.0)
+    loop.answer()
+    loop.tick += periods - 1
+    loop.rates = np.array([0.0, 0.8])
+    loop.aim(end_effector=goal_at(TIP + np.array([0.0, 9.0, 0.0])))
+    state = ControlState(
+        np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3), SHAPE, loop.rates
+    )
+    wrench, tau = loop.answer()
+    _, qddot = plant_of(load("planar_manipulator"), state).acceleration(Actuation(wrench, tau))
+    # 1 rad/s is the limit: 0.2 rad/s are left, for two commands.
+    assert qddot[1] == pytest.approx(0.2 / (2 * periods * LOOP_PERIOD), rel=1e-6)
 
 
 def test_a_command_that_keeps_the_rates_is_not_touched() -> None:
@@ -409,3 +426,31 @@ def test_without_a_goal_a_reset_robot_stays_where_it_is() -> None:
     assert loop.state == "holding"
     loop.place = np.zeros(3)
     np.testing.assert_allclose(loop.answer()[0][:3], 2 * KP * AIM, atol=1e-12)
+
+
+@pytest.mark.parametrize("stopped", ["abort", "rearm"])
+def test_a_robot_with_smooth_references_is_held_where_it_is(stopped: str) -> None:
+    """A reference that comes from where it was before would pull the robot back there."""
+    loop = ExecutiveLoop(profile="quintic")
+    loop.aim(base=goal_at(4 * AIM, "g"))
+    loop.answer(5)
+    loop.place = AIM
+    if stopped == "abort":
+        loop.executive.abort()
+    else:
+        loop.executive.plant_stopped("latched")
+        loop.executive.plant_obeys_again()
+    np.testing.assert_allclose(np.concatenate(loop.answer(20)), 0.0, atol=1e-9)
+    loop.place = 2 * AIM
+    np.testing.assert_allclose(loop.answer()[0][:3], -2 * KP * AIM, atol=1e-9)
+
+
+def test_what_is_held_does_not_change_with_the_arrays_of_a_state() -> None:
+    config = configured(ControllerConfig, {"law": "computed_torque", "tick_rate": 100.0})
+    controller = build_controller(load("planar_manipulator"), config)
+    q = np.array([-1.0, 1.0])
+    state = replace(planar_start(), q=q)
+    first = controller.command(0.0, state, q, state.qdot).realised.tau
+    np.testing.assert_allclose(first, 0.0, atol=1e-9)
+    q[1] += 0.1
+    assert np.abs(controller.command(0.01, state, q, state.qdot).realised.tau).max() > 0.1

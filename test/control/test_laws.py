@@ -199,3 +199,19 @@ def test_the_units_of_gains_in_the_parameters_are_those_of_the_laws() -> None:
             stated = next(part for part in described.split(" with ")[1:] if name in part)
             before = described.split(stated)[0]
             assert before.endswith(f"{unit} with ")
+
+
+@pytest.mark.parametrize("law", list(LAWS))
+def test_gains_are_bounded_so_that_commands_are_numbers(law: str) -> None:
+    names = [f"gains.{group}.{gain}" for group in vars(Gains()) for gain in ("kp", "kd")]
+    for name in names:
+        with pytest.raises(ParameterError, match=name.replace(".", r"\.")):
+            configured(ControllerConfig, {"law": law, name: 1e300})
+    largest = configured(ControllerConfig, {"law": law, **dict.fromkeys(names, 1e9)})
+    controller = build_controller(load("planar_manipulator"), largest)
+    state = replace(planar_start(), qdot=np.array([0.5, -0.25]))
+    controller.command(0.0, state, state.q, state.qdot)
+    result = controller.command(0.01, replace(state, r_WB=np.full(3, 100.0)), state.q, state.qdot)
+    for part in (result.realised, result.loss):
+        assert np.isfinite(part.wrench_B).all()
+        assert np.isfinite(part.tau).all()

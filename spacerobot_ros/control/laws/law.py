@@ -41,6 +41,7 @@ class GainPair:
         "1/s^2 with laws that command accelerations (model_based, computed_torque)",
         unit="by law",
         minimum=1e-9,
+        maximum=1e9,
         read_only=False,
     )
     kd: float = parameter(
@@ -49,6 +50,7 @@ class GainPair:
         "1/s with laws that command accelerations (model_based, computed_torque)",
         unit="by law",
         minimum=1e-9,
+        maximum=1e9,
         read_only=False,
     )
 
@@ -238,6 +240,10 @@ class ControlLaw(ABC):
     def error(self) -> Array:
         """The error (m,) at the last command, in the order of ``outputs.labels``."""
         return self._out["error"].copy()
+
+    def largest_error_share(self, bounds: Array) -> float:
+        """Return the largest error at the last command in parts of bounds (m,), which are > 0."""
+        return float(np.abs(self._out["error"] / bounds).max(initial=0.0))
 
     @property
     def error_rate(self) -> Array:
