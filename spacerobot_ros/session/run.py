@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +16,8 @@ from rclpy.signals import SignalHandlerOptions
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
 from spacerobot_ros.bag.recorded_robot import columns
 from spacerobot_ros.control.status import ControllerStatus
+from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.nodes.common.process import use_loopback_discovery, use_private_discovery
 from spacerobot_ros.nodes.plant.diagnostics import PROPELLANT
@@ -126,13 +128,14 @@ def _summary(stack: Stack, wall_time: float) -> dict[str, Any]:
         plans = "planner" in scenario.commanders
         method = scenario.planner.method if plans else scenario.controller.law
     assert stack.bag is not None
-    bag, goal = read_bag(stack.bag), scenario.goal
-    robot = RecordedRobot(bag)
-    n = len(robot.joint_names)
-    time, pose = robot.truth("odom", columns("odom", "pose.pose"))
-    _, joints = robot.truth("joint_states", ["position", "velocity"], 2 * n)
+    bags, goal = _files(stack.bag), scenario.goal
+    robots = [RecordedRobot(bag) for bag in bags]
+    joint_names = next((robot.joint_names for robot in robots if robot.joint_names), [])
+    n = len(joint_names)
+    time, pose = _truth(robots, "odom", columns("odom", "pose.pose"))
+    _, joints = _truth(robots, "joint_states", ["position", "velocity"], 2 * n)
     error = PoseError.between(pose[-1, :3], pose[-1, 3:], goal)
-    linear, angular = _momentum_changes(robot)
+    linear, angular = _momentum_changes(robots)
     sim_time, ticks = float(time[-1] - time[0]), len(time) - 1
     interrupted = f"Interrupted after {sim_time:.6g} s of simulated time."
     summary: dict[str, Any] = {
@@ -142,7 +145,7 @@ def _summary(stack: Stack, wall_time: float) -> dict[str, Any]:
         "final_position_m": pose[-1, :3].tolist(),
         "final_attitude_rotvec_rad": rotvec_from_quaternion(pose[-1, 3:]).tolist(),
         "final_joint_positions": joints[-1, :n].tolist(),
-        "joint_names": robot.joint_names,
+        "joint_names": joint_names,
         "position_error_m": error.distance,
         "attitude_error_rad": error.angle,
         "sim_time_s": sim_time,
@@ -152,8 +155,8 @@ def _summary(stack: Stack, wall_time: float) -> dict[str, Any]:
         "ticks": ticks,
         "ticks_per_s": ticks / wall_time,
         "real_time_factor": sim_time / wall_time,
-        "messages_recorded": bag.message_count(),
-        "bag": str(stack.bag),
+        "messages_recorded": sum(bag.message_count() for bag in bags),
+        "bag": str(bags[0].path),
         "momentum_drift": max(linear, angular),
         "linear_momentum_drift": linear,
         "angular_momentum_drift": angular,
@@ -164,15 +167,16 @@ def _summary(stack: Stack, wall_time: float) -> dict[str, Any]:
         "message": interrupted if outcome is Outcome.INTERRUPTED else client.sentence,
         "succeeded": outcome is Outcome.REACHED,
     }
-    tool = robot.get("end_effector_pose")
-    if scenario.end_effector_goal is not None and tool is not None:
-        last = tool.table(columns("end_effector_pose", "pose"))[-1]
+    tools = [tool for robot in robots if (tool := robot.get("end_effector_pose")) is not None]
+    if scenario.end_effector_goal is not None and tools:
+        last = tools[-1].table(columns("end_effector_pose", "pose"))[-1]
         end = PoseError.between(last[:3], last[3:], scenario.end_effector_goal)
         summary["end_effector_final_position_m"] = last[:3].tolist()
         summary["end_effector_position_error_m"] = end.distance
         if _turns_end_effector(client.status):
             summary["end_effector_attitude_error_rad"] = end.angle
-    propellant = _last_diagnosis(bag, PROPELLANT)
+    diagnoses = [_last_diagnosis(bag, PROPELLANT) for bag in bags]
+    propellant = next((value for value in reversed(diagnoses) if value is not None), None)
     if propellant is not None:
         summary["propellant_kg"] = float(propellant)
     return summary
@@ -186,20 +190,45 @@ def _turns_end_effector(status: Status | None) -> bool:
     )
 
 
-def _momentum_changes(robot: RecordedRobot) -> tuple[float, float]:
+def _files(path: Path) -> list[Bag]:
+    """Return the files of a bag in order: one, or ``NAME_0``, ``NAME_1``, ... if it was split."""
+    parts: list[Path] = []
+    while (part := path.with_name(f"{path.stem}_{len(parts)}{path.suffix}")).exists():
+        parts.append(part)
+    return [read_bag(part) for part in ([path] if path.exists() or not parts else parts)]
+
+
+def _truth(
+    robots: Sequence[RecordedRobot], name: str, fields: list[str], width: int | None = None
+) -> tuple[Array, Array]:
+    """Return :meth:`RecordedRobot.truth` of all files; where none has any, its error."""
+    having = [robot for robot in robots if robot.get(name) or robot.get(f"{name}_true")]
+    tables = [robot.truth(name, fields, width) for robot in having or robots[:1]]
+    return np.concatenate([t for t, _ in tables]), np.concatenate([x for _, x in tables])
+
+
+def _momentum_changes(robots: Sequence[RecordedRobot]) -> tuple[float, float]:
     """Return the largest changes of linear and angular momentum that thrust does not explain."""
-    momentum = np.asarray(robot["momentum"].field("data"))[:, :6]
-    expected = robot.get("momentum_expected")
+
+    def data(name: str) -> Array | None:
+        found = [topic for robot in robots if (topic := robot.get(name)) is not None]
+        if not found:
+            return None
+        return np.concatenate([np.asarray(topic.field("data"))[:, :6] for topic in found])
+
+    momentum, expected = data("momentum"), data("momentum_expected")
+    if momentum is None:
+        raise RecordingError(f"The bag {robots[0].bag.path} has no momenta.")
     # Without thrusters nothing is published, and nothing is to change.
     if expected is not None and len(expected) == len(momentum):
-        momentum = momentum - np.asarray(expected.field("data"))
+        momentum = momentum - expected
     linear, angular = np.split(momentum - momentum[0], 2, axis=1)
     return float(np.linalg.norm(linear, axis=1).max()), float(np.linalg.norm(angular, axis=1).max())
 
 
 def _last_diagnosis(bag: Bag, key: str) -> str | None:
     """Return the last value of a key in the recorded diagnostics, None where there is none."""
-    if not bag.message_count("/diagnostics"):
+    if "/diagnostics" not in bag.topics:
         return None
     value = None
     for _, array in bag["/diagnostics"].messages():

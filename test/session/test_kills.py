@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.killed_flight import (
     KILLS,
+    TIMEOUT,
     Away,
     Flight,
     assert_at_rest_while_away,
@@ -43,10 +44,17 @@ def scenario(folder: Path) -> Scenario:
 
 
 @pytest.fixture
-def flight(ros_domain: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Flight]:
+def flight(
+    ros_domain: int,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
+) -> Iterator[Flight]:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
     with ros(private=False):
-        flight = Flight(tmp_path, scenario(tmp_path))
+        commands_end = request.node.callspec.params.get("name") != "recorder"
+        timeout = TIMEOUT if commands_end else 100 * TIMEOUT
+        flight = Flight(tmp_path, scenario(tmp_path), timeout)
         try:
             yield flight
         finally:

@@ -11,6 +11,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from support.made_bags import array, joint_states, made_bag, odometry, pose
 
+from spacerobot_ros.bag import BagWriter, iterate_raw
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import (
@@ -58,7 +59,7 @@ def summary(path: Path, wall_time: float = 0.5, **options: Any) -> dict[str, Any
     """
     scenario = options.pop("scenario", load_scenario("sliding_masses").with_goal(_pose(GOAL)))
     more = options.pop("more", lambda say, time, k: None)
-    true = options.pop("true", False)
+    true, diagnosed = options.pop("true", False), options.pop("diagnosed", True)
     with made_bag(path) as (_, say):
         for k, rates in enumerate(RATES):
             time = 2.0 + 0.25 * k
@@ -75,7 +76,8 @@ def summary(path: Path, wall_time: float = 0.5, **options: Any) -> dict[str, Any
             swing = (0.0, 3.0, -4.0, 0.0)[k]
             say("/momentum", array(5.0 + 3 * swing, 4 * swing, 0, 0, -swing, 7.0, 1.0), time)
             more(say, time, k)
-        say("/diagnostics", DiagnosticArray(), 9.0)
+        if diagnosed:
+            say("/diagnostics", DiagnosticArray(), 9.0)
     flown = Flown(scenario, path, options.pop("client", Client()), PlannerStatistics(0.75, 2, 100))
     assert not options
     return run._summary(flown, wall_time)  # type: ignore[arg-type]
@@ -111,6 +113,29 @@ def test_the_numbers_of_a_flight(tmp_path: Path, true: bool) -> None:
     assert (found["succeeded"], found["state"]) == (True, "reached")
     assert "propellant_kg" not in found
     assert "end_effector_position_error_m" not in found
+
+
+def test_a_bag_without_diagnostics_is_summed_up(tmp_path: Path) -> None:
+    found = summary(tmp_path / "a.mcap", diagnosed=False)
+    assert found["messages_recorded"] == 12
+    assert "propellant_kg" not in found
+
+
+def test_a_flight_whose_bag_was_split_is_summed_up_as_a_whole(tmp_path: Path) -> None:
+    """Some ticks in each of two files, one of them in both, the diagnostics alone in a third."""
+    whole = summary(tmp_path / "whole.mcap")
+    for part in range(3):
+        with BagWriter(tmp_path / f"split_{part}.mcap") as bag:
+            for topic, kind, time_ns, _, raw in iterate_raw(tmp_path / "whole.mcap"):
+                later = time_ns >= 2.4e9 or (topic == "/joint_states" and time_ns > 2.1e9)
+                if part == (2 if topic == "/diagnostics" else later):
+                    bag.write(bag.add_topic(topic, kind), raw, time_ns, time_ns)
+    scenario = load_scenario("sliding_masses").with_goal(_pose(GOAL))
+    path = tmp_path / "split.mcap"
+    flown = Flown(scenario, path, Client(), PlannerStatistics(0.75, 2, 100))
+    found = run._summary(flown, 0.5)  # type: ignore[arg-type]
+    assert found["bag"] == str(tmp_path / "split_0.mcap")
+    assert {**found, "bag": whole["bag"]} == whole
 
 
 def test_momenta_that_thrusters_have_put_in_are_no_drift(tmp_path: Path) -> None:

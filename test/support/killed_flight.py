@@ -28,12 +28,23 @@ Away = list[tuple[float, float]]
 
 
 class Flight:
-    """A scenario in real time, and what kills and restarts its nodes."""
+    """A scenario in real time, and what kills and restarts its nodes.
 
-    def __init__(self, folder: Path, scenario: Scenario) -> None:
+    Parameters
+    ----------
+    folder
+        Of the bags.
+    scenario
+        What is flown.
+    timeout
+        After which the plant does without commands, simulated s. Where no commander is killed it
+        is longer than any busy machine makes one wait.
+    """
+
+    def __init__(self, folder: Path, scenario: Scenario, timeout: float = TIMEOUT) -> None:
         self.folder = folder
         self.bags = [folder / "flight.mcap"]
-        plant = {"time_mode": "realtime", "real_time_factor": PACE, "command_timeout": TIMEOUT}
+        plant = {"time_mode": "realtime", "real_time_factor": PACE, "command_timeout": timeout}
         scenario = scenario.with_overrides("plant", plant).with_overrides(
             "recorder", {"flush_period": 0.1}
         )
