@@ -79,16 +79,20 @@ class EnergyCheck:
     For robots that efforts drive. Under the latch nothing thrusts, both momenta stay, and brakes
     take energy away. After the rearm a controller holds the robot where it is: thrusters may brake
     the base, and the arm may swing with it, but a spring that begins where the robot is and a
-    damper never give more than there was. Thrusters that are on or off push a little too much.
+    damper never give more than there was. Thrusters that are on or off push a little too much, and
+    so do commands that a busy machine holds longer than their control period, in real time.
     """
 
-    FLOOR, FLOOR_OF_NOZZLES = 1e-6, 0.05
-    """Energies that are none, J: rounding; some of the shortest pulses of all thrusters."""
+    FLOOR, FLOOR_OF_LATENESS, FLOOR_OF_NOZZLES = 1e-6, 1e-3, 0.05
+    """Energies that are none, J: rounding; late commands; some of the shortest pulses."""
 
     SHARE = 1.02
 
-    def __init__(self, setup: Setup, situation: Situation) -> None:
+    def __init__(self, setup: Setup, situation: Situation, *, lockstep: bool) -> None:
         self._setup, self._situation = setup, situation
+        self._floor = self.FLOOR if lockstep else self.FLOOR_OF_LATENESS
+        if setup.nozzles:
+            self._floor = self.FLOOR_OF_NOZZLES
         self._most: float | None = None
         """Kinetic energy under the latch at first, J."""
         self._latched_at = -1
@@ -112,10 +116,9 @@ class EnergyCheck:
             # Energy is compared from a latch on alone: later there may be a spring already.
             self._most = energy if situation.latched else None
             return None
-        floor = self.FLOOR_OF_NOZZLES if self._setup.nozzles else self.FLOOR
         self.states += 1
         self.rearmed += situation.rearmed
-        if energy > self.SHARE * self._most + floor:
+        if energy > self.SHARE * self._most + self._floor:
             return f"energy is {energy:.3g} J after a latch, where it was {self._most:.3g} J"
         return None
 

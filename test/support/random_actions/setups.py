@@ -103,8 +103,17 @@ _WALL = {"time_mode": "realtime", "command_timeout": 2.0}
 # The least inertia of the wrist is 0.012 kg m^2, and commands are held for 0.02 s, in real time now
 # and then for twice as long: the gains of the scenarios, which are for 0.01 s, would be unstable.
 _WRIST: dict[str, Any] = {
+    "gains.end_effector_position.kp": 50.0,
+    "gains.end_effector_position.kd": 60.0,
     "gains.end_effector_attitude.kp": 0.4,
     "gains.end_effector_attitude.kd": 0.4,
+}
+
+# Half of the paper's gains, which are for 0.01 s, likewise.
+_HALF: dict[str, Any] = {
+    f"gains.{group}.{name}": gain
+    for group in ("base_position", "base_attitude", "end_effector_position")
+    for name, gain in (("kp", 15.0), ("kd", 30.0))
 }
 
 SETUPS: dict[str, Setup] = {
@@ -165,8 +174,9 @@ SETUPS: dict[str, Setup] = {
             position_tolerance=0.005,
             attitude_tolerance=0.01,
             time_limit=30.0,
+            **_HALF,
         ),
-        real_time={**_WALL, "real_time_factor": 2.0, "command_timeout": 1.0},
+        real_time={**_WALL, "real_time_factor": 1.0, "command_timeout": 1.0},
         reach=(0.1, 0.1, 0.0),
         turn=(0.0, 0.0, 0.1),
         tip=True,
@@ -192,7 +202,7 @@ SETUPS: dict[str, Setup] = {
             time_limit=100.0,
             **_WRIST,
         ),
-        real_time={**_WALL, "real_time_factor": 2.0, "command_timeout": 1.0},
+        real_time={**_WALL, "real_time_factor": 1.0, "command_timeout": 1.0},
         reach=(0.05, 0.05, 0.05),
         turn=(0.05, 0.05, 0.05),
         tip=True,
@@ -211,7 +221,7 @@ SETUPS: dict[str, Setup] = {
             time_limit=100.0,
             **_WRIST,
         ),
-        real_time={**_WALL, "real_time_factor": 2.0, "command_timeout": 1.0},
+        real_time={**_WALL, "real_time_factor": 1.0, "command_timeout": 1.0},
         reach=(0.05, 0.05, 0.05),
         turn=(0.05, 0.05, 0.05),
         tip=True,
