@@ -62,7 +62,8 @@ def assert_flies(
 ) -> TrackedFlight:
     flight = track(robot, schedule)
     assert np.all(np.abs(flight.realised) <= robot.effort_limit)
-    # Feedback may ask for a little more where accelerations jump from one limit to the other.
+    # Not because anything was clipped: feedback may ask for a little more in single ticks, where
+    # accelerations jump from one limit to the other.
     beyond = np.any(np.abs(flight.asked) > robot.effort_limit, axis=1)
     assert beyond.mean() <= 0.01
     left = Rotation.from_quat(flight.quaternion).inv() * Rotation.from_rotvec(turn)
@@ -87,8 +88,8 @@ def test_a_chain_keeps_a_tenth_of_its_efforts() -> None:
     slow = plan(robot, **asked, effort_limits=1)
     assert_flies(robot, slow, CHAIN_TURN, 1e-5)
     assert "effort of pin_" in str(slow.notes["limited_by"])
-    # The same path would take the root of 10 times as long, and of 1 / 0.9 for the reserve.
-    assert fast.duration * 1.5 < slow.duration < fast.duration * 3.3
+    # The same path would take the root of 10 times as long, and of 1 / 0.85 for the reserve.
+    assert fast.duration * 1.5 < slow.duration < fast.duration * 3.5
 
 
 @pytest.mark.slow
@@ -111,7 +112,7 @@ def test_a_tenth_of_the_efforts(name: str, start: list[float], turn: list[float]
     robot = tenth(urdf, np.abs(track(free, fast).asked).max(axis=0))
     slow = plan(robot, **asked, effort_limits=1)
     assert_flies(robot, slow, turn, 1e-4)
-    assert slow.duration < fast.duration * 3.3
+    assert slow.duration < fast.duration * 3.5
 
 
 def test_efforts_are_limited_where_a_controller_is_given_a_reference(chain: SpaceRobot) -> None:
@@ -134,7 +135,7 @@ def test_a_correction_keeps_them(chain: SpaceRobot) -> None:
     goal = Goal.checked(np.zeros(3), Rotation.from_rotvec([0, 0, 0.02]).as_quat())
     schedule = planner.plan(state, goal, correction=True)
     shares = JointEfforts(chain, np.array([0.05, 0.04]), PERIOD).shares(schedule.positions)
-    assert 0.5 < np.abs(shares).max() <= 0.9
+    assert 0.5 < np.abs(shares).max() <= 0.85 * (1 + 1e-8)
 
 
 @pytest.mark.slow
@@ -144,7 +145,7 @@ def test_a_given_duration_is_long_enough_or_refused(chain: SpaceRobot) -> None:
     schedule = plan(chain, **asked, **limited, duration=4.0)
     assert schedule.duration == pytest.approx(4.0)
     shares = JointEfforts(chain, np.array([3.4, 1.6]), PERIOD).shares(schedule.positions)
-    assert np.abs(shares).max() <= 0.9 + 1e-9
+    assert np.abs(shares).max() <= 0.85 * (1 + 1e-8)
     with pytest.raises(PlanningError, match="the solver came to no way that keeps the limits"):
         plan(chain, **asked, **limited, duration=1.5)
 

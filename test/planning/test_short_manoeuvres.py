@@ -75,6 +75,18 @@ def test_a_coarse_control_period_is_no_reason_to_take_long() -> None:
     assert slow.duration <= quick.duration + 2 * 0.5
 
 
+def test_a_closed_loop_has_three_corners() -> None:
+    """Out and back, in two control periods, turns nothing."""
+    start = [1.5, -1.4]
+    asked: dict[str, Any] = {**ASKED, "control_period": 0.5, "starts": 1}
+    schedule = plan(
+        "planar_chain", rotvec=[0, 0, 1e-5], joint_positions=start, start=start, **asked
+    )
+    assert 3 <= schedule.ticks <= 5
+    assert abs(2 * schedule.path.quaternion[-1, 2] - 1e-5) <= 1e-8
+    np.testing.assert_allclose(schedule.positions[-1], start, atol=1e-9)
+
+
 def test_what_one_joint_cannot_reach_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     robot, oracle = SpaceRobot.from_urdf(ONE), PinocchioOracle(ONE, ["j1"])
     # The base turns by the integral of the momentum's ratio, over the joint's travel from 0.3.

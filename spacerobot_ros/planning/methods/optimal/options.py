@@ -58,7 +58,7 @@ class OptimalOptions:
         of_joints=True,
     )
     effort_reserve: float = parameter(
-        0.1,
+        0.15,
         "share of the effort limits that is left to the feedback of the controller",
         minimum=0.0,
         maximum=0.95,
