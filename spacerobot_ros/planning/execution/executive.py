@@ -431,9 +431,13 @@ class Executive:
             return
         found = self._in_motion.remaining(self.config, pursuit, self._stamp_ns, state)
         if found is not None:
-            take_over, state = found
-            reason = PlanReason.SHRINKING_HORIZON
-            self._request(Ticket(pursuit.identified, reason, take_over=take_over), state)
+            ticket = Ticket(
+                pursuit.identified,
+                PlanReason.SHRINKING_HORIZON,
+                take_over=found.take_over,
+                aim=found.aim,
+            )
+            self._request(ticket, found.state)
 
     def _await_take_over(self) -> None:
         """Take the plan that is made in motion, and have it take over at its tick."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
 from spacerobot_ros.planning.core.goal import POSE, Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -18,8 +19,18 @@ from spacerobot_ros.planning.execution.worker import PlanningWorker
 _MOST_ATTEMPTS = 2
 """Plans in motion that are tried for a goal: each takes over twice as late as the one before."""
 
-_NEAR_ENOUGH = 0.5
-"""Share of the tolerances within which the remaining motion is not planned again."""
+_NEAR_ENOUGH, _AIM = 0.6, 0.4
+"""Shares of the tolerances: within the first the remaining motion is not planned again; where it
+is, the second may be left, since late turns of the base take long."""
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """The remaining motion to plan again: when it takes over, the state now, and the goal."""
+
+    take_over: TakeOver
+    state: RobotState
+    aim: Goal
 
 
 class InMotion:
@@ -69,11 +80,11 @@ class InMotion:
 
     def remaining(
         self, config: PlannerConfig, pursuit: Pursuit, stamp_ns: int, state: RobotState
-    ) -> tuple[TakeOver, RobotState] | None:
-        """Return when the remaining motion, planned again, takes over, and the state now.
+    ) -> Remainder | None:
+        """Return what remains to be planned again from ``state``, which is due.
 
-        ``state`` is one that is due. None where it is not time yet, where the motion so far leads
-        near enough to the goal, or where no time is left.
+        None where it is not time yet, where the motion so far leads near enough to the goal, or
+        where no time is left.
         """
         if not self.replans(config, pursuit):
             return None
@@ -82,15 +93,18 @@ class InMotion:
             return None
         self._replan_ns = stamp_ns + round(config.replanning * 1e9)
         position, quaternion = self._tracker.end
-        error = PoseError.between(position, quaternion, pursuit.identified.goal)
-        within = config.tolerance
+        goal, within = pursuit.identified.goal, config.tolerance
+        error = PoseError.between(position, quaternion, goal)
         near = Tolerance(*(_NEAR_ENOUGH * x for x in (within.position, within.attitude)))
         if near.admits(error, pursuit.schedule.controls & POSE):
             return None
         take_over = self._tracker.take_over(stamp_ns, state.q, config.takeover_time)
         if take_over is None:
             return None
-        return take_over, replace(state, q=take_over.shapes[0].copy())
+        moved = error.position * _beyond(error.distance, within.position)
+        turned = quaternion_from_rotvec(error.rotvec * _beyond(error.angle, within.attitude))
+        aim = Goal(position + moved, quaternion_multiply(quaternion, turned), goal.joint_positions)
+        return Remainder(take_over, replace(state, q=take_over.shapes[0].copy()), aim)
 
     def _able(self, config: PlannerConfig, pursuit: Pursuit) -> bool:
         """Whether a plan may take over in motion from what is tracked."""
@@ -99,6 +113,11 @@ class InMotion:
             and not self._tracker.stuck
             and self._worker.starts_in_motion(pursuit.schedule)
         )
+
+
+def _beyond(error: float, tolerance: float) -> float:
+    """Return the share of an error that is to be made good."""
+    return max(0.0, 1.0 - _AIM * tolerance / error) if error > 0 else 0.0
 
 
 def same_goal(first: Goal, second: Goal) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from spacerobot_ros.events import EventKind
-from spacerobot_ros.planning.core.goal import PoseError, RobotState, Tolerance
+from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
@@ -32,6 +32,8 @@ class Ticket:
     remaining: PoseError | None = None
     take_over: TakeOver | None = None
     """When the plan takes over in motion; None: it begins when it is there."""
+    aim: Goal | None = None
+    """What is planned for, if it is not quite the goal."""
 
     def is_late(self, stamp_ns: int) -> bool:
         """Whether the plan should have taken over by now."""
@@ -90,7 +92,7 @@ class PlanDesk:
         self.ticket = ticket
         request = PlanRequest(
             state,
-            ticket.identified.goal,
+            ticket.aim or ticket.identified.goal,
             tolerance,
             correction=ticket.reason in (PlanReason.CORRECTION, PlanReason.CONTINUATION),
             previous=None if pursuit is None else pursuit.schedule,
@@ -114,6 +116,9 @@ class PlanDesk:
         self.plans += 1
         self._out.notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
         if isinstance(result, Planned):
+            # Whatever was aimed at, the goal is what counts.
+            schedule = replace(result.schedule, goal=ticket.identified.goal)
+            result = replace(result, schedule=schedule)
             method, duration = result.schedule.method, result.schedule.duration
             self._out.happened(
                 EventKind.PLAN_READY,

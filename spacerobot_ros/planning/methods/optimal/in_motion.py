@@ -8,13 +8,14 @@ into held commands within the limits.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import NotFoundError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
@@ -41,6 +42,19 @@ rest, but a joint near its limit may need all to come to rest in time."""
 _SLOWER = 0.02
 """Share of velocities that is left for the same reason, at most: a joint at full speed is slowed
 down to the rest in a quarter of a control period."""
+
+_COARSER, _FEWEST_INTERVALS = 4, 10
+"""The grid on which solutions are looked for is coarser by this factor, and has at least as many
+intervals."""
+
+_REFINED = 3
+"""Of the solutions, so many are made into commands, the fastest first, until one keeps all."""
+
+_SAME, _AGREED = 1e-3, 3
+"""Solutions of the same duration, relative, that end the search."""
+
+_FEWEST_TICKS = 4
+"""Control periods that a manoeuvre takes at least."""
 
 _MORE_TICKS = (0, 1, 3, 7)
 """Control periods by which a manoeuvre is made longer where its commands exceed a limit."""
@@ -123,36 +137,47 @@ class MotionSearch:
 
         Raises
         ------
-        PlanningError
+        NotFoundError
             None was found.
         PlanningCancelled
             The search was cancelled.
         """
         boundary = replace(boundary, velocity=self._velocity(motion, limits))
-        found: list[HeldCommands] = []
-        starts, rejection = 0, ""
-        solver = self._solver(intervals, boundary.center is not None)
-        for guess in self._guesses(boundary, limits, solver, motion.remaining):
+        full = self._solver(intervals, boundary.center is not None)
+        coarse = full
+        if intervals >= _COARSER * _FEWEST_INTERVALS:
+            coarse = self._solver(intervals // _COARSER, boundary.center is not None)
+        stop = StopRule(budget.iterations, cancellation)
+        candidates: list[Trajectory] = []
+        starts, rejection = 0, "the solver came to no way that keeps the limits"
+        guesses = self._guesses(boundary, limits, coarse, motion.remaining)
+        for guess in itertools.islice(guesses, budget.starts):
+            starts += 1
+            if budget.duration > 0:
+                candidates.append(guess)
+            else:
+                solution = self._fastest(coarse, boundary, limits, guess, stop, budget)
+                candidates += [] if solution is None else [solution]
+            cancellation.raise_if_requested()
+            if len(candidates) >= budget.solutions or _agreed(candidates):
+                break
+        # What is left of a motion is short: the coarse grid is fine enough for it.
+        fine = coarse if budget.solutions == 1 else full
+        for candidate in sorted(candidates, key=lambda each: each.duration)[:_REFINED]:
             try:
-                held = self._manoeuvre(
-                    solver, boundary, limits, guess, motion, budget, cancellation
-                )
+                held = self._commanded(fine, boundary, limits, candidate, motion, budget, stop)
                 attitudes = np.array([quaternion_multiply(quaternion, x) for x in held.quaternions])
                 self._constraints.check(held.positions, attitudes, self._period)
-                found.append(held)
             except CandidateError as reason:
                 rejection = str(reason)
-            cancellation.raise_if_requested()
-            starts += 1
-            if len(found) >= budget.solutions or starts >= budget.starts:
-                break
-        if not found:
-            raise PlanningError(
-                f"No manoeuvre to the goal that begins in motion was found from {starts} start(s): "
-                f"{rejection}."
-            )
-        durations = [(len(held.positions) - 1) * self._period for held in found]
-        return MovingManoeuvre(min(found, key=lambda held: len(held.positions)), starts, durations)
+                continue
+            finally:
+                cancellation.raise_if_requested()
+            return MovingManoeuvre(held, starts, [each.duration for each in candidates])
+        raise NotFoundError(
+            f"No manoeuvre to the goal that begins in motion was found from {starts} start(s): "
+            f"{rejection}."
+        )
 
     def _speed(self, limits: MotionLimits) -> Array:
         """Return the velocities (n,) that are planned with at most."""
@@ -168,67 +193,94 @@ class MotionSearch:
         speed = self._speed(limits)
         return np.clip(between, -speed, speed)
 
-    def _manoeuvre(
+    def _fastest(
         self,
         solver: MultipleShooting,
         boundary: BoundaryConditions,
         limits: MotionLimits,
         guess: Trajectory,
+        stop: StopRule,
+        budget: MotionBudget,
+    ) -> Trajectory | None:
+        """Return the fastest trajectory near a guess, None if there is none."""
+        shortest = min(_FEWEST_TICKS * self._period, budget.longest)
+        for room in _ROOMS:
+            solution = solver.solve(
+                boundary,
+                self._narrowed(limits, room),
+                guess,
+                stop,
+                shortest=shortest,
+                longest=budget.longest,
+            )
+            if solution is not None or stop.cancellation.requested:
+                return solution
+        return None
+
+    def _narrowed(self, limits: MotionLimits, room: float) -> MotionLimits:
+        velocity = self._speed(limits)
+        return replace(limits, velocity=velocity, acceleration=room * limits.acceleration)
+
+    def _commanded(
+        self,
+        solver: MultipleShooting,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        candidate: Trajectory,
         motion: InitialMotion,
         budget: MotionBudget,
-        cancellation: Cancellation,
+        stop: StopRule,
     ) -> HeldCommands:
-        """Return held commands from a guess.
+        """Return a candidate as held commands.
 
         Raises
         ------
         CandidateError
             There are none that reach the goal within the limits.
         """
-        stop = StopRule(budget.iterations, cancellation)
-        duration, fastest_used = budget.duration, self._speed(limits)
-        for room in _ROOMS:
-            narrowed = replace(
-                limits, velocity=fastest_used, acceleration=room * limits.acceleration
-            )
-            if duration > 0:
-                break
-            fastest = solver.solve(
-                boundary, narrowed, guess, stop, shortest=4 * self._period, longest=budget.longest
-            )
-            cancellation.raise_if_requested()
-            if fastest is not None:
-                guess, duration = fastest, fastest.duration
+        guesses = self._initial_guesses(solver)
+        guess, duration = guesses.refined(candidate), budget.duration
+        most = 1 if duration > 0 else len(_MORE_TICKS)
         if duration == 0:
-            raise CandidateError("the solver came to no way that keeps the limits")
+            finer = self._fastest(solver, boundary, limits, guess, stop, budget)
+            guess = guess if finer is None else finer
+            duration = guess.duration
         ticks = max(1, math.ceil(duration / self._period - 1e-6))
-        for more in _MORE_TICKS if budget.duration == 0 else (0,):
+        for more, room in itertools.product(_MORE_TICKS[:most], _ROOMS):
             T = (ticks + more) * self._period
             solution = solver.solve(
                 boundary,
-                narrowed,
+                self._narrowed(limits, room),
                 replace(guess, step=T / solver.intervals),
                 stop,
                 shortest=T,
                 longest=T,
                 least_effort=True,
             )
-            cancellation.raise_if_requested()
-            if solution is None:
-                continue
-            final = boundary.final
-            if final is None:
-                final = np.clip(solution.shapes[-1], limits.lower, limits.upper)
-            if boundary.center is not None:
-                final = nearest_for_center(self._robot, limits, final, boundary.center)
-            if final is None:
-                continue
-            held = self._holder.hold(
-                solution, boundary, final, limits, fixed=True, before=motion.velocity
-            )
+            if stop.cancellation.requested:
+                break
+            held = None if solution is None else self._held(solution, boundary, limits, motion)
             if held is not None:
                 return held
         raise CandidateError("held commands could not be brought to the goal within the limits")
+
+    def _held(
+        self,
+        solution: Trajectory,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        motion: InitialMotion,
+    ) -> HeldCommands | None:
+        final = boundary.final
+        if final is None:
+            final = np.clip(solution.shapes[-1], limits.lower, limits.upper)
+        if boundary.center is not None:
+            final = nearest_for_center(self._robot, limits, final, boundary.center)
+        if final is None:
+            return None
+        return self._holder.hold(
+            solution, boundary, final, limits, fixed=True, before=motion.velocity
+        )
 
     def _guesses(
         self,
@@ -239,9 +291,18 @@ class MotionSearch:
     ) -> Iterator[Trajectory]:
         """Yield what remains of the motion so far, then guesses with loops, from its velocity."""
         velocity = np.broadcast_to(boundary.velocity, boundary.start.shape)
-        curvature = self._robot.function("curvature", compile=False)
-        guesses = InitialGuesses(solver.turn, curvature, solver.intervals)
+        guesses = self._initial_guesses(solver)
         if len(remaining) > 1:
             yield guesses.along(remaining, velocity, self._period)
         for guess in guesses.of(boundary, limits, boundary.likely):
             yield guesses.moving(guess, velocity, limits)
+
+    def _initial_guesses(self, solver: MultipleShooting) -> InitialGuesses:
+        curvature = self._robot.function("curvature", compile=False)
+        return InitialGuesses(solver.turn, curvature, solver.intervals)
+
+
+def _agreed(found: list[Trajectory]) -> bool:
+    """Whether the fastest trajectory was found often enough."""
+    durations = np.array([each.duration for each in found])
+    return int(np.sum(durations <= durations.min(initial=math.inf) * (1 + _SAME))) >= _AGREED

@@ -47,8 +47,8 @@ from spacerobot_ros.private_files import Cache
 
 _CORRECTION_INTERVALS = 40
 
-_ANSWERS_IN_MOTION = 3
-"""Manoeuvres from moving joints that are enough: the robot flies on meanwhile."""
+_STARTS_IN_MOTION = 12
+"""Guesses that are tried for a manoeuvre from moving joints: the robot flies on meanwhile."""
 
 _NOTHING_LEFT = 1e-10
 """A goal this near, rad, m and joint coordinates, is where the robot is."""
@@ -190,15 +190,15 @@ class OptimalGait(GaitMethod):
         budget = MotionBudget(
             duration,
             chosen.longest,
-            starts=1 if again else chosen.starts,
-            solutions=1 if again else min(chosen.answers, _ANSWERS_IN_MOTION),
+            starts=1 if again else min(chosen.starts, _STARTS_IN_MOTION),
+            solutions=1 if again else chosen.answers,
             iterations=chosen.iterations,
         )
         found = self._motion_search.search(
             boundary,
             limits,
             request.state.quaternion,
-            self._intervals(True),
+            self._intervals(False),
             budget,
             motion,
             cancellation,
