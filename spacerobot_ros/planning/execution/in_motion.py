@@ -19,9 +19,12 @@ from spacerobot_ros.planning.execution.worker import PlanningWorker
 _MOST_ATTEMPTS = 2
 """Plans in motion that are tried for a goal: each takes over twice as late as the one before."""
 
-_NEAR_ENOUGH, _AIM = 0.6, 0.4
-"""Shares of the tolerances: within the first the remaining motion is not planned again; where it
-is, the second may be left, since late turns of the base take long."""
+_NEAR_ENOUGH, _AIM = (0.6, 0.8), (0.4, 0.6)
+"""Shares of the tolerances, early and late in a motion: within the first the remaining motion is
+not planned again; where it is, the second may be left."""
+
+_LATE = 1 / 3
+"""It is late when this share of the motion is left: turns of the base then take long."""
 
 
 @dataclass(frozen=True)
@@ -92,18 +95,22 @@ class InMotion:
         if stamp_ns < self._replan_ns or pursuit.schedule.partial:
             return None
         self._replan_ns = stamp_ns + round(config.replanning * 1e9)
-        position, quaternion = self._tracker.end
+        position, quaternion, extra = self._tracker.end
         goal, within = pursuit.identified.goal, config.tolerance
-        error = PoseError.between(position, quaternion, goal)
-        near = Tolerance(*(_NEAR_ENOUGH * x for x in (within.position, within.attitude)))
+        # Where the base will be, by what its turns so far tell of the model.
+        expected = quaternion_multiply(quaternion, quaternion_from_rotvec(extra))
+        error = PoseError.between(position, expected, goal)
+        late = pursuit.ends_at - stamp_ns / 1e9 < _LATE * pursuit.manoeuvre_time
+        near = Tolerance(*(_NEAR_ENOUGH[late] * x for x in (within.position, within.attitude)))
         if near.admits(error, pursuit.schedule.controls & POSE):
             return None
         take_over = self._tracker.take_over(stamp_ns, state.q, config.takeover_time)
         if take_over is None:
             return None
-        moved = error.position * _beyond(error.distance, within.position)
-        turned = quaternion_from_rotvec(error.rotvec * _beyond(error.angle, within.attitude))
-        aim = Goal(position + moved, quaternion_multiply(quaternion, turned), goal.joint_positions)
+        moved = error.position * _beyond(error.distance, _AIM[late] * within.position)
+        turn = error.rotvec * _beyond(error.angle, _AIM[late] * within.attitude)
+        aimed = quaternion_multiply(quaternion, quaternion_from_rotvec(turn))
+        aim = Goal(position + moved, aimed, goal.joint_positions)
         return Remainder(take_over, replace(state, q=take_over.shapes[0].copy()), aim)
 
     def _able(self, config: PlannerConfig, pursuit: Pursuit) -> bool:
@@ -115,9 +122,9 @@ class InMotion:
         )
 
 
-def _beyond(error: float, tolerance: float) -> float:
-    """Return the share of an error that is to be made good."""
-    return max(0.0, 1.0 - _AIM * tolerance / error) if error > 0 else 0.0
+def _beyond(error: float, left: float) -> float:
+    """Return the share of an error that is to be made good, where some may be left."""
+    return max(0.0, 1.0 - left / error) if error > 0 else 0.0
 
 
 def same_goal(first: Goal, second: Goal) -> bool:

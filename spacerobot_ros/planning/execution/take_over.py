@@ -61,6 +61,30 @@ class TakeOver:
         return cls(start_ns + tick * period_ns, positions[now : tick + 1].copy(), motion)
 
 
+_PRIOR = 0.05
+"""Weight of no error of the model, rad^2: noise of a milliradian, and errors of a few per cent."""
+
+
+class TurnModelError:
+    """By how much a base turns otherwise than predicted, since its masses are not quite known.
+
+    Where the prediction is the rotation vector w, in base components, it turns by ``w + E w``. The
+    estimate of E is that of least squares over all measurements.
+    """
+
+    def __init__(self) -> None:
+        self._squares, self._products = _PRIOR * np.eye(3), np.zeros((3, 3))
+
+    def add(self, predicted: Array, error: Array) -> None:
+        """Add that the base turned by ``predicted + error`` instead of ``predicted``, (3,) each."""
+        self._squares += np.outer(predicted, predicted)
+        self._products += np.outer(error, predicted)
+
+    def expected(self, predicted: Array) -> Array:
+        """Return E w (3,) for a turn w that is predicted."""
+        return np.asarray(self._products @ np.linalg.solve(self._squares, predicted))
+
+
 class PathDeviation:
     """By how much the measured base is off a predicted path, averaged over the last measurements.
 
@@ -70,17 +94,28 @@ class PathDeviation:
         The prediction.
     count
         Measurements to average.
+    model
+        What is known of the robot's turns, and is learnt from these measurements.
     """
 
-    def __init__(self, path: BasePath, count: int) -> None:
+    def __init__(self, path: BasePath, count: int, model: TurnModelError | None = None) -> None:
         self._path = path
         self._recent: deque[Array] = deque(maxlen=count)
+        self._model = model or TurnModelError()
+        self._first: tuple[int, Array] | None = None
 
     def add(self, k: int, position: Array, quaternion: Array) -> None:
         """Add a measured position (3,) and attitude (4,) at instant k of the path."""
         predicted = self._path.quaternion[k]
         turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, quaternion)
         self._recent.append(np.concatenate([position - self._path.position[k], turn]))
+        if self._first is None:
+            self._first = k, turn
+            return
+        begin, offset = self._first
+        to_base = matrix_from_quaternion(self._path.quaternion[begin]).T
+        turned = attitude_error(self._path.quaternion[begin], predicted)
+        self._model.add(turned, to_base @ (turn - offset))
 
     def pose(self, k: int) -> tuple[Array, Array]:
         """Return where the base is at instant k: position (3,) and attitude (4,)."""
@@ -92,14 +127,21 @@ class PathDeviation:
         )
 
     def end(self, k: int) -> tuple[Array, Array]:
-        """Return where the base comes to if it goes on as predicted from instant k."""
-        position, _ = self.pose(k)
+        """Return where the path leads to from instant k, if the base turns as predicted."""
+        position, quaternion = self.pose(k)
         turn = quaternion_from_rotvec(self._mean()[3:])
         way = self._path.position[-1] - self._path.position[k]
         return (
             position + matrix_from_quaternion(turn) @ way,
-            quaternion_multiply(turn, self._path.quaternion[-1]),
+            quaternion_multiply(quaternion, quaternion_from_rotvec(self._ahead(k))),
         )
+
+    def extra_turn(self, k: int) -> Array:
+        """Return by what rotation vector (3,) the base will turn more from instant k to the end."""
+        return self._model.expected(self._ahead(k))
+
+    def _ahead(self, k: int) -> Array:
+        return attitude_error(self._path.quaternion[k], self._path.quaternion[-1])
 
     def _mean(self) -> Array:
         return np.asarray(np.mean(self._recent, axis=0)) if self._recent else np.zeros(6)

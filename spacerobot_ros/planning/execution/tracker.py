@@ -14,7 +14,7 @@ from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.stuck_joints import StuckJointWatch
-from spacerobot_ros.planning.execution.take_over import PathDeviation, TakeOver
+from spacerobot_ros.planning.execution.take_over import PathDeviation, TakeOver, TurnModelError
 
 _AT_END = 1e-6
 """A schedule has ended when every joint is this near its last position, m or rad."""
@@ -188,6 +188,8 @@ class TrackingErrorCheck:
         Largest distance and angle that are near enough, m and rad; 0: any.
     average
         Measured poses whose mean deviation from the path counts for plans in motion; 0: none are.
+    model
+        What is learnt of the robot's turns meanwhile.
     """
 
     def __init__(
@@ -197,9 +199,10 @@ class TrackingErrorCheck:
         position: float,
         attitude: float,
         average: int = 0,
+        model: TurnModelError | None = None,
     ) -> None:
         self._path = schedule.path
-        self._deviation = PathDeviation(schedule.path, average)
+        self._deviation = PathDeviation(schedule.path, average, model)
         self._position, self._attitude = position or np.inf, attitude or np.inf
         self._stamps = start_ns + (schedule.path.time * 1e9).round().astype(np.int64)
         self._slack = round(schedule.control_period * 0.5e9)
@@ -225,9 +228,9 @@ class TrackingErrorCheck:
         return self._deviation.pose(self._next)
 
     @property
-    def end(self) -> tuple[Array, Array]:
-        """Where the base will be at the end of the path by the mean deviation: (3,), (4,)."""
-        return self._deviation.end(self._next)
+    def end(self) -> tuple[Array, Array, Array]:
+        """Where the path leads to by the mean deviation: (3,), (4,), and the extra turn (3,)."""
+        return *self._deviation.end(self._next), self._deviation.extra_turn(self._next)
 
     def error(self, position: Array, quaternion: Array) -> TrackingError | None:
         """Return the tracking error of a pose that is due, None if it is small enough."""
@@ -260,6 +263,7 @@ class TrajectoryTracker:
         self._follower: ScheduleFollower | BrakingFollower | None = None
         self._holding = False
         """Whether the position of the setpoint is the shape to hold."""
+        self._model = TurnModelError()
         band = 2 * config.shape_deadband
         self._watch = StuckJointWatch(robot.n, config.stuck_ticks, config.control_period, band)
 
@@ -282,7 +286,8 @@ class TrajectoryTracker:
         gain = config.shape_gain if self._commands_plant else 0.0
         self._follower = ScheduleFollower(schedule, stamp_ns, gain, config.shape_deadband)
         self._check = TrackingErrorCheck(
-            schedule, stamp_ns, config.drift_position, config.drift_attitude, average
+            *(schedule, stamp_ns, config.drift_position, config.drift_attitude),
+            *(average, self._model),
         )
         self._watch.restart()
 
@@ -338,8 +343,8 @@ class TrajectoryTracker:
         return replace(state, position=position, quaternion=quaternion)
 
     @property
-    def end(self) -> tuple[Array, Array]:
-        """Where the base will be at the end of the path by the mean deviation: (3,), (4,)."""
+    def end(self) -> tuple[Array, Array, Array]:
+        """Where the path leads to by the mean deviation: (3,), (4,), and the extra turn (3,)."""
         return self._check.end
 
     def error(self, state: RobotState) -> TrackingError | None:
