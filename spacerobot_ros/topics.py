@@ -130,6 +130,7 @@ _ODOMETRY = "nav_msgs/msg/Odometry"
 _POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 _STATUS = "diagnostic_msgs/msg/DiagnosticStatus"
 _STRING = "std_msgs/msg/String"
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 
 # The plant publishes its state in this order: the clock first, so that a subscriber that sees a
@@ -228,6 +229,22 @@ _TABLE = (
         of="thrusters",
         # On-times go on from before the first state of a bag.
         verified=False,
+    ),
+    Topic(
+        "/tf",
+        _TRANSFORMS,
+        _PLANT,
+        "base link in the world and links in their parents, as odom and joint_states have them, "
+        "every `tf_period`",
+        when="tf2_msgs is installed; in bags always",
+    ),
+    Topic(
+        "/tf_static",
+        _TRANSFORMS,
+        _PLANT,
+        "the links that fixed joints hold in their parents",
+        when="likewise, and the robot has such links",
+        latched=True,
     ),
     Topic("robot_description", _STRING, _PLANT, "the URDF of the robot", latched=True),
     Topic(

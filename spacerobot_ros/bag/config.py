@@ -28,6 +28,13 @@ class RecorderConfig(WatchdogConfig):
     diagnostics_period: float = parameter(
         0.0, "wall time between diagnostics; 0: losses only", unit="s", minimum=0.0
     )
+    tf_period: float = parameter(
+        0.1,
+        "bag time between transforms of all links, which are put into the bag where nobody "
+        "publishes /tf; 0: none",
+        unit="s",
+        minimum=0.0,
+    )
     flush_period: float = parameter(
         0.5, "wall time that a kill can lose at most", unit="s", minimum=0.01
     )

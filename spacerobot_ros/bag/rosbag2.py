@@ -26,6 +26,14 @@ _TYPE_NAME = re.compile(r"([a-zA-Z]\w*)/(?:msg/)?([a-zA-Z]\w*)", re.ASCII)
 # text of a schema could differ from the text that `ros2 bag record` writes.
 _FIELD_TYPE = re.compile(r"(?:^|\n)\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+", re.ASCII)
 
+_OWN_DEFINITIONS = {
+    ("tf2_msgs", "TFMessage"): (
+        "geometry_msgs/TransformStamped[] transforms\n",
+        "RIHS01_e369d0f05a23ae52508854b66f6aa04437f3449d652e8cbf61d5abe85d020f087",
+    )
+}
+"""Text and hash of types that are in bags whether their packages are installed or not."""
+
 _INTEGERS = {f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
 _PRIMITIVES = {"bool", "byte", "char", "float32", "float64", "string", "wstring", *_INTEGERS}
 
@@ -56,7 +64,12 @@ def message_definition(type_name: str) -> str:
 
 def _with_dependencies(type_name: str, seen: set[str]) -> str:
     package, name = _split(type_name)
-    text = _message_file(package, name).read_bytes().decode()
+    try:
+        text = _message_file(package, name).read_bytes().decode()
+    except RecordingError:
+        if (package, name) not in _OWN_DEFINITIONS:
+            raise
+        text, _ = _OWN_DEFINITIONS[package, name]
     types = {
         found if "/" in found else f"{package}/{found}"
         for found in _FIELD_TYPE.findall(text)
@@ -80,7 +93,12 @@ def type_hash(type_name: str) -> str:
     :func:`message_definition` does.
     """
     package, name = _split(type_name)
-    description = _message_file(package, name).with_suffix(".json")
+    try:
+        description = _message_file(package, name).with_suffix(".json")
+    except RecordingError:
+        if (package, name) not in _OWN_DEFINITIONS:
+            raise
+        return _OWN_DEFINITIONS[package, name][1]
     if not description.is_file():
         return ""
     hashes = json.loads(description.read_bytes())["type_hashes"]

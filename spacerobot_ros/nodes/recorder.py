@@ -29,16 +29,24 @@ from spacerobot_ros.nodes.common.cdr import HEADER_STAMP, NANOSECONDS, first_tim
 from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
+from spacerobot_ros.nodes.common.recorded_transforms import RecordedTransforms
 from spacerobot_ros.nodes.common.remote_parameters import RemoteParameters
 from spacerobot_ros.nodes.common.streams import RawInput, RawStream, Take
+from spacerobot_ros.nodes.common.transforms import (
+    STATIC_TRANSFORMS,
+    TRANSFORM_TYPE,
+    TRANSFORMS,
+)
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.topics import NOT_RECORDED
 
 _CLOCK = "/clock"
 """Where no remap moves it; as every absolute name that a stack uses."""
 
-_SHARED = ("/diagnostics", "/tf", "/tf_static")
+_SHARED = ("/diagnostics", TRANSFORMS, STATIC_TRANSFORMS)
 """Absolute names of what stacks in different namespaces may have in common, before remaps."""
+
+_DESCRIPTION = "robot_description"
 
 _CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
@@ -106,6 +114,15 @@ class RecorderNode(FlightNode):
         self._wanted = {self.resolve_topic_name(topic) for topic in config.topics.split()}
         self._shared = {self._clock, *map(self.resolve_topic_name, _SHARED)}
         self._asked = {}
+        frames = tuple(map(self.resolve_topic_name, (TRANSFORMS, STATIC_TRANSFORMS)))
+        self._listeners: dict[str, Take] = {}
+        if config.tf_period and self._is_chosen(frames[0], TRANSFORM_TYPE):
+            self._listeners = RecordedTransforms(
+                self.recording,
+                config.tf_period,
+                (frames[0], frames[1]),
+                lambda: frames[0] in self._recorded,
+            ).listeners(*map(self.resolve_topic_name, ("odom", "joint_states", _DESCRIPTION)))
         self._recorded: set[str] = set()
         self._unknown: set[str] = set()
         self._diagnostics: Publisher | None = None
@@ -300,7 +317,8 @@ class RecorderNode(FlightNode):
             return
         self._recorded.add(topic)
         self._ask_for_parameters(topic, publishers)
-        take = _take(recording, self._stamps, topic, kind, channel, self._clock)
+        record = _take(recording, self._stamps, topic, kind, channel, self._clock)
+        take = _both(record, self._listeners.get(topic))
         qos = _subscribed_qos(offered)
         if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
             recording.latched[channel] = None
@@ -455,10 +473,22 @@ def _take(
 
     if topic == clock:
         return on_clock
-    if topic.endswith("/robot_description"):
+    if topic.endswith(f"/{_DESCRIPTION}"):
         return on_description
     header = next(iter(kind.get_fields_and_field_types().values()), "")
     return on_stamped if header == "std_msgs/Header" else lambda raw: record(channel, raw)
+
+
+def _both(record: Take, listener: Take | None) -> Take:
+    """Return what records a message, and shows it to a listener then."""
+    if listener is None:
+        return record
+
+    def take(raw: bytes) -> None:
+        record(raw)
+        listener(raw)
+
+    return take
 
 
 def loss_events(recording: Recording, topic: str) -> SubscriptionEventCallbacks:

@@ -133,15 +133,17 @@ def require_values(named: Sequence[str], quantity: str, count: int) -> None:
         raise CommandError(f"{len(named)} joint(s) are named but {count} {quantity} value(s) given")
 
 
-def require_frame(frame: str, base_link: str) -> None:
+def require_frame(frame: str, base_link: str, prefix: str = "") -> None:
     """Refuse a wrench that is not in the frame of the base link; an empty name is that frame.
+
+    The name may have the prefix of the robot's frames, if they have one.
 
     Raises
     ------
     CommandError
         It is one.
     """
-    if frame not in ("", base_link):
+    if frame not in ("", base_link, prefix + base_link):
         raise CommandError(f"the wrench is in frame '{frame}'; it is taken in '{base_link}'")
 
 

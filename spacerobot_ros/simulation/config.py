@@ -112,10 +112,31 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     world_frame: str = parameter("world", "name of the inertial frame")
     end_effector_frame: str = parameter("", "link of end_effector_pose; '': 'end_effector', if any")
     base_pose_period: float = parameter(
-        0.0, "simulated time between base_pose; 0: every tick", unit="s", minimum=0.0, maximum=_FAR
+        0.0,
+        "simulated time between base_pose; 0: every tick. Realtime: at most 0.5 s of wall time",
+        unit="s",
+        minimum=0.0,
+        maximum=_FAR,
     )
     marker_period: float = parameter(
-        0.5, "simulated time between markers; 0: none", unit="s", minimum=0.0, maximum=_FAR
+        0.5,
+        "simulated time between markers; 0: none. Realtime: at most 0.5 s of wall time",
+        unit="s",
+        minimum=0.0,
+        maximum=_FAR,
+    )
+    tf_period: float = parameter(
+        0.1,
+        "simulated time between transforms on /tf; 0: none. Realtime: at most 0.1 s of wall time",
+        unit="s",
+        minimum=0.0,
+        maximum=_FAR,
+    )
+    tf_links: bool = parameter(
+        True, "whether all links are on /tf; false: the base alone, beside robot_state_publisher"
+    )
+    frame_prefix: str = parameter(
+        "", "before the names of the robot's frames, such as 'robot_1/'; not of world_frame"
     )
     diagnostics_period: float = parameter(
         1.0,

@@ -66,7 +66,8 @@ class RecordedFlight:
             stamp = message.header.stamp
             tick, rest = divmod(stamp.sec * _SECOND + stamp.nanosec, self.config.period_ns)
             if not rest and tick not in commands:
-                commands[tick] = read_command(message, source, self.robot)
+                prefix = self.config.frame_prefix
+                commands[tick] = read_command(message, source, self.robot, prefix)
         return commands
 
     @property
@@ -75,14 +76,16 @@ class RecordedFlight:
         return self.recorded.bag.path
 
 
-def read_command(message: Any, source: CommandSource, robot: SpaceRobot) -> RecordedCommand:
+def read_command(
+    message: Any, source: CommandSource, robot: SpaceRobot, frame_prefix: str = ""
+) -> RecordedCommand:
     """Return what a decoded message commands, in the order of the robot's joints.
 
-    Joints that it does not name are commanded nothing.
+    Joints that it does not name are commanded nothing; ``frame_prefix`` is of the robot's frames.
     """
     try:
         if source.quantity == "wrench":
-            require_frame(message.header.frame_id, robot.base_link)
+            require_frame(message.header.frame_id, robot.base_link, frame_prefix)
             force, torque = message.wrench.force, message.wrench.torque
             return np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
         order = joint_order(robot.joint_names, message.name)

@@ -106,7 +106,7 @@ def test_a_new_topic_is_an_entry_in_the_table_and_a_quantity(
     plant = build_plant(SLIDERS, config)
     state = ReportedState(plant, config)
     streams: Any = _Streams()
-    publisher = StatePublisher(streams, SLIDERS, state, "world")
+    publisher = StatePublisher(streams, SLIDERS, state, PlantConfig())
     publisher.publish(0, all_topics=True)
     plant.step(np.array([0.1, 0.0, 0.0]))
     publisher.publish(50_000_000, all_topics=False)

@@ -6,6 +6,7 @@ import math
 import time
 from abc import abstractmethod
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -19,10 +20,13 @@ from sensor_msgs.msg import JointState
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS, JointReader, first_time_ns
 from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.node import STREAM, RobotNode
+from spacerobot_ros.nodes.common.state_synchroniser import StateSynchroniser
 from spacerobot_ros.nodes.common.state_times import StateTimes
+from spacerobot_ros.nodes.common.transforms import KnownFrames, StateFrames, robot_frames
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
@@ -151,6 +155,7 @@ class CommanderNode(RobotNode):
     depends_on = (Role.PLANT,)
 
     config: PlannerConfig | ControllerConfig
+    _states: StateSynchroniser
 
     def listen(self, control_period: float) -> None:
         """Subscribe to what the plant publishes; to be called while the node is configured."""
@@ -169,6 +174,7 @@ class CommanderNode(RobotNode):
         self._joints_input = self.create_subscription(
             JointState, "joint_states", self._on_joints, STREAM, raw=True
         )
+        self._known_frames = KnownFrames(self)
         self._answered = time.monotonic()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_LOOK_PERIOD, self._look_at_times, clock=steady)
@@ -206,6 +212,20 @@ class CommanderNode(RobotNode):
         super().on_silence(silence)
         if self.config.watchdog_action == "abort" and not silence.over:
             self._plant_stopped(Stopped(silence.sentence))
+
+    def _pose_of(self, frame: str) -> Array | None:
+        """Return the pose (7,) of a frame in the world, None if that is not known.
+
+        The robot's own frames are where they were measured last, the others where /tf had them.
+        """
+        own: dict[str, tuple[str, Array]] = {}
+        robot, states = self._robot, self._states
+        if robot is not None and states.odom and states.joint_states:
+            state = StateFrames(robot.description)
+            with suppress(CommandError):  # Of another robot: nothing is known then.
+                state.accept(states.odom, states.joint_states)
+                own = robot_frames(robot.description, state)
+        return self._known_frames.pose(frame, self.config.world_frame, own)
 
     # -- what the plant publishes -------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from visualization_msgs.msg import Marker
 from spacerobot_ros.bag import message_definition
 from spacerobot_ros.errors import PlanningError, RecordingError, SpaceRobotError
 from spacerobot_ros.model.description import Array, Shape
+from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_multiply
 from spacerobot_ros.planning import Goal
 
 _KINDS = {
@@ -71,20 +72,40 @@ def shape_marker(shape: Shape, frame: str, namespace: str, number: int) -> Marke
 
 
 def goal_of(
-    message: PoseStamped, frame: str, what: str = "The goal pose", shape: Array | None = None
+    message: PoseStamped,
+    frame: str,
+    what: str = "The goal pose",
+    shape: Array | None = None,
+    pose_of: Callable[[str], Array | None] = lambda frame: None,
 ) -> Goal:
-    """Return the goal of a pose message, which is taken in ``frame``; ``shape`` goes with it.
+    """Return the goal of a pose message in ``frame``; ``shape`` goes with it.
+
+    ``pose_of`` returns the pose (7,) of another frame in that one, None for one that is not known.
 
     Raises
     ------
     PlanningError
         It is in another frame, or no pose; ``what`` names it.
     """
-    given = message.header.frame_id
-    if given not in ("", frame):
-        raise PlanningError(f"{what} is in frame '{given}'; goals are taken in '{frame}'.")
+    given = message.header.frame_id.removeprefix("/")
     p, o = message.pose.position, message.pose.orientation
-    return Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w], shape)
+    if given in ("", frame):
+        return Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w], shape)
+    pose = pose_of(given)
+    if pose is None:
+        raise PlanningError(
+            f"{what} is in frame '{given}'; goals are taken in '{frame}', in frames of the robot "
+            "once its state is known, and in those that /tf connects with them."
+        )
+    goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w], shape)
+    moved = chained(pose, np.concatenate([goal.position, goal.quaternion]))
+    return Goal.checked(moved[:3], moved[3:], shape)
+
+
+def chained(outer: Array, inner: Array) -> Array:
+    """Return the pose (7,) that ``inner`` has where the frame that it is in has ``outer``."""
+    position = outer[:3] + matrix_from_quaternion(outer[3:]) @ inner[:3]
+    return np.concatenate([position, quaternion_multiply(outer[3:], inner[3:])])
 
 
 def shape_of(message: JointState, joint_names: Sequence[str]) -> Array:

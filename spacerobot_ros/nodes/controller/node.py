@@ -148,7 +148,7 @@ class CoordinatedControlNode(CommanderNode):
         goal_id = self._goal_ids.of(stamp.sec, stamp.nanosec)
         what = f"The goal of the {key.replace('_', '-')}"
         try:
-            goal = goal_of(message, self.config.world_frame, what)
+            goal = goal_of(message, self.config.world_frame, what, pose_of=self._pose_of)
         except PlanningError as error:
             self._refuse(error, goal_id)
             return

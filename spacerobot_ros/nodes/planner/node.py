@@ -161,7 +161,9 @@ class PlannerNode(CommanderNode):
             return
         goal_id = self._goal_ids.of(message.header.stamp.sec, message.header.stamp.nanosec)
         try:
-            goal = goal_of(message, self.config.world_frame, shape=self._goal_shape)
+            goal = goal_of(
+                message, self.config.world_frame, shape=self._goal_shape, pose_of=self._pose_of
+            )
         except PlanningError as error:
             self._publish_status(PlannerStatus(PlannerState.REFUSED, str(error), goal_id=goal_id))
             return

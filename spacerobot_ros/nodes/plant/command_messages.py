@@ -29,14 +29,19 @@ class CommandReader:
         Where the commands come from.
     robot
         The model.
+    frame_prefix
+        Which the name of the base link may have in commands.
     """
 
-    def __init__(self, source: CommandSource, robot: SpaceRobot) -> None:
+    def __init__(self, source: CommandSource, robot: SpaceRobot, frame_prefix: str = "") -> None:
         self.source = source
         self.message_type: type[Any] = JointState
         self._reader: JointReader | _WrenchReader
         if source.quantity == "wrench":
-            self.message_type, self._reader = WrenchStamped, _WrenchReader(robot.base_link)
+            self.message_type, self._reader = (
+                WrenchStamped,
+                _WrenchReader(robot.base_link, frame_prefix),
+            )
             self._values = self._reader.values
         else:
             self._reader = JointReader(robot.joint_names, [source.quantity])
@@ -56,16 +61,16 @@ class CommandReader:
 class _WrenchReader:
     """Reads force over torque (6,) into ``values``; their frame must be that of the base link."""
 
-    def __init__(self, base_link: str) -> None:
+    def __init__(self, base_link: str, frame_prefix: str) -> None:
         self.values: Array = np.zeros(6)
-        self._base_link = base_link
+        self._base_link, self._prefix = base_link, frame_prefix
         self._reader = TemplateReader(WrenchStamped, lambda _: {"wrench.force.x": 6})
 
     def accept(self, raw: bytes) -> int:
         self._reader.accept(raw)
         message = self._reader.prototype
         assert message is not None
-        require_frame(message.header.frame_id, self._base_link)
+        require_frame(message.header.frame_id, self._base_link, self._prefix)
         self.values[:] = self._reader.floats("wrench.force.x")
         return self._reader.stamp_ns
 

@@ -29,7 +29,11 @@ from spacerobot_ros.nodes.common.streams import RawInput
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
 from spacerobot_ros.nodes.plant.command_messages import CommandReader
 from spacerobot_ros.nodes.plant.diagnostics import PlantReport
-from spacerobot_ros.nodes.plant.publisher import LinkMarkers, StatePublisher
+from spacerobot_ros.nodes.plant.publisher import (
+    LinkMarkers,
+    StatePublisher,
+    TransformPublisher,
+)
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.building import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
@@ -54,6 +58,9 @@ _LONGEST_REST = 0.8
 
 _REPORT_PERIOD_NS = 950_000_000
 """Wall time without diagnostics after which they are due: with the look's, one a second."""
+
+_VIEWED, _VIEWED_FRAMES = 0.5, 0.1
+"""Longest wall s, in real time, from one look of the robot to the next: markers, and /tf."""
 
 # Looked up for every command: an enum takes its time to find a member.
 _RUNNING, _PAUSED, _RESTING = PlantState.RUNNING, PlantState.PAUSED, PlantState.RESTING
@@ -98,6 +105,11 @@ class PlantNode(FlightNode):
         return self.time_ns / NANOSECONDS
 
     @property
+    def status_topic(self) -> str:
+        """Full name of the topic of the status, which is published from the beginning."""
+        return str(self._status.topic_name)
+
+    @property
     def state(self) -> PlantState:
         """What the plant does with time and with commands."""
         return self.status.state
@@ -137,14 +149,18 @@ class PlantNode(FlightNode):
         self._monitor = PlantMonitor(
             self._commands, self.plant, lockstep=self._lockstep is not None
         )
-        self._publisher = StatePublisher(self, robot, self._reported, config.world_frame)
+        self._publisher = StatePublisher(self, robot, self._reported, config)
+        self._transforms = TransformPublisher(self, robot, self._reported, config)
         self._markers = LinkMarkers(self, self.plant, config.world_frame)
         self._report = PlantReport(self, self.plant, self._commands, self._real_time)
-        self._pose_ticks = self._ticks(config.base_pose_period) or 1
-        self._marker_ticks = self._ticks(config.marker_period)
+        self._pose_ticks = self._viewed_ticks(config.base_pose_period, _VIEWED) or 1
+        self._marker_ticks = self._viewed_ticks(config.marker_period, _VIEWED)
+        self._tf_ticks = 0
+        if self._transforms.publishes:
+            self._tf_ticks = self._viewed_ticks(config.tf_period, _VIEWED_FRAMES)
         self._report_ticks = self._ticks(config.diagnostics_period)
         for source in self._commands.sources:
-            reader = CommandReader(source, robot)
+            reader = CommandReader(source, robot, config.frame_prefix)
             self.take_raw(
                 reader.message_type,
                 source.topic,
@@ -165,6 +181,8 @@ class PlantNode(FlightNode):
         self._active = self._when_active
         self._commands.begin(self.time_ns)
         self._publisher.publish_description()
+        if self._tf_ticks:
+            self._transforms.publish_static(self.time_ns)
         self._steady = steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._reported_ns = steady.now().nanoseconds
         if self._real_time is None:
@@ -301,6 +319,8 @@ class PlantNode(FlightNode):
         self._publisher.publish(now, all_topics=self._tick % self._pose_ticks == 0)
         if self._marker_ticks and self._tick % self._marker_ticks == 0:
             self._markers.publish(now)
+        if self._tf_ticks and self._tick % self._tf_ticks == 0:
+            self._transforms.publish(now)
         if self._report_ticks and self._tick % self._report_ticks == 0:
             self._publish_report()
 
@@ -315,6 +335,12 @@ class PlantNode(FlightNode):
 
     def _ticks(self, seconds: float) -> int:
         return max(1, round(seconds * NANOSECONDS / self._period_ns)) if seconds else 0
+
+    def _viewed_ticks(self, seconds: float, longest_wall: float) -> int:
+        """Return the ticks of a period; in real time somebody may look, whatever a file says."""
+        if self._real_time is not None and seconds:
+            seconds = min(seconds, longest_wall * self.config.real_time_factor)
+        return self._ticks(seconds)
 
     def _on_wall_tick(self) -> None:
         real_time = self._real_time

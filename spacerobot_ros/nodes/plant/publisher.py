@@ -18,6 +18,13 @@ from spacerobot_ros.nodes.common.cdr import MessageTemplate, stamp_bytes
 from spacerobot_ros.nodes.common.messages import message_class, shape_marker
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.streams import RawOutput
+from spacerobot_ros.nodes.common.transforms import (
+    STATIC_TRANSFORMS,
+    TRANSFORMS,
+    RobotTransforms,
+    transform_class,
+)
+from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.reported_state import ReportedState
 from spacerobot_ros.topics import TOPICS, Topic
@@ -37,14 +44,16 @@ class StatePublisher:
         Whose state it is.
     state
         What it reports.
-    world_frame
-        Name of the inertial frame.
+    config
+        Names of the frames.
     """
 
     def __init__(
-        self, node: FlightNode, robot: SpaceRobot, state: ReportedState, world_frame: str
+        self, node: FlightNode, robot: SpaceRobot, state: ReportedState, config: PlantConfig
     ) -> None:
-        self._node, self._robot, self._state, self._world = node, robot, state, world_frame
+        self._node, self._robot, self._state = node, robot, state
+        self._world = config.world_frame
+        self._base = config.frame_prefix + robot.base_link
         self._outputs: dict[str, RawOutput] = {}
         self._readers: frozenset[bytes] = frozenset()
         self._matched = 0
@@ -114,14 +123,13 @@ class StatePublisher:
         message = message_class(topic.type)()
         names = list(self._state.names(topic))
         if topic.state and hasattr(message, "header"):
-            base = self._robot.base_link
-            message.header.frame_id = base if topic.frame == "base" else self._world
+            message.header.frame_id = self._base if topic.frame == "base" else self._world
         for field in topic.state:
             if not field.members:
                 setattr(message, field.path, [0.0] * len(field.entries or names))
         match message:
             case Odometry():
-                message.child_frame_id = self._robot.base_link
+                message.child_frame_id = self._base
             case JointState():
                 message.name = names
             case Float64MultiArray():
@@ -136,6 +144,42 @@ class StatePublisher:
             if values.size:
                 template.feed(field.columns[0], values)
         return template
+
+
+class TransformPublisher:
+    """The measured frames of a robot on /tf, and those that do not move on /tf_static.
+
+    Without ``tf2_msgs`` there is nothing to publish with; bags have transforms all the same.
+    """
+
+    def __init__(
+        self, node: FlightNode, robot: SpaceRobot, state: ReportedState, config: PlantConfig
+    ) -> None:
+        self._state, self._kind = state, transform_class()
+        if self._kind is None or not config.tf_period:
+            self.publishes = False
+            return
+        self.publishes = True
+        self._frames = RobotTransforms(
+            robot.description, config.world_frame, config.frame_prefix, links=config.tf_links
+        )
+        self._stream = node.send_raw(self._kind, TRANSFORMS)
+        self._static: RawOutput | None = None
+        if self._frames.static_message(0) is not None:
+            self._static = node.send_raw(self._kind, STATIC_TRANSFORMS, LATCHED)
+
+    def publish_static(self, time_ns: int) -> None:
+        """Publish what does not move."""
+        if self._static is not None:
+            self._static.take(self._frames.static_message(time_ns) or b"")
+
+    def publish(self, time_ns: int) -> None:
+        """Publish the state that was reported last; without a pose there is nothing to say."""
+        if not self._state.sensors.dropout:
+            quantities = self._state.quantities
+            self._stream.take(
+                self._frames.message(time_ns, quantities["measured_pose"], quantities["measured_q"])
+            )
 
 
 class LinkMarkers:

@@ -1,0 +1,186 @@
+"""Frames: what bags hold on /tf against odom and Pinocchio, and goals in frames of the robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio
+import pytest
+from geometry_msgs.msg import TransformStamped
+from rclpy.serialization import serialize_message
+from support.ros_harness import Harness
+
+from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
+from spacerobot_ros.bag.recorded_robot import columns
+from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.model.urdf import load_robot
+from spacerobot_ros.nodes import PlantNode, RecorderNode
+from spacerobot_ros.nodes.common.messages import chained
+from spacerobot_ros.nodes.common.transforms import KnownFrames, TransformTemplate
+from spacerobot_ros.resources import resource_names, robot_file
+
+TOLERANCE = 1e-12
+
+
+def placed(transform: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotation matrix and position of a geometry_msgs/Transform."""
+    r, o = transform.translation, transform.rotation
+    R = matrix_from_quaternion([o.x, o.y, o.z, o.w])
+    return R, np.array([r.x, r.y, r.z])
+
+
+def world_poses(
+    messages: list[Any], world: str = "world"
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return rotation and position in the world of every frame, the root's parent first."""
+    parents = {t.child_frame_id: t for message in messages for t in message.transforms}
+    found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+
+    def of(frame: str) -> tuple[np.ndarray, np.ndarray]:
+        if frame == world:
+            return np.eye(3), np.zeros(3)
+        R, r = of(parents[frame].header.frame_id)
+        step_R, step_r = placed(parents[frame].transform)
+        return R @ step_R, r + R @ step_r
+
+    for frame in parents:
+        found[frame] = of(frame)
+    return found
+
+
+def record_states(harness: Harness, bag: Path, robot: str, **plant: Any) -> Bag:
+    """Record some states of a robot whose joints are where none of them is at zero."""
+    n = len(load_robot(robot_file(robot)).joint_names)
+    shape = [0.02 + 0.013 * i for i in range(n)]
+    values = {
+        "robot": robot,
+        "actuation": "effort",
+        "tick_rate": 50.0,
+        "initial_position": [0.3, -0.2, 0.7],
+        "initial_orientation": [0.1, -0.3, 0.2, 0.9],
+        "initial_joint_positions": shape,
+        "initial_joint_velocities": [0.01 + 0.003 * i for i in range(n)],
+        "angular_momentum": [0.3, 0.1, -0.2],
+        **plant,
+    }
+    node = harness.make(PlantNode, values, autostart=False)
+    node.require(node.trigger_configure)
+    recorder = harness.make(RecorderNode, {"bag": str(bag)}, autostart=False)
+    recorder.watch([node])
+    recorder.start()
+    harness.spin_until(lambda: {"/odom", "/joint_states", "/robot_description"} <= recorder.topics)
+    node.require(node.trigger_activate)
+    harness.spin_until(lambda: node.tick > 25)
+    node.trigger_deactivate()
+    recorder.trigger_deactivate()
+    recorder.trigger_cleanup()
+    return read_bag(bag)
+
+
+@pytest.mark.parametrize("robot", ["servicer", "sliding_masses"])
+def test_a_bag_has_the_frames_of_odom_and_of_pinocchio(
+    harness: Harness, tmp_path: Path, robot: str
+) -> None:
+    bag = record_states(harness, tmp_path / "bag.mcap", robot)
+    assert bag.topics["/tf"] == "tf2_msgs/msg/TFMessage"
+    recorded = RecordedRobot(bag)
+    odom, joints = recorded["odom"], recorded["joint_states"]
+    poses = odom.table(columns("odom", "pose.pose"))
+    positions = np.asarray(joints.field("position"))
+    static = [message for _, message in bag["/tf_static"].messages()] if "/tf_static" in (
+        bag.topics
+    ) else []  # fmt: skip
+    model = pinocchio.buildModelFromXML(
+        robot_file(robot).read_text(), pinocchio.JointModelFreeFlyer()
+    )
+    data = model.createData()
+    names = recorded.joint_names
+    seen = 0
+    for _, message in bag["/tf"].messages():
+        stamps = {(t.header.stamp.sec, t.header.stamp.nanosec) for t in message.transforms}
+        ((sec, nanosec),) = stamps
+        (k,) = np.flatnonzero(odom.stamp_ns == sec * 10**9 + nanosec)
+        (j,) = np.flatnonzero(joints.stamp_ns == sec * 10**9 + nanosec)
+        q = pinocchio.neutral(model)
+        q[:7] = poses[k]
+        for name, value in zip(names, positions[j], strict=True):
+            joint = model.joints[model.getJointId(name)]
+            q[joint.idx_q : joint.idx_q + joint.nq] = (
+                [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+            )
+        pinocchio.framesForwardKinematics(model, data, q)
+        found = world_poses([message, *static])
+        links = {link.name for link in load_robot(robot_file(robot)).links}
+        assert set(found) == links
+        for link in links:
+            oracle = data.oMf[model.getFrameId(link)]
+            R, r = found[link]
+            assert np.abs(r - oracle.translation).max() < TOLERANCE
+            assert np.abs(R - oracle.rotation).max() < TOLERANCE
+        base = next(t for t in message.transforms if t.header.frame_id == "world").transform
+        r, o = base.translation, base.rotation
+        assert [r.x, r.y, r.z, o.x, o.y, o.z, o.w] == poses[k].tolist()
+        seen += 1
+    assert seen >= 3
+    # One every 0.1 s: every fifth state.
+    gaps = np.diff([t for t, _ in bag["/tf"].messages()])
+    assert set(gaps) == {100_000_000}
+
+
+def test_frames_have_the_prefix_that_they_are_given(harness: Harness, tmp_path: Path) -> None:
+    bag = record_states(
+        harness, tmp_path / "bag.mcap", "servicer", frame_prefix="one/", world_frame="orbit"
+    )
+    _, message = next(iter(bag["/tf"].messages()))
+    for transform in message.transforms:
+        assert transform.child_frame_id.startswith("one/")
+        assert transform.header.frame_id == "orbit" or transform.header.frame_id.startswith("one/")
+    _, odom = next(iter(bag["/odom"].messages()))
+    assert (odom.header.frame_id, odom.child_frame_id) == ("orbit", "one/base_link")
+
+
+@pytest.mark.parametrize("robot", resource_names("urdf", ".urdf"))
+def test_serialised_frames_are_what_ros_makes_of_each(robot: str) -> None:
+    links = [joint.child for joint in load_robot(robot_file(robot)).joints]
+    frames = tuple((f"p{'x' * i}", name) for i, name in enumerate(links))
+    poses = np.random.default_rng(3).normal(size=(len(frames), 7))
+    raw = TransformTemplate(frames).serialised(5_000_000_007, poses)
+    place = 8
+    for (parent, child), pose in zip(frames, poses, strict=True):
+        one = TransformStamped(child_frame_id=child)
+        one.header.frame_id = parent
+        one.header.stamp.sec, one.header.stamp.nanosec = 5, 7
+        t = one.transform.translation
+        t.x, t.y, t.z = pose[:3].tolist()
+        o = one.transform.rotation
+        o.x, o.y, o.z, o.w = pose[3:].tolist()
+        # Alone a message begins where doubles are aligned; in the list wherever the last ended.
+        head = serialize_message(one)[4:]
+        first = 8 + 4 + len(parent) + 1
+        second = first + -first % 4
+        text = second + 4 + len(child) + 1
+        assert raw[place : place + first] == head[:first]
+        assert raw[place + second : place + text] == head[second:text], "but for the padding"
+        end = place + text
+        end += -(end - 4) % 8
+        assert raw[end : end + 56] == head[-56:]
+        place = end + 56
+    assert len(raw) == place
+
+
+def test_chains_of_frames_end_in_the_world_or_nowhere() -> None:
+    class Deaf:
+        def create_subscription(self, *given: Any, **options: Any) -> None: ...
+
+    frames = KnownFrames(Deaf())
+    half = np.sqrt(0.5)
+    up = np.array([0.0, 0.0, 1.0, 0.0, 0.0, half, half])
+    own = {"a": ("world", up), "b": ("a", up), "x": ("y", up), "y": ("x", up)}
+    assert frames.pose("world", "world", own) == pytest.approx([0, 0, 0, 0, 0, 0, 1])
+    assert frames.pose("b", "world", own) == pytest.approx([0, 0, 2, 0, 0, 1, 0])
+    assert frames.pose("x", "world", own) is None
+    assert frames.pose("moon", "world", own) is None
+    aside = chained(up, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
+    assert aside == pytest.approx([0, 1, 1, 0, 0, half, half])
