@@ -29,7 +29,7 @@ _FIELD_TYPE = re.compile(r"(?:^|\n)\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+", re.AS
 _OWN_DEFINITIONS = {
     ("tf2_msgs", "TFMessage"): (
         "geometry_msgs/TransformStamped[] transforms\n",
-        "RIHS01_e369d0f05a23ae52508854b66f6aa04437f3449d652e8cbf61d5abe85d020f087",
+        "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
     )
 }
 """Text and hash of types that are in bags whether their packages are installed or not."""

@@ -119,7 +119,7 @@ def test_every_message_opens_with_other_libraries(result: RunResult) -> None:
     assert len(by_mcap) == len(by_rosbags) == result.summary["messages_recorded"]
     topics = {"/clock", "/odom", "/base_pose", "/joint_states", "/momentum", "/joint_commands"}
     topics |= {"/goal_pose", "/gait_schedule", "/planned_path", "/planner/status", "/markers"}
-    topics |= {"/plant/status", "/events"}
+    topics |= {"/plant/status", "/events", "/tf"}
     assert {topic for topic, _, _ in by_mcap} == topics | {"/diagnostics", "/robot_description"}
 
     def positions(entries: list[tuple[str, int, Any]]) -> list[float]:

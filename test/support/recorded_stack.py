@@ -34,6 +34,9 @@ STREAMS = (
     "/diagnostics", "/goal_pose", "/events",
 )  # fmt: skip
 
+WRITTEN_BY_THE_RECORDER = ("/tf", "/tf_static")
+"""Nobody publishes them where tf2_msgs is not installed."""
+
 
 def parameters_of(node: FlightNode) -> dict[str, str]:
     """Return a node's parameters as JSON texts by name, for a bag's metadata."""
@@ -64,10 +67,12 @@ class BagContent:
             reader = make_reader(file)
             for schema, channel, record in reader.iter_messages(log_time_order=False):
                 assert schema is not None
+                self.log_times.append(record.log_time)
+                if channel.topic in WRITTEN_BY_THE_RECORDER:
+                    continue
                 message = deserialize_message(record.data, message_class(schema.name))
                 entry = Recorded(record.log_time, record.publish_time, message)
                 self.by_topic.setdefault(channel.topic, []).append(entry)
-                self.log_times.append(record.log_time)
             self.metadata = {m.name: dict(m.metadata) for m in reader.iter_metadata()}
             self.attachments = {a.name: (a.media_type, a.data) for a in reader.iter_attachments()}
 
