@@ -10,10 +10,14 @@ import pinocchio
 import pytest
 from geometry_msgs.msg import TransformStamped
 from rclpy.serialization import serialize_message
+from scipy.spatial.transform import Rotation
+from support.planner_flight import NEAR, Flight, goal_at, values_of
 from support.ros_harness import Harness
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
 from spacerobot_ros.bag.recorded_robot import columns
+from spacerobot_ros.model.link_transforms import LinkTransforms
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
@@ -184,3 +188,39 @@ def test_chains_of_frames_end_in_the_world_or_nowhere() -> None:
     assert frames.pose("moon", "world", own) is None
     aside = chained(up, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
     assert aside == pytest.approx([0, 1, 1, 0, 0, half, half])
+
+
+LINK = next(joint for joint in load_robot(robot_file("sliding_masses")).joints).child
+
+
+@pytest.mark.parametrize("frame", ["base_link", "/base_link", LINK])
+def test_a_goal_in_a_frame_of_the_robot_is_one_in_the_world(harness: Harness, frame: str) -> None:
+    away, turned = [0.4, -0.2, 0.3], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]
+    flight = Flight(harness, None, {"initial_position": away, "initial_orientation": turned})
+    flight.start()
+    flight.ticks(2)
+    base = np.array([*away, *turned])
+    links = LinkTransforms(load_robot(robot_file("sliding_masses")))
+    pose = base if frame != LINK else chained(base, links.poses[0])
+    # The base where it is now, as it looks from the frame, and 3 cm ahead of that.
+    there = np.linalg.inv(homogeneous(pose)) @ homogeneous(base)
+    there[:3, 3] += 0.03 * there[:3, 0]
+    goal = goal_at((there[:3, 3], Rotation.from_matrix(there[:3, :3]).as_rotvec()), frame)
+    values = values_of(flight.decide(goal))
+    assert values["state"] != "refused", values
+    position = [float(x) for x in values["goal"].split()[:3]]
+    expected = homogeneous(pose) @ there
+    assert position == pytest.approx(expected[:3, 3].tolist(), abs=1e-9)
+
+
+def test_a_goal_in_an_unknown_frame_is_refused_with_what_is_known(harness: Harness) -> None:
+    flight = Flight(harness)
+    status = flight.decide(goal_at(NEAR, "moon"))
+    assert values_of(status)["state"] == "refused"
+    assert_one_sentence(status.message, "'moon'", "'world'", "/tf")
+
+
+def homogeneous(pose: Any) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]
+    return matrix

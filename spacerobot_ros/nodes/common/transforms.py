@@ -245,4 +245,3 @@ def robot_frames(description: RobotDescription, state: StateFrames) -> dict[str,
         for (parent, child), pose in zip(names, poses, strict=True):
             frames[prefix + child] = prefix + parent, pose
     return frames
-

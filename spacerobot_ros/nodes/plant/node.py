@@ -105,11 +105,6 @@ class PlantNode(FlightNode):
         return self.time_ns / NANOSECONDS
 
     @property
-    def status_topic(self) -> str:
-        """Full name of the topic of the status, which is published from the beginning."""
-        return str(self._status.topic_name)
-
-    @property
     def state(self) -> PlantState:
         """What the plant does with time and with commands."""
         return self.status.state
