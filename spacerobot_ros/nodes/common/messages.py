@@ -88,16 +88,18 @@ def goal_of(
         It is in another frame, or no pose; ``what`` names it.
     """
     given = message.header.frame_id.removeprefix("/")
+    pose = None
+    if given not in ("", frame):
+        pose = pose_of(given)
+        if pose is None:
+            raise PlanningError(
+                f"{what} is in frame '{given}'; goals are taken in '{frame}', in frames of the "
+                "robot once its state is known, and in those that /tf connects with them."
+            )
     p, o = message.pose.position, message.pose.orientation
-    if given in ("", frame):
-        return Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w], shape)
-    pose = pose_of(given)
-    if pose is None:
-        raise PlanningError(
-            f"{what} is in frame '{given}'; goals are taken in '{frame}', in frames of the robot "
-            "once its state is known, and in those that /tf connects with them."
-        )
     goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w], shape)
+    if pose is None:
+        return goal
     moved = chained(pose, np.concatenate([goal.position, goal.quaternion]))
     return Goal.checked(moved[:3], moved[3:], shape)
 
