@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,11 +21,12 @@ from support.slides_and_turns import PERIOD, goal_at, note, origin, planner, sta
 
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import Tolerance, plan
+from spacerobot_ros.planning import PlanRequest, Tolerance, plan
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.state_machine import Phase
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
+from spacerobot_ros.planning.methods.auto import _Result
 from spacerobot_ros.planning.methods.geometric_phase import (
     PlanarPhase,
     curvature_peaks,
@@ -196,3 +199,15 @@ def test_of_equally_good_shapes_the_one_nearest_to_the_middle_is_taken() -> None
     at = np.array([[-1.0, 0.2], [1.0, 0.2], [0.9, -0.1], [0.95, 0.1]])
     assert _most_central(at, np.array([1.0, 1.0, 0.5, 1.0]), np.array([0.9, 0.0])) == 3
     assert _most_central(at, np.array([1.0, 1.0, 0.5, 1.0]), np.array([-0.9, 0.0])) == 0
+
+
+def test_whether_a_plan_reaches_a_shape_is_told_by_where_it_ends() -> None:
+    controls: frozenset[Any] = frozenset({"position", "shape"})
+    state = origin()
+    aim = goal_at([0.05, -0.03, 0.02], Rotation.identity())
+    end = -8 * aim.position
+    for shape, reaches in ((end, True), (state.q, False), (end + 0.01, False)):
+        goal = replace(aim, joint_positions=shape)
+        request = PlanRequest(state, goal, Tolerance(1e-6, 1e-6, 1e-3))
+        schedule = replace(StubMethod().plan(request), controls=controls)
+        assert _Result.of(schedule, request).reaches is reaches
