@@ -219,6 +219,7 @@ class OptimalGait(GaitMethod):
             longest=chosen.longest,
             starts=chosen.starts,
             solutions=1 if correction else chosen.answers,
+            agreeing=chosen.agreeing,
             iterations=chosen.iterations,
             time_budget=chosen.time_budget,
             gentle=correction,

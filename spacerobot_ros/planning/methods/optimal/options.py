@@ -108,6 +108,12 @@ class OptimalOptions:
         minimum=1,
         maximum=10000,
     )
+    agreeing: int = parameter(
+        3,
+        "solutions that are the best one and end the search; 0: only answers and starts do",
+        minimum=0,
+        maximum=10000,
+    )
     iterations: int = parameter(
         300, "steps of the solver from one guess at most", minimum=1, maximum=100000
     )

@@ -73,9 +73,6 @@ grid overrates some solutions by more than others."""
 _SAME = 1e-3
 """Solutions whose costs are this near, relative, are taken for one."""
 
-_AGREED = 3
-"""Solutions are enough when so many of them are the best one: other starts come to the same."""
-
 _FULL_STARTS = 3
 """Guesses that are tried on the full grid where nothing came of the coarse one."""
 
@@ -94,7 +91,9 @@ class SearchBudget:
     longest
         Longest manoeuvre, s.
     starts, solutions
-        Guesses that are tried at most, and manoeuvres that are enough.
+        Guesses that are tried at most, and solutions that are enough.
+    agreeing
+        Solutions that are the best one and enough; 0: no number is.
     iterations
         Steps of the solver from each guess at most.
     time_budget
@@ -108,6 +107,7 @@ class SearchBudget:
     longest: float
     starts: int
     solutions: int
+    agreeing: int
     iterations: int
     time_budget: float
     gentle: bool = False
@@ -189,7 +189,8 @@ class _Progress:
     def agreed(self, solutions: list[Trajectory]) -> bool:
         """Whether the best solution was found often enough."""
         costs = np.array([self.cost(each) for each in solutions])
-        return int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _SAME))) >= _AGREED
+        same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _SAME)))
+        return 0 < self.budget.agreeing <= same
 
     def cost(self, trajectory: Trajectory) -> float:
         """Return what is to be least: the duration, or in a given one the effort."""
