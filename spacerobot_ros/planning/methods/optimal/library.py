@@ -133,7 +133,7 @@ def load_library(path: str, key: str) -> SolutionLibrary | None:
     """
     if not path:
         cache, name = library_file(key)
-        kept = cache.load(name, key)
+        kept = cache.load(name, key) if (cache.folder / name).exists() else None
         if kept is None:
             return None
         try:
