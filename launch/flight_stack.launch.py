@@ -32,6 +32,9 @@ ARGUMENTS = (
 GLOBAL_TOPICS = ("/clock", "/tf", "/tf_static")
 """Absolute names; in a namespace each stack has its own."""
 
+VIEWED = 0.1
+"""Longest time between transforms that are recorded in real time, s."""
+
 RESPAWN_DELAY = 1.0
 """Wall s from the death of a node to its next start."""
 
@@ -93,6 +96,7 @@ def parameters(
             given["bag"] = chosen["bag"]
         if live:
             given["diagnostics_period"] = section.get("diagnostics_period", 1.0)
+            given["tf_period"] = min(section.get("tf_period", VIEWED), VIEWED)
         return given
     if chosen["robot"]:
         robot = robot_file(chosen["robot"])  # Refused here, with one sentence.

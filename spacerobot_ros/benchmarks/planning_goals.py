@@ -28,7 +28,7 @@ from spacerobot_ros.planning.methods.optimal.method import OptimalGait
 from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
 
 _PERIOD = 0.05
-_LEAST = 0.05
+_ANGLES = 0.05, 1.0
 _SCATTER = 0.3
 
 
@@ -36,19 +36,17 @@ _SCATTER = 0.3
 class Case:
     """A robot, the shape that its goals start near, and its options.
 
-    Goals are turned by up to ``angle``, rad; ``planar`` ones about the third axis. Of ``sliding``
-    ones the position counts, too.
+    ``planar`` goals turn about the third axis; of ``sliding`` ones the position counts, too.
     """
 
     start: tuple[float, ...]
     options: dict[str, Any]
-    angle: float = 1.0
     planar: bool = False
     sliding: bool = False
 
 
 CASES = {
-    "planar_chain": Case((0.0, 0.0), {}, angle=3.0, planar=True),
+    "planar_chain": Case((0.0, 0.0), {}, planar=True),
     "sliding_masses": Case(
         (0.0, 0.0, 0.0),
         {
@@ -72,7 +70,7 @@ def requests(robot: SpaceRobot, case: Case, count: int, seed: int) -> Iterator[P
         axis = rng.normal(size=3)
         if case.planar:
             axis = np.array([0.0, 0.0, axis[2]])
-        turn = quaternion_from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(_LEAST, case.angle))
+        turn = quaternion_from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(*_ANGLES))
         position = np.zeros(3)
         if case.sliding:
             last = np.clip(q + rng.uniform(-1.0, 1.0, robot.n), robot.lower, robot.upper)

@@ -32,7 +32,16 @@ class CommanderConfig(WatchdogConfig, BelievedRobotConfig):
         minimum=0.001,
         maximum=100000.0,
     )
-    world_frame: str = parameter("world", "frame that goals must be given in")
+    world_frame: str = parameter(
+        "world", "frame that goals are in, if they name no other that is known"
+    )
+    diagnostics_period: float = parameter(
+        1.0,
+        "simulated time between diagnostics; 0: ignored states only. Outside of a run in one "
+        "process also once a second of wall time",
+        unit="s",
+        minimum=0.0,
+    )
     position_tolerance: float = parameter(
         0.001,
         "largest position error at a goal that is reached",

@@ -26,7 +26,7 @@ from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.nodes.common.cdr import HEADER_STAMP, NANOSECONDS, first_time_ns
-from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
+from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.recorded_transforms import RecordedTransforms
@@ -151,6 +151,10 @@ class RecorderNode(FlightNode):
             self.recording.start()
             # Without the name: what two equal flights record is equal.
             self.report_event(Event(EventKind.RECORDING, "Recording has begun."))
+
+    def start_sentence(self) -> str:
+        """Return where it records to."""
+        return f"Records into {self.recording.writer.path}." if self.recording else ""
 
     def deactivate(self) -> None:
         """Pause: what arrives is not recorded."""
@@ -384,8 +388,9 @@ class RecorderNode(FlightNode):
         # A publisher without need would be one more thing to wait for and to record.
         if self._diagnostics is None:
             self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
-        name = f"{self.get_fully_qualified_name()}: {what}"
-        array = DiagnosticArray(status=[diagnostic_status(name, level, sentence, values)])
+        name = diagnostic_name(self.get_fully_qualified_name(), what)
+        bag = "" if self.recording is None else self.recording.writer.path.name
+        array = DiagnosticArray(status=[diagnostic_status(name, level, sentence, values, bag)])
         now_ns = self.recording.now_ns if self.recording is not None else 0
         array.header.stamp.sec, array.header.stamp.nanosec = divmod(now_ns, NANOSECONDS)
         self._diagnostics.publish(array)

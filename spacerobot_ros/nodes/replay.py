@@ -108,6 +108,11 @@ class ReplayNode(FlightNode):
         if not self.config.wait:
             self._begin()
 
+    def start_sentence(self) -> str:
+        """Return what is replayed."""
+        config = self.config
+        return f"Replays {len(self._outputs)} topic(s) of {config.bag} at {config.rate:g} times."
+
     def deactivate(self) -> None:
         """Stand still; what was sent stays sent."""
         if self._timers:

@@ -67,6 +67,9 @@ _KEYS = (
 _LOCKSTEP: Mapping[str, Mapping[str, Any]] = {"plant": {"time_mode": "lockstep"}}
 """The overrides of a scenario as it is loaded: they go before what its file has."""
 
+_VIEWED = 0.1
+"""Longest wall s between transforms in a bag that is flown in real time."""
+
 _KILL = re.compile(r"(\S+) at (\S+)(?: until (\S+))?")
 
 
@@ -254,7 +257,12 @@ class Scenario:
         scenario = self.with_overrides("plant", pace)
         if "planner" in self.commanders:
             scenario = scenario.with_overrides("planner", {"plan_in_background": True})
-        return scenario.with_overrides("recorder", {"diagnostics_period": 1.0})
+        # Viewers look at wall time; the plant heeds that by itself.
+        shown = {"diagnostics_period": 1.0}
+        period = self.config("recorder").tf_period
+        if period:
+            shown["tf_period"] = min(period, _VIEWED * factor)
+        return scenario.with_overrides("recorder", shown)
 
     def with_settings(self, texts: Sequence[str]) -> Scenario:
         """Return the scenario with ``node.parameter=value`` set, each as :func:`parse_setting`.

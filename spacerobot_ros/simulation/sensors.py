@@ -61,6 +61,9 @@ class Sensors:
         """Whether the pose was not measured at all."""
         self._pose_bias, self._joint_bias = np.zeros(6), np.zeros(n)
         self._noise = dict.fromkeys(_NOISES, 0.0)
+        self.pose_covariance, self.twist_covariance = np.zeros(36), np.zeros(36)
+        """Of what odom measures: position and attitude, velocities, each 6 x 6 in a row. Noise
+        alone counts: a bias and a delay are unknown to who measures."""
         self._delay = 0
         self._past: deque[tuple[Array, Array]] = deque([(self.pose, self.twist)], maxlen=1)
         self._adopt(plant.active)
@@ -122,5 +125,11 @@ class Sensors:
             elif fault.kind == "sensor_delay":
                 delay = max(delay, fault.value)
         self._noise = {group: variance**0.5 for group, variance in variances.items()}
+        # The noise of a group is the same in all directions: so it is in any frame.
+        for covariance, linear, angular in (
+            (self.pose_covariance, "position", "attitude"),
+            (self.twist_covariance, "velocity", "angular_velocity"),
+        ):
+            covariance[[0, 7, 14]], covariance[[21, 28, 35]] = variances[linear], variances[angular]
         self._delay = round(delay / self._control_period)
         self._past = deque(self._past, maxlen=self._delay + 1)

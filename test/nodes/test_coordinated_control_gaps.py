@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from support.control_loop import KP, STATUS, TICK_NS, Loop, pose
+from sensor_msgs.msg import JointState
+from support.control_loop import JOINTS, KP, STATUS, TICK_NS, Loop, pose
 from support.ros_harness import Harness, nanoseconds
 from support.sentences import assert_one_sentence
+
+from spacerobot_ros.nodes import CoordinatedControlNode
 
 
 def test_without_odom_the_base_is_estimated_and_then_the_thrusters_are_off(
@@ -54,3 +57,19 @@ def test_without_odom_from_the_beginning_nothing_is_thrust(harness: Harness) -> 
     loop.show(odom=True)
     loop.wait_for("tracking")
     np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
+
+
+def test_a_pose_that_was_never_met_is_not_lost(harness: Harness) -> None:
+    node = harness.make(
+        CoordinatedControlNode, {"robot": "planar_manipulator", "tick_rate": 100.0}, name="control"
+    )
+    probe = harness.probe({STATUS: DiagnosticStatus}, latched=(STATUS,))
+    joints = probe.create_publisher(JointState, "joint_states", 10)
+    harness.matched(joints)
+    for tick in range(1, 6):
+        message = JointState(name=JOINTS, position=[0.1, 0.2], velocity=[0.0] * 2, effort=[0.0] * 2)
+        message.header.stamp.nanosec = tick * TICK_NS
+        joints.publish(message)
+        harness.settle(probe)
+    assert node.is_active
+    assert not probe.messages[STATUS], "nothing is stopped before anything began"

@@ -95,14 +95,14 @@ def test_a_plant_in_real_time_tells_its_timing(harness: Harness) -> None:
     harness.spin_until(lambda: probe.count("joint_states") > 40, "forty ticks")
     plant.trigger_deactivate()
     status = {s.name: values(s) for s in probe.last("/diagnostics").status}
-    timing = status["/plant: timing"]
+    timing = status["plant: timing"]
     ticks = int(timing["ticks"])
     assert 30 <= ticks <= 45
     # Every state is answered, the first one too, whose stamp is zero: nothing is out of order.
-    assert status["/plant: commands"]["refused"] == "0"
+    assert status["plant: commands"]["refused"] == "0"
     assert int(timing["commands"]) in (ticks - 2, ticks - 1)
-    assert set(status["/plant: strokes"]) == set(plant.plant.robot.joint_names)
-    left = float(status["/plant: strokes"]["slider_2"])
+    assert set(status["plant: strokes"]) == set(plant.plant.robot.joint_names)
+    left = float(status["plant: strokes"]["slider_2"])
     assert left == pytest.approx(plant.plant.robot.upper[1], abs=1e-9), "it has not moved"
 
 

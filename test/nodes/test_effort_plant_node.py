@@ -82,7 +82,7 @@ class Effort:
 
     def diagnosed(self, what: str) -> dict[str, str]:
         (status,) = (
-            s for s in self.probe.last("/diagnostics").status if s.name == f"/plant: {what}"
+            s for s in self.probe.last("/diagnostics").status if s.name == f"plant: {what}"
         )
         return {pair.key: pair.value for pair in status.values}
 
@@ -139,7 +139,7 @@ def test_a_wrench_in_another_frame_is_refused_and_time_goes_on(harness: Harness)
     rig.wait(2)
     assert rig.speed == 0.0
     assert rig.diagnosed("commands")["refused"] == "1"
-    (status,) = (s for s in rig.probe.last("/diagnostics").status if s.name == "/plant: commands")
+    (status,) = (s for s in rig.probe.last("/diagnostics").status if s.name == "plant: commands")
     assert status.level == DiagnosticStatus.WARN
     assert_one_sentence(status.message, "base_wrench", "'world'", "base_link")
     rig.push(4.7, frame="")

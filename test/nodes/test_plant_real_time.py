@@ -86,7 +86,7 @@ def test_real_time_holds_the_last_good_command(harness: Harness) -> None:
             status.message
             for array in rig.probe.messages["/diagnostics"]
             for status in array.status
-            if status.name == "/plant: commands" and status.level == DiagnosticStatus.WARN
+            if status.name == "plant: commands" and status.level == DiagnosticStatus.WARN
         ]
         assert_one_sentence(warned[-1], "refused", reason)
     np.testing.assert_array_equal(rig.probe.last("joint_states").velocity, [0.1, 0.0, -0.1])

@@ -287,7 +287,7 @@ def test_the_recorder_tells_of_its_bag(harness: Harness, tmp_path: Path) -> None
             {pair.key: pair.value for pair in status.values}
             for array in stack.probe.messages["/diagnostics"]
             for status in array.status
-            if status.name == "/recorder: bag"
+            if status.name == "recorder: bag"
         ]
 
     before = len(told())

@@ -155,8 +155,8 @@ def test_a_silent_planner_is_noticed_by_the_plant_and_is_back(harness: Harness) 
     flight.wait("executing")
     assert flight.silence(flight.planner) < 1.0
     assert flight.events("node_silent") == [("/plant", "/planner")]
-    harness.spin_until(lambda: flight.diagnosed("/plant: watchdog"), "the diagnostics")
-    status = flight.diagnosed("/plant: watchdog")[-1]
+    harness.spin_until(lambda: flight.diagnosed("plant: watchdog"), "the diagnostics")
+    status = flight.diagnosed("plant: watchdog")[-1]
     assert status.level == DiagnosticStatus.ERROR
     assert "/planner" in status.message
     assert flight.plant.state is PlantState.RUNNING  # It is reported, and no more.
@@ -164,7 +164,7 @@ def test_a_silent_planner_is_noticed_by_the_plant_and_is_back(harness: Harness) 
     harness.spin_until(lambda: flight.events("node_back"), "the planner")
     assert flight.events("node_back") == [("/plant", "/planner")]
     harness.spin_until(
-        lambda: flight.diagnosed("/plant: watchdog")[-1].level == DiagnosticStatus.OK, "an OK"
+        lambda: flight.diagnosed("plant: watchdog")[-1].level == DiagnosticStatus.OK, "an OK"
     )
 
 

@@ -63,6 +63,7 @@ def test_overrides_go_before_the_file_and_have_the_declared_types() -> None:
         "actuation": "velocity",
         "base_pose_period": 1.0,
         "marker_period": 10.0,
+        "tf_period": 1.0,
         "diagnostics_period": 20.0,
         "time_mode": "lockstep",
         "tick_rate": 10.0,

@@ -125,7 +125,7 @@ class FaultFlight:
     def diagnosis(self, what: str) -> DiagnosticStatus:
         """Return the plant's latest diagnostic status of a kind."""
         (status,) = (
-            s for s in self.probe.last("/diagnostics").status if s.name == f"/plant: {what}"
+            s for s in self.probe.last("/diagnostics").status if s.name == f"plant: {what}"
         )
         return status
 

@@ -120,7 +120,7 @@ class Rig:
             "diagnostics of the last tick",
         )
         (status,) = (
-            s for s in self.probe.last("/diagnostics").status if s.name == f"/plant: {what}"
+            s for s in self.probe.last("/diagnostics").status if s.name == f"plant: {what}"
         )
         return status
 

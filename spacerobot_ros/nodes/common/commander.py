@@ -22,7 +22,7 @@ from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS, JointReader, first_time_ns
-from spacerobot_ros.nodes.common.messages import diagnostic_status
+from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
 from spacerobot_ros.nodes.common.node import STREAM, RobotNode
 from spacerobot_ros.nodes.common.state_synchroniser import StateSynchroniser
 from spacerobot_ros.nodes.common.state_times import StateTimes
@@ -39,6 +39,9 @@ _STANDSTILL = 0.005
 
 _REPORT_PERIOD = 1.0
 """Least wall s between two diagnostics about ignored states."""
+
+_DIAGNOSED = 1.0
+"""Longest wall s between two diagnostics, where a run need not be repeatable."""
 
 _STATUSES = QoSProfile(
     depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -174,6 +177,11 @@ class CommanderNode(RobotNode):
         self._joints_input = self.create_subscription(
             JointState, "joint_states", self._on_joints, STREAM, raw=True
         )
+        self._said: DiagnosticStatus | None = None
+        """The last status of the node."""
+        period = self.config.diagnostics_period or math.inf
+        self._diagnostics_period_ns = period * NANOSECONDS
+        self._diagnosed_ns, self._diagnosed = 0, time.monotonic()
         self._known_frames = KnownFrames(self)
         self._answered = time.monotonic()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -239,6 +247,9 @@ class CommanderNode(RobotNode):
         elif self._is_of_the_robot(raw) and self._times.admits(raw):
             self._take_joints(raw)
         self._answered = time.monotonic()
+        now_ns = self._times.now_ns
+        if not 0 <= now_ns - self._diagnosed_ns < self._diagnostics_period_ns:
+            self._publish_diagnostics(self._times)
 
     def _take_last(self, raw: bytes) -> None:
         """Answer only the last of the states that wait after this node stood still.
@@ -299,6 +310,14 @@ class CommanderNode(RobotNode):
             self._ignored_reported = times.ignored
             self._next_report = time.monotonic() + _REPORT_PERIOD
             self.get_logger().warning(times.last_ignored)
+            self._publish_diagnostics(times, ignored=True)
+        elif (
+            # In a run that is to be repeatable only simulated time counts.
+            self.events_have_wall_time
+            and self.config.diagnostics_period
+            and self.is_active
+            and time.monotonic() - self._diagnosed >= _DIAGNOSED
+        ):
             self._publish_diagnostics(times)
 
     def _take_waiting_statuses(self) -> None:
@@ -308,11 +327,26 @@ class CommanderNode(RobotNode):
             while (taken := handle.take_message(DiagnosticStatus, False)) is not None:
                 self._on_plant_status(taken[0])
 
-    def _publish_diagnostics(self, times: StateTimes) -> None:
-        """Publish how many states were ignored, and why the last one was."""
-        name, level = f"{self.get_fully_qualified_name()}: states", DiagnosticStatus.WARN
-        status = diagnostic_status(name, level, times.last_ignored, {"ignored": times.ignored})
-        array = DiagnosticArray(status=[status])
+    def _publish_diagnostics(self, times: StateTimes, *, ignored: bool = False) -> None:
+        """Publish what the status says, how many states were ignored, and why the last one was."""
+        full, robot = self.get_fully_qualified_name(), self._robot
+        hardware = robot.description.name if robot is not None else ""
+        level = DiagnosticStatus.WARN if ignored else DiagnosticStatus.OK
+        sentence = times.last_ignored if ignored else "states are answered"
+        name, values = diagnostic_name(full, "states"), {"ignored": times.ignored}
+        array = DiagnosticArray(status=[diagnostic_status(name, level, sentence, values, hardware)])
+        said = self._said
+        if said is not None and not ignored:
+            array.status.append(
+                DiagnosticStatus(
+                    level=said.level,
+                    name=diagnostic_name(full, "goal"),
+                    message=said.message,
+                    hardware_id=hardware,
+                    values=said.values,
+                )
+            )
+        self._diagnosed_ns, self._diagnosed = times.now_ns, time.monotonic()
         array.header.stamp.sec, array.header.stamp.nanosec = divmod(times.now_ns, NANOSECONDS)
         self._diagnostics.publish(array)
 

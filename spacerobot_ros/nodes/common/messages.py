@@ -44,14 +44,23 @@ def message_class(type_name: str) -> Any:
         raise SpaceRobotError(f"its type {type_name} is not installed here.") from None
 
 
+def diagnostic_name(node: str, part: str) -> str:
+    """Return the name of a part of a node in /diagnostics, as diagnostic_updater forms it.
+
+    Aggregators match the beginning of names, and make folders of them: no slash comes first.
+    """
+    return f"{node.removeprefix('/')}: {part}"
+
+
 def diagnostic_status(
-    name: str, level: bytes, sentence: str, values: Mapping[str, object]
+    name: str, level: bytes, sentence: str, values: Mapping[str, object], hardware_id: str = ""
 ) -> DiagnosticStatus:
     """Return the message about what goes by ``name``; values as texts."""
     return DiagnosticStatus(
         level=level,
         name=name,
         message=sentence,
+        hardware_id=hardware_id,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
     )
 
@@ -102,6 +111,14 @@ def goal_of(
         return goal
     moved = chained(pose, np.concatenate([goal.position, goal.quaternion]))
     return Goal.checked(moved[:3], moved[3:], shape)
+
+
+def goal_sentence(part: str, goal_id: str, message: PoseStamped, goal: Goal) -> str:
+    """Return one line about a goal that has come."""
+    position = ", ".join(f"{x:.4g}" for x in goal.position)
+    quaternion = ", ".join(f"{x:.4g}" for x in goal.quaternion)
+    given = f", given in '{message.header.frame_id}'" if message.header.frame_id else ""
+    return f"Goal {goal_id} of the {part}: ({position}) m, ({quaternion}){given}."
 
 
 def chained(outer: Array, inner: Array) -> Array:

@@ -351,6 +351,10 @@ class FlightNode(LifecycleNode):
     def activate(self) -> None:
         """Begin to work."""
 
+    def start_sentence(self) -> str:
+        """Return what is to be known of the node when it begins to work."""
+        return f"Node '{self.get_name()}' is active."
+
     def deactivate(self) -> None:
         """Stop working, keeping everything."""
 
@@ -410,6 +414,7 @@ class FlightNode(LifecycleNode):
         result = self._run(self.activate)
         if result is TransitionCallbackReturn.SUCCESS and self._liveness is not None:
             self._liveness.begin()
+            self.get_logger().info(self.start_sentence())
         return self._report_transition(result, EventKind.ACTIVATED)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -596,6 +601,14 @@ class RobotNode(FlightNode):
                 self.get_logger().error(f"robot_description: {error}")
                 return
             self._on_part()
+
+
+def described_robot(robot: SpaceRobot | None) -> str:
+    """Return what is to be known of a robot, for one line."""
+    if robot is None:
+        return "the robot that robot_description will bring"
+    mass = robot.description.total_mass
+    return f"'{robot.description.name}' ({robot.n} joint(s), {mass:.4g} kg)"
 
 
 def _described(error: BaseException) -> str:

@@ -15,7 +15,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 
-from spacerobot_ros.nodes.common.messages import diagnostic_status
+from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
 
 TOPIC = "heartbeat"
 
@@ -250,9 +250,10 @@ class Liveness:
         values = dict.fromkeys(silent, "silent")
         values.update({each.name: "back" for each in news if each.over})
         status = diagnostic_status(
-            f"{node.get_fully_qualified_name()}: watchdog",
+            diagnostic_name(node.get_fully_qualified_name(), "watchdog"),
             DiagnosticStatus.ERROR if silent else DiagnosticStatus.OK,
             f"silent: {', '.join(silent)}" if silent else "all nodes are heard",
             values,
+            "" if self._role is None else self._role.value,
         )
         self._diagnostics.publish(DiagnosticArray(status=[status]))

@@ -30,8 +30,8 @@ from spacerobot_ros.nodes.common.cdr import (
     stamp_bytes,
 )
 from spacerobot_ros.nodes.common.commander import Change, CommanderNode, Stopped
-from spacerobot_ros.nodes.common.messages import diagnostic_status, goal_of
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM
+from spacerobot_ros.nodes.common.messages import diagnostic_status, goal_of, goal_sentence
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.state_synchroniser import CONTRADICTION, Pairing, StateSynchroniser
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
@@ -64,6 +64,7 @@ class CoordinatedControlNode(CommanderNode):
         self._odom, self._base_reference = _odometry_reader(), _odometry_reader()
         self._goal_file = GoalFile(self.config.resume_file, GOAL_KEYS)
         self._goal_ids = GoalIds()
+        self._posed = self._odom_met = False
         self._waiting: dict[str, IdentifiedGoal] = {}
         """Goals that have come before the robot."""
         self._joint_commands = self.send_raw(JointState, "joint_commands")
@@ -96,6 +97,14 @@ class CoordinatedControlNode(CommanderNode):
             self._states.require(topic, required=self.count_publishers(topic) > 0)
         # A lockstep plant may have been waiting for an answer since before.
         self._on_part()
+
+    def start_sentence(self) -> str:
+        """Return what it controls by which law, and where goals are taken."""
+        config, topic = self.config, self.resolve_topic_name("goal_pose")
+        return (
+            f"Controls {described_robot(self._robot)} by '{config.law}' at {config.tick_rate:g} "
+            f"Hz; goals on '{topic}' in '{config.world_frame}'."
+        )
 
     def deactivate(self) -> None:
         """Command nothing any more; goals are dropped, but not those in the file."""
@@ -156,6 +165,8 @@ class CoordinatedControlNode(CommanderNode):
             self._refuse(PlanningError(self._plant.blocked), goal_id)
             return
         identified = IdentifiedGoal(goal, goal_id)
+        part = key.replace("_", "-")
+        self.get_logger().info(goal_sentence(part, goal_id, message, goal))
         if self._robot is None:
             self._waiting[key] = identified
         else:
@@ -196,7 +207,8 @@ class CoordinatedControlNode(CommanderNode):
 
     def _publish_status(self, status: ControllerStatus) -> None:
         name, level = self.get_fully_qualified_name(), bytes([status.state.level])
-        self._status.publish(diagnostic_status(name, level, status.sentence, status.to_values()))
+        self._said = diagnostic_status(name, level, status.sentence, status.to_values())
+        self._status.publish(self._said)
         if status.state.decided and self.config.stop_when_decided:
             self._running = False
         if status.state.level:
@@ -230,12 +242,21 @@ class CoordinatedControlNode(CommanderNode):
         self._on_part()
 
     def _take_joints(self, raw: bytes) -> None:
-        overdue = self._states.overdue() if self._running and self._robot is not None else None
+        overdue = None
+        if self._running and self._robot is not None and not self._waits_for_first_pose():
+            overdue = self._states.overdue()
         if overdue is not None:
             # An answer to a lost pose would come a tick late; what it estimates goes on from there.
             self._on_state(overdue, send=overdue is Pairing.WHOLE)
         self._states.put_joint_states(raw)
         self._on_part()
+
+    def _waits_for_first_pose(self) -> bool:
+        """Whether the state before came when odom was not met yet: its pose is not lost."""
+        if self._posed:
+            return False
+        before, self._odom_met = self._odom_met, self._odom_input.get_publisher_count() > 0
+        return not before
 
     def _on_reference(self, topic: str, raw: bytes) -> None:
         self._states.put_required(topic, raw)
@@ -250,6 +271,7 @@ class CoordinatedControlNode(CommanderNode):
 
     def _on_state(self, pairing: Pairing, *, send: bool = True) -> None:
         """Answer one state with one command of the same stamp."""
+        self._posed = self._posed or pairing is Pairing.WHOLE
         try:
             stamp = self._joints.accept(self._states.joint_states)
         except CommandError as error:

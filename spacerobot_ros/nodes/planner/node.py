@@ -20,8 +20,8 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import stamp_bytes
 from spacerobot_ros.nodes.common.commander import Change, CommanderNode, Stopped
-from spacerobot_ros.nodes.common.messages import goal_of, shape_of
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM
+from spacerobot_ros.nodes.common.messages import goal_of, goal_sentence, shape_of
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.state_synchroniser import CONTRADICTION, Pairing, StateSynchroniser
 from spacerobot_ros.nodes.planner.messages import (
@@ -121,6 +121,14 @@ class PlannerNode(CommanderNode):
         # A lockstep plant may have been waiting for an answer since before.
         self._on_part()
 
+    def start_sentence(self) -> str:
+        """Return how it plans, and where goals are taken."""
+        config, topic = self.config, self.resolve_topic_name("goal_pose")
+        return (
+            f"Plans by '{config.method}' for {described_robot(self._robot)} at "
+            f"{config.tick_rate:g} Hz; goals on '{topic}' in '{config.world_frame}'."
+        )
+
     def deactivate(self) -> None:
         """Give up the present goal and command nothing any more; the goal file stays."""
         if self._running and self._executive is not None:
@@ -172,6 +180,7 @@ class PlannerNode(CommanderNode):
             self._publish_status(refusal)
             return
         identified = IdentifiedGoal(goal, goal_id)
+        self.get_logger().info(goal_sentence("base", goal_id, message, goal))
         self._propose(identified)
         if self._executive is None:
             self._publish_waiting(identified, "The goal waits for a robot on robot_description.")
@@ -317,7 +326,8 @@ class PlannerNode(CommanderNode):
 
     def _publish_status(self, status: PlannerStatus) -> None:
         """Publish a status, and an event where it decides a goal, and log its sentence."""
-        self._status_topic.publish(status_message(status, self.get_fully_qualified_name()))
+        self._said = status_message(status, self.get_fully_qualified_name())
+        self._status_topic.publish(self._said)
         kind = _DECISIONS.get(status.state)
         if kind is not None:
             level, goal_id = status.state.level, status.goal_id

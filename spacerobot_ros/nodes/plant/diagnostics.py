@@ -7,7 +7,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
-from spacerobot_ros.nodes.common.messages import diagnostic_status
+from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
 from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
 from spacerobot_ros.simulation.faults import FaultyPlant
@@ -113,10 +113,12 @@ class PlantReport:
             array.status.append(self._thruster_status(self._thrusters))
         if self._real_time is not None:
             array.status.append(timing_status(self._name("timing"), self._real_time))
+        for status in array.status:
+            status.hardware_id = self._plant.robot.description.name
         self._publisher.publish(array)
 
     def _name(self, part: str) -> str:
-        return f"{self._node.get_fully_qualified_name()}: {part}"
+        return diagnostic_name(self._node.get_fully_qualified_name(), part)
 
     @property
     def _ticks_lost(self) -> int:

@@ -23,7 +23,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import robot_of
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.messages import diagnostic_status
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.streams import RawInput
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
@@ -201,6 +201,17 @@ class PlantNode(FlightNode):
         self._active = PlantState.INACTIVE
         self._commands.rest()
         self._look_at_status()
+
+    def start_sentence(self) -> str:
+        """Return which robot it is, and how its time runs."""
+        config = self.config
+        pace = "in lockstep"
+        if self._real_time is not None:
+            pace = f"in real time times {config.real_time_factor:g}"
+        return (
+            f"Simulates {described_robot(self.plant.robot)} under {config.actuation} commands at "
+            f"{config.tick_rate:g} Hz {pace}."
+        )
 
     def on_failure(self, sentence: str, error: Exception) -> None:
         """Report the failure, and command nothing when the plant is started again."""

@@ -139,6 +139,9 @@ class StatePublisher:
                 )
                 message.layout.dim = [dimension]
         template = MessageTemplate(message)
+        if topic.name == "odom" and self._state.sensors.used:
+            template.feed("pose.covariance", self._state.sensors.pose_covariance)
+            template.feed("twist.covariance", self._state.sensors.twist_covariance)
         for field in topic.state:
             values = self._state.quantities[field.quantity]
             if values.size:
