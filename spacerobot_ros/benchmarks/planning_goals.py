@@ -28,7 +28,7 @@ from spacerobot_ros.planning.methods.optimal.method import OptimalGait
 from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
 
 _PERIOD = 0.05
-_ANGLES = 0.05, 1.0
+_LEAST = 0.05
 _SCATTER = 0.3
 
 
@@ -36,17 +36,19 @@ _SCATTER = 0.3
 class Case:
     """A robot, the shape that its goals start near, and its options.
 
-    ``planar`` goals turn about the third axis; of ``sliding`` ones the position counts, too.
+    Goals are turned by up to ``angle``, rad; ``planar`` ones about the third axis. Of ``sliding``
+    ones the position counts, too.
     """
 
     start: tuple[float, ...]
     options: dict[str, Any]
+    angle: float = 1.0
     planar: bool = False
     sliding: bool = False
 
 
 CASES = {
-    "planar_chain": Case((0.0, 0.0), {}, planar=True),
+    "planar_chain": Case((0.0, 0.0), {}, angle=3.0, planar=True),
     "sliding_masses": Case(
         (0.0, 0.0, 0.0),
         {
@@ -70,7 +72,7 @@ def requests(robot: SpaceRobot, case: Case, count: int, seed: int) -> Iterator[P
         axis = rng.normal(size=3)
         if case.planar:
             axis = np.array([0.0, 0.0, axis[2]])
-        turn = quaternion_from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(*_ANGLES))
+        turn = quaternion_from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(_LEAST, case.angle))
         position = np.zeros(3)
         if case.sliding:
             last = np.clip(q + rng.uniform(-1.0, 1.0, robot.n), robot.lower, robot.upper)

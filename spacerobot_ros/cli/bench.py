@@ -36,6 +36,21 @@ from spacerobot_ros.cli.options import PATH, json_option, write_json
     help="Instead: fly for S s in real time with a goal every 12 s; whether memory, descriptors "
     "and threads of all processes stay flat. With --json also a picture beside it.",
 )
+@click.option(
+    "--planning",
+    "goals",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Instead: plan N cold goals of four robots; CPU time. With --against also the ratios of "
+    "times and durations.",
+)
+@click.option(
+    "--long-search",
+    "starts",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="... and compare the durations with those of a search from N guesses.",
+)
 @json_option("Write the figures.")
 @click.option(
     "--against",
@@ -55,6 +70,8 @@ def command(
     seconds: float | None,
     rates: tuple[float, ...],
     soak: float | None,
+    goals: int | None,
+    starts: int | None,
     json_file: Path | None,
     against: Path | None,
     rounds: int,
@@ -74,7 +91,11 @@ def command(
         if not figures["flat"]:
             fail()
         return
-    if against is not None:
+    if goals is not None:
+        from spacerobot_ros.benchmarks.planning import run_planning_benchmark
+
+        figures = run_planning_benchmark(goals, against, starts, click.echo)
+    elif against is not None:
         from spacerobot_ros.benchmarks.against import compare_checkouts
 
         words = ["--ticks", str(ticks)]

@@ -43,3 +43,19 @@ def test_the_time_without_a_base_is_reported() -> None:
         loop.answer(measured=False)
         words = f"it is estimated since {count * PERIOD:.3g} s."
         assert loop.status.sentence.endswith(words)
+
+
+@pytest.mark.parametrize(
+    ("rate", "gap", "jumped"),
+    [(100.0, 0.98, False), (100.0, 1.5, True), (2.0, 4.9, False), (2.0, 5.2, True)],
+)
+def test_a_gap_of_a_second_or_ten_periods_is_time_that_passes(
+    rate: float, gap: float, jumped: bool
+) -> None:
+    loop = ExecutiveLoop(tick_rate=rate, settle_time=0.05, time_limit=0.5)
+    loop.aim(base=goal_at([3.0, 0.0, 0.0]))
+    loop.answer(3)
+    assert loop.state == "tracking"
+    loop.tick += round(gap / PERIOD)
+    loop.answer()
+    assert loop.state == ("tracking" if jumped else "failed")

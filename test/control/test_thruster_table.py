@@ -155,3 +155,12 @@ def test_the_servicer_has_redundant_thrusters() -> None:
     # Each sits on a corner of the bus and pushes into it.
     assert np.all(np.abs(table.r_B) == [0.6, 0.5, 0.5])
     assert np.all(np.sum(table.r_B * table.direction_B, axis=1) < 0.0)
+
+
+def test_what_a_thruster_leaves_open(tmp_path: Path) -> None:
+    """It pushes along x, as the axis of a joint does, from the base, in pulses of any length."""
+    entry = {"name": "a", "position": [1.0, 2.0, 3.0], "force": 5.0, "isp": 200.0}
+    table = of_yaml(tmp_path, [entry, {**entry, "name": "b", "rpy": [0.0, 0.0, np.pi / 2]}])
+    np.testing.assert_allclose(table.direction_B, np.eye(3)[:2], atol=1e-15)
+    assert table.r_B.tolist() == [[1.0, 2.0, 3.0]] * 2
+    assert table.min_on_time.tolist() == [0.0, 0.0]

@@ -13,7 +13,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
-from support.planner_flight import NEAR, TURNED, Flight, Place, goal_at, values_of
+from support.planner_flight import NEAR, TURNED, Flight, Place, goal_at, stamp_of, values_of
 from support.plant_rig import TICK_NS
 from support.ros_harness import Harness
 from support.sentences import assert_one_sentence
@@ -194,3 +194,38 @@ def test_a_planner_that_starts_again_resumes_its_goal_by_its_id(
         ("reached", "7.000000000"),
     ]
     assert not (tmp_path / "goal.json").exists()
+
+
+# -- without a stop ---------------------------------------------------------------------------
+
+
+def test_a_goal_that_is_changed_in_flight_causes_no_stop(harness: Harness) -> None:
+    chain: dict[str, Any] = {"robot": "planar_chain"}
+    optimal = {"method": "optimal", "optimal.cache": 0, "optimal.answers": 1, "takeover_time": 0.3}
+    plant = {**chain, "initial_joint_positions": [0.3, -0.2]}
+    flight = Flight(harness, {**chain, **optimal}, plant)
+    flight.send(([0.0, 0.0, 0.0], [0.0, 0.0, 1.2]))
+    flight.start()
+    flight.wait("executing")
+    flight.ticks(6)
+    first = flight.probe.last("gait_schedule")
+    flight.send(([0.0, 0.0, 0.0], [0.0, 0.0, 1.4]))
+    schedules = flight.probe.messages["gait_schedule"]
+    harness.spin_until(lambda: len(schedules) == 2, "the plan takes over")
+    second = flight.probe.last("gait_schedule")
+    begins = stamp_of(second)
+    # The first shape of the second is on the first, at the tick that its stamp says.
+    tick = (begins - stamp_of(first)) // TICK_NS
+    assert list(second.points[0].positions) == pytest.approx(
+        list(first.points[tick].positions), abs=1e-9
+    )
+    flight.wait("reached", "failed")
+    assert flight.states == ["idle", "executing", "executing", "reached"]
+    assert flight.error_to(([0.0, 0.0, 0.0], [0.0, 0.0, 1.4]))[1] < 1e-3
+    near = [
+        max(map(abs, message.velocity))
+        for message in flight.probe.messages["joint_commands"]
+        if abs(stamp_of(message) - begins) <= 4 * TICK_NS
+    ]
+    assert len(near) == 9
+    assert min(near) > 0.1, "it never stops"

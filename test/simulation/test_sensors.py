@@ -182,3 +182,19 @@ def test_a_bias_of_other_joints_is_refused() -> None:
 def test_parameters_that_would_overflow_are_refused_by_name(name: str, value: object) -> None:
     with pytest.raises(ParameterError, match=name):
         configured(PlantConfig, {name: value})
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "sensor_bias position_x 0.1",
+        "sensor_noise joints 0.1",
+        "sensor_dropout odom",
+        "sensor_delay odom 0.1",
+    ],
+)
+def test_sensors_that_will_fail_are_in_use_from_the_begin(fault: str) -> None:
+    flight = Flight(SensorConfig(), f"{fault} at 5", ticks=1)
+    assert flight.sensors.used
+    assert not flight.sensors.imperfect
+    assert not Flight(SensorConfig(), "joint_stuck elbow_pitch at 5", ticks=1).sensors.used

@@ -18,6 +18,8 @@ def test_a_plant_without_a_pose_steps_at_its_second_look_in_a_tick() -> None:
     config = PlantConfig(time_mode="lockstep")
     plant = build_plant(SpaceRobot.from_file(robot_file("sliding_masses")), config)
     commands = CommandValidator(plant, config)
+    for first in (0, 1, 2):
+        assert not Lockstep(commands).looks(first, pose_lost=True), "its first look"
     time = Lockstep(commands)
     assert not time.may_step
     assert [time.looks(3, pose_lost=True), time.waits] == [False, False]

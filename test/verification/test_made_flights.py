@@ -291,6 +291,7 @@ def test_a_message_between_two_ticks_is_refused_with_its_time(tmp_path: Path) ->
         Made([RATES] * 3).add(bag, say)
         late = JointState(name=NAMES, position=[0.0] * 3, velocity=[0.0] * 3, effort=[0.0] * 3)
         say("/joint_states", stamped(late, 0.25, "base_link"), 0.25)
+        say("/joint_states", stamped(late, 0.27, "base_link"), 0.27)
     words = "is stamped 0.25 s, between the ticks of the plant in it"
     with pytest.raises(RecordingError, match=words):
         verify_bag(path)

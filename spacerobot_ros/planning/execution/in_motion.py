@@ -19,7 +19,7 @@ from spacerobot_ros.planning.execution.worker import PlanningWorker
 _MOST_ATTEMPTS = 2
 """Plans in motion that are tried for a goal: each takes over twice as late as the one before."""
 
-_NEAR_ENOUGH, _AIM = (0.6, 0.8), (0.4, 0.6)
+_NEAR_ENOUGH, _AIM = (0.6, 0.8), (0.1, 0.6)
 """Shares of the tolerances, early and late in a motion: within the first the remaining motion is
 not planned again; where it is, the second may be left."""
 

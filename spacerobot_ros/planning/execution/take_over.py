@@ -61,8 +61,11 @@ class TakeOver:
         return cls(start_ns + tick * period_ns, positions[now : tick + 1].copy(), motion)
 
 
-_PRIOR = 0.05
+_PRIOR = 0.02
 """Weight of no error of the model, rad^2: noise of a milliradian, and errors of a few per cent."""
+
+_WINDOW = 8
+"""Instants of a path from the turns between which the error of the model is learnt."""
 
 
 class TurnModelError:
@@ -102,20 +105,19 @@ class PathDeviation:
         self._path = path
         self._recent: deque[Array] = deque(maxlen=count)
         self._model = model or TurnModelError()
-        self._first: tuple[int, Array] | None = None
+        self._window: deque[tuple[int, Array]] = deque(maxlen=_WINDOW)
 
     def add(self, k: int, position: Array, quaternion: Array) -> None:
         """Add a measured position (3,) and attitude (4,) at instant k of the path."""
         predicted = self._path.quaternion[k]
         turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, quaternion)
         self._recent.append(np.concatenate([position - self._path.position[k], turn]))
-        if self._first is None:
-            self._first = k, turn
-            return
-        begin, offset = self._first
-        to_base = matrix_from_quaternion(self._path.quaternion[begin]).T
-        turned = attitude_error(self._path.quaternion[begin], predicted)
-        self._model.add(turned, to_base @ (turn - offset))
+        self._window.append((k, turn))
+        if len(self._window) == _WINDOW:
+            begin, offset = self._window[0]
+            to_base = matrix_from_quaternion(self._path.quaternion[begin]).T
+            turned = attitude_error(self._path.quaternion[begin], predicted)
+            self._model.add(turned, to_base @ (turn - offset))
 
     def pose(self, k: int) -> tuple[Array, Array]:
         """Return where the base is at instant k: position (3,) and attitude (4,)."""
@@ -138,7 +140,13 @@ class PathDeviation:
 
     def extra_turn(self, k: int) -> Array:
         """Return by what rotation vector (3,) the base will turn more from instant k to the end."""
-        return self._model.expected(self._ahead(k))
+        attitudes, extra = self._path.quaternion, np.zeros(3)
+        to_end = matrix_from_quaternion(attitudes[-1]).T
+        for i in range(k, len(attitudes) - 1, _WINDOW):
+            following = attitudes[min(i + _WINDOW, len(attitudes) - 1)]
+            more = self._model.expected(attitude_error(attitudes[i], following))
+            extra += to_end @ matrix_from_quaternion(following) @ more
+        return extra
 
     def _ahead(self, k: int) -> Array:
         return attitude_error(self._path.quaternion[k], self._path.quaternion[-1])

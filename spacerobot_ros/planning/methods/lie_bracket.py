@@ -183,7 +183,7 @@ class LieBracketGait(GaitMethod):
                 f"than {gap:.3g} m to it."
             )
         # Other joints move the centre of mass too, but not by this method.
-        if len(self.sliders) < self.robot.n:
+        if len(self.sliders) < self.robot.n or self.robot.description.coupled:
             raise PlanningError(sentence)
         raise UnreachableError(sentence, Proof.LIMITS)
 

@@ -136,6 +136,13 @@ class InitialGuesses:
         step = solution.duration / intervals
         return Trajectory(step, shapes, velocities, self._attitudes(shapes, step * velocities))
 
+    def through(self, shapes: Array, limits: MotionLimits) -> Trajectory:
+        """Return a guess through shapes (M, n) at equal intervals, as fast as the limits allow."""
+        at = np.linspace(0.0, 1.0, len(shapes))
+        columns = [np.interp(self._instants, at, column) for column in shapes.T]
+        (trajectory,) = self._candidates(np.column_stack(columns)[np.newaxis], limits)
+        return trajectory
+
     def along(self, positions: Array, velocity: Array, period: float) -> Trajectory:
         """Return shapes (M + 1, n) at ticks that begin with a velocity (n,) and end at rest."""
         ticks = np.linspace(0.0, 1.0, len(positions))

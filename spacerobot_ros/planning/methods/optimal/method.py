@@ -12,8 +12,10 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import ClassVar
 
 import casadi as ca
@@ -24,7 +26,11 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import attitude_error
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    quaternion_inverse,
+    quaternion_multiply,
+)
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
@@ -34,6 +40,12 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
 from spacerobot_ros.planning.methods.optimal.in_motion import MotionBudget, MotionSearch
 from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
+from spacerobot_ros.planning.methods.optimal.library import (
+    SolutionLibrary,
+    library_file,
+    library_key,
+    load_library,
+)
 from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -98,6 +110,31 @@ class OptimalGait(GaitMethod):
         self._search = ManoeuvreSearch(*problem, compiling=chosen.answers > 1)
         self._motion_search = MotionSearch(*problem, self._search.solver)
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
+        self._library_key = library_key(
+            robot, self._limits, self._specification.axes, position=self._specification.position
+        )
+        self._library = load_library(chosen.library, self._library_key)
+
+    def made_library(self, requests: Iterable[PlanRequest]) -> SolutionLibrary | None:
+        """Return the manoeuvres of all requests that can be reached; None if none can.
+
+        They are planned without a library.
+        """
+        self._library = None
+        schedules, turns = [], []
+        for request in requests:
+            with suppress(PlanningError):
+                schedules.append(self.plan(request))
+                begins = quaternion_inverse(request.state.quaternion)
+                turns.append(quaternion_multiply(begins, request.goal.quaternion))
+        if not schedules:
+            return None
+        return SolutionLibrary.of(self._library_key, schedules, np.array(turns))
+
+    def keep_library(self, library: SolutionLibrary) -> Path | None:
+        """Put a library where plans find it; return where, None if that is not possible."""
+        cache, name = library_file(self._library_key)
+        return cache.store(name, self._library_key, library.to_bytes())
 
     @classmethod
     def require_suitable(cls, robot: SpaceRobot) -> None:
@@ -151,6 +188,7 @@ class OptimalGait(GaitMethod):
             self._intervals(correction),
             self._budget(correction),
             cancellation,
+            library=None if correction else self._library,
         )
         notes: Notes = {
             "starts": float(found.starts),
@@ -219,6 +257,7 @@ class OptimalGait(GaitMethod):
             longest=chosen.longest,
             starts=chosen.starts,
             solutions=1 if correction else chosen.answers,
+            agreeing=chosen.agreeing,
             iterations=chosen.iterations,
             time_budget=chosen.time_budget,
             gentle=correction,
@@ -277,6 +316,9 @@ class OptimalGait(GaitMethod):
         }
         if self._efforts is not None:
             numbers["effort"] = self._efforts.limit
+        if self._library is not None:
+            digest = bytes.fromhex(self._library.digest)
+            numbers["library"] = np.frombuffer(digest, np.uint8).astype(float)
         return plan_key(self.robot, numbers, values_of(self.options))
 
     def _loaded(

@@ -108,6 +108,12 @@ class OptimalOptions:
         minimum=1,
         maximum=10000,
     )
+    agreeing: int = parameter(
+        3,
+        "solutions that are the best one and end the search; 0: only answers and starts do",
+        minimum=0,
+        maximum=10000,
+    )
     iterations: int = parameter(
         300, "steps of the solver from one guess at most", minimum=1, maximum=100000
     )
@@ -121,5 +127,8 @@ class OptimalOptions:
     )
     longest: float = parameter(
         3600.0, "longest manoeuvre that is still planned", unit="s", minimum=1.0, maximum=1e9
+    )
+    library: str = parameter(
+        "", "file of spacerobot library with manoeuvres to begin with; '': that of the cache"
     )
     cache: int = parameter(1, "1: manoeuvres are kept on disk", minimum=0, maximum=1)

@@ -29,6 +29,7 @@ from spacerobot_ros.planning.methods.optimal.joint_efforts import (
     EffortLimitedShooting,
     JointEfforts,
 )
+from spacerobot_ros.planning.methods.optimal.library import SolutionLibrary
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import MultipleShooting, StopRule
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -73,8 +74,8 @@ grid overrates some solutions by more than others."""
 _SAME = 1e-3
 """Solutions whose costs are this near, relative, are taken for one."""
 
-_AGREED = 3
-"""Solutions are enough when so many of them are the best one: other starts come to the same."""
+_AGREEING_WITH_LIBRARY = 2
+"""Solutions that are the best one and enough, where a library has the first guesses."""
 
 _FULL_STARTS = 3
 """Guesses that are tried on the full grid where nothing came of the coarse one."""
@@ -94,7 +95,9 @@ class SearchBudget:
     longest
         Longest manoeuvre, s.
     starts, solutions
-        Guesses that are tried at most, and manoeuvres that are enough.
+        Guesses that are tried at most, and solutions that are enough.
+    agreeing
+        Solutions that are the best one and enough; 0: no number is.
     iterations
         Steps of the solver from each guess at most.
     time_budget
@@ -108,6 +111,7 @@ class SearchBudget:
     longest: float
     starts: int
     solutions: int
+    agreeing: int
     iterations: int
     time_budget: float
     gentle: bool = False
@@ -147,7 +151,7 @@ class _Progress:
 
     Attributes
     ----------
-    boundary, limits, quaternion, budget, cancellation
+    boundary, limits, quaternion, budget, cancellation, library
         As of :meth:`ManoeuvreSearch.search`.
     starts, rejection
         Guesses that were tried, and why the last candidate was none.
@@ -158,6 +162,7 @@ class _Progress:
     quaternion: Array
     budget: SearchBudget
     cancellation: Cancellation
+    library: SolutionLibrary | None = None
     starts: int = 0
     rejection: str = ""
     _began: float = field(default_factory=time.monotonic)
@@ -189,7 +194,12 @@ class _Progress:
     def agreed(self, solutions: list[Trajectory]) -> bool:
         """Whether the best solution was found often enough."""
         costs = np.array([self.cost(each) for each in solutions])
-        return int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _SAME))) >= _AGREED
+        agreeing = self.budget.agreeing
+        if self.library is not None:
+            # What was found for goals nearby has been agreed upon before.
+            agreeing = min(agreeing, _AGREEING_WITH_LIBRARY)
+        same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _SAME)))
+        return 0 < agreeing <= same
 
     def cost(self, trajectory: Trajectory) -> float:
         """Return what is to be least: the duration, or in a given one the effort."""
@@ -241,8 +251,11 @@ class ManoeuvreSearch:
         intervals: int,
         budget: SearchBudget,
         cancellation: Cancellation = NEVER,
+        library: SolutionLibrary | None = None,
     ) -> Manoeuvre:
         """Return the fastest manoeuvre found from attitude ``quaternion`` (4,) of R_WB.
+
+        The nearest manoeuvres of a library are the first guesses.
 
         Raises
         ------
@@ -258,7 +271,7 @@ class ManoeuvreSearch:
                 f"Manoeuvres take at least {_FEWEST_TICKS} control periods of {self._period:g} s, "
                 f"more than optimal.longest = {budget.longest:g} s."
             )
-        progress = _Progress(boundary, limits, quaternion, budget, cancellation)
+        progress = _Progress(boundary, limits, quaternion, budget, cancellation, library)
         full = self.solver(intervals, boundary.center is not None)
         coarser = intervals // _COARSER
         found: list[Manoeuvre] = []
@@ -289,7 +302,11 @@ class ManoeuvreSearch:
     ) -> list[Manoeuvre]:
         """Return manoeuvres from at most ``starts`` guesses on a grid; none where none is found."""
         guesses = self._guesses(full, grid.intervals)
-        of_boundary = guesses.of(progress.boundary, progress.limits, progress.boundary.likely)
+        boundary, limits = progress.boundary, progress.limits
+        of_boundary = guesses.of(boundary, limits, boundary.likely)
+        if progress.library is not None:
+            near = progress.library.nearest(boundary, limits)
+            of_boundary = itertools.chain((guesses.through(x, limits) for x in near), of_boundary)
         solutions: list[Trajectory] = []
         enough = progress.budget.solutions
         for number, guess in enumerate(itertools.islice(of_boundary, starts), 1):

@@ -1,0 +1,121 @@
+"""Cold plans of ``optimal`` by this checkout, by another one, and by a long search."""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.benchmarks import planning_goals
+from spacerobot_ros.benchmarks.against import Checkout
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.resources import share_directory
+from spacerobot_ros.termination import child_options
+
+_SEED = 7
+
+_LONGER = (1.01, 1.02, 1.03)
+"""Ratios of durations below which goals are counted."""
+
+Plans = Mapping[str, list[float]]
+
+
+def run_planning_benchmark(
+    goals: int, other: Path | None, starts: int | None, show: Callable[[str], None]
+) -> dict[str, Any]:
+    """Plan goals of every robot and return the figures by its name.
+
+    CPU time is compared, with one process at a time: what else the machine does falls on all.
+
+    Parameters
+    ----------
+    goals
+        How many of each robot.
+    other
+        Folder of a checkout that plans the same goals; None: of none.
+    starts
+        Compare durations with those of a search from so many guesses; None: do not.
+    show
+        Called with lines for people.
+
+    Raises
+    ------
+    SpaceRobotError
+        There is no such checkout, or a benchmark fails.
+    """
+    ours = Checkout.ours()
+    theirs = None if other is None else Checkout.at(other)
+    figures: dict[str, Any] = {}
+    for name in planning_goals.CASES:
+        plans = _plans(ours, name, goals, {})
+        found: dict[str, Any] = {"median_cpu_s": statistics.median(plans["cpu_s"]), **plans}
+        show(f"{name}: {found['median_cpu_s']:.3f} s of CPU time in the median of {goals} goals")
+        if theirs is not None:
+            before = _plans(theirs, name, goals, {})
+            median = statistics.median(before["cpu_s"])
+            found |= {"there": before, "times_faster": median / found["median_cpu_s"]}
+            show(f"... there {median:.3f} s: {found['times_faster']:.2f} times faster here")
+            found["durations_to_there"] = _compared(plans, before, "there", show)
+        if starts is not None:
+            options = {"starts": starts, "answers": starts, "agreeing": 0}
+            long = _plans(ours, name, goals, options)
+            found |= {"long_search": long}
+            words = f"by a search from {starts} guesses"
+            found["durations_to_long_search"] = _compared(plans, long, words, show)
+        figures[name] = found
+    return figures
+
+
+def _plans(checkout: Checkout, name: str, goals: int, options: Mapping[str, Any]) -> Plans:
+    """Return CPU times and durations of the plans that a checkout makes."""
+    urdf = share_directory() / "urdf" / f"{name}.urdf"
+    with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
+        result = Path(folder, "plans.json")
+        words = [str(urdf), name, str(goals), str(_SEED), json.dumps(options), str(result)]
+        run = subprocess.run(
+            [sys.executable, str(planning_goals.__file__), *words],
+            cwd=folder,
+            **child_options({**os.environ, "PYTHONPATH": str(checkout.folder)}),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if run.returncode != 0:
+            last = (run.stderr.strip().splitlines() or ["it gave no reason."])[-1]
+            raise SpaceRobotError(f"Planning by {checkout.folder} failed: {last}")
+        plans: Plans = json.loads(result.read_text("utf-8"))
+    return plans
+
+
+def _compared(
+    plans: Plans, others: Plans, whose: str, show: Callable[[str], None]
+) -> dict[str, float]:
+    """Return how the durations compare, and show it."""
+    here, there = (np.array(each["duration_s"]) for each in (plans, others))
+    figures = duration_figures(here, there)
+    shares = ", ".join(
+        f"{100 * figures[f'share_below_{limit:g}']:.0f} % at most {100 * (limit - 1):.0f} %"
+        for limit in _LONGER
+    )
+    show(f"... durations beside those {whose}: {shares} longer; at most {figures['worst']:.3f}")
+    return figures
+
+
+def duration_figures(here: Array, there: Array) -> dict[str, float]:
+    """Return shares of goals (K,) by the ratio of their durations, and the largest ratio.
+
+    A goal that is refused (NaN) here alone counts as infinitely longer, there alone as shorter.
+    """
+    ratio = np.where(np.isnan(there), np.where(np.isnan(here), 1.0, 0.0), here / there)
+    ratio = np.where(np.isnan(ratio), np.inf, ratio)
+    shares = {f"share_below_{limit:g}": float(np.mean(ratio <= limit)) for limit in _LONGER}
+    return {**shares, "worst": float(ratio.max()), "best": float(ratio.min())}
