@@ -100,9 +100,9 @@ class OptimalOptions:
     intervals: int = parameter(
         80, "steps of the optimal control problem", minimum=10, maximum=10000
     )
-    starts: int = parameter(32, "guesses that are tried at most", minimum=1, maximum=10000)
+    starts: int = parameter(24, "guesses that are tried at most", minimum=1, maximum=10000)
     answers: int = parameter(
-        24,
+        16,
         "solutions to find, unless starts agree before; several are found on a coarse grid, and "
         "the best of them is refined",
         minimum=1,

@@ -58,10 +58,10 @@ _UNHURRIED = 4.0
 """A gentle manoeuvre is the path of least effort in this many times the time of its guess, then as
 fast as the limits allow."""
 
-_COARSER = 4
+_COARSER = 5
 """The coarse grid has so many times fewer intervals than the full one ..."""
 
-_FEWEST_INTERVALS = 10
+_FEWEST_INTERVALS = 8
 """... and at least so many; otherwise there is no coarse grid."""
 
 _REFINED = 2
