@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 import yaml
 
-from spacerobot_ros.bag import Bag, read_bag
-from spacerobot_ros.resources import resource_names, share_directory
+from spacerobot_ros.bag import Bag, message_definition, read_bag
+from spacerobot_ros.model.urdf import load_robot
+from spacerobot_ros.resources import resource_names, robot_file, share_directory
+from spacerobot_ros.topics import TOPICS
 
 SHARE = share_directory()
 SENT_BY_PEOPLE = {
@@ -20,12 +22,46 @@ SENT_BY_PEOPLE = {
 }
 # Of rviz_default_plugins.
 DISPLAYED = {
+    "rviz_default_plugins/RobotModel": "std_msgs/msg/String",
     "rviz_default_plugins/MarkerArray": "visualization_msgs/msg/MarkerArray",
     "rviz_default_plugins/Odometry": "nav_msgs/msg/Odometry",
     "rviz_default_plugins/Pose": "geometry_msgs/msg/PoseStamped",
     "rviz_default_plugins/Path": "nav_msgs/msg/Path",
 }
-PANELS = {"3D", "Plot", "DiagnosticSummary", "RawMessages"}
+TITLES = {"foxglovePanelTitle", "lichtblickPanelTitle"}
+"""Keys of a panel's title: Foxglove reads the first, Lichtblick the second; `title` nobody."""
+
+# The keys that the published sources of Lichtblick (and of Foxglove before it was closed) read of
+# each panel: types.ts, or the configuration of the renderer. Others are dropped silently.
+KEYS = {
+    "3D": {
+        "cameraState", "followTf", "followMode", "scene", "publish", "transforms", "topics",
+        "layers", "imageMode",
+    },
+    "Plot": {
+        "paths", "showLegend", "legendDisplay", "showPlotValuesInLegend", "showXAxisLabels",
+        "showYAxisLabels", "isSynced", "xAxisVal", "sidebarDimension",
+    },
+    "DiagnosticSummary": {
+        "minLevel", "pinnedIds", "hardwareIdFilter", "topicToRender", "sortByLevel",
+    },
+    "RawMessages": {
+        "diffEnabled", "diffMethod", "diffTopicPath", "showFullMessageForDiff", "topicPath",
+    },
+    # Buttons that abort, rearm and pause: the layout could only look on.
+    "CallService": {
+        "serviceName", "requestPayload", "layout", "buttonText", "buttonTooltip", "buttonColor",
+    },
+    # Goals of base and end-effector with three axes, and faults.
+    "Publish": {
+        "topicName", "datatype", "buttonText", "buttonTooltip", "buttonColor", "advancedView",
+        "value",
+    },
+    # When plant, planner and controller were in which state.
+    "StateTransitions": {"isSynced", "paths"},
+}  # fmt: skip
+PATH_KEYS = {"value", "label", "enabled", "timestampMethod"}
+PANELS = set(KEYS)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +117,9 @@ def test_foxglove_names_topics_and_fields_of_the_stack(
         if name.startswith("RawMessages!"):
             assert types[panel["topicPath"]].endswith("DiagnosticStatus")
         for path in panel.get("paths", ()):
-            match = re.fullmatch(r"(/[\w/]+)\.([\w.]+?)(\[\d*:\d*\])?", path["value"])
+            if name.startswith("StateTransitions!"):
+                continue
+            match = re.fullmatch(r"(/[\w/]+)\.([\w.]+?)(\[\d+\])?", path["value"])
             assert match is not None
             topic, field, is_array = match.groups()
             bag = next(bag for bag in bags if topic in bag.topics)
@@ -96,10 +134,55 @@ def test_rviz_names_topics_of_the_type_that_its_displays_take(types: dict[str, s
     manager = config["Visualization Manager"]
     assert manager["Global Options"]["Fixed Frame"] == "world"
     found = {d["Class"]: d["Topic"] for d in manager["Displays"] if "Topic" in d}
+    robot = next(d for d in manager["Displays"] if d["Class"].endswith("/RobotModel"))
+    found["rviz_default_plugins/RobotModel"] = robot["Description Topic"]
+    assert any(d["Class"] == "rviz_default_plugins/TF" for d in manager["Displays"])
     assert set(found) == set(DISPLAYED)
     for kind, topic in found.items():
         assert types[topic["Value"]] == DISPLAYED[kind]
-        latched = topic["Value"] == "/planned_path"
+        latched = topic["Value"] in ("/planned_path", "/robot_description")
         assert topic["Durability Policy"] == ("Transient Local" if latched else "Volatile")
-    (goal,) = [tool["Topic"]["Value"] for tool in manager["Tools"] if "Topic" in tool]
-    assert types[goal] == "geometry_msgs/msg/PoseStamped"
+    goals = [tool["Topic"]["Value"] for tool in manager["Tools"] if "Topic" in tool]
+    assert set(goals) == set(SENT_BY_PEOPLE)
+
+
+def test_foxglove_reads_every_key_of_the_layout(foxglove: dict[str, Any]) -> None:
+    for name, panel in foxglove["configById"].items():
+        kind = name.split("!")[0]
+        assert set(panel) == TITLES | (set(panel) & KEYS[kind]), name
+        assert len({panel[key] for key in TITLES}) == 1
+        for path in panel.get("paths", ()):
+            assert set(path) == PATH_KEYS, name
+
+
+def test_foxglove_draws_a_line_for_each_joint_of_every_robot(foxglove: dict[str, Any]) -> None:
+    most = max(
+        len(load_robot(robot_file(name)).joint_names) for name in resource_names("urdf", ".urdf")
+    )
+    for panel, field in (("joints", "position"), ("rates", "velocity")):
+        values = [path["value"] for path in foxglove["configById"][f"Plot!{panel}"]["paths"]]
+        assert values[:most] == [f"/joint_states.{field}[{i}]" for i in range(most)]
+        # A slice of an array is one line that zig-zags through all its entries.
+        assert len(
+            {path["label"] for path in foxglove["configById"][f"Plot!{panel}"]["paths"]}
+        ) == len(values)
+
+
+def test_foxglove_commands_what_the_nodes_offer(foxglove: dict[str, Any]) -> None:
+    panels = foxglove["configById"]
+    services = {p["serviceName"] for n, p in panels.items() if n.startswith("CallService!")}
+    assert services == {"/plant/abort", "/plant/rearm", "/plant/pause", "/planner/abort"}
+    for name, panel in panels.items():
+        if name.startswith("CallService!"):
+            json.loads(panel["requestPayload"])
+        if name.startswith("Publish!"):
+            topic = TOPICS[panel["topicName"][1:]]
+            assert panel["datatype"] == topic.type
+            fields = json.loads(panel["value"])
+            known = message_definition(topic.type)
+            assert all(re.search(rf"\b{field}\b", known) for field in fields)
+    states = panels["StateTransitions!states"]["paths"]
+    for path in states:
+        match = re.fullmatch(r'/([\w/]+)\.values\[:\]\{key=="state"\}\.value', path["value"])
+        assert match is not None
+        assert TOPICS[match[1]].type.endswith("DiagnosticStatus")
