@@ -35,6 +35,12 @@ class CommanderConfig(WatchdogConfig, BelievedRobotConfig):
     world_frame: str = parameter(
         "world", "frame that goals are in, if they name no other that is known"
     )
+    state_reliability: str = parameter(
+        "auto",
+        "how odom and joint_states are subscribed: best_effort hears every publisher, reliable "
+        "loses nothing of one that is reliable; auto: reliable, until a publisher offers less",
+        choices=("auto", "reliable", "best_effort"),
+    )
     diagnostics_period: float = parameter(
         1.0,
         "simulated time between diagnostics; 0: ignored states only. Outside of a run in one "

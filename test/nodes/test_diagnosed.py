@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from support.control_loop import Loop
 from support.planner_flight import NEAR, Flight
@@ -16,7 +17,9 @@ from support.plant_rig import Rig
 from support.ros_harness import Harness, Probe
 from visualization_msgs.msg import MarkerArray
 
-from spacerobot_ros.nodes import PlantNode
+from spacerobot_ros.model.urdf import load_robot
+from spacerobot_ros.nodes import PlannerNode, PlantNode
+from spacerobot_ros.resources import robot_file
 
 # Each noise is another one, so that one that is taken for another is noticed.
 NOISES = {
@@ -116,3 +119,28 @@ def test_a_stack_in_real_time_is_alive_whatever_its_file_says(harness: Harness) 
         lambda: probe.count("markers") >= 3 and probe.count("/diagnostics") >= 2, "a sign of life"
     )
     assert plant.is_active
+
+
+@pytest.mark.parametrize("choice", ["auto", "best_effort", "reliable"])
+def test_a_driver_that_publishes_with_best_effort_is_heard(harness: Harness, choice: str) -> None:
+    planner = harness.make(
+        PlannerNode,
+        {"robot": "planar_chain", "tick_rate": 20.0, "state_reliability": choice},
+    )
+    probe = harness.probe({"joint_commands": JointState})
+    drivers = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    joints = probe.create_publisher(JointState, "joint_states", drivers)
+    message = JointState(
+        name=["joint_1", "joint_2"], position=[0.0, 0.0], velocity=[0.0, 0.0], effort=[0.0, 0.0]
+    )
+    message.name = list(load_robot(robot_file("planar_chain")).joint_names)
+    heard = False
+    for tick in range(1, 60):
+        message.header.stamp.nanosec = 10_000_000 * tick
+        joints.publish(message)
+        harness.spin_for(0.02)
+        heard = heard or bool(probe.messages["joint_commands"])
+        if heard:
+            break
+    assert heard == (choice != "reliable")
+    assert planner.is_active

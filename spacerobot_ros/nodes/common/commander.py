@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
@@ -14,6 +14,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
@@ -23,7 +24,7 @@ from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS, JointReader, first_time_ns
 from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
-from spacerobot_ros.nodes.common.node import STREAM, RobotNode
+from spacerobot_ros.nodes.common.node import BEST_EFFORT, STREAM, RobotNode
 from spacerobot_ros.nodes.common.state_synchroniser import StateSynchroniser
 from spacerobot_ros.nodes.common.state_times import StateTimes
 from spacerobot_ros.nodes.common.transforms import KnownFrames, StateFrames, robot_frames
@@ -171,12 +172,11 @@ class CommanderNode(RobotNode):
         self._statuses = self.create_subscription(
             DiagnosticStatus, "plant/status", self._on_plant_status, _STATUSES
         )
-        self._odom_input = self.create_subscription(
-            Odometry, "odom", self._on_odom, STREAM, raw=True
-        )
-        self._joints_input = self.create_subscription(
-            JointState, "joint_states", self._on_joints, STREAM, raw=True
-        )
+        self._best_effort = self.config.state_reliability == "best_effort"
+        self._unheard = ""
+        """A topic of the state with a publisher that this node cannot hear as it subscribes."""
+        self._odom_input = self._subscribe_state(Odometry, "odom", self._on_odom)
+        self._joints_input = self._subscribe_state(JointState, "joint_states", self._on_joints)
         self._said: DiagnosticStatus | None = None
         """The last status of the node."""
         period = self.config.diagnostics_period or math.inf
@@ -295,9 +295,39 @@ class CommanderNode(RobotNode):
             while (taken := handle.take_message(kind, True)) is not None:
                 yield taken[0]
 
+    def _subscribe_state(
+        self, kind: type[Any], topic: str, callback: Callable[[bytes], None]
+    ) -> Subscription:
+        def on_incompatible(_: Any) -> None:
+            self._unheard = topic
+
+        auto = self.config.state_reliability == "auto" and not self._best_effort
+        events = SubscriptionEventCallbacks(incompatible_qos=on_incompatible) if auto else None
+        return self.create_subscription(
+            kind,
+            topic,
+            callback,
+            BEST_EFFORT if self._best_effort else STREAM,
+            raw=True,
+            event_callbacks=events,
+        )
+
+    def _hear_everybody(self) -> None:
+        """Subscribe to the state as drivers of sensors publish it."""
+        self.get_logger().info(
+            f"A publisher of '{self._unheard}' offers best effort: the state is subscribed so."
+        )
+        self._unheard, self._best_effort = "", True
+        for old in (self._odom_input, self._joints_input):
+            self.destroy_subscription(old)
+        self._odom_input = self._subscribe_state(Odometry, "odom", self._on_odom)
+        self._joints_input = self._subscribe_state(JointState, "joint_states", self._on_joints)
+
     def _look_at_times(self) -> None:
         """Take up what waits: statuses, and a state that was set aside once it is believed."""
         self._take_waiting_statuses()
+        if self._unheard:
+            self._hear_everybody()
         times = self._times
         # A plant that is paused publishes nothing that could contradict it.
         believed = None if self._plant.paused else times.believed()

@@ -45,6 +45,9 @@ from spacerobot_ros.parameters import Parameter, Value, configured, declared, va
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """State and commands: reliable, deep enough for a reader that is briefly busy."""
 
+BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""The same from drivers of sensors, which repeat nothing that was lost."""
+
 EVENTS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """Events: none may be lost, and a late subscriber gets none of before."""
 
