@@ -9,20 +9,22 @@ import numpy as np
 import pinocchio
 import pytest
 from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from scipy.spatial.transform import Rotation
 from support.planner_flight import NEAR, Flight, goal_at, values_of
-from support.ros_harness import Harness
+from support.ros_harness import Harness, nanoseconds
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
+from spacerobot_ros.bag import Bag, RecordedRobot, read_bag, type_hash
 from spacerobot_ros.bag.recorded_robot import columns
+from spacerobot_ros.bag.rosbag2 import _OWN_DEFINITIONS
 from spacerobot_ros.model.link_transforms import LinkTransforms
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
 from spacerobot_ros.nodes.common.messages import chained
-from spacerobot_ros.nodes.common.transforms import KnownFrames, TransformTemplate
+from spacerobot_ros.nodes.common.transforms import TRANSFORM_TYPE, KnownFrames, TransformTemplate
 from spacerobot_ros.resources import resource_names, robot_file
 
 TOLERANCE = 1e-12
@@ -188,6 +190,33 @@ def test_chains_of_frames_end_in_the_world_or_nowhere() -> None:
     assert frames.pose("moon", "world", own) is None
     aside = chained(up, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
     assert aside == pytest.approx([0, 1, 1, 0, 0, half, half])
+
+
+def test_the_topic_has_the_frames_of_odom(harness: Harness) -> None:
+    messages = pytest.importorskip("tf2_msgs.msg")
+    assert type_hash(TRANSFORM_TYPE) == _OWN_DEFINITIONS["tf2_msgs", "TFMessage"][1]
+    plant = harness.make(
+        PlantNode, {"robot": "servicer", "tick_rate": 50.0, "initial_position": [1.0, 2.0, 3.0]}
+    )
+    probe = harness.probe(
+        {"/tf": messages.TFMessage, "/tf_static": messages.TFMessage, "odom": Odometry},
+        latched=("/tf_static",),
+    )
+    harness.spin_until(lambda: probe.count("/tf") >= 3 and probe.count("odom") >= 30)
+    assert probe.count("/tf_static") == 1
+    poses = {nanoseconds(m.header.stamp): m.pose.pose for m in probe.messages["odom"]}
+    seen = 0
+    for message in probe.messages["/tf"]:
+        base = next(t for t in message.transforms if t.header.frame_id == "world")
+        pose = poses.get(nanoseconds(base.header.stamp))
+        if pose is None:
+            continue  # Of before odom was met.
+        t, o = base.transform.translation, base.transform.rotation
+        assert [t.x, t.y, t.z] == [pose.position.x, pose.position.y, pose.position.z]
+        assert [o.x, o.w] == [pose.orientation.x, pose.orientation.w]
+        seen += 1
+    assert seen >= 2
+    assert plant.is_active
 
 
 LINK = next(joint for joint in load_robot(robot_file("sliding_masses")).joints).child
