@@ -14,7 +14,7 @@ import numpy as np
 _GENERATORS = (
     "ament-cmake", "ament-cmake-gmock", "ament-cmake-gtest", "ament-cmake-include-directories",
     "ament-cmake-pytest", "ament-cmake-ros", "ament-package", "geometry-msgs",
-    "python-cmake-module", "rosidl-core-generators", "rosidl-default-generators",
+    "python-cmake-module", "rclpy[fastrtps]", "rosidl-core-generators", "rosidl-default-generators",
 )  # fmt: skip
 
 _CMAKE = """
@@ -78,7 +78,10 @@ def build_tf2_msgs(folder: Path) -> dict[str, str]:
     return {
         "AMENT_PREFIX_PATH": f"{prefix}:{sys.prefix}",
         "PYTHONPATH": f"{module}:{os.environ.get('PYTHONPATH', '')}",
-        "LD_LIBRARY_PATH": f"{prefix / 'lib'}:{Path(sys.prefix, 'lib')}",
+        # The wheels have set theirs for this process, and do so once.
+        "LD_LIBRARY_PATH": ":".join(
+            [str(prefix / "lib"), os.environ.get("LD_LIBRARY_PATH", ""), f"{sys.prefix}/lib"]
+        ),
     }
 
 
