@@ -23,6 +23,7 @@ from spacerobot_ros.nodes.common.cdr import NANOSECONDS, raw_publish
 from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
+from spacerobot_ros.nodes.common.transforms import TRANSFORM_TYPE
 from spacerobot_ros.nodes.common.watchdog import Role
 
 _READER_CHECK = 0.05
@@ -145,7 +146,12 @@ class ReplayNode(FlightNode):
                     f"Topic '{topic.name}' cannot be replayed as '{name}': that is no topic name."
                 ) from None
             except SpaceRobotError as error:
-                self.get_logger().warning(f"Topic '{topic.name}' is not replayed: {error}")
+                sentence = f"Topic '{topic.name}' is not replayed: {error}"
+                # Every bag has transforms, and few machines without ROS have their type.
+                if topic.type_name == TRANSFORM_TYPE:
+                    self.get_logger().info(sentence)
+                else:
+                    self.get_logger().warning(sentence)
                 continue
             self._outputs.append(publisher)
             self._sends[topic.name] = raw_publish(publisher)
