@@ -127,9 +127,8 @@ def test_a_bad_change_in_flight_is_refused(harness: Harness) -> None:
     cases: list[tuple[str, Any, str]] = [
         ("position_tolerance", -1.0, "position_tolerance"),
         ("max_corrections", -1, "max_corrections"),
-        # What follows rclpy itself refuses.
-        ("attitude_tolerance", "small", "DOUBLE"),
-        ("max_corrections", 2.5, "INTEGER"),
+        ("attitude_tolerance", "small", "'attitude_tolerance' is 'small'; it must be a number"),
+        ("max_corrections", 2.5, "'max_corrections' is 2.5; it must be a whole number"),
         ("tick_rate", 50.0, "tick_rate"),
     ]
     for name, value, mention in cases:
