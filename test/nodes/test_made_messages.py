@@ -176,7 +176,7 @@ class Diagnosed:
     def status(self, part: str, time_ns: int = 0) -> tuple[bytes, str, dict[str, str]]:
         """Publish, and return level, sentence and values of a part."""
         self.report.publish(time_ns)
-        (found,) = (s for s in self.node.published[-1].status if s.name == f"/a/plant: {part}")
+        (found,) = (s for s in self.node.published[-1].status if s.name == f"a/plant: {part}")
         return found.level, found.message, {pair.key: pair.value for pair in found.values}
 
 

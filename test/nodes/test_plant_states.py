@@ -172,7 +172,7 @@ def test_a_namespace_moves_all_but_the_clock_and_the_diagnostics(harness: Harnes
         lambda: probe.last("/craft/joint_states").velocity[0] == 0.5, "a step in the namespace"
     )
     harness.spin_until(lambda: probe.count("/diagnostics"), "diagnostics")
-    assert probe.last("/diagnostics").status[0].name == "/craft/plant: commands"
+    assert probe.last("/diagnostics").status[0].name == "craft/plant: commands"
 
 
 # -- momentum ---------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -251,6 +252,8 @@ def messages_of(bag: Path) -> dict[str, list[Any]]:
         for schema, channel, record in make_reader(file).iter_messages(log_time_order=False):
             assert schema is not None
             package, _, name = schema.name.split("/")
+            if find_spec(package) is None:
+                continue  # tf2_msgs is no part of the wheels; bags have /tf all the same.
             kind = getattr(import_module(f"{package}.msg"), name)
             content.setdefault(channel.topic, []).append(deserialize_message(record.data, kind))
     return content
