@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spacerobot_ros.model.description import Array, Joint, JointKind, RobotDescription
+from spacerobot_ros.model.description import Array, Joint, JointKind, Mimic, RobotDescription
 from spacerobot_ros.model.rotations import quaternion_from_matrix, quaternion_multiply
 
 Frames = tuple[tuple[str, str], ...]
@@ -41,7 +41,10 @@ class LinkTransforms:
         self.fixed: Frames = tuple((joint.parent, joint.child) for joint in fixed)
         self.fixed_poses = np.array([_at_zero(joint) for joint in fixed]).reshape(-1, 7)
         self.poses = np.array([_at_zero(joint) for joint in moving]).reshape(-1, 7)
-        self._index = np.array([names.index(joint.name) for joint in moving], dtype=int)
+        follows = [joint.mimic or Mimic(joint.name, 1.0, 0.0) for joint in moving]
+        self._index = np.array([names.index(each.joint) for each in follows], dtype=int)
+        self._factor = np.array([each.multiplier for each in follows])
+        self._offset = np.array([each.offset for each in follows])
         slides = np.array([joint.kind is JointKind.PRISMATIC for joint in moving], dtype=bool)
         axes = np.array([joint.axis for joint in moving]).reshape(-1, 3)
         turned = np.array([joint.origin.R @ joint.axis for joint in moving]).reshape(-1, 3)
@@ -54,7 +57,7 @@ class LinkTransforms:
 
     def update(self, q: Array) -> None:
         """Place the links for the positions (n,) of the joints, m or rad."""
-        moved = q[self._index]
+        moved = self._factor * q[self._index] + self._offset
         half = self._half * moved
         self.poses[:, :3] = self._position + moved[:, None] * self._direction
         self.poses[:, 3:] = (
