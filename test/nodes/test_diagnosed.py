@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from support.control_loop import Loop
@@ -90,18 +91,22 @@ def test_the_controller_is_in_the_diagnostics(harness: Harness) -> None:
     assert diagnosed(probe, "control: states")
 
 
-def test_every_node_says_what_it_does_when_it_starts(
-    harness: Harness, capfd: pytest.CaptureFixture[str]
-) -> None:
+def logged(probe: Probe, line: str) -> bool:
+    return any(re.search(line, message.msg) for message in probe.messages["/rosout"])
+
+
+def test_every_node_says_what_it_does_when_it_starts(harness: Harness) -> None:
     flight = Flight(harness)
+    flight.probe.watch("/rosout", Log, latched=True)
     flight.start()
     flight.send(NEAR)
     flight.wait("executing")
-    lines = capfd.readouterr()
-    text = lines.out + lines.err
-    assert re.search(r"Simulates 'sliding_masses' \(3 joint.* 20 Hz in lockstep", text)
-    assert re.search(r"Plans by 'lie_bracket' for 'sliding_masses'.*/goal_pose", text)
-    assert re.search(r"Goal .* of the base: \(0.05, -0.03, 0.02\) m", text)
+    for line in (
+        r"Simulates 'sliding_masses' \(3 joint.* 20 Hz in lockstep",
+        r"Plans by 'lie_bracket' for 'sliding_masses'.*/goal_pose",
+        r"Goal .* of the base: \(0.05, -0.03, 0.02\) m",
+    ):
+        harness.spin_until(partial(logged, flight.probe, line), line)
 
 
 def test_a_stack_in_real_time_is_alive_whatever_its_file_says(harness: Harness) -> None:

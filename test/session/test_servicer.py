@@ -180,6 +180,7 @@ def either_way() -> Callable[[], float]:
     return lambda: float(rng.uniform(0.9, 1.1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [heavier, pytest.param(either_way, marks=pytest.mark.slow)])
 def test_both_poses_are_reached_with_wrong_masses(
     law: str, error: Callable[[], Callable[[], float]], tmp_path: Path

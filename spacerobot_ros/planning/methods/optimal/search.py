@@ -165,7 +165,7 @@ class _Progress:
     library: SolutionLibrary | None = None
     starts: int = 0
     rejection: str = ""
-    _began: float = field(default_factory=time.monotonic)
+    _began: float = field(default_factory=lambda: time.monotonic())
 
     def stop_rule(self, *, found: bool) -> StopRule:
         """Return when the solver stops; until something is found it may go on for longer."""
