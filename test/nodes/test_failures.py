@@ -137,3 +137,19 @@ def test_a_fault_of_any_size_stops_no_plant(harness: Harness, line: str) -> None
     rig.wait_for_log("is refused")
     assert list(rig.step([0.2, 0.0, 0.0]).velocity) == [0.2, 0.0, 0.0]
     assert rig.plant.state is PlantState.RUNNING
+
+
+def test_a_callback_that_was_queued_when_its_subscription_was_destroyed_is_no_failure(
+    harness: Harness,
+) -> None:
+    node = harness.add(Fragile("fragile", context=harness.context))
+    subscription = next(each for each in node.subscriptions if each.topic_name == "/joints")
+    queued = node._guarded(lambda _: subscription.handle.__enter__(), "a message on 'joints'")
+    assert node.trigger_deactivate() is TransitionCallbackReturn.SUCCESS
+    assert node.trigger_cleanup() is TransitionCallbackReturn.SUCCESS
+    queued(None)
+    assert node.said == ""
+    assert node.fault is None
+    assert node.trigger_configure() is TransitionCallbackReturn.SUCCESS
+    queued(None)
+    assert "cannot use Destroyable" in node.said

@@ -18,6 +18,7 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rclpy._rclpy_pybind11 import RCLError
+from rclpy.exceptions import InvalidHandle
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
@@ -68,6 +69,13 @@ _CAN_SHUT_DOWN = (
     State.PRIMARY_STATE_INACTIVE,
     State.PRIMARY_STATE_ACTIVE,
 )
+
+_WITHOUT_ENTITIES = (
+    State.PRIMARY_STATE_UNKNOWN,
+    State.PRIMARY_STATE_UNCONFIGURED,
+    State.PRIMARY_STATE_FINALIZED,
+)
+"""States in which what configure created is destroyed."""
 
 
 class FlightNode(LifecycleNode):
@@ -273,8 +281,8 @@ class FlightNode(LifecycleNode):
 
     def _fail(self, what: str, error: Exception) -> None:
         """Stop working after an exception of a callback; whoever spins the node goes on."""
-        if self._destroyed:
-            return  # The executor had the callback in its queue.
+        if self._destroyed or (isinstance(error, InvalidHandle) and not self._is_configured):
+            return  # The executor had the callback in its queue when its entity was destroyed.
         self.get_logger().debug("".join(traceback.format_exception(error)))
         if isinstance(error, SpaceRobotError):
             sentence = str(error)
@@ -329,6 +337,11 @@ class FlightNode(LifecycleNode):
     def _is_in(self, state: int) -> bool:
         machine = self._state_machine
         return bool(machine and machine.current_state[0] == state)
+
+    @property
+    def _is_configured(self) -> bool:
+        machine = self._state_machine
+        return bool(machine and machine.current_state[0] not in _WITHOUT_ENTITIES)
 
     def finalize(self) -> None:
         """Take the transition to the end, unless somebody has had the node take it before."""
