@@ -111,7 +111,8 @@ class Stack:
         # A matched subscription has not yet received what its publisher sent before.
         if "/plant/status" in self.recorder.topics:
             self.harness.spin_until(
-                lambda: recording.messages_waiting > 0, "the recorder receives the plant's status"
+                lambda: recording.messages_waiting > 0 and self.probe.count("/plant/status") > 0,
+                "recorder and probe receive the plant's status",
             )
 
     def await_topics(self, *topics: str) -> None:
