@@ -9,12 +9,13 @@ import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlparse
 from xml.etree import ElementTree
 
 import numpy as np
 from urdf_parser_py.urdf import URDF
 
-from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.errors import RobotDescriptionError, SpaceRobotError
 from spacerobot_ros.model.description import (
     Array,
     Inertia,
@@ -29,7 +30,7 @@ from spacerobot_ros.model.description import (
     weld,
 )
 from spacerobot_ros.model.rotations import matrix_from_rpy
-from spacerobot_ros.resources import suggestion
+from spacerobot_ros.resources import share_directory, suggestion
 
 _LARGEST = 1e12
 """Larger numbers (kg, m, kg m^2) are slips, and their squares soon overflow."""
@@ -119,6 +120,33 @@ def _mesh_beside(resource: str, folder: Path) -> Path | None:
         if parent.name == package and (parent / inside).is_file():
             return parent / inside
     return None
+
+
+def mesh_file(resource: str) -> Path | None:
+    """Return the file of a mesh by its URI (``file://``, ``package://``) or path; None: not there.
+
+    Packages are looked for in the ROS environment; this package's own need none.
+    """
+    url = urlparse(resource)
+    if url.scheme == "package":
+        folder = _package(url.netloc)
+        path = None if folder is None else folder / unquote(url.path).lstrip("/")
+    elif url.scheme in ("file", ""):
+        path = Path(unquote(url.path))
+    else:
+        return None
+    return path if path is not None and path.is_file() else None
+
+
+def _package(name: str) -> Path | None:
+    if name == "spacerobot_ros":
+        return share_directory()
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        return Path(get_package_share_directory(name))
+    except (ImportError, LookupError, OSError, ValueError, SpaceRobotError):
+        return None
 
 
 def parse_robot(text: str) -> RobotDescription:

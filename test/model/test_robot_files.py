@@ -8,7 +8,7 @@ import pytest
 
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model import load_robot
-from spacerobot_ros.model.meshes import mesh_file
+from spacerobot_ros.model.urdf import mesh_file
 from spacerobot_ros.resources import robot_file
 
 INERTIAL = """<inertial><mass value="{mass}"/>
@@ -56,7 +56,7 @@ def test_a_xacro_file_that_cannot_be_expanded_is_refused(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("root:x:0:0:root:/root:/bin/bash\n", r"not valid URDF: it is no XML"),
+        ("name:password:0:0\n", r"not valid URDF: it is no XML"),
         ("<sdf version='1.9'><model name='a'/></sdf>", r"but an SDF model: .* <sdf>"),
         ("<mujoco><worldbody/></mujoco>", r"but a MuJoCo model: .* <mujoco>"),
         ("<html><body/></html>", r"but something else: .* <html>"),

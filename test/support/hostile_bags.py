@@ -13,7 +13,7 @@ import os
 import resource
 import signal
 import sys
-import time
+import threading
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -73,16 +73,12 @@ def command(*words: str) -> Callable[[Path], None]:
 
 def replay(path: Path) -> None:
     """Replay for at most ten seconds: what would go on for ever is stopped like by Ctrl-C."""
-    if not (stopper := os.fork()):
-        time.sleep(10.0)
-        os.kill(os.getppid(), signal.SIGINT)
-        os._exit(0)
+    stopper = threading.Timer(10.0, os.kill, (os.getpid(), signal.SIGINT))
+    stopper.start()
     try:
         command("replay", "{bag}", "--rate", "1e6", "--wait", "0", "--clock")(path)
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(stopper, signal.SIGKILL)
-        os.waitpid(stopper, 0)
+        stopper.cancel()
 
 
 def everything(path: Path) -> None:
