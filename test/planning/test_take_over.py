@@ -185,6 +185,16 @@ def test_of_many_goals_only_the_newest_is_planned_for(held: bool) -> None:
     assert loop.error_to(OTHER)[0] < 1e-3
 
 
+def test_a_plan_for_an_earlier_goal_is_cancelled_at_once() -> None:
+    loop = flying(held=True, ticks=80)
+    loop.propose(([0.01, 0.02, 0.0], [0.0, 0.0, 0.0]))
+    loop.tick(2)
+    assert loop.executive.phase is Phase.REPLANNING
+    assert not loop.held.cancelled
+    loop.propose(OTHER)
+    assert loop.held.cancelled
+
+
 def test_the_present_goal_once_more_goes_on_under_its_new_id(tmp_path: Path) -> None:
     loop = flying()
     loop.executive._file = GoalFile(str(tmp_path / "goal.json"))
