@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.termination import child_options
@@ -69,11 +70,29 @@ class Checkout:
         """
         module, _, function = self.entry.partition(":")
         call = f"import {module} as m; m.{function}(prog_name='spacerobot')"
+        figures = self.run(["-c", call, "bench", *words, "--json"])
+        return {
+            name: float(value) for name, value in figures.items() if isinstance(value, (int, float))
+        }
+
+    def run(self, arguments: Sequence[str]) -> Any:
+        """Run Python with this package and return what it writes to its last argument as JSON.
+
+        Parameters
+        ----------
+        arguments
+            Those of Python; the name of a file, in a folder of its own, is added.
+
+        Raises
+        ------
+        SpaceRobotError
+            It fails; the sentence is its last.
+        """
         # Away from any checkout: Python looks for packages in the current folder first.
         with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
             result = Path(folder, "figures.json")
             run = subprocess.run(
-                [sys.executable, "-c", call, "bench", *words, "--json", str(result)],
+                [sys.executable, *arguments, str(result)],
                 cwd=folder,
                 **child_options({**os.environ, "PYTHONPATH": str(self.folder)}),
                 capture_output=True,
@@ -83,10 +102,7 @@ class Checkout:
             if run.returncode != 0:
                 last = (run.stderr.strip().splitlines() or ["it gave no reason."])[-1]
                 raise SpaceRobotError(f"The benchmark of {self.folder} failed: {last}")
-            figures = json.loads(result.read_text("utf-8"))
-        return {
-            name: float(value) for name, value in figures.items() if isinstance(value, (int, float))
-        }
+            return json.loads(result.read_text("utf-8"))
 
 
 def compare_checkouts(

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import statistics
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,10 +12,8 @@ import numpy as np
 
 from spacerobot_ros.benchmarks import planning_goals
 from spacerobot_ros.benchmarks.against import Checkout
-from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import share_directory
-from spacerobot_ros.termination import child_options
 
 _SEED = 7
 
@@ -78,21 +72,8 @@ def run_planning_benchmark(
 def _plans(checkout: Checkout, name: str, goals: int, options: Mapping[str, Any]) -> Plans:
     """Return CPU times and durations of the plans that a checkout makes."""
     urdf = share_directory() / "urdf" / f"{name}.urdf"
-    with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
-        result = Path(folder, "plans.json")
-        words = [str(urdf), name, str(goals), str(_SEED), json.dumps(options), str(result)]
-        run = subprocess.run(
-            [sys.executable, str(planning_goals.__file__), *words],
-            cwd=folder,
-            **child_options({**os.environ, "PYTHONPATH": str(checkout.folder)}),
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if run.returncode != 0:
-            last = (run.stderr.strip().splitlines() or ["it gave no reason."])[-1]
-            raise SpaceRobotError(f"Planning by {checkout.folder} failed: {last}")
-        plans: Plans = json.loads(result.read_text("utf-8"))
+    words = [str(urdf), name, str(goals), str(_SEED), json.dumps(options)]
+    plans: Plans = checkout.run([str(planning_goals.__file__), *words])
     return plans
 
 

@@ -14,7 +14,11 @@ from support.oracles import PinocchioOracle
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
-from spacerobot_ros.planning.methods.optimal.multiple_shooting import MultipleShooting, StopRule
+from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
+    DurationBounds,
+    MultipleShooting,
+    StopRule,
+)
 from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -49,7 +53,7 @@ def solved(
     curvature = arm.function("curvature", compile=False)
     guesses = InitialGuesses(stages.turn, curvature, INTERVALS)
     guess = next(guesses.of(boundary, limits, ARM_START))
-    solution = solver.solve(boundary, limits, guess, StopRule(300), shortest=1.0, longest=60.0)
+    solution = solver.solve(boundary, limits, guess, StopRule(300), DurationBounds(1.0, 60.0))
     assert solver.converged
     assert solution is not None
     return solution

@@ -31,6 +31,7 @@ from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
+    PathConstraints,
     Trajectory,
 )
 
@@ -69,24 +70,36 @@ class HeldCommands:
     miss: float
 
 
-class CommandHolder:
-    """Turns trajectories of one robot into held commands.
+@dataclass(frozen=True)
+class ManoeuvreModel:
+    """What all manoeuvres of one robot must obey.
 
-    ``axes`` (m, 3) are the directions in the base along which the attitude is reached, ``efforts``
-    those of the joints, within limits; None: any.
+    Attributes
+    ----------
+    robot, prediction, control_period
+        The model, the base motion that commands cause, and how long each is held, s.
+    axes
+        (m, 3) directions in the base along which the attitude is reached.
+    constraints, efforts
+        What the path must keep; no efforts: any.
     """
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        prediction: BasePrediction,
-        control_period: float,
-        axes: Array,
-        efforts: JointEfforts | None = None,
-    ) -> None:
-        self._prediction = prediction
-        self._period = control_period
-        self._axes, self._efforts = axes, efforts
+    robot: SpaceRobot
+    prediction: BasePrediction
+    control_period: float
+    axes: Array
+    constraints: PathConstraints
+    efforts: JointEfforts | None = None
+
+
+class CommandHolder:
+    """Turns trajectories of one robot into held commands."""
+
+    def __init__(self, model: ManoeuvreModel) -> None:
+        robot = model.robot
+        self._prediction = model.prediction
+        self._period = model.control_period
+        self._axes, self._efforts = model.axes, model.efforts
         self._curvature = robot.function("curvature", compile=False)
         self._connection = robot.connection
         self._n = robot.n

@@ -16,22 +16,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spacerobot_ros.errors import NotFoundError
-from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import InitialMotion
-from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
-from spacerobot_ros.planning.methods.optimal.held_commands import CommandHolder, HeldCommands
+from spacerobot_ros.planning.methods.optimal.held_commands import (
+    CommandHolder,
+    HeldCommands,
+    ManoeuvreModel,
+)
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
-from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
-from spacerobot_ros.planning.methods.optimal.multiple_shooting import MultipleShooting, StopRule
+from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
+    DurationBounds,
+    MultipleShooting,
+    StopRule,
+)
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     CandidateError,
     MotionLimits,
-    PathConstraints,
     Trajectory,
 )
 
@@ -97,28 +101,18 @@ class MotionSearch:
 
     Parameters
     ----------
-    robot, prediction, control_period
-        The model, the base motion that commands cause, and how long each is held, s.
-    axes
-        (m, 3) directions in the base along which the attitude is reached.
-    constraints, efforts
-        What the path must keep; no efforts: any.
+    model
+        What they must obey.
     solver
         Returns what solves the problem on so many intervals, with or without a position.
     """
 
     def __init__(
-        self,
-        robot: SpaceRobot,
-        prediction: BasePrediction,
-        control_period: float,
-        axes: Array,
-        constraints: PathConstraints,
-        efforts: JointEfforts | None,
-        solver: Callable[[int, bool], MultipleShooting],
+        self, model: ManoeuvreModel, solver: Callable[[int, bool], MultipleShooting]
     ) -> None:
-        self._robot, self._period, self._constraints = robot, control_period, constraints
-        self._holder = CommandHolder(robot, prediction, control_period, axes, efforts)
+        self._robot, self._period = model.robot, model.control_period
+        self._constraints = model.constraints
+        self._holder = CommandHolder(model)
         self._solver = solver
 
     def search(
@@ -204,15 +198,10 @@ class MotionSearch:
     ) -> Trajectory | None:
         """Return the fastest trajectory near a guess, None if there is none."""
         shortest = min(_FEWEST_TICKS * self._period, budget.longest)
+        duration = DurationBounds(shortest, budget.longest)
         for room in _ROOMS:
-            solution = solver.solve(
-                boundary,
-                self._narrowed(limits, room),
-                guess,
-                stop,
-                shortest=shortest,
-                longest=budget.longest,
-            )
+            narrowed = self._narrowed(limits, room)
+            solution = solver.solve(boundary, narrowed, guess, stop, duration)
             if solution is not None or stop.cancellation.requested:
                 return solution
         return None
@@ -253,9 +242,7 @@ class MotionSearch:
                 self._narrowed(limits, room),
                 replace(guess, step=T / solver.intervals),
                 stop,
-                shortest=T,
-                longest=T,
-                least_effort=True,
+                DurationBounds(T, T),
             )
             if stop.cancellation.requested:
                 break

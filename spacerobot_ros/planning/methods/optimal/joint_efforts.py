@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,7 +18,11 @@ import numpy as np
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.methods.optimal.multiple_shooting import MultipleShooting, StopRule
+from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
+    DurationBounds,
+    MultipleShooting,
+    StopRule,
+)
 from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -168,26 +171,18 @@ class EffortLimitedShooting(MultipleShooting):
         limits: MotionLimits,
         guess: Trajectory,
         stop: StopRule,
-        *,
-        shortest: float,
-        longest: float,
-        least_effort: bool = False,
+        duration: DurationBounds,
     ) -> Trajectory | None:
         """Solve as :class:`MultipleShooting` does, within the limits of the efforts."""
-        asked: dict[str, Any] = {
-            "shortest": shortest,
-            "longest": longest,
-            "least_effort": least_effort,
-        }
         self._last = None
         # A guess that uses the efforts just up to their limits was made for them.
         if not _AT_LIMITS <= self._efforts.peak(guess) <= 1 + _WITHIN:
-            solution = super().solve(boundary, limits, guess, stop, **asked)
+            solution = super().solve(boundary, limits, guess, stop, duration)
             if solution is None or self._efforts.peak(solution) <= 1:
                 return solution
-            guess = solution if shortest == longest else self._efforts.slowed(solution)
+            guess = solution if duration.fixed else self._efforts.slowed(solution)
         if self._limited is None:
             stages = self._stages((self._efforts.inequality,))
             self._limited = MultipleShooting(stages, self.intervals)
         self._last = self._limited
-        return self._limited.solve(boundary, limits, guess, stop, **asked)
+        return self._limited.solve(boundary, limits, guess, stop, duration)

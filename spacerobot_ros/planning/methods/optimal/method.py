@@ -38,6 +38,7 @@ from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanR
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
+from spacerobot_ros.planning.methods.optimal.held_commands import ManoeuvreModel
 from spacerobot_ros.planning.methods.optimal.in_motion import MotionBudget, MotionSearch
 from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
 from spacerobot_ros.planning.methods.optimal.library import (
@@ -103,12 +104,16 @@ class OptimalGait(GaitMethod):
         self._constraints = PathConstraints.of(robot, chosen)
         self._efforts = JointEfforts.of(robot, chosen, self.control_period)
         self._prediction = BasePrediction(robot, self.control_period, self.integration_step)
-        problem = (
-            *(robot, self._prediction, self.control_period),
-            *(self._specification.axes, self._constraints, self._efforts),
+        model = ManoeuvreModel(
+            robot,
+            self._prediction,
+            self.control_period,
+            self._specification.axes,
+            self._constraints,
+            self._efforts,
         )
-        self._search = ManoeuvreSearch(*problem, compiling=chosen.answers > 1)
-        self._motion_search = MotionSearch(*problem, self._search.solver)
+        self._search = ManoeuvreSearch(model, compiling=chosen.answers > 1)
+        self._motion_search = MotionSearch(model, self._search.solver)
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
         self._library_key = library_key(
             robot, self._limits, self._specification.axes, position=self._specification.position

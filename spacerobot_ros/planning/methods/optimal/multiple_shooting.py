@@ -62,6 +62,19 @@ class StopRule:
         return end < math.inf and time.monotonic() > end
 
 
+@dataclass(frozen=True)
+class DurationBounds:
+    """What a trajectory may take, s: from ``shortest`` to ``longest``."""
+
+    shortest: float
+    longest: float
+
+    @property
+    def fixed(self) -> bool:
+        """Whether it is given."""
+        return self.shortest == self.longest
+
+
 class MultipleShooting:
     """Solves the problem of one robot for many boundary conditions.
 
@@ -106,12 +119,12 @@ class MultipleShooting:
         limits: MotionLimits,
         guess: Trajectory,
         stop: StopRule,
-        *,
-        shortest: float,
-        longest: float,
-        least_effort: bool = False,
+        duration: DurationBounds,
     ) -> Trajectory | None:
-        """Return the fastest trajectory near ``guess``, or that of least effort; None if none.
+        """Return the fastest trajectory near ``guess``; None if none.
+
+        In a fixed time it is the one of least effort: of the least mean square of the
+        accelerations, over the joints' speeds.
 
         Parameters
         ----------
@@ -119,10 +132,8 @@ class MultipleShooting:
             The problem, and where the solver begins.
         stop
             When the solver stops early.
-        shortest, longest
-            Bounds of the duration, s; equal for least effort in a given time.
-        least_effort
-            Whether the mean square of the accelerations, over the joints' speeds, is minimised.
+        duration
+            What it may take.
         """
         N, layout = self.intervals, self._program.layout
         vertices = np.array([np.tile(x, (N + 1, 1)) for x in (limits.lower, limits.upper)])
@@ -133,7 +144,7 @@ class MultipleShooting:
         attitudes = np.multiply.outer([-1.0, 1.0], np.full((N + 1, 4), 1.1))
         attitudes[:, 0] = [0.0, 0.0, 0.0, 1.0]
         accelerations = np.multiply.outer([-1.0, 1.0], np.tile(limits.acceleration, (N, 1)))
-        steps = shortest / N, longest / N
+        steps = duration.shortest / N, duration.longest / N
         least, most = (
             _packed(layout, steps[i], attitudes[i], vertices[i], velocities[i], accelerations[i])
             for i in (0, 1)
@@ -145,7 +156,7 @@ class MultipleShooting:
             ubx=most,
             lbg=self._program.lower,
             ubg=self._program.upper,
-            p=_parameters(boundary, limits, guess if least_effort else None),
+            p=_parameters(boundary, limits, guess if duration.fixed else None),
         )
         x = result["x"].full().ravel()
         if not self.converged:

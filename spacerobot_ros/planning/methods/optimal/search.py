@@ -17,25 +17,27 @@ from functools import partial
 import numpy as np
 
 from spacerobot_ros.errors import NotFoundError, PlanningError
-from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
-from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
-from spacerobot_ros.planning.methods.optimal.held_commands import CommandHolder, HeldCommands
-from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
-from spacerobot_ros.planning.methods.optimal.joint_efforts import (
-    EffortLimitedShooting,
-    JointEfforts,
+from spacerobot_ros.planning.methods.optimal.held_commands import (
+    CommandHolder,
+    HeldCommands,
+    ManoeuvreModel,
 )
+from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
+from spacerobot_ros.planning.methods.optimal.joint_efforts import EffortLimitedShooting
 from spacerobot_ros.planning.methods.optimal.library import SolutionLibrary
-from spacerobot_ros.planning.methods.optimal.multiple_shooting import MultipleShooting, StopRule
+from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
+    DurationBounds,
+    MultipleShooting,
+    StopRule,
+)
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     CandidateError,
     MotionLimits,
-    PathConstraints,
     Trajectory,
 )
 from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages
@@ -215,31 +217,17 @@ class ManoeuvreSearch:
 
     Parameters
     ----------
-    robot, prediction, control_period
-        The model, the base motion that commands cause, and how long each is held, s.
-    axes
-        (m, 3) directions in the base along which the attitude is reached.
-    constraints, efforts
-        What the path must keep; no efforts: any.
+    model
+        What they must obey.
     compiling
         Whether searches are long enough for compiled functions to pay.
     """
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        prediction: BasePrediction,
-        control_period: float,
-        axes: Array,
-        constraints: PathConstraints,
-        efforts: JointEfforts | None = None,
-        *,
-        compiling: bool = True,
-    ) -> None:
+    def __init__(self, model: ManoeuvreModel, *, compiling: bool = True) -> None:
         self._compiling = compiling
-        self._robot, self._period = robot, control_period
-        self._axes, self._constraints, self._efforts = axes, constraints, efforts
-        self._holder = CommandHolder(robot, prediction, control_period, axes, efforts)
+        self._robot, self._period, self._axes = model.robot, model.control_period, model.axes
+        self._constraints, self._efforts = model.constraints, model.efforts
+        self._holder = CommandHolder(model)
         self._stages: dict[tuple[bool, bool], Stages] = {}
         self._solvers: dict[tuple[int, bool], MultipleShooting] = {}
 
@@ -417,17 +405,14 @@ class ManoeuvreSearch:
             guess = self._slowed(guess)
             T = max(_UNHURRIED * guess.duration, shortest)
         else:
-            solution = solver.solve(
-                boundary, limits, guess, stop, shortest=shortest, longest=budget.longest
-            )
+            duration = DurationBounds(shortest, budget.longest)
+            solution = solver.solve(boundary, limits, guess, stop, duration)
             if solution is None or solver.converged or self._constraints.base_rate > 0:
                 return solution
             # What was cut short has time to spare.
             return self._slowed(solution.hurried(limits, shortest))
         guess = guess.retimed(T / guess.duration)
-        solution = solver.solve(
-            boundary, limits, guess, stop, shortest=T, longest=T, least_effort=True
-        )
+        solution = solver.solve(boundary, limits, guess, stop, DurationBounds(T, T))
         if solution is None or not budget.gentle:
             return solution
         return self._slowed(solution.hurried(limits, shortest))
