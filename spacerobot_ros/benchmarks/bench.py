@@ -30,6 +30,7 @@ from std_msgs.msg import Float64MultiArray
 
 from spacerobot_ros.bag import BagWriter
 from spacerobot_ros.benchmarks.dynamics import dynamics_benchmark
+from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import c_compiler
 from spacerobot_ros.nodes import ReplayNode
@@ -38,7 +39,6 @@ from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import PlanRequest
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.session.run import ros
-from spacerobot_ros.session.scenario import load_scenario
 from spacerobot_ros.session.stack import InProcessStack
 from spacerobot_ros.simulation import VelocityPlant
 from spacerobot_ros.simulation.trials import state_of

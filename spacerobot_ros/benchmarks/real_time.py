@@ -19,11 +19,11 @@ import numpy as np
 
 from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.run import ros
-from spacerobot_ros.session.scenario import load_scenario
 from spacerobot_ros.termination import ended_on_request
 
 _MEMORY_PERIOD = 1.0

@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.run import ros
-from spacerobot_ros.session.scenario import load_scenario
 from spacerobot_ros.termination import ended_on_request
 
 GOAL_PERIOD = 12.0

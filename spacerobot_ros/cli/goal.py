@@ -32,8 +32,8 @@ def command(
         raise click.UsageError("A goal is X Y Z, or X Y Z QX QY QZ QW.")
     if rotvec and rpy_deg:
         raise click.UsageError("The attitude is given twice, in radians and in degrees.")
+    from spacerobot_ros.flight.scenario import goal_from_rotvec, goal_from_rpy
     from spacerobot_ros.planning import Goal
-    from spacerobot_ros.session.scenario import goal_from_rotvec, goal_from_rpy
 
     wanted = Goal.checked(pose[:3], pose[3:] or (0.0, 0.0, 0.0, 1.0))
     if rotvec:

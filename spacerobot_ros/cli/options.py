@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 if TYPE_CHECKING:
-    from spacerobot_ros.session.scenario import Scenario
+    from spacerobot_ros.flight.scenario import Scenario
 
     _Choice = click.Choice[str]
 else:  # Generic in new versions only.

@@ -27,7 +27,7 @@ from spacerobot_ros.cli.options import (
 from spacerobot_ros.errors import ParameterError
 
 if TYPE_CHECKING:
-    from spacerobot_ros.session.scenario import Scenario
+    from spacerobot_ros.flight.scenario import Scenario
 
 
 @click.command("run")
@@ -95,7 +95,7 @@ def _chosen(
 ) -> Scenario:
     """Return the scenario with what the command line changes."""
     from spacerobot_ros.control.laws.registry import LAWS
-    from spacerobot_ros.session.scenario import scenario_or_robot
+    from spacerobot_ros.flight.scenario import scenario_or_robot
 
     scenario = goal.of(scenario_or_robot(name))
     scenario.require_goal()

@@ -8,7 +8,7 @@ import click
 @click.command("scenarios")
 def command() -> None:
     """List the scenarios that come with the package."""
-    from spacerobot_ros.session.scenario import load_scenario, scenario_names
+    from spacerobot_ros.flight.scenario import load_scenario, scenario_names
 
     for name in scenario_names():
         click.echo(f"{name:<26}{load_scenario(name).description}")

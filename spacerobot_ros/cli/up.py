@@ -28,7 +28,7 @@ def command(
 
     They end at Ctrl-C, SIGTERM or SIGHUP; goals come by topic.
     """
-    from spacerobot_ros.session.scenario import scenario_or_robot
+    from spacerobot_ros.flight.scenario import scenario_or_robot
 
     chosen = scenario_or_robot(scenario).in_real_time(rate).with_settings(settings)
     from spacerobot_ros.session.live import keep_up

@@ -25,7 +25,8 @@ from spacerobot_ros.bag import BagWriter, QosProfile, Recording, RecordingState
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.nodes.common.cdr import HEADER_STAMP, NANOSECONDS, first_time_ns
+from spacerobot_ros.flight.state_synchroniser import HEADER_STAMP
+from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns
 from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node

@@ -14,6 +14,7 @@ from spacerobot_ros.bag import Bag, RecordedRobot, TopicSeries, read_bag
 from spacerobot_ros.bag.recorded_robot import columns
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import PlanningError, RobotDescriptionError, SpaceRobotError
+from spacerobot_ros.flight.scenario import Published
 from spacerobot_ros.model import RobotDescription, parse_robot
 from spacerobot_ros.model.description import Array, Joint, Pose
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
@@ -23,7 +24,6 @@ from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.events import FlightEvent, read_events
 from spacerobot_ros.report.signals import Cycles, Signal, find_cycles, nearest_rotvec, rotvecs
 from spacerobot_ros.report.solids import SolidRobot
-from spacerobot_ros.session.scenario import Published
 from spacerobot_ros.topics import TOPICS
 
 _FOLLOWED = frozenset(("executing", "reached", "failed", "aborted"))

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spacerobot_ros.flight.scenario import Published
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.report.figures_time import joint_unit
 from spacerobot_ros.report.flight import Flight
-from spacerobot_ros.session.scenario import Published
 
 _ABSENT = "–"
 

@@ -10,7 +10,7 @@ from click.testing import CliRunner, Result
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.session.scenario import load_scenario, parse_setting, scenario_names
+from spacerobot_ros.flight.scenario import load_scenario, parse_setting, scenario_names
 
 QUICK = [
     "--method",

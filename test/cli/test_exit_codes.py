@@ -9,7 +9,7 @@ import yaml
 from click.testing import CliRunner
 
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.session.scenario import load_scenario
+from spacerobot_ros.flight.scenario import load_scenario
 
 SLIDING = ("sliding_masses", "--method", "lie_bracket")
 

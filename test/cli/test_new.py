@@ -11,11 +11,11 @@ from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.cli.main import main
+from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import JointLimits
 from spacerobot_ros.resources import resource_names, robot_file
 from spacerobot_ros.session.own_robot import first_shape, remarks
-from spacerobot_ros.session.scenario import load_scenario
 from spacerobot_ros.simulation.trials import try_method
 
 

@@ -12,11 +12,11 @@ from sensor_msgs.msg import JointState
 from support.fuzzing import NUMBERS, TEXTS, VALUES, attempt, fuzz
 from support.planners import planner_of
 
+from spacerobot_ros.flight.scenario import goal_from_rotvec
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.messages import goal_of, shape_of
 from spacerobot_ros.planning import Goal, RobotState, Tolerance
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.session.scenario import goal_from_rotvec
 
 ROBOTS = {
     "lie_bracket": "sliding_masses",

@@ -18,6 +18,7 @@ from support.planner_flight import NEAR, Flight
 from support.ros_harness import Harness
 
 from spacerobot_ros.errors import CommandError, SpaceRobotError
+from spacerobot_ros.flight.state_synchroniser import Pairing, StateSynchroniser
 from spacerobot_ros.nodes import PlantNode
 from spacerobot_ros.nodes.common.cdr import (
     JointReader,
@@ -26,7 +27,6 @@ from spacerobot_ros.nodes.common.cdr import (
     first_time_ns,
     stamp_bytes,
 )
-from spacerobot_ros.nodes.common.state_synchroniser import Pairing, StateSynchroniser
 from spacerobot_ros.nodes.planner.messages import path_message
 from spacerobot_ros.planning import BasePath
 

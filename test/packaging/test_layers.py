@@ -23,6 +23,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("report",),
         ("session",),
         ("nodes",),
+        ("flight",),  # above the bag and the plant, beside no ROS
         ("verification",),
         ("bag", "simulation"),
         ("control",),  # above planning, whose goals it takes

@@ -11,8 +11,8 @@ import numpy as np
 
 from spacerobot_ros.bag import Bag, RecordingError, read_bag
 from spacerobot_ros.bag.salvage import salvage_bag
+from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.session.processes import MultiProcessStack
-from spacerobot_ros.session.scenario import Scenario
 
 KILLS = 20
 TIMEOUT = 0.5

@@ -41,8 +41,6 @@ _SIZES = {
     "uint32": 4, "int32": 4, "float": 4, "uint64": 8, "int64": 8, "double": 8,
 }  # fmt: skip
 _TIME = struct.Struct("<iI")
-HEADER_STAMP = slice(_ENCAPSULATION, _ENCAPSULATION + _TIME.size)
-"""Where the stamp of a serialised message is that begins with a header; bytes to compare."""
 
 NANOSECONDS = 1_000_000_000
 

@@ -7,8 +7,6 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
-from enum import Enum
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -21,16 +19,17 @@ from sensor_msgs.msg import JointState
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
+from spacerobot_ros.flight.plant_listener import Change, PlantListener, Stopped
+from spacerobot_ros.flight.state_synchroniser import StateSynchroniser
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS, JointReader, first_time_ns
 from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
 from spacerobot_ros.nodes.common.node import BEST_EFFORT, STREAM, RobotNode
-from spacerobot_ros.nodes.common.state_synchroniser import StateSynchroniser
 from spacerobot_ros.nodes.common.state_times import StateTimes
 from spacerobot_ros.nodes.common.transforms import KnownFrames, StateFrames, robot_frames
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.simulation.status import PlantState, PlantStatus
+from spacerobot_ros.simulation.status import PlantStatus
 
 _LOOK_PERIOD = 0.1
 """Wall s between two looks at states that were set aside."""
@@ -48,104 +47,6 @@ _STATUSES = QoSProfile(
     depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 """Every status counts, not only the last: deeper than what latecomers get."""
-
-
-@dataclass(frozen=True)
-class Stopped:
-    """The plant does not do what it is commanded.
-
-    Attributes
-    ----------
-    why
-        The plant's sentence.
-    commanded_until_ns
-        Where it rests because no command came: the stamp of the last one; None: it obeys nothing.
-    rests_since_ns
-        Since when it rests then, as far as is known.
-    """
-
-    why: str
-    commanded_until_ns: int | None = None
-    rests_since_ns: int = 0
-
-
-class Change(Enum):
-    """What else a plant reports."""
-
-    OBEYS = "obeys"
-    """Commands pass again."""
-    RESET = "reset"
-    """The robot is back in its initial state."""
-
-
-class PlantListener:
-    """What a commander knows of its plant from plant/status; nothing, if none is published."""
-
-    def __init__(self) -> None:
-        self._status: PlantStatus | None = None
-        self._name = "plant"
-
-    @property
-    def blocked(self) -> str:
-        """Why no goal is accepted now, as a sentence; empty: goals are."""
-        status = self._status
-        if status is None:
-            return ""
-        if status.latched_fault:
-            return f"The plant is latched: {status.latched_fault}; call '{self._name}/rearm' first."
-        if status.state is PlantState.FAILED:
-            return f"The plant has failed: {status.sentence}"
-        return ""
-
-    @property
-    def rests(self) -> bool:
-        """Whether no command is in force."""
-        return self._status is not None and self._status.state is PlantState.RESTING
-
-    @property
-    def paused(self) -> bool:
-        """Whether the plant's time stands still."""
-        return self._status is not None and self._status.state is PlantState.PAUSED
-
-    def take(self, status: PlantStatus, name: str = "plant") -> list[Stopped | Change]:
-        """Take up a status of the plant of this name; return what a commander has to do about it.
-
-        Statuses may be missed: the counters of a plant tell what has happened in between.
-        """
-        before, was_blocked = self._status, bool(self.blocked)
-        self._status, self._name = status, name
-        news: list[Stopped | Change] = []
-        if self.blocked:
-            if before is None or not was_blocked or status.latched_fault != before.latched_fault:
-                news.append(Stopped(status.sentence))
-            return news
-        if before is None:
-            return news
-        if status.rearms > before.rearms and not was_blocked:
-            news.append(Stopped("Commands pass again after a fault was latched."))
-        if status.timeouts > before.timeouts or (
-            status.reason == "timeout" and before.reason != "timeout"
-        ):
-            rested = _rested(status)
-            if rested is not None:
-                news.append(rested)
-        if status.resets > before.resets:
-            news.append(Change.RESET)
-        if was_blocked or status.rearms > before.rearms:
-            news.append(Change.OBEYS)
-        return news
-
-
-def _rested(status: PlantStatus) -> Stopped | None:
-    """Return that a plant rests, or has rested meanwhile; None if it says nonsense of the time."""
-    last, since = status.last_command_s, status.time_s
-    last = since if last is None else last
-    why = status.sentence
-    if status.reason != "timeout":
-        since, why = last, "The joints were brought to rest: no command came in time."
-    if not (math.isfinite(last) and math.isfinite(since)):
-        return None
-    return Stopped(why, round(last * NANOSECONDS), round(since * NANOSECONDS))
 
 
 class CommanderNode(RobotNode):

@@ -10,9 +10,10 @@ from std_msgs.msg import String
 from spacerobot_ros.bag import QosProfile, Recording
 from spacerobot_ros.bag.rosbag2 import LATCHED
 from spacerobot_ros.errors import CommandError, RecordingError, RobotDescriptionError
+from spacerobot_ros.flight.state_synchroniser import HEADER_STAMP
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.nodes.common.cdr import HEADER_STAMP, NANOSECONDS, first_time_ns
+from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns
 from spacerobot_ros.nodes.common.streams import Take
 from spacerobot_ros.nodes.common.transforms import TRANSFORM_TYPE, RobotTransforms, StateFrames
 

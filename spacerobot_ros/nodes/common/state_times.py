@@ -6,7 +6,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from spacerobot_ros.nodes.common.cdr import HEADER_STAMP, NANOSECONDS, first_time_ns
+from spacerobot_ros.flight.state_synchroniser import HEADER_STAMP
+from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns
 
 LONGEST_DOUBT = 0.2
 """Wall s after which a state of another time is believed that no state of the old time follows."""

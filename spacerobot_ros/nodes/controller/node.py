@@ -20,6 +20,8 @@ from spacerobot_ros.control.reference import HeldVelocityReference
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.flight.plant_listener import Change, Stopped
+from spacerobot_ros.flight.state_synchroniser import CONTRADICTION, Pairing, StateSynchroniser
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import (
@@ -29,11 +31,10 @@ from spacerobot_ros.nodes.common.cdr import (
     TemplateReader,
     stamp_bytes,
 )
-from spacerobot_ros.nodes.common.commander import Change, CommanderNode, Stopped
+from spacerobot_ros.nodes.common.commander import CommanderNode
 from spacerobot_ros.nodes.common.messages import diagnostic_status, goal_of, goal_sentence
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.common.state_synchroniser import CONTRADICTION, Pairing, StateSynchroniser
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
 
 JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"

@@ -16,14 +16,15 @@ from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.flight.plant_listener import Change, Stopped
+from spacerobot_ros.flight.state_synchroniser import CONTRADICTION, Pairing, StateSynchroniser
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.cdr import stamp_bytes
-from spacerobot_ros.nodes.common.commander import Change, CommanderNode, Stopped
+from spacerobot_ros.nodes.common.commander import CommanderNode
 from spacerobot_ros.nodes.common.messages import goal_of, goal_sentence, shape_of
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.common.state_synchroniser import CONTRADICTION, Pairing, StateSynchroniser
 from spacerobot_ros.nodes.planner.messages import (
     StateReader,
     goal_markers,

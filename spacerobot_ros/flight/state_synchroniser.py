@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from enum import Enum
 
-from spacerobot_ros.nodes.common.cdr import HEADER_STAMP
+HEADER_STAMP = slice(4, 12)
+"""Where the stamp of a serialised message is that begins with a header: after the encapsulation,
+seconds and nanoseconds of four bytes each. They are only compared."""
 
 CONTRADICTION = (
     "odom: two messages of one time differ; more than one node publishes it, and such poses are "

@@ -11,9 +11,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import GoalError, ParameterError
-from spacerobot_ros.nodes import NODE_TYPES
-from spacerobot_ros.resources import robot_file, share_directory
-from spacerobot_ros.session.scenario import (
+from spacerobot_ros.flight.scenario import (
     CONFIGS,
     NODES,
     Kill,
@@ -22,6 +20,8 @@ from spacerobot_ros.session.scenario import (
     scenario_names,
     scenario_or_robot,
 )
+from spacerobot_ros.nodes import NODE_TYPES
+from spacerobot_ros.resources import robot_file, share_directory
 
 
 def test_the_configurations_are_those_of_the_nodes() -> None:

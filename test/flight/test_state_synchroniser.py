@@ -7,7 +7,7 @@ from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
-from spacerobot_ros.nodes.common.state_synchroniser import Pairing, StateSynchroniser
+from spacerobot_ros.flight.state_synchroniser import Pairing, StateSynchroniser
 
 WHOLE, WITHOUT_POSE, LATE_POSE = Pairing.WHOLE, Pairing.WITHOUT_POSE, Pairing.LATE_POSE
 
