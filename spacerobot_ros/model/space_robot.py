@@ -41,6 +41,7 @@ from spacerobot_ros.model.dynamics import (
     generalised_forces,
     point_jacobian,
 )
+from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.integration import attitude_step, repeated, runge_kutta_step
 from spacerobot_ros.model.kinematics import tree_kinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
@@ -88,6 +89,17 @@ class SpaceRobot:
     def from_urdf(cls, text: str) -> SpaceRobot:
         """Read the robot of a URDF text; see :func:`parse_robot`."""
         return cls(parse_robot(text))
+
+    def with_inertial(self, parameters: InertialParameters) -> SpaceRobot:
+        """Return the robot with other masses, centres of mass and inertias.
+
+        Raises
+        ------
+        RobotDescriptionError
+            No robot weighs that.
+        """
+        parameters.require_physical([body.name for body in self.description.bodies])
+        return SpaceRobot(parameters.described(self.description))
 
     # -- quantities ---------------------------------------------------------------------------
 

@@ -29,6 +29,7 @@ from spacerobot_ros.model.description import (
     Shape,
     weld,
 )
+from spacerobot_ros.model.inertial_parameters import TRIANGLE_SLACK
 from spacerobot_ros.model.rotations import matrix_from_rpy
 from spacerobot_ros.resources import share_directory, suggestion
 
@@ -44,9 +45,6 @@ _MESH = re.compile(
 
 _OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model", "COLLADA": "a COLLADA file"}
 """What files with another root element than <robot> are."""
-
-_TRIANGLE_SLACK = 0.01
-"""Share by which rounded principal moments may break the triangle inequality."""
 
 
 def load_robot(path: str | Path) -> RobotDescription:
@@ -266,7 +264,7 @@ def _require_possible(about: Array, where: str) -> None:
         raise RobotDescriptionError(
             f"The inertia of {where} has a negative principal moment; check its signs."
         )
-    if high > (1 + _TRIANGLE_SLACK) * (low + middle) + 1e-12:
+    if high > (1 + TRIANGLE_SLACK) * (low + middle) + 1e-12:
         raise RobotDescriptionError(
             f"The inertia of {where} is that of no body: its principal moments are {low:.4g}, "
             f"{middle:.4g} and {high:.4g} kg m^2, and none can be larger than the sum of the other "

@@ -25,6 +25,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("nodes",),
         ("flight",),  # above the bag and the plant, beside no ROS
         ("verification",),
+        ("batch",),
         ("bag", "simulation"),
         ("control",),  # above planning, whose goals it takes
         ("planning",),

@@ -1,0 +1,25 @@
+"""Thousands of flights at once: the plant on vector registers, a flight in each lane."""
+
+from spacerobot_ros.batch.flights import (
+    BatchResult,
+    FlightProgram,
+    Flights,
+    FollowedSchedule,
+    HeldCommands,
+    SensorErrors,
+    Starts,
+)
+from spacerobot_ros.batch.flying import fly_lanes
+from spacerobot_ros.batch.scalar import fly_one_by_one
+
+__all__ = [
+    "BatchResult",
+    "FlightProgram",
+    "Flights",
+    "FollowedSchedule",
+    "HeldCommands",
+    "SensorErrors",
+    "Starts",
+    "fly_lanes",
+    "fly_one_by_one",
+]

@@ -1,0 +1,439 @@
+"""What many flights have in common, what differs, and what comes of them.
+
+Rows are samples. A row says what :class:`.PlantConfig`, :class:`.InitialState` and
+:class:`.SensorConfig` say of one flight; the same numbers give the same flight there and here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.inertial_parameters import InertialParameters
+from spacerobot_ros.model.integration import steps_in
+from spacerobot_ros.planning.core.schedule import GaitSchedule
+from spacerobot_ros.simulation.building import PLANTS
+from spacerobot_ros.simulation.config import SensorConfig
+from spacerobot_ros.simulation.initial_state import InitialState
+
+Counts = npt.NDArray[np.int64]
+
+NOISES = (
+    "position_noise",
+    "attitude_noise",
+    "velocity_noise",
+    "angular_velocity_noise",
+    "joint_noise",
+    "joint_rate_noise",
+)
+"""The parameters of :class:`SensorConfig` that the columns of :attr:`SensorErrors.noise` are."""
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Where flights start, a row each; see :class:`.InitialState`.
+
+    Attributes
+    ----------
+    position
+        (N, 3) of the base link in W, m; where ``of_center``, of the system's centre of mass.
+    quaternion
+        (N, 4) of ``R_WB`` (x, y, z, w), unit quaternions.
+    q, qdot
+        (N, n) joint positions and rates, m or rad (a second).
+    momenta
+        (N, 6) total linear (kg m/s) over angular momentum about the centre of mass (kg m^2/s), W.
+    of_center
+        (N,) whether ``position`` is that of the centre of mass.
+    """
+
+    position: Array
+    quaternion: Array
+    q: Array
+    qdot: Array
+    momenta: Array
+    of_center: npt.NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, robot: SpaceRobot, initial: Sequence[InitialState]) -> Starts:
+        """Return the rows of initial states.
+
+        Raises
+        ------
+        ParameterError
+            One of them is refused, as the plant would refuse it.
+        """
+        centers = [each.center_of_mass for each in initial]
+        return cls(
+            np.array(
+                [
+                    each.position if center is None else center
+                    for each, center in zip(initial, centers, strict=True)
+                ],
+                dtype=float,
+            ).reshape(-1, 3),
+            np.array([each.attitude() for each in initial]).reshape(-1, 4),
+            np.array([each.shape(robot) for each in initial]).reshape(-1, robot.n),
+            np.array([each.rates(robot) for each in initial]).reshape(-1, robot.n),
+            np.array([each.momenta() for each in initial]).reshape(-1, 6),
+            np.array([center is not None for center in centers], dtype=np.bool_),
+        )
+
+    @classmethod
+    def alike(cls, robot: SpaceRobot, initial: InitialState, count: int) -> Starts:
+        """Return ``count`` equal rows; replace the columns that differ.
+
+        Raises
+        ------
+        ParameterError
+            The initial state is refused, as the plant would refuse it.
+        """
+        one = cls.of(robot, [initial])
+        return cls(
+            position=np.repeat(one.position, count, axis=0),
+            quaternion=np.repeat(one.quaternion, count, axis=0),
+            q=np.repeat(one.q, count, axis=0),
+            qdot=np.repeat(one.qdot, count, axis=0),
+            momenta=np.repeat(one.momenta, count, axis=0),
+            of_center=np.repeat(one.of_center, count),
+        )
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def initial_state(self, index: int) -> InitialState:
+        """Return one row as the plant takes it."""
+        of_center = bool(self.of_center[index])
+        state = InitialState(
+            quaternion=self.quaternion[index],
+            joint_positions=self.q[index],
+            joint_velocities=self.qdot[index],
+            linear_momentum=self.momenta[index, :3],
+            angular_momentum=self.momenta[index, 3:],
+            center_of_mass=self.position[index] if of_center else None,
+        )
+        return state if of_center else replace(state, position=self.position[index])
+
+
+@dataclass(frozen=True)
+class SensorErrors:
+    """How sensors err, a row a flight; see :class:`.SensorConfig`.
+
+    Attributes
+    ----------
+    noise
+        (N, 6) 1 sigma by group: position (m), attitude (rad), velocity (m/s), angular velocity
+        (rad/s), joints (m or rad), joint rates.
+    pose_bias
+        (N, 6) of the position in W (m) over a rotation vector in B (rad).
+    joint_bias
+        (N, n) of the joint positions, m or rad.
+    seeds
+        (N,) of the noise: a flight whose sensors err draws what :class:`.Sensors` draws.
+    """
+
+    noise: Array
+    pose_bias: Array
+    joint_bias: Array
+    seeds: Counts
+
+    @classmethod
+    def none(cls, robot: SpaceRobot, count: int) -> SensorErrors:
+        """Return perfect sensors."""
+        zeros = np.zeros
+        return cls(
+            zeros((count, 6)), zeros((count, 6)), zeros((count, robot.n)), zeros(count, np.int64)
+        )
+
+    @classmethod
+    def of(cls, robot: SpaceRobot, each: Sequence[SensorConfig]) -> SensorErrors:
+        """Return the rows of configurations."""
+        zero = (0.0, 0.0, 0.0)
+        return cls(
+            np.array([[getattr(one, name) for name in NOISES] for one in each]).reshape(-1, 6),
+            np.array(
+                [[*(one.position_bias or zero), *(one.attitude_bias or zero)] for one in each]
+            ).reshape(-1, 6),
+            np.array([one.joint_bias or (0.0,) * robot.n for one in each]).reshape(-1, robot.n),
+            np.array([one.seed for one in each], dtype=np.int64),
+        )
+
+    def __len__(self) -> int:
+        return len(self.seeds)
+
+    def config(self, index: int) -> SensorConfig:
+        """Return one row as the plant takes it."""
+        return SensorConfig(
+            **dict(zip(NOISES, self.noise[index].tolist(), strict=True)),
+            position_bias=tuple(self.pose_bias[index, :3].tolist()),
+            attitude_bias=tuple(self.pose_bias[index, 3:].tolist()),
+            joint_bias=tuple(self.joint_bias[index].tolist()),
+            seed=int(self.seeds[index]),
+        )
+
+    @property
+    def used(self) -> npt.NDArray[np.bool_]:
+        """(N,) whether what is measured differs from the truth: only then noise is drawn."""
+        return np.asarray(
+            self.noise.any(axis=1) | self.pose_bias.any(axis=1) | self.joint_bias.any(axis=1)
+        )
+
+
+@dataclass(frozen=True)
+class FollowedSchedule:
+    """Velocity commands of the planner's tracker along a schedule (:class:`.ScheduleFollower`).
+
+    Attributes
+    ----------
+    positions
+        (T + 1, n) shapes at the ticks, or (N, T + 1, n) of each flight; the last is held.
+    shape_gain
+        Feedback from measured shape errors to velocities, 1/s; 0: open loop.
+    deadband
+        Shape errors up to this are not fed back, m or rad.
+    """
+
+    positions: Array
+    shape_gain: float = 0.0
+    deadband: float = 0.0
+
+    @classmethod
+    def of(
+        cls, schedule: GaitSchedule, shape_gain: float = 0.0, deadband: float = 0.0
+    ) -> FollowedSchedule:
+        """Return the program of a planned schedule."""
+        return cls(schedule.positions, shape_gain, deadband)
+
+
+@dataclass(frozen=True)
+class HeldCommands:
+    """Commands a tick, whatever is measured.
+
+    Attributes
+    ----------
+    joints
+        (T, n) or (N, T, n) joint velocities or efforts, by the actuation; zero after the last.
+    wrench
+        (T, 6) or (N, T, 6) force (N) over torque (N m) on the base, base components; None: none.
+    """
+
+    joints: Array
+    wrench: Array | None = None
+
+
+FlightProgram = FollowedSchedule | HeldCommands
+
+
+@dataclass(frozen=True)
+class Flights:
+    """N flights of one robot that differ in numbers.
+
+    Attributes
+    ----------
+    robot
+        The robot; its masses where ``inertial`` gives none.
+    actuation
+        ``velocity`` or ``effort``.
+    control_period
+        Duration of a tick, s.
+    ticks
+        Ticks of each flight.
+    starts
+        Where they start: its rows are the flights.
+    program
+        What is commanded.
+    inertial
+        Masses, centres and inertias, (N, ...); None: those of the robot.
+    sensors
+        How sensors err; None: not at all.
+    integration_step
+        Longest Runge-Kutta step, s; 0: by the actuation.
+    instants
+        Ticks after which the state is reported, ascending, 0 the start; the last is the end unless
+        given.
+
+    Raises
+    ------
+    ParameterError
+        The parts do not go together; the sentence says which.
+    RobotDescriptionError
+        What the bodies weigh is not possible.
+    """
+
+    robot: SpaceRobot
+    actuation: str
+    control_period: float
+    ticks: int
+    starts: Starts
+    program: FlightProgram
+    inertial: InertialParameters | None = None
+    sensors: SensorErrors | None = None
+    integration_step: float = 0.0
+    instants: tuple[int, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        count, robot = len(self), self.robot
+        if self.actuation not in PLANTS:
+            raise ParameterError(f"The actuation is '{self.actuation}', not velocity or effort.")
+        if self.ticks < 1:
+            raise ParameterError(f"A flight of {self.ticks} ticks is none.")
+        if not self.instants:
+            object.__setattr__(self, "instants", (self.ticks,))
+        last = -1
+        for instant in self.instants:
+            if not last < instant <= self.ticks:
+                raise ParameterError(
+                    f"The instants {self.instants} are not ascending ticks of a flight of "
+                    f"{self.ticks}."
+                )
+            last = instant
+        if self.inertial is not None:
+            bodies = robot.description.bodies
+            if self.inertial.masses.shape != (count, len(bodies)):
+                raise ParameterError(
+                    f"The masses are {self.inertial.masses.shape}, not {count} flights of "
+                    f"{len(bodies)} bodies."
+                )
+            self.inertial.require_physical([body.name for body in bodies])
+        if self.sensors is not None and len(self.sensors) != count:
+            raise ParameterError(f"Sensors of {len(self.sensors)} flights are not of {count}.")
+        match self.program:
+            case FollowedSchedule(positions=commanded):
+                if self.actuation != "velocity":
+                    raise ParameterError("A schedule is followed under velocity actuation only.")
+                joints = commanded
+            case HeldCommands(joints=commanded, wrench=wrench):
+                joints = commanded
+                if wrench is not None and self.actuation != "effort":
+                    raise ParameterError("A wrench pushes the base under effort actuation only.")
+                _require_rows("wrench", wrench, count, 6)
+        _require_rows("joints", joints, count, robot.n)
+        if self.actuation == "velocity" and self.starts.qdot.any():
+            raise ParameterError("Joints under velocity commands start at rest.")
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    @property
+    def substeps(self) -> int:
+        """Runge-Kutta steps in a tick."""
+        step = self.integration_step or PLANTS[self.actuation].integration_step
+        return steps_in(self.control_period, step)
+
+    def robot_of(self, index: int) -> SpaceRobot:
+        """Return the robot of one flight."""
+        if self.inertial is None:
+            return self.robot
+        return self.robot.with_inertial(self.inertial[index])
+
+
+def _require_rows(what: str, array: Array | None, count: int, width: int) -> None:
+    if array is None:
+        return
+    if array.ndim not in (2, 3) or array.shape[-1] != width or array.shape[-2] < 1:
+        raise ParameterError(f"The {what} are {array.shape}, not (ticks, {width}).")
+    if array.ndim == 3 and len(array) != count:
+        raise ParameterError(f"The {what} of {len(array)} flights are not of {count}.")
+    if not np.all(np.isfinite(array)):
+        raise ParameterError(f"The {what} hold a number that is not finite.")
+
+
+@dataclass(frozen=True)
+class BatchResult:
+    """What came of N flights, at I instants.
+
+    Attributes
+    ----------
+    engine
+        What flew them, for people.
+    time
+        (I,) s.
+    pose
+        (N, I, 7) position ``r_WB`` (m) and quaternion ``R_WB`` of the base.
+    twist
+        (N, I, 6) ``v_WB_B`` (m/s) and ``omega_WB_B`` (rad/s).
+    q, qdot
+        (N, I, n) joint positions and rates.
+    momentum
+        (N, I, 7) linear and angular momentum in W, kinetic energy.
+    measured_pose, measured_q
+        (N, I, 7) and (N, I, n) what the sensors measured then.
+    peak_rate
+        (N, n) largest joint rate at the end of a tick, m/s or rad/s.
+    peak_effort
+        (N, n) largest effort of a joint in a tick, N or N m; zero under velocity actuation.
+    peak_wrench
+        (N, 2) largest force (N) and torque (N m) on the base.
+    impulse
+        (N, 2) integrals of the sizes of force (N s) and torque (N m s) over time.
+    limited
+        (N, n) ticks in which each joint was limited, by what limited it, as the plant counts.
+    fallback_ticks
+        (N,) ticks that the scalar plant flew because lanes cannot.
+    failures
+        Sentences of the flights that did not end, by their row; their later numbers are NaN.
+    """
+
+    engine: str
+    time: Array
+    pose: Array
+    twist: Array
+    q: Array
+    qdot: Array
+    momentum: Array
+    measured_pose: Array
+    measured_q: Array
+    peak_rate: Array
+    peak_effort: Array
+    peak_wrench: Array
+    impulse: Array
+    limited: Mapping[str, Counts]
+    fallback_ticks: Counts
+    failures: Mapping[int, str]
+
+    @classmethod
+    def empty(cls, flights: Flights) -> BatchResult:
+        """Return the memory of a result, to be filled."""
+        N, instants, n = len(flights), len(flights.instants), flights.robot.n
+        first = {"velocity": "rate", "effort": "effort"}[flights.actuation]
+
+        def reported(width: int) -> Array:
+            return np.full((N, instants, width), np.nan)
+
+        return cls(
+            engine="",
+            time=np.array(flights.instants) * flights.control_period,
+            pose=reported(7),
+            twist=reported(6),
+            q=reported(n),
+            qdot=reported(n),
+            momentum=reported(7),
+            measured_pose=reported(7),
+            measured_q=reported(n),
+            peak_rate=np.zeros((N, n)),
+            peak_effort=np.zeros((N, n)),
+            peak_wrench=np.zeros((N, 2)),
+            impulse=np.zeros((N, 2)),
+            limited={name: np.zeros((N, n), np.int64) for name in (first, "stroke")},
+            fallback_ticks=np.zeros(N, np.int64),
+            failures={},
+        )
+
+    def errors(self, position: Array, quaternion: Array) -> tuple[Array, Array]:
+        """Return distance (N, I) in m and angle (N, I) in rad to a pose (3,) and (4,), or to one of
+        each flight, (N, 3) and (N, 4).
+        """
+        wanted = np.broadcast_to(position, (len(self.pose), 3))[:, None]
+        attitude = np.broadcast_to(quaternion, (len(self.pose), 4))[:, None]
+        x, y = self.pose[..., 3:6], attitude[..., :3]
+        a, b = self.pose[..., 6:], attitude[..., 3:]
+        vector = np.linalg.norm(a * y - b * x - np.cross(x, y), axis=-1)
+        scalar = np.abs((x * y).sum(axis=-1) + (a * b)[..., 0])
+        distance = np.linalg.norm(self.pose[..., :3] - wanted, axis=-1)
+        return distance, 2 * np.arctan2(vector, scalar)

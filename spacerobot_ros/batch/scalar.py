@@ -1,0 +1,139 @@
+"""Flights one after the other in the package's own plant: what the batch is held against."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.batch.flights import BatchResult, Flights, FollowedSchedule, HeldCommands
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.goal import Goal
+from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
+from spacerobot_ros.planning.execution.tracker import ScheduleFollower
+from spacerobot_ros.simulation.building import PLANTS
+from spacerobot_ros.simulation.config import SensorConfig
+from spacerobot_ros.simulation.effort_plant import EffortPlant
+from spacerobot_ros.simulation.faults import FaultyPlant
+from spacerobot_ros.simulation.plant import Plant
+from spacerobot_ros.simulation.sensors import Sensors
+
+
+def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> BatchResult:
+    """Fly the flights of some rows (all, unless given) in the plant, tick by tick.
+
+    The rows that are not flown are NaN or zero.
+    """
+    result = BatchResult.empty(flights)
+    failures: dict[int, str] = {}
+    for row in range(len(flights)) if rows is None else rows:
+        try:
+            _fly(flights, row, result)
+        except SpaceRobotError as error:
+            failures[row] = str(error)
+    return replace(result, engine="scalar", failures=failures)
+
+
+def _fly(flights: Flights, row: int, result: BatchResult) -> None:
+    plant = plant_of(flights, row)
+    config = SensorConfig() if flights.sensors is None else flights.sensors.config(row)
+    faulty = FaultyPlant(plant, (), flights.control_period, wrench=isinstance(plant, EffortPlant))
+    sensors = Sensors(faulty, config, flights.control_period)
+    commands = _Commands(flights, row)
+    wanted = iter(flights.instants)
+    next_instant, column = next(wanted), 0
+    for tick in range(flights.ticks + 1):
+        sensors.measure()
+        if tick == next_instant:
+            _report(plant, sensors, result, row, column)
+            column += 1
+            next_instant = next(wanted, -1)
+        if tick == flights.ticks:
+            break
+        plant.step(*commands.at(tick, sensors.q if sensors.used else plant.q))
+        _account(plant, flights.control_period, result, row)
+    for name, counts in plant.limit_counts.items():
+        result.limited[name][row] = counts
+
+
+def plant_of(flights: Flights, row: int) -> Plant:
+    """Return the plant of one flight at its start."""
+    kind = PLANTS[flights.actuation]
+    return kind.plant(
+        flights.robot_of(row),
+        flights.control_period,
+        flights.starts.initial_state(row),
+        flights.integration_step or kind.integration_step,
+    )
+
+
+class _Commands:
+    """What is commanded in one flight, tick by tick."""
+
+    def __init__(self, flights: Flights, row: int) -> None:
+        n, program = flights.robot.n, flights.program
+        self._velocity, self._position = np.zeros(n), np.zeros(n)
+        self._nothing: list[Array] = [np.zeros(n)]
+        self._follower: ScheduleFollower | None = None
+        match program:
+            case FollowedSchedule():
+                self._follower = ScheduleFollower(
+                    _schedule(flights, _of_row(program.positions, row)),
+                    *(0, program.shape_gain, program.deadband),
+                )
+                self._period_ns = round(flights.control_period * 1e9)
+            case HeldCommands():
+                self._held: list[Array] = [_of_row(program.joints, row)]
+                if program.wrench is not None:
+                    self._held.append(_of_row(program.wrench, row))
+                    self._nothing.append(np.zeros(6))
+
+    def at(self, tick: int, q: Array) -> list[Array]:
+        """Return the commands of a tick at the measured shape ``q`` (n,)."""
+        if self._follower is not None:
+            stamp = tick * self._period_ns
+            self._follower.command(stamp, q, self._position, self._velocity)
+            return [self._velocity]
+        return [
+            held[tick] if tick < len(held) else nothing
+            for held, nothing in zip(self._held, self._nothing, strict=True)
+        ]
+
+
+def _schedule(flights: Flights, positions: Array) -> GaitSchedule:
+    pose = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+    path = BasePath(np.zeros(1), pose[0][None], pose[1][None])
+    names = flights.robot.joint_names
+    return GaitSchedule("", names, flights.control_period, positions, path, Goal(*pose))
+
+
+def _of_row(array: Array, row: int) -> Array:
+    return array if array.ndim == 2 else np.asarray(array[row])
+
+
+def _report(plant: Plant, sensors: Sensors, result: BatchResult, row: int, column: int) -> None:
+    measured: Any = sensors if sensors.used else plant
+    for name, value in (
+        ("pose", plant.pose),
+        ("twist", plant.twist),
+        ("q", plant.q),
+        ("qdot", plant.qdot),
+        ("momentum", plant.momentum),
+        ("measured_pose", measured.pose),
+        ("measured_q", measured.q),
+    ):
+        getattr(result, name)[row, column] = value
+
+
+def _account(plant: Plant, control_period: float, result: BatchResult, row: int) -> None:
+    """Take the peaks and integrals of a tick."""
+    for name, value in (("peak_rate", plant.qdot), ("peak_effort", plant.effort)):
+        peak = getattr(result, name)[row]
+        np.maximum(peak, np.abs(value), out=peak)
+    if isinstance(plant, EffortPlant):
+        sizes = np.linalg.norm(plant.wrench.reshape(2, 3), axis=1)
+        np.maximum(result.peak_wrench[row], sizes, out=result.peak_wrench[row])
+        result.impulse[row] += control_period * sizes
