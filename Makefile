@@ -14,7 +14,7 @@ TESTED := $(BIN)/python3 -c 'import sys; print("-cconstraints.txt" * (sys.versio
 # What decides on the dependencies, and what is installed with the package. Directories are among
 # the latter because a deleted file changes nothing else.
 DECLARATION := setup.py setup.cfg constraints.txt
-SOURCES := package.xml LICENSE $(shell find $(wildcard bags config foxglove launch resource rviz \
+SOURCES := package.xml LICENSE $(shell find $(wildcard bags config foxglove launch meshes resource rviz \
     scripts spacerobot_ros urdf) -not -path bags -not -path '*/__pycache__*' -not -name '.*')
 
 # The environment has a ROS 2 of its own, which one that the shell has sourced would be mixed with.

@@ -40,6 +40,9 @@ DOCS = [
     "ziamath",
 ]
 
+# Kinds of meshes other than STL and OBJ, which need nothing.
+MESHES = ["pycollada", "trimesh"]
+
 setup(
     name=NAME,
     version=VERSION,
@@ -57,6 +60,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         *share("urdf"),
+        *share("meshes"),
         *share("config"),
         *share("launch"),
         *share("bags"),
@@ -90,7 +94,7 @@ setup(
             "ros-jazzy-rclpy[fastrtps]",
         ],
         # The 3D view of reports is MeshCat's. Only its script is used, but the package brings much.
-        "viewer": ["meshcat"],
+        "viewer": ["meshcat", *MESHES],
         "docs": DOCS,
         "test": [
             *DOCS,
@@ -98,6 +102,7 @@ setup(
             "hypothesis",
             "mcap-ros2-support",
             "meshcat",
+            *MESHES,
             'mujoco>=4; python_version >= "3.11"',
             "mypy",
             "pin",

@@ -26,6 +26,10 @@ class RobotDescriptionError(SpaceRobotError):
     """A URDF that does not describe a free-floating robot; the sentence names the element."""
 
 
+class MeshError(SpaceRobotError):
+    """A mesh that is not found or cannot be read; the sentence says why, and what to do."""
+
+
 class ParameterError(SpaceRobotError):
     """A parameter or option whose value is refused; the sentence names it."""
 

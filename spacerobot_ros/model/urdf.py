@@ -50,8 +50,8 @@ _OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model", "COLLADA": 
 def load_robot(path: str | Path) -> RobotDescription:
     """Read the robot of a URDF file, or of a xacro file, which is expanded.
 
-    Paths of meshes that are relative to the file, or in a package that is a folder around it,
-    become absolute in the text that the robot keeps.
+    Paths of meshes that are relative to the file, or in a package that is not installed and is a
+    folder around the file, become absolute in the text that the robot keeps.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def _mesh_beside(resource: str, folder: Path) -> Path | None:
     if not mark:
         found = folder / resource
         return found.resolve() if found.is_file() else None
-    if scheme != "package":
+    if scheme != "package" or mesh_file(resource) is not None:
         return None
     package, _, inside = rest.partition("/")
     for parent in (folder, *folder.parents):

@@ -143,7 +143,7 @@ def test_everything_that_is_imported_is_known_to_these_tests() -> None:
     needed = {
         *("ament_index_python", "casadi", "click", "lz4", "matplotlib", "mcap", "meshcat"),
         *("mujoco", "numpy", "rosbags", "rosidl_parser", "rpyutils", "scipy"),
-        *("urdf_parser_py", "xacro", "yaml", "zstandard"),
+        *("urdf_parser_py", "xacro", "yaml", "zstandard", "collada", "trimesh"),
     }
     others = {name.split(".")[0] for module in sources() for name in imports(module)} - known
     assert others <= needed

@@ -83,7 +83,9 @@ def project(tmp_path: Path) -> Path:
     project.mkdir()
     for name in ("LICENSE", "package.xml", "pyproject.toml", "setup.cfg", "setup.py"):
         shutil.copy2(ROOT / name, project)
-    for name in ("bags", "config", "foxglove", "launch", "resource", "rviz", "scripts", "urdf"):
+    for name in (
+        *("bags", "config", "foxglove", "launch", "meshes", "resource", "rviz", "scripts", "urdf"),
+    ):
         if (ROOT / name).is_dir():
             shutil.copytree(ROOT / name, project / name)
     for folder in ("urdf/meshes", "config"):
@@ -109,6 +111,7 @@ def check_installed(prefix: Path) -> None:
     assert (share / "package.xml").is_file()
     assert (share / "urdf" / "meshes" / "packaging_test.txt").is_file()
     assert (share / "config" / "packaging_test.txt").is_file()
+    assert (share / "meshes" / "surveyor" / "bus.stl").is_file()
     for node in NODES:
         assert os.access(prefix / "lib" / "spacerobot_ros" / node, os.X_OK)
 

@@ -1,0 +1,283 @@
+"""Triangles of the meshes that a URDF names, for whatever draws a robot.
+
+:func:`shape_mesh` returns the triangles of a visual in the frame of its link::
+
+    for link in robot.links:
+        for shape in link.shapes:
+            if shape.kind == "mesh":
+                mesh = shape_mesh(shape, most=20_000)   # MeshError: a sentence for the user
+                draw(mesh.vertices, mesh.faces, shape.rgba)
+
+STL and OBJ are read here; COLLADA, glTF and PLY by trimesh, where it is installed. Files come from
+strangers, also by way of bags: what is read is bounded, and no sentence quotes what a file holds.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.errors import MeshError
+from spacerobot_ros.model.description import Array, Pose, Shape
+from spacerobot_ros.model.urdf import mesh_file
+
+_MOST_BYTES = 100_000_000
+_MOST_TRIANGLES = 2_000_000
+
+_LARGEST = 1e6
+"""Coordinates beyond that are a damaged file's, in whatever unit."""
+
+_HEADER = 84
+"""Bytes of a binary STL before its triangles: a text of 80, and their number."""
+
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+_VERTEX = re.compile(rb"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)\s*$", re.MULTILINE)
+
+_OF_TRIMESH = (".dae", ".glb", ".gltf", ".ply")
+
+Faces = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """Triangles: ``vertices`` (N, 3) in m, ``faces`` (M, 3) of their indices.
+
+    The corners of a face go round counterclockwise, seen from outside, where the file has them so.
+    """
+
+    vertices: Array
+    faces: Faces
+
+    def moved(self, pose: Pose, scale: tuple[float, ...] = (1.0, 1.0, 1.0)) -> TriangleMesh:
+        """Return the mesh, scaled along its own axes, in the frame in which it has ``pose``.
+
+        A scale that mirrors turns the faces round, so that outside stays outside.
+        """
+        vertices = (self.vertices * np.asarray(scale)) @ pose.R.T + pose.r
+        faces = self.faces if np.prod(scale) >= 0 else self.faces[:, ::-1]
+        return TriangleMesh(vertices, np.ascontiguousarray(faces))
+
+    def coarsened(self, most: int) -> TriangleMesh:
+        """Return a mesh of at most ``most`` faces, which looks alike from afar.
+
+        Vertices in one cell of a grid become their mean, and faces that lose their area go. The
+        grid has cubes, as fine as ``most`` allows among halvings of the whole.
+        """
+        if len(self.faces) <= most:
+            return self
+        low = self.vertices.min(axis=0)
+        size = float(np.ptp(self.vertices, axis=0).max()) or 1.0
+        coarse = TriangleMesh(self.vertices[:1], np.zeros((0, 3), np.int32))
+        for cells in (2**power for power in range(1, 12)):
+            cell = np.floor((self.vertices - low) * (cells / size)).astype(np.int64)
+            key = (cell[:, 0] * (cells + 1) + cell[:, 1]) * (cells + 1) + cell[:, 2]
+            _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
+            mean = np.stack(
+                [np.bincount(inverse, self.vertices[:, axis]) / count for axis in range(3)], axis=1
+            )
+            faces = _without_slivers(inverse[self.faces].astype(np.int32))
+            faces = faces[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]]
+            if len(faces) > most:
+                break
+            coarse = TriangleMesh(mean, faces)
+        return coarse
+
+
+def shape_mesh(shape: Shape, most: int = _MOST_TRIANGLES) -> TriangleMesh:
+    """Return the triangles of a mesh of a URDF in the frame of its link, origin and scale applied.
+
+    Parameters
+    ----------
+    shape
+        A visual of the kind ``mesh``.
+    most
+        With more faces the mesh is made coarser (:meth:`TriangleMesh.coarsened`).
+
+    Raises
+    ------
+    MeshError
+        The file is not found or cannot be read; the sentence says what to do.
+    """
+    path = mesh_file(shape.resource)
+    if path is None:
+        raise MeshError(
+            f"The mesh '{shape.resource}' was not found: give a path beside the URDF, or source "
+            "the workspace of its package."
+        )
+    return read_mesh(path).coarsened(most).moved(shape.pose, shape.size)
+
+
+def read_mesh(path: str | Path) -> TriangleMesh:
+    """Read the triangles of a file, in its own frame and unit (COLLADA: in m).
+
+    Raises
+    ------
+    MeshError
+        The file is too large, damaged, or of a kind that cannot be read.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".stl", ".obj", *_OF_TRIMESH):
+        raise MeshError(
+            f"The mesh {path} is of no kind that can be read (STL, OBJ, COLLADA, glTF, PLY): "
+            "convert it to STL."
+        )
+    try:
+        if (size := path.stat().st_size) > _MOST_BYTES:
+            raise MeshError(
+                f"The mesh {path} has {size / 1e6:.0f} MB; at most {_MOST_BYTES / 1e6:.0f} MB are "
+                "read. Make it coarser."
+            )
+        data = path.read_bytes()
+    except OSError as error:
+        raise MeshError(f"The mesh {path} cannot be read: {error.strerror}.") from error
+    try:
+        if suffix == ".stl":
+            mesh = _read_stl(data)
+        elif suffix == ".obj":
+            mesh = _read_obj(data)
+        else:
+            mesh = _read_by_trimesh(path, data)
+        return _checked(mesh)
+    except _DamagedError as error:
+        raise MeshError(f"The mesh {path} cannot be read: {error}.") from error
+
+
+class _DamagedError(Exception):
+    """What is wrong with the contents of a file, as the end of a sentence."""
+
+
+def _checked(mesh: TriangleMesh) -> TriangleMesh:
+    """Return a mesh without faces of no area, refusing numbers and indices that none has."""
+    vertices, faces = mesh.vertices, mesh.faces
+    if len(faces) > _MOST_TRIANGLES:
+        raise _DamagedError(
+            f"it has {len(faces)} triangles, and at most {_MOST_TRIANGLES} are read"
+        )
+    if not np.all(np.abs(vertices) < _LARGEST):  # A NaN is not below it either.
+        raise _DamagedError(f"a coordinate is not finite, or beyond {_LARGEST:g}")
+    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise _DamagedError("a face names a vertex that is not there")
+    faces = _without_slivers(faces)
+    if not len(faces):
+        raise _DamagedError("it has no triangle")
+    return TriangleMesh(vertices, faces)
+
+
+def _without_slivers(faces: Faces) -> Faces:
+    """Return the faces with three different corners."""
+    a, b, c = faces.T
+    return faces[(a != b) & (b != c) & (c != a)]
+
+
+def _read_stl(data: bytes) -> TriangleMesh:
+    """Read STL, binary where its length is what its header says, or else text."""
+    if len(data) >= _HEADER:
+        count = int.from_bytes(data[80:_HEADER], "little")
+        if len(data) >= _HEADER + count * _TRIANGLE.itemsize and (
+            not data[:80].lstrip().startswith(b"solid")
+            or len(data) == _HEADER + count * _TRIANGLE.itemsize
+        ):
+            triangles = np.frombuffer(data, _TRIANGLE, count, _HEADER)
+            return _joined(triangles["corners"].reshape(-1, 3))
+    if not data.lstrip().startswith(b"solid"):
+        raise _DamagedError("it is no STL, or the file is cut")
+    if b"endsolid" not in data:
+        raise _DamagedError("its end is missing: the file is cut")
+    corners = _VERTEX.findall(data)
+    if len(corners) % 3:
+        raise _DamagedError("a triangle has not three corners")
+    return _joined(_numbers(corners).reshape(-1, 3))
+
+
+def _joined(corners: npt.NDArray[Any]) -> TriangleMesh:
+    """Return the mesh of triangles that are given by their corners (3 M, 3): equal ones are one."""
+    if not len(corners):
+        return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+    # Adding zero makes one of both zeros, so that equal numbers are equal bytes.
+    rows = np.ascontiguousarray(corners + 0.0)
+    keys = rows.view(np.dtype((np.void, rows.dtype.itemsize * 3))).ravel()
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    return TriangleMesh(rows[first].astype(float), inverse.reshape(-1, 3).astype(np.int32))
+
+
+def _numbers(texts: Any) -> Array:
+    try:
+        return np.array(texts, dtype=bytes).astype(float)
+    except ValueError:
+        raise _DamagedError("a coordinate is no number") from None
+
+
+def _read_obj(data: bytes) -> TriangleMesh:
+    """Read vertices and faces of OBJ; a face of many corners becomes a fan of triangles."""
+    corners: list[list[bytes]] = []
+    faces: list[tuple[int, int, int]] = []
+    for line in data.replace(b"\\\n", b" ").replace(b"\\\r\n", b" ").splitlines():
+        words = line.split()
+        if not words:
+            continue
+        if words[0] == b"v":
+            if len(words) < 4:
+                raise _DamagedError("a vertex has not three coordinates")
+            corners.append(words[1:4])
+        elif words[0] == b"f":
+            face = [_index(word, len(corners)) for word in words[1:]]
+            faces += [(face[0], a, b) for a, b in pairwise(face[1:])]
+            if len(faces) > _MOST_TRIANGLES:
+                raise _DamagedError(f"it has more than {_MOST_TRIANGLES} triangles")
+    return TriangleMesh(
+        _numbers(corners).reshape(-1, 3), np.array(faces, dtype=np.int32).reshape(-1, 3)
+    )
+
+
+def _index(word: bytes, count: int) -> int:
+    """Return the index from 0 of a corner ``v/vt/vn``; files count from 1, or from the last -1."""
+    try:
+        number = int(word.split(b"/")[0])
+    except ValueError:
+        raise _DamagedError("a corner of a face is no number") from None
+    if not 0 < abs(number) <= _MOST_BYTES:
+        raise _DamagedError("a face names a vertex that is not there")
+    return number - 1 if number > 0 else count + number
+
+
+def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
+    """Read what trimesh reads; all parts of a scene where they are in it."""
+    # trimesh takes a second to import, and few robots need it.
+    try:
+        import trimesh
+
+        if path.suffix.lower() == ".dae":
+            import collada  # noqa: F401  # What trimesh reads COLLADA with
+    except ImportError:
+        raise MeshError(
+            f"The mesh {path} is read by trimesh, which is not installed: "
+            "`pip install 'spacerobot_ros[viewer]'`, or convert it to STL."
+        ) from None
+    load: Callable[..., Any] = trimesh.load
+    try:
+        found = load(path, force="mesh", process=False, skip_materials=True)
+        vertices = np.asarray(found.vertices, dtype=float).reshape(-1, 3)
+        faces = np.asarray(found.faces, dtype=np.int32).reshape(-1, 3)
+    except Exception as error:  # Of many parsers, by what is broken
+        raise _DamagedError(f"trimesh says {type(error).__name__}") from error
+    return TriangleMesh(vertices * _unit(path, data), faces)
+
+
+def _unit(path: Path, data: bytes) -> float:
+    """Return the unit of a COLLADA file in m; those of the other formats are m."""
+    if path.suffix.lower() != ".dae":
+        return 1.0
+    found = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']+)[\"']", data)
+    unit = 1.0 if found is None else float(_numbers([found[1]])[0])
+    if not 0 < unit < _LARGEST:
+        raise _DamagedError("its unit is no length")
+    return unit
