@@ -43,6 +43,9 @@ DOCS = [
 # Kinds of meshes other than STL and OBJ, which need nothing.
 MESHES = ["pycollada", "trimesh"]
 
+# Tables for pandas and xarray, and in Parquet.
+DATA = ["pandas>=2.1", "pyarrow", "xarray"]
+
 setup(
     name=NAME,
     version=VERSION,
@@ -95,8 +98,10 @@ setup(
         ],
         # The 3D view of reports is MeshCat's. Only its script is used, but the package brings much.
         "viewer": ["meshcat", *MESHES],
+        "data": DATA,
         "docs": DOCS,
         "test": [
+            *DATA,
             *DOCS,
             "catkin_pkg",
             "hypothesis",
@@ -106,6 +111,7 @@ setup(
             'mujoco>=4; python_version >= "3.11"',
             "mypy",
             "pin",
+            "pypdf",
             "pytest>=8",
             "pytest-xdist",
             "ruff",

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import cached_property
+from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -14,6 +16,7 @@ from mcap.records import Attachment, Channel, Metadata
 from numpy.typing import NDArray
 
 from spacerobot_ros.bag.definitions import MessageTypes
+from spacerobot_ros.bag.export import to_pandas, to_xarray
 from spacerobot_ros.bag.mcap_reading import (
     RawMessage,
     indexed_bodies,
@@ -24,7 +27,12 @@ from spacerobot_ros.bag.mcap_reading import (
 from spacerobot_ros.bag.mcap_records import file_size, open_bag, parsed
 from spacerobot_ros.bag.rosbag2 import QosProfile
 from spacerobot_ros.bag.series import TopicSeries
-from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.bag.tables import TopicTable, table_of
+from spacerobot_ros.errors import RecordingError, RobotDescriptionError
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 _DECODABLE, _DECODABLE_TIMES = 16_000_000, 50
 """Bytes of a topic that may become objects, which take ten times as much: so many, or so many times
@@ -71,10 +79,11 @@ def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, i
 
 
 class Bag:
-    """A bag as time series: ``bag["/odom"].field("pose.pose.position.x")``.
+    """A bag as time series: ``bag["odom"].field("pose.pose.position.x")``.
 
-    A topic is read when it is first asked for and kept. The file is not held open. Raises as
-    :func:`read_bag` does.
+    It is a mapping from the names of its topics, with the slash before them or without, to their
+    messages. A topic is read when it is first asked for and kept. The file is not held open. Raises
+    as :func:`read_bag` does.
     """
 
     def __init__(self, path: Path) -> None:
@@ -97,6 +106,63 @@ class Bag:
         """Name and type of every topic, with messages or without."""
         channels = self._summary.channels.values()
         return {c.topic: _type_name(self._summary.schemas, c) for c in channels}
+
+    def keys(self) -> list[str]:
+        """Return the names of all topics, as they were recorded."""
+        return list(self.topics)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.topics)
+
+    def __len__(self) -> int:
+        return len(self.topics)
+
+    def __bool__(self) -> bool:
+        return True
+
+    def __contains__(self, topic: object) -> bool:
+        return isinstance(topic, str) and self._recorded_name(topic) in self.topics
+
+    def items(self) -> Iterator[tuple[str, TopicSeries]]:
+        """Go through names and messages of all topics.
+
+        Raises
+        ------
+        RecordingError
+            The bag is damaged.
+        """
+        return ((topic, self[topic]) for topic in self)
+
+    def __repr__(self) -> str:
+        rows = self._overview()
+        wide = max((len(row[0]) for row in rows), default=0)
+        lines = [f"  {name:<{wide}}  {count:>7}  {kind}" for name, count, kind in rows]
+        return "\n".join([f"{self._headline()}:", *lines])
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><td>{escape(name)}</td><td>{count}</td><td>{escape(kind)}</td></tr>"
+            for name, count, kind in self._overview()
+        )
+        head = "<tr><th>topic</th><th>messages</th><th>type</th></tr>"
+        return f"<p>{escape(self._headline())}</p><table>{head}{rows}</table>"
+
+    def _headline(self) -> str:
+        span = f", {self.end_time - self.start_time:.6g} s" if self.message_count() else ""
+        return f"Bag {self.path}: {self.message_count()} messages on {len(self)} topics{span}"
+
+    def _overview(self) -> list[tuple[str, int, str]]:
+        """Name, number of messages and type of every topic, by name."""
+        counts = self._statistics.channel_message_counts
+        return [
+            (topic, sum(counts.get(c.id, 0) for c in channels), self.topics[topic])
+            for topic, channels in sorted(self._channels_by_topic.items())
+        ]
+
+    def _recorded_name(self, topic: str) -> str:
+        """Return the name as recorded of a topic named with or without the slash before it."""
+        other = topic[1:] if topic.startswith("/") else f"/{topic}"
+        return other if topic not in self.topics and other in self.topics else topic
 
     @cached_property
     def metadata(self) -> dict[str, dict[str, str]]:
@@ -208,11 +274,75 @@ class Bag:
         """
         return self[topic].messages()
 
+    @overload
+    def to_pandas(self, topic: str) -> pandas.DataFrame: ...
+    @overload
+    def to_pandas(self, topic: None = None) -> dict[str, pandas.DataFrame]: ...
+    def to_pandas(self, topic: str | None = None) -> pandas.DataFrame | dict[str, pandas.DataFrame]:
+        """Return a topic as a table of pandas, or every topic by its name.
+
+        The index is the log time in seconds, ``attrs["units"]`` has the units of the columns; see
+        :func:`~spacerobot_ros.bag.tables.table_of` for what the columns are.
+
+        Raises
+        ------
+        RecordingError
+            There is no such topic, the bag is damaged, or pandas is not installed.
+        """
+        if topic is not None:
+            return to_pandas(self.table(topic))
+        return {name: to_pandas(self.table(name)) for name in self}
+
+    @overload
+    def to_xarray(self, topic: str) -> xarray.Dataset: ...
+    @overload
+    def to_xarray(self, topic: None = None) -> dict[str, xarray.Dataset]: ...
+    def to_xarray(self, topic: str | None = None) -> xarray.Dataset | dict[str, xarray.Dataset]:
+        """Return a topic as a dataset of xarray, or every topic by its name.
+
+        Arrays stay arrays, over ``time`` and ``joint`` for joint states; every variable has its
+        ``units``.
+
+        Raises
+        ------
+        RecordingError
+            There is no such topic, the bag is damaged, or xarray is not installed.
+        """
+        if topic is not None:
+            return to_xarray(self.table(topic))
+        return {name: to_xarray(self.table(name)) for name in self}
+
+    def table(self, topic: str) -> TopicTable:
+        """Return a topic as a table; the units of joints are those of the robot in the bag.
+
+        Raises
+        ------
+        RecordingError
+            There is no such topic, or the bag is damaged.
+        """
+        return table_of(self[topic], self._sliding)
+
+    @cached_property
+    def _sliding(self) -> dict[str, bool]:
+        """Of each joint of the robots in the bag whether it slides."""
+        # The model takes as long to import as everything else here.
+        from spacerobot_ros.model.description import JointKind
+        from spacerobot_ros.model.urdf import parse_robot
+
+        found: dict[str, bool] = {}
+        for name, text in self.attachments.items():
+            if name.endswith(".urdf"):
+                with suppress(RobotDescriptionError, UnicodeDecodeError):
+                    joints = parse_robot(text.decode()).movable_joints
+                    found |= {each.name: each.kind is JointKind.PRISMATIC for each in joints}
+        return found
+
     def __getitem__(self, topic: str) -> TopicSeries:
+        topic = self._recorded_name(topic)
         if topic not in self._series:
             channels = self._channels(topic)
             decode = self._decoder(channels[0])
-            times, data = self._read(self.channel_ids(topic))
+            times, data = self._read({channel.id for channel in channels})
             self._series[topic] = TopicSeries(
                 topic, self.topics[topic], times, data, self._types.fields, decode, self._decodable
             )
@@ -223,7 +353,7 @@ class Bag:
         return self._summary.statistics
 
     def _channels(self, topic: str) -> list[Channel]:
-        channels = self._channels_by_topic.get(topic, [])
+        channels = self._channels_by_topic.get(self._recorded_name(topic), [])
         if not channels:
             raise RecordingError(
                 f"The bag {self.path} has no topic {topic}: it has {_listed(list(self.topics))}."

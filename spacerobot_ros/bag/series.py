@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Iterator, KeysView, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
@@ -58,7 +59,7 @@ class TopicSeries:
     topic, type_name
         Name of the topic and of the type of its messages.
     time_ns
-        Log times in nanoseconds, not decreasing, shape (N,).
+        Log times in nanoseconds, not decreasing, shape (N,), read-only.
     """
 
     def __init__(
@@ -74,6 +75,8 @@ class TopicSeries:
         self.topic = topic
         self.type_name = type_name
         self.time_ns = time_ns
+        # Those who would change it in place would change it for all.
+        self.time_ns.flags.writeable = False
         self._data = data
         self._fields = fields
         self._decode = decode
@@ -82,23 +85,53 @@ class TopicSeries:
     def __len__(self) -> int:
         return len(self._data)
 
-    @cached_property
+    def __repr__(self) -> str:
+        span = f", {self.time[0]:.6g} to {self.time[-1]:.6g} s" if len(self) else ""
+        return (
+            f"<{self.topic}: {len(self)} {self.type_name}{span}; fields: {', '.join(self.paths)}>"
+        )
+
+    @property
+    def paths(self) -> list[str]:
+        """Paths of the fields, for :meth:`field`; of what lists hold, the list."""
+        return list(self._leaves(self.type_name, ""))
+
+    def _leaves(self, type_name: str, prefix: str) -> Iterator[str]:
+        for name, (kind, detail) in self._fields[type_name][1]:
+            if kind == Nodetype.NAME:
+                yield from self._leaves(detail, f"{prefix}{name}.")
+            else:
+                yield prefix + name
+
+    def element_type(self, path: str) -> str:
+        """Return the type of the messages in a list of them, or of one; empty for all else.
+
+        Raises
+        ------
+        RecordingError
+            There is no such field.
+        """
+        return self._resolve(path)[3] or ""
+
+    @property
     def time(self) -> NDArray[np.float64]:
-        """Log times in seconds, shape (N,)."""
+        """Log times in seconds, shape (N,), a copy."""
         return np.asarray(self.time_ns / 1e9)
 
-    @cached_property
+    @property
     def stamp(self) -> NDArray[np.float64]:
-        """Stamps of the headers in seconds, shape (N,); the log times where messages have none."""
+        """Stamps of the headers in seconds (N,), a copy; the log times where messages have none."""
         return np.asarray(self.stamp_ns / 1e9)
 
     @cached_property
     def stamp_ns(self) -> NDArray[np.int64]:
-        """The same in nanoseconds."""
+        """The same in nanoseconds, read-only."""
         if not self.stamped:
             return self.time_ns
         seconds, nanoseconds = self.field("header.stamp.sec"), self.field("header.stamp.nanosec")
-        return np.asarray(seconds, np.int64) * 10**9 + np.asarray(nanoseconds, np.int64)
+        stamps = np.asarray(seconds, np.int64) * 10**9 + np.asarray(nanoseconds, np.int64)
+        stamps.flags.writeable = False
+        return np.asarray(stamps)
 
     @property
     def stamped(self) -> bool:
@@ -125,18 +158,20 @@ class TopicSeries:
         RecordingError
             There is no such field, or a message is damaged.
         """
-        dtype, is_array, in_list = self._resolve(path)
+        dtype, is_array, in_list, type_name = self._resolve(path)
         if self._columns is not None and path in self._columns.paths:
             try:
                 return self._columns[path]
             except UnicodeDecodeError as error:
                 raise self._damaged(error) from error
-        messages = self._messages
+        # What is kept is not handed out, where it could be changed.
+        fresh = in_list or type_name is not None
+        messages = [m for _, m in self.messages()] if fresh else self._messages
         if in_list:
             return [_values(message, path.split(".")) for message in messages]
         values = list(map(attrgetter(path), messages))
         if dtype is None or (is_array and len(set(map(len, values))) > 1):
-            return values
+            return [copy(value) for value in values] if is_array and not fresh else values
         if is_array and not values:
             return np.empty((0, 0), dtype)
         return np.array(values, dtype)
@@ -209,8 +244,10 @@ class TopicSeries:
         reason = str(error) or type(error).__name__
         return RecordingError(f"A message on {self.topic} is no {self.type_name}: {reason}.")
 
-    def _resolve(self, path: str) -> tuple[np.dtype[Any] | None, bool, bool]:
-        """Follow a path: type of its numbers if any, whether an array, whether inside of a list."""
+    def _resolve(self, path: str) -> tuple[np.dtype[Any] | None, bool, bool, str | None]:
+        """Follow a path: type of its numbers if any, whether an array, whether inside of a list,
+        type of its messages if any.
+        """
         type_name: str | None = self.type_name
         dtype, is_array, in_list = None, False, False
         for part in path.split("."):
@@ -227,7 +264,7 @@ class TopicSeries:
                 kind, detail = detail[0]
             type_name = detail if kind == Nodetype.NAME else None
             dtype = _DTYPES.get(detail[0]) if kind == Nodetype.BASE else None
-        return None if dtype is None else _widened(dtype), is_array, in_list
+        return None if dtype is None else _widened(dtype), is_array, in_list, type_name
 
 
 def _matrix(values: Any, width: int) -> NDArray[np.float64]:

@@ -142,8 +142,9 @@ def test_everything_that_is_imported_is_known_to_these_tests() -> None:
     known = {*sys.stdlib_module_names, *ROS, PACKAGE}
     needed = {
         *("ament_index_python", "casadi", "click", "lz4", "matplotlib", "mcap", "meshcat"),
-        *("mujoco", "numpy", "rosbags", "rosidl_parser", "rpyutils", "scipy"),
-        *("urdf_parser_py", "xacro", "yaml", "zstandard", "collada", "trimesh"),
+        *("mujoco", "numpy", "pandas", "rosbags", "rosidl_parser", "rpyutils", "scipy"),
+        *("urdf_parser_py", "xacro", "xarray", "yaml", "zstandard"),
+        *("collada", "trimesh"),
     }
     others = {name.split(".")[0] for module in sources() for name in imports(module)} - known
     assert others <= needed

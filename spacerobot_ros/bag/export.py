@@ -1,0 +1,269 @@
+"""The topics of a bag for other programs: pandas, xarray, and files in CSV, Parquet and MAT."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from spacerobot_ros.bag.tables import TopicTable
+from spacerobot_ros.errors import RecordingError
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+COLUMNS = "_columns.csv"
+"""File beside tables in CSV: topic, file, column and unit of every column."""
+
+_UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
+_LONGEST_NAME = 63
+"""Of a variable in MATLAB, characters."""
+
+
+class ExportFormat(str, Enum):
+    """What :func:`export` writes."""
+
+    CSV = "csv"
+    PARQUET = "parquet"
+    MAT = "mat"
+
+
+@dataclass(frozen=True)
+class Export:
+    """What was written.
+
+    Attributes
+    ----------
+    path
+        The folder, or the file.
+    rows
+        Number of rows of each topic that is in it.
+    """
+
+    path: Path
+    rows: dict[str, int]
+
+
+def to_pandas(table: TopicTable) -> pandas.DataFrame:
+    """Return a table as pandas has it, a copy; :meth:`Bag.to_pandas` says more.
+
+    Raises
+    ------
+    RecordingError
+        pandas is not installed.
+    """
+    pandas = _library("pandas")
+    index = pandas.Index(table.time, name="time")
+    frame = pandas.DataFrame(table.columns, index=index, copy=True)
+    frame.attrs.update(topic=table.topic, type=table.type_name, units=table.units)
+    return frame
+
+
+def to_xarray(table: TopicTable) -> xarray.Dataset:
+    """Return a table as xarray has it, a copy; :meth:`Bag.to_xarray` says more.
+
+    Raises
+    ------
+    RecordingError
+        xarray is not installed.
+    """
+    xarray = _library("xarray")
+    variables: dict[str, Any] = {}
+    coordinates: dict[str, Any] = {"time": ("time", table.time.copy(), {"units": "s"})}
+    for field in table.fields:
+        units: str | list[str] = list(field.units)
+        if len(set(field.units)) == 1:
+            units = field.units[0]
+        dimensions = ["time"]
+        if field.values.ndim == 2:
+            name = field.of if field.of != "entry" else f"{field.path} entry"
+            dimensions.append(name)
+            coordinates[name] = (name, list(field.labels))
+        variables[field.path] = (dimensions, field.values.copy(), {"units": units} if units else {})
+    attributes = {"topic": table.topic, "type": table.type_name}
+    return xarray.Dataset(variables, coordinates, attributes)
+
+
+def export(
+    tables: Iterable[TopicTable], path: str | os.PathLike[str], format: ExportFormat
+) -> Export:
+    """Write tables for other programs.
+
+    CSV and Parquet make a folder with a file for each topic that has messages (``odom.csv``,
+    ``planner.status.csv``); MAT makes one file with a struct for each. Nothing is ever written
+    over, and what cannot be finished is removed.
+
+    Parameters
+    ----------
+    tables
+        What to write; :meth:`Bag.table` makes them.
+    path
+        The folder, or the file.
+    format
+        What to write.
+
+    Raises
+    ------
+    RecordingError
+        There is something at ``path``, a file cannot be written, or a library is not installed.
+    """
+    target = Path(path)
+    if os.path.lexists(target):
+        raise RecordingError(f"There is something at {target} already: name another place.")
+    write = {
+        ExportFormat.CSV: _write_csv,
+        ExportFormat.PARQUET: _write_parquet,
+        ExportFormat.MAT: _write_mat,
+    }[format]
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        made = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+        try:
+            rows = write(_named(tables), made)
+            result = made / "tables.mat" if format is ExportFormat.MAT else made
+            result.chmod(0o777 & ~_umask() if result.is_dir() else 0o666 & ~_umask())
+            _place(result, target)
+        finally:
+            shutil.rmtree(made, ignore_errors=True)
+    except OSError as error:
+        raise RecordingError(f"{target} cannot be written: {error.strerror}.") from error
+    return Export(target, rows)
+
+
+def _place(made: Path, target: Path) -> None:
+    """Give what was made its name, unless something else has got it in the meantime."""
+    if made.is_dir():
+        # Takes the place of an empty folder at most.
+        made.rename(target)
+    else:
+        os.link(made, target)
+
+
+def _umask() -> int:
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
+
+
+def _named(tables: Iterable[TopicTable]) -> dict[str, TopicTable]:
+    """Return the tables that have rows, by names that are safe for files, each once."""
+    found: dict[str, TopicTable] = {}
+    for table in tables:
+        if len(table):
+            name = _UNSAFE.sub("_", table.topic.strip("/").replace("/", ".")).lstrip("._-")
+            found[_free(name[:100] or "topic", found)] = table
+    return found
+
+
+def _free(name: str, taken: Mapping[str, Any]) -> str:
+    """Return a name that no other differs from by case alone."""
+    others = {each.lower() for each in taken}
+    names = (name, *(f"{name}_{number}" for number in range(2, len(others) + 3)))
+    return next(each for each in names if each.lower() not in others)
+
+
+def _write_csv(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
+    def rows(file: Path, head: list[str], columns: list[list[Any]]) -> None:
+        with file.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(head)
+            writer.writerows(zip(*columns, strict=True))
+
+    about: list[tuple[str, str, str, str]] = []
+    for name, table in tables.items():
+        columns = {"time": table.time, **table.columns}
+        file = f"{name}.csv"
+        rows(folder / file, list(columns), [values.tolist() for values in columns.values()])
+        units = {"time": "s", **table.units}
+        about += [(table.topic, file, column, unit) for column, unit in units.items()]
+    head = ["topic", "file", "column", "unit"]
+    rows(folder / COLUMNS, head, [list(each) for each in zip(*about, strict=True)] or [[]] * 4)
+    return {table.topic: len(table) for table in tables.values()}
+
+
+def _write_parquet(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
+    arrow, parquet = _library("pyarrow"), _library("pyarrow.parquet")
+    for name, table in tables.items():
+        made = arrow.Table.from_pandas(to_pandas(table), preserve_index=True)
+        units = {"time": "s", **table.units}
+        described = [
+            each.with_metadata({"unit": units[each.name]}) if units.get(each.name) else each
+            for each in made.schema
+        ]
+        about = {"topic": table.topic, "type": table.type_name, **(made.schema.metadata or {})}
+        made = made.cast(arrow.schema(described, metadata=about))
+        parquet.write_table(made, folder / f"{name}.parquet")
+    return {table.topic: len(table) for table in tables.values()}
+
+
+def _write_mat(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
+    # Takes a tenth of a second, and only this format needs it.
+    from scipy.io import savemat
+    from scipy.io.matlab import MatWriteError
+
+    variables: dict[str, Any] = {}
+    about: dict[str, Any] = {}
+    for table in tables.values():
+        name = _identifier(table.topic.strip("/"), variables)
+        struct: dict[str, Any] = {"time": table.time[:, np.newaxis]}
+        for field in table.fields:
+            *way, last = field.path.split(".")
+            place = struct
+            for part in way:
+                place = place.setdefault(_existing(part), {})
+            values = field.values[:, np.newaxis] if field.values.ndim == 1 else field.values
+            place[_identifier(last, place)] = values
+        variables[name] = struct
+        about[name] = {
+            "topic": table.topic,
+            "type": table.type_name,
+            "columns": _cells(["time", *table.columns]),
+            "units": _cells(["s", *table.units.values()]),
+        }
+    variables[_identifier("about", variables)] = about
+    try:
+        savemat(folder / "tables.mat", variables, long_field_names=True, do_compression=True)
+    except (MatWriteError, ValueError, OverflowError) as error:
+        raise RecordingError(f"MAT cannot hold these tables: {error}.") from error
+    return {table.topic: len(table) for table in tables.values()}
+
+
+def _existing(part: str) -> str:
+    return _identifier(part, {})
+
+
+def _identifier(name: str, taken: Mapping[str, Any]) -> str:
+    """Return a name of a variable for MATLAB that is not taken."""
+    made = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")
+    made = made if made[:1].isalpha() else f"x{made}"
+    return _free(made[: _LONGEST_NAME - 4], taken)
+
+
+def _cells(texts: list[str]) -> Any:
+    made = np.empty((len(texts), 1), object)
+    made[:, 0] = texts
+    return made
+
+
+def _library(name: str) -> Any:
+    """Import a library of the extra ``data``."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        if error.name is None or error.name.split(".")[0] != name.split(".")[0]:
+            raise
+        raise RecordingError(
+            f"This takes {name.split('.')[0]}, which is not installed: "
+            "pip install 'spacerobot_ros[data]'."
+        ) from error

@@ -1,0 +1,304 @@
+"""Bags as tables of pandas and xarray, and in files that other programs read."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from click.testing import CliRunner
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.serialization import serialize_message
+from scipy.io import loadmat
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+from support.sentences import assert_one_sentence
+
+from spacerobot_ros.bag import Bag, BagWriter, RecordingError, read_bag
+from spacerobot_ros.bag.export import ExportFormat, export
+from spacerobot_ros.bag.tables import TopicTable
+from spacerobot_ros.cli.main import main
+from spacerobot_ros.resources import share_directory
+
+SERVICER = share_directory() / "bags" / "servicer_thrusters.mcap"
+JOINTS = "shoulder_yaw", "shoulder_pitch", "elbow_pitch", "wrist_roll", "wrist_pitch", "tool_roll"
+NASTY = 'a "quoted" text, with\nlines, a µ and ; semicolons'
+
+
+def written(path: Path, messages: list[tuple[str, str, float, Any]]) -> Bag:
+    """Write (topic, type, time in s, message) and open the bag."""
+    with BagWriter(path) as writer:
+        channels = {topic: writer.add_topic(topic, kind) for topic, kind, _, _ in messages}
+        for topic, _, time, message in messages:
+            ns = round(time * 1e9)
+            writer.write(channels[topic], serialize_message(message), ns, ns)
+    return read_bag(path)
+
+
+def event(kind: str, **about: str) -> DiagnosticStatus:
+    values = [KeyValue(key=key, value=value) for key, value in {"event": kind, **about}.items()]
+    return DiagnosticStatus(name="plant", message=NASTY, values=values)
+
+
+def joints(names: list[str], *position: float) -> JointState:
+    return JointState(name=names, position=position)
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Bag:
+    """Texts, keys that differ, arrays that differ in length, numbers that only exact text keeps."""
+    state, status = "sensor_msgs/msg/JointState", "diagnostic_msgs/msg/DiagnosticStatus"
+    return written(
+        tmp_path / "small.mcap",
+        [
+            ("/joint_states", state, 0.1, joints(["b", "a"], 0.1, 1 / 3)),
+            ("/joint_states", state, 0.2, joints(["b", "a"], -1e-300, math.nan)),
+            ("/changing", state, 0.3, joints(["x"], 1.0)),
+            ("/changing", state, 0.4, joints(["y", "x"], 2.0, 3.0)),
+            ("/events", status, 0.5, event("goal_accepted", goal_id="7")),
+            ("/events", status, 0.5, event("fault_injected", joint="a")),
+            ("/About", "std_msgs/msg/String", 0.6, String(data="1")),
+            ("/about", "std_msgs/msg/String", 0.7, String(data="2")),
+            ("/a/b", "std_msgs/msg/Float64MultiArray", 0.8, Float64MultiArray(data=[1.0, 2.0])),
+        ],
+    )
+
+
+def test_a_bag_is_a_mapping_of_topics_with_and_without_the_slash(bag: Bag) -> None:
+    assert bag["joint_states"] is bag["/joint_states"]
+    assert bag.message_count("events") == bag.message_count("/events") == 2
+    assert "events" in bag
+    assert "/events" in bag
+    assert "event" not in bag
+    assert 7 not in bag
+    assert list(bag) == bag.keys() == list(bag.topics)
+    assert len(bag) == 6
+    assert dict(bag.items())["/a/b"] is bag["a/b"]
+    with pytest.raises(RecordingError, match="no topic event: it has"):
+        bag["event"]
+
+
+def test_a_bag_and_a_topic_say_what_they_hold(bag: Bag) -> None:
+    text = repr(bag)
+    assert text.startswith(f"Bag {bag.path}: 9 messages on 6 topics, 0.7 s:\n")
+    assert "/joint_states        2  sensor_msgs/msg/JointState" in text
+    html = bag._repr_html_()
+    assert "<tr><td>/joint_states</td><td>2</td><td>sensor_msgs/msg/JointState</td></tr>" in html
+    assert "2 sensor_msgs/msg/JointState, 0.1 to 0.2 s; fields: header.stamp.sec" in repr(
+        bag["joint_states"]
+    )
+
+
+def test_what_is_handed_out_is_a_copy(bag: Bag) -> None:
+    series = bag["joint_states"]
+    for change in (series.time, series.stamp, series.field("position")):
+        change += 1.0
+    series.field("name")[0][0] = "other"
+    bag["changing"].field("position")[0][:] = 7.0
+    bag["events"].field("values")[0][0].key = "other"
+    bag["events"].field("values.key")[0][0] = "other"
+    frame = bag.to_pandas("joint_states")
+    frame.loc[:, "position[b]"] = 5.0
+    bag.to_xarray("joint_states")["position"][:] = 5.0
+    assert series.time.tolist() == [0.1, 0.2]
+    assert series.field("position")[0].tolist() == [0.1, 1 / 3]
+    assert series.field("name")[0] == ["b", "a"]
+    assert bag["changing"].field("position")[0].tolist() == [1.0]
+    assert bag["events"].field("values.key")[0] == ["event", "goal_id"]
+    for kept in (series.time_ns, series.stamp_ns):
+        with pytest.raises(ValueError, match="read-only"):
+            kept += 1
+
+
+def test_columns_have_the_names_of_joints_and_keys(bag: Bag) -> None:
+    frame = bag.to_pandas("joint_states")
+    assert frame.index.name == "time"
+    assert frame.index.tolist() == [0.1, 0.2]
+    assert frame["position[a]"].tolist()[0] == 1 / 3
+    assert "name" not in frame
+    changing = bag.to_pandas("changing")
+    assert list(map(json.loads, changing["position"])) == [[1.0], [2.0, 3.0]]
+    assert list(map(json.loads, changing["name"])) == [["x"], ["y", "x"]]
+    events = bag.to_pandas("events")
+    assert events["values[goal_id]"].tolist() == ["7", ""]
+    assert events["values[event]"].tolist() == ["goal_accepted", "fault_injected"]
+    assert events["message"].tolist() == [NASTY] * 2
+
+
+def test_units_are_those_of_the_robot_and_the_topic() -> None:
+    opened = read_bag(SERVICER)
+    units = {
+        topic: opened.to_pandas(topic).attrs["units"]
+        for topic in ("odom", "joint_states", "thrusters", "momentum", "base_wrench")
+    }
+    assert units["odom"]["pose.pose.position.x"] == "m"
+    assert units["odom"]["twist.twist.angular.z"] == "rad/s"
+    assert units["joint_states"]["position[wrist_roll]"] == "rad"
+    assert units["joint_states"]["effort[wrist_roll]"] == "N m"
+    assert set(units["thrusters"].values()) == {"s", "", "1", "N"}
+    assert units["momentum"]["data[angular_x]"] == "kg m^2/s"
+    assert units["momentum"]["data[kinetic_energy]"] == "J"
+    assert units["base_wrench"]["wrench.torque.y"] == "N m"
+    sliding = read_bag(share_directory() / "bags" / "sliding_masses.mcap").to_pandas("joint_states")
+    assert sliding.attrs["units"]["velocity[slider_1]"] == "m/s"
+
+
+def test_xarray_keeps_arrays_over_joints() -> None:
+    opened = read_bag(SERVICER)
+    states = opened.to_xarray("joint_states")
+    assert states["position"].dims == ("time", "joint")
+    assert states["joint"].values.tolist() == list(JOINTS)
+    assert states["velocity"].attrs["units"] == "rad/s"
+    np.testing.assert_array_equal(states["position"], opened["joint_states"].field("position"))
+    momentum = opened.to_xarray("momentum")["data"]
+    energy = momentum.sel({"data entry": "kinetic_energy"})
+    np.testing.assert_array_equal(energy, opened["momentum"].field("data")[:, 6])
+
+
+def test_all_topics_at_once_are_tables_by_name(bag: Bag) -> None:
+    assert bag.to_xarray().keys() == bag.to_pandas().keys() == bag.topics.keys()
+
+
+def from_csv(path: Path, like: pd.DataFrame) -> pd.DataFrame:
+    """Read a table in CSV as the manual says."""
+    numbers = like.select_dtypes("number").columns
+    return pd.read_csv(
+        path,
+        index_col="time",
+        keep_default_na=False,
+        na_values={name: ["nan"] for name in numbers},
+        dtype=dict.fromkeys(like.columns.difference(numbers), str),
+    )
+
+
+def from_mat(struct: dict[str, Any], path: str) -> Any:
+    """Return a field of a topic in MAT, whose names are those of a program."""
+    for part in path.split("."):
+        struct = struct[re.sub(r"\W+", "_", part).strip("_")]
+    return struct
+
+
+@pytest.mark.parametrize("which", ["small", "servicer"])
+def test_the_same_bag_in_three_formats_is_equal(which: str, tmp_path: Path, bag: Bag) -> None:
+    opened = bag if which == "small" else read_bag(SERVICER)
+    tables = [opened.table(topic) for topic in opened]
+    folder, parquet, mat = (tmp_path / kind.value for kind in ExportFormat)
+    for path, kind in zip((folder, parquet, mat), ExportFormat, strict=True):
+        assert export(tables, path, kind).rows == {t.topic: len(t) for t in tables}
+    listed = pd.read_csv(folder / "_columns.csv", keep_default_na=False)
+    structs = loadmat(mat, simplify_cells=True)
+    names = {each["topic"]: name for name, each in next(find_about(structs)).items()}
+    for table in tables:
+        expected = opened.to_pandas(table.topic)
+        units = {"time": "s", **table.units}
+        rows = listed[listed["topic"] == table.topic]
+        assert dict(zip(rows["column"], rows["unit"], strict=True)) == units
+        (file,) = set(rows["file"])
+        read = from_csv(folder / file, expected)
+        pd.testing.assert_frame_equal(read, expected, check_exact=True, check_dtype=False)
+        stored = parquet / Path(file).with_suffix(".parquet")
+        read = pd.read_parquet(stored)
+        pd.testing.assert_frame_equal(read, expected, check_exact=True)
+        assert read.attrs == expected.attrs
+        metadata = {each.name: each.metadata or {} for each in pq.read_schema(stored)}
+        assert {name: kept.get(b"unit", b"").decode() for name, kept in metadata.items()} == units
+        struct = structs[names[table.topic]]
+        np.testing.assert_array_equal(np.atleast_1d(struct["time"]), table.time)
+        for field in table.fields:
+            values = np.asarray(from_mat(struct, field.path)).reshape(field.values.shape)
+            if field.values.dtype == object:
+                # An empty text is an empty array of characters.
+                values = np.array([x if isinstance(x, str) else "".join(x) for x in values])
+            np.testing.assert_array_equal(values, field.values)
+
+
+def find_about(structs: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the struct that says what the others are."""
+    for each in structs.values():
+        if isinstance(each, dict) and all(
+            isinstance(x, dict) and {"columns", "units"} <= x.keys() for x in each.values()
+        ):
+            yield each
+
+
+@pytest.mark.parametrize(
+    ("name", "made"), [("csv", "b_csv"), ("parquet", "b_parquet"), ("mat", "b.mat")]
+)
+def test_the_command_writes_beside_the_bag_and_never_over_anything(
+    name: str, made: str, tmp_path: Path
+) -> None:
+    copy = tmp_path / "b.mcap"
+    copy.write_bytes(SERVICER.read_bytes())
+    words = ["export", str(copy), "--format", name, "--topic", "odom", "--topic", "/thrusters"]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 0, result.output
+    printed = [line.split()[0] for line in result.output.splitlines()]
+    assert printed == ["/odom", "/thrusters", "tables"]
+    before = {each: each.stat().st_mtime_ns for each in sorted(tmp_path.rglob("*"))}
+    assert tmp_path / made in before
+    again = CliRunner().invoke(main, words)
+    assert again.exit_code == 2
+    assert_one_sentence(again.stderr, made, "already")
+    assert {each: each.stat().st_mtime_ns for each in sorted(tmp_path.rglob("*"))} == before
+
+
+def test_what_cannot_be_exported_leaves_nothing_behind(tmp_path: Path, bag: Bag) -> None:
+    (tmp_path / "taken").symlink_to("nowhere")
+    with pytest.raises(RecordingError, match="already"):
+        export([], tmp_path / "taken", ExportFormat.CSV)
+    with pytest.raises(RecordingError, match="cannot be written"):
+        export([], bag.path / "below", ExportFormat.CSV)
+
+    def damaged() -> Iterator[TopicTable]:
+        yield bag.table("events")
+        raise RecordingError("damaged")
+
+    for kind in ExportFormat:
+        with pytest.raises(RecordingError, match="damaged"):
+            export(damaged(), tmp_path / "out" / "x", kind)
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_names_of_topics_make_no_paths(tmp_path: Path) -> None:
+    text, kind = String(data="x"), "std_msgs/msg/String"
+    topics = ["/../../up", "/.hidden", "/Odom", "/odom", "/" + "long" * 60, "/1.2", "/_columns"]
+    opened = written(tmp_path / "b.mcap", [(topic, kind, 1.0, text) for topic in topics])
+    made = export((opened.table(topic) for topic in opened), tmp_path / "x", ExportFormat.CSV)
+    files = {each.name for each in made.path.iterdir()}
+    assert len(files) == len({name.lower() for name in files}) == len(topics) + 1
+    assert {each.parent for each in tmp_path.rglob("*.csv")} == {made.path}
+    export((opened.table(topic) for topic in opened), tmp_path / "x.mat", ExportFormat.MAT)
+    found = loadmat(tmp_path / "x.mat", simplify_cells=True)
+    assert all(name.isidentifier() for name in found)
+    assert len([1 for each in found.values() if isinstance(each, dict)]) == len(topics) + 1
+
+
+@pytest.mark.parametrize("library", ["pandas", "xarray"])
+def test_a_missing_library_is_one_sentence(
+    library: str, bag: Bag, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(RecordingError) as refused:
+        bag.to_pandas("events") if library == "pandas" else bag.to_xarray("events")
+    assert_one_sentence(str(refused.value), library, "pip install 'spacerobot_ros[data]'")
+
+
+def test_csv_takes_no_library(bag: Bag, tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        "sys.modules.update(dict.fromkeys(('pandas', 'pyarrow', 'xarray', 'scipy')))\n"
+        "from spacerobot_ros.cli.main import main\n"
+        "main(sys.argv[1:], standalone_mode=False)"
+    )
+    words = ["export", str(bag.path), "--out", str(tmp_path / "tables")]
+    subprocess.run([sys.executable, "-c", code, *words], check=True, capture_output=True)
+    assert (tmp_path / "tables" / "joint_states.csv").is_file()
