@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from spacerobot_ros.bag import read_bag
-    from spacerobot_ros.planning import plan
+    from spacerobot_ros.flight.api import fly, plan
+    from spacerobot_ros.flight.scenario import load_scenario
 
 __version__ = "0.2.0"
 
-__all__ = ["__version__", "plan", "read_bag"]
+__all__ = ["__version__", "fly", "load_scenario", "plan", "read_bag"]
 
 
 _TOO_LITTLE = 16 * 2**10
@@ -37,10 +38,14 @@ _warn_of_full_shared_memory()
 
 def __getattr__(name: str) -> Any:
     # Imported when first asked for: the package itself is light.
-    if name == "plan":
-        from spacerobot_ros.planning import plan
+    if name in ("fly", "plan"):
+        from spacerobot_ros.flight import api
 
-        return plan
+        return getattr(api, name)
+    if name == "load_scenario":
+        from spacerobot_ros.flight.scenario import load_scenario
+
+        return load_scenario
     if name == "read_bag":
         from spacerobot_ros.bag import read_bag
 

@@ -34,6 +34,14 @@ class MessageTypes:
         """Type name -> constants and fields, as ``rosbags`` parses a definition."""
         return self._store.fielddefs
 
+    def kind(self, type_name: str) -> Any:
+        """Return the class of the messages of a type that a decoder was asked for."""
+        return self._store.types[type_name]
+
+    def serialise(self, message: Any) -> memoryview | bytes:
+        """Return a message as ROS serialises it."""
+        return self._store.serialize_cdr(message, message.__msgtype__)
+
     def decoder(self, type_name: str, text: bytes) -> Callable[[bytes], Any]:
         """Return what decodes the messages of a type, given the text of its schema.
 

@@ -415,3 +415,17 @@ class _Layout:
     def _align(self, size: int) -> None:
         # Counted from the end of the header.
         self.position += -(self.position - _HEADER_SIZE) % size
+
+
+def places(message: bytes, type_name: str, fields: Fields) -> dict[str, slice]:
+    """Return where the fields of one serialised message are, outside of lists of messages.
+
+    Raises
+    ------
+    IndexError
+        The message ends before its fields.
+    """
+    layout = _Layout(message, fields)
+    layout.walk(type_name, "")
+    leaves = layout.leaves.items()
+    return {path: slice(leaf.offset, leaf.offset + leaf.size) for path, leaf in leaves}

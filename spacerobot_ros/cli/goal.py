@@ -41,8 +41,8 @@ def command(
         wanted = goal_from_rotvec(pose[:3], rotvec)
     if rpy_deg:
         wanted = goal_from_rpy(pose[:3], rpy_deg)
+    from spacerobot_ros.flight.arrays import Outcome
     from spacerobot_ros.session.live import send_goal
-    from spacerobot_ros.session.mission_client import Outcome
 
     outcome = send_goal(wanted, click.echo, namespace=namespace, timeout=timeout)
     end_if_requested()

@@ -24,7 +24,6 @@ from spacerobot_ros.cli.options import (
     settings_option,
     write_json,
 )
-from spacerobot_ros.errors import ParameterError
 
 if TYPE_CHECKING:
     from spacerobot_ros.flight.scenario import Scenario
@@ -94,7 +93,6 @@ def _chosen(
     realtime: float | None,
 ) -> Scenario:
     """Return the scenario with what the command line changes."""
-    from spacerobot_ros.control.laws.registry import LAWS
     from spacerobot_ros.flight.scenario import scenario_or_robot
 
     scenario = goal.of(scenario_or_robot(name))
@@ -102,17 +100,7 @@ def _chosen(
     if realtime is not None:
         scenario = scenario.in_real_time(realtime)
     scenario = scenario.with_settings(settings)
-    if method is not None:
-        kind, node, parameter = "gait method", "planner", "method"
-        if method in LAWS:
-            kind, node, parameter = "control law", "coordinated_control", "law"
-        if node not in scenario.commanders:
-            raise ParameterError(
-                f"'{method}' is a {kind}, and the scenario '{scenario.name}' has no section "
-                f"'{node}' that could use it: it flies with {' and '.join(scenario.commanders)}."
-            )
-        return scenario.with_overrides(node, {parameter: method})
-    return scenario
+    return scenario if method is None else scenario.with_method(method)
 
 
 @contextmanager

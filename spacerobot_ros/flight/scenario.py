@@ -14,6 +14,7 @@ import yaml
 
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.rotations import (
@@ -263,6 +264,24 @@ class Scenario:
         if period:
             shown["tf_period"] = min(period, _VIEWED * factor)
         return scenario.with_overrides("recorder", shown)
+
+    def with_method(self, method: str) -> Scenario:
+        """Return the scenario with another gait method, or another control law.
+
+        Raises
+        ------
+        ParameterError
+            It has no planner or no controller that could use it.
+        """
+        kind, node, parameter = "gait method", "planner", "method"
+        if method in LAWS:
+            kind, node, parameter = "control law", "coordinated_control", "law"
+        if node not in self.commanders:
+            raise ParameterError(
+                f"'{method}' is a {kind}, and the scenario '{self.name}' has no section "
+                f"'{node}' that could use it: it flies with {' and '.join(self.commanders)}."
+            )
+        return self.with_overrides(node, {parameter: method})
 
     def with_settings(self, texts: Sequence[str]) -> Scenario:
         """Return the scenario with ``node.parameter=value`` set, each as :func:`parse_setting`.

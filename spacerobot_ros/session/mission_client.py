@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from enum import Enum
+from collections.abc import Callable, Sequence
 
 import rclpy
 from builtin_interfaces.msg import Time
@@ -17,22 +16,14 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
-from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.arrays import Outcome, Status
+from spacerobot_ros.flight.recorded import STATUS_TOPICS
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
-
-Status = PlannerStatus | ControllerStatus
-"""What a commander reports."""
-
-_STATUS: Mapping[str, tuple[str, Callable[[Mapping[str, str], str], Status]]] = {
-    "planner": ("planner/status", PlannerStatus.from_values),
-    "coordinated_control": ("controller/status", ControllerStatus.from_values),
-}
-"""By commander: the topic of its status, and how it is read."""
 
 _LOOK_PERIOD = 0.2
 """Wall s from one look of a follower to the next."""
@@ -41,17 +32,6 @@ _LONGEST_DELIVERY = 5.0
 """Wall s in which a goal reaches those that take it."""
 
 _SECOND = 10**9
-
-
-class Outcome(str, Enum):
-    """What became of a goal; the values are those of ``state`` in the status, but the last."""
-
-    REACHED = "reached"
-    FAILED = "failed"
-    REFUSED = "refused"
-    ABORTED = "aborted"
-    INTERRUPTED = "interrupted"
-    """The client stopped following it."""
 
 
 class MissionClient:
@@ -105,7 +85,7 @@ class MissionClient:
             self._end_effector_topic = self.node.create_publisher(
                 PoseStamped, "end_effector/goal_pose", STREAM
             )
-        topic, self._read = _STATUS[decider]
+        topic, self._read = STATUS_TOPICS[decider]
         self._status_topic = self.node.create_subscription(
             DiagnosticStatus, topic, self._on_status, LATCHED
         )

@@ -24,6 +24,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.scenario import COMMANDERS, Kill, Scenario
 from spacerobot_ros.model.robot_source import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
@@ -31,7 +32,7 @@ from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.connections import Connections, unconnected
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
-from spacerobot_ros.session.mission_client import MissionClient, Outcome
+from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.stack import Stack
 from spacerobot_ros.termination import child_options
 from spacerobot_ros.topics import NOT_RECORDED

@@ -17,6 +17,7 @@ from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
 from spacerobot_ros.bag.recorded_robot import columns
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.flight.arrays import Outcome, Status
 from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
@@ -24,7 +25,6 @@ from spacerobot_ros.nodes.common.process import use_loopback_discovery, use_priv
 from spacerobot_ros.nodes.plant.diagnostics import PROPELLANT
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
-from spacerobot_ros.session.mission_client import Outcome, Status
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.stack import InProcessStack, Stack
 from spacerobot_ros.termination import ended_on_request

@@ -17,6 +17,7 @@ from rclpy.parameter import Parameter
 
 from spacerobot_ros.bag import free_name
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.nodes import (
     NODE_TYPES,
@@ -27,7 +28,7 @@ from spacerobot_ros.nodes import (
 )
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
-from spacerobot_ros.session.mission_client import MissionClient, Outcome
+from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.topics import NOT_RECORDED
 
 _DISCOVERY_TIMEOUT = 10.0

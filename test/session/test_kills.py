@@ -17,9 +17,9 @@ from support.killed_flight import (
     whole,
 )
 
+from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.scenario import Scenario, load_scenario
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.session.mission_client import Outcome
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.run import ros
 

@@ -13,9 +13,10 @@ from support.ros_harness import LATCHED, Harness, Probe
 
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
-from spacerobot_ros.session.mission_client import MissionClient, Outcome
+from spacerobot_ros.session.mission_client import MissionClient
 
 NOW = 12_000_000_345
 GOAL = Goal.checked([1.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0])

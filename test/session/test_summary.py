@@ -13,6 +13,7 @@ from support.made_bags import array, joint_states, made_bag, odometry, pose
 
 from spacerobot_ros.bag import BagWriter, iterate_raw
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
+from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.scenario import Scenario, load_scenario
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import (
@@ -21,7 +22,6 @@ from spacerobot_ros.planning.execution.status import (
     PlannerStatus,
 )
 from spacerobot_ros.session import run
-from spacerobot_ros.session.mission_client import Outcome
 
 HALF = math.sin(0.05), math.cos(0.05)
 """Of a quaternion that turns by 0.1 rad."""

@@ -1,0 +1,219 @@
+"""A flight to look at: a table, a figure, an animation. pandas and matplotlib are loaded here."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
+from spacerobot_ros.topics import TOPICS
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from spacerobot_ros.flight.arrays import FlightArrays
+
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+_INK, _GOAL = "#1f2328", "#CC79A7"
+
+_NAMES = {
+    "pose": ("x", "y", "z", "qx", "qy", "qz", "qw"),
+    "twist": ("vx", "vy", "vz", "wx", "wy", "wz"),
+    "momentum": ("px", "py", "pz", "Lx", "Ly", "Lz", "kinetic_energy"),
+}
+
+
+class Picture(Figure):
+    """A matplotlib figure that notebooks show without pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        stream = io.BytesIO()
+        self.savefig(stream, format="png", dpi=100, bbox_inches="tight")
+        return stream.getvalue()
+
+
+class Animation:
+    """An animation as HTML, which notebooks show; :meth:`save` writes the page.
+
+    Attributes
+    ----------
+    html
+        What a notebook shows.
+    """
+
+    def __init__(self, html: str) -> None:
+        self.html = html
+
+    def _repr_html_(self) -> str:
+        return self.html
+
+    def __repr__(self) -> str:
+        size = len(self.html) / 1e6
+        return f"<Animation, {size:.1f} MB of HTML: show it in a notebook, or save(PATH)>"
+
+    def save(self, path: str) -> None:
+        """Write the animation as a page of its own."""
+        with open(path, "w", encoding="utf-8") as file:
+            file.write(f'<!DOCTYPE html>\n<meta charset="utf-8">\n{self.html}\n')
+
+
+def table(flight: FlightArrays) -> pd.DataFrame:
+    """Return a table with a row a state, indexed by time (s).
+
+    Raises
+    ------
+    SpaceRobotError
+        pandas is not installed.
+    """
+    try:
+        import pandas as pd
+    except ImportError:
+        raise SpaceRobotError(
+            "Tables need pandas, which is not installed: pip install 'spacerobot_ros[data]'."
+        ) from None
+    names = flight.joint_names
+    columns: dict[str, Array] = {}
+    for quantity, words in _NAMES.items():
+        for word, column in zip(words, getattr(flight, quantity).T, strict=True):
+            columns[f"{quantity}.{word}"] = column
+    for quantity in ("q", "qdot", "effort"):
+        for word, column in zip(names, getattr(flight, quantity).T, strict=True):
+            columns[f"{quantity}.{word}"] = column
+    labels = _labels(flight)
+    for quantity, values in flight.quantities.items():
+        if len(values) == len(flight.time):
+            for word, column in zip(labels.get(quantity, ()), values.T, strict=False):
+                columns[f"{quantity}.{word}" if word else quantity] = column
+    return pd.DataFrame(columns, index=pd.Index(flight.time, name="time"))
+
+
+def _labels(flight: FlightArrays) -> dict[str, tuple[str, ...]]:
+    """Return what the numbers of the other quantities are called."""
+    names: dict[str, tuple[str, ...]] = {"propellant": ("",), "pose_lost": ("",)}
+    for part in ("measured_pose", "end_effector_pose"):
+        names[part] = _NAMES["pose"]
+    names["measured_twist"] = _NAMES["twist"]
+    names["measured_q"] = names["measured_qdot"] = flight.joint_names
+    for name in ("momentum_expected", "base_wrench_realised"):
+        for field in TOPICS[name].state:
+            names[field.quantity] = tuple(field.entries or field.members)
+    count = flight.quantities.get("thruster_duty", np.zeros((0, 0))).shape[1]
+    for name in ("thruster_on_time", "thruster_duty", "thruster_force"):
+        names[name] = tuple(str(i) for i in range(count))
+    return names
+
+
+def figure(flight: FlightArrays) -> Picture:
+    """Draw the pose of the base beside its goal, the joints, and what drove them."""
+    efforts = flight.scenario.plant.actuation == "effort"
+    wrench = flight.commands.get("base_wrench")
+    thrust = wrench is not None and bool(np.any(wrench.values))
+    rows = 4 + thrust
+    made = Picture(figsize=(8.0, 1.9 * rows + 0.6), layout="constrained")
+    FigureCanvasAgg(made)
+    panels = made.subplots(rows, 1, sharex=True)
+    time, goal = flight.time, flight.goal
+    attitude = np.unwrap([rotvec_from_quaternion(o) for o in flight.pose[:, 3:]], axis=0)
+    target = rotvec_from_quaternion(goal.quaternion)
+    _lines(panels[0], time, flight.pose[:, :3], "xyz", "position, m", goal.position)
+    _lines(panels[1], time, attitude, "xyz", "rotation vector, rad", target)
+    names = flight.joint_names
+    _lines(panels[2], time, flight.q, names, "joints, m or rad")
+    if efforts:
+        _lines(panels[3], time, flight.effort, names, "joint efforts, N or N m")
+    else:
+        _lines(panels[3], time, flight.qdot, names, "joint rates, 1/s")
+    if thrust and wrench is not None:
+        norms: Array = np.linalg.norm(wrench.values.reshape(-1, 2, 3), axis=2)
+        at = wrench.tick * np.float64(flight.control_period)
+        _lines(panels[4], at, norms, ("force, N", "torque, N m"), "thrust")
+    panels[-1].set_xlabel("time, s")
+    made.suptitle(f"{flight.scenario.name}, {flight.method}: {flight.sentence}", fontsize=10)
+    return made
+
+
+def _lines(
+    axes: Any, time: Array, values: Array, names: Any, label: str, goal: Array | None = None
+) -> None:
+    for i, name in enumerate(names):
+        colour = _COLOURS[i % len(_COLOURS)]
+        axes.plot(time, values[:, i], color=colour, label=name, linewidth=1.3)
+        if goal is not None:
+            axes.axhline(goal[i], color=colour, linestyle=":", linewidth=1.0)
+    axes.set_ylabel(label, fontsize=9)
+    axes.grid(visible=True, color="#e9ebee")
+    if len(names):
+        axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+
+
+def animation(flight: FlightArrays, seconds: float, frames: int) -> Animation:
+    """Draw the robot in motion: its joints as points, the links between them as lines."""
+    from matplotlib.animation import FuncAnimation
+
+    rows = np.unique(np.linspace(0, len(flight.time) - 1, frames).round().astype(int))
+    skeleton = _Skeleton(flight.robot)
+    shapes = np.array([skeleton.points(flight.pose[i], flight.q[i]) for i in rows])
+    goal = np.concatenate([flight.goal.position, flight.goal.quaternion])
+    ghost = skeleton.points(goal, flight.q[-1])
+    made = Figure(figsize=(5.6, 5.0), dpi=72)
+    FigureCanvasAgg(made)
+    axes = made.add_subplot(projection="3d")
+    everything = np.concatenate([shapes.reshape(-1, 3), ghost])
+    middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
+    half = max(float(np.ptp(everything, axis=0).max()) / 2, 0.1)
+    axes.set(
+        xlim=(middle[0] - half, middle[0] + half),
+        ylim=(middle[1] - half, middle[1] + half),
+        zlim=(middle[2] - half, middle[2] + half),
+        xlabel="x, m",
+        ylabel="y, m",
+        zlabel="z, m",
+    )
+    for a, b in skeleton.links:
+        axes.plot(*ghost[[a, b]].T, color=_GOAL, alpha=0.35, linewidth=3)
+    axes.plot(*flight.pose[:, :3].T, color="#8a919c", linewidth=0.8)
+    lines = [axes.plot([], [], [], color=_INK, linewidth=2.5)[0] for _ in skeleton.links]
+    (dots,) = axes.plot([], [], [], "o", color=_COLOURS[0], markersize=4)
+
+    def draw(k: int) -> list[Any]:
+        points = shapes[k]
+        for line, (a, b) in zip(lines, skeleton.links, strict=True):
+            line.set_data_3d(*points[[a, b]].T)
+        dots.set_data_3d(*points.T)
+        axes.set_title(f"{flight.time[rows[k]]:.2f} s", fontsize=10)
+        return [*lines, dots]
+
+    interval = 1000.0 * seconds / len(rows)
+    moving = FuncAnimation(made, draw, frames=len(rows), interval=interval)
+    return Animation(str(moving.to_jshtml(default_mode="loop")))
+
+
+class _Skeleton:
+    """The links of a robot as points: the origins of their frames, and their centres of mass."""
+
+    def __init__(self, description: RobotDescription) -> None:
+        self._robot = SpaceRobot(description)
+        names = [link.name for link in description.links]
+        index = {name: i for i, name in enumerate(names)}
+        count = len(names)
+        self._com = np.array([link.inertia.com for link in description.links])
+        # From a link's frame to its centre of mass, and from its parent's centre of mass to it.
+        self.links = [(i, count + i) for i in range(count)]
+        self.links += [(count + index[j.parent], index[j.child]) for j in description.joints]
+
+    def points(self, pose: Array, q: Array) -> Array:
+        """Return (2 L, 3) in the world, m: the frames, and the centres of mass."""
+        R_WB, r_WB = matrix_from_quaternion(pose[3:]), pose[:3]
+        frames, centres = [], []
+        for k, name in enumerate(self._robot.link_names):
+            R_BL, r_BL = self._robot.link_pose(name, q)
+            frames.append(r_WB + R_WB @ r_BL)
+            centres.append(r_WB + R_WB @ (r_BL + R_BL @ self._com[k]))
+        return np.array([*frames, *centres])

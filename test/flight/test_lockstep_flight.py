@@ -1,0 +1,173 @@
+"""Flights without ROS beside the same flights through the nodes, as bags hold them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spacerobot_ros.bag import read_bag
+from spacerobot_ros.errors import ParameterError, RecordingError
+from spacerobot_ros.flight.arrays import Outcome
+from spacerobot_ros.flight.flight import Flight
+from spacerobot_ros.flight.lockstep import fly_scenario
+from spacerobot_ros.flight.recorded import recorded_flight, recorded_scenario
+from spacerobot_ros.flight.scenario import Scenario, load_scenario
+from spacerobot_ros.session.run import run_scenario
+from spacerobot_ros.verification.comparison import verify_bag
+
+ROOT = Path(__file__).resolve().parents[2]
+
+WHOLE = ("time", "pose", "twist", "q", "qdot", "effort", "momentum")
+
+HEAVY = {"servicer", "servicer_thrusters", "arm_attitude", "coordinated_control"}
+"""Reference bags whose robot takes seconds to compile."""
+
+BAGS = [
+    pytest.param(path, marks=pytest.mark.slow if path.stem in HEAVY else (), id=path.stem)
+    for path in sorted((ROOT / "bags").glob("*.mcap"))
+]
+
+
+def assert_same(flight: Flight, other: Flight, tolerance: float = 0.0) -> None:
+    """Hold every number of two flights against each other."""
+    for name in WHOLE:
+        mine, its = getattr(flight, name), getattr(other, name)
+        assert mine.shape == its.shape, name
+        np.testing.assert_allclose(mine, its, rtol=tolerance, atol=tolerance, err_msg=name)
+    assert {"pose_lost", *other.quantities} == {"pose_lost", *flight.quantities}
+    for name, values in other.quantities.items():
+        mine = flight.quantities[name]
+        if name.startswith(("measured_pose", "measured_twist")):
+            mine = mine[flight.quantities["pose_lost"][:, 0] == 0.0]  # Nothing was published.
+        exact = 1e-12 if name == "propellant" else tolerance  # A sum, in another order.
+        np.testing.assert_allclose(mine, values, rtol=exact, atol=exact, err_msg=name)
+    for topic, sent in other.commands.items():
+        mine, count = flight.commands[topic], len(sent.tick)
+        # The node may have ended before the command that no one needs any more.
+        assert len(mine.tick) - 1 <= count <= len(mine.tick)
+        np.testing.assert_array_equal(mine.tick[:count], sent.tick)
+        np.testing.assert_allclose(mine.values[:count], sent.values, rtol=tolerance, atol=tolerance)
+    assert flight.outcome is other.outcome
+    assert flight.corrections == other.corrections
+    assert flight.manoeuvre_time == pytest.approx(other.manoeuvre_time, rel=1e-8)
+
+
+@pytest.mark.parametrize("bag", BAGS)
+def test_reference_bags_are_flown_again_without_ros(bag: Path) -> None:
+    """They were flown through the nodes. Plans may differ in the last digits between machines."""
+    flight, recorded = fly_scenario(recorded_scenario(read_bag(bag))), recorded_flight(bag)
+    assert len(recorded.time) > 50
+    assert_same(flight, recorded, 1e-9)
+
+
+@pytest.fixture
+def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
+
+
+BROKEN = ["plant.tick_rate=50", "coordinated_control.tick_rate=50"]
+NOISY = ["plant.sensors.position_noise=0.001", "plant.sensors.joint_rate_noise=0.002"]
+"""Faults of actuators and half a second without pose, which controllers and plant wait for."""
+
+BY_ROS = [
+    pytest.param("faults/stuck_slider", [], Outcome.FAILED),
+    pytest.param(
+        "faults/broken_thrusters", [*BROKEN, *NOISY], Outcome.FAILED, marks=pytest.mark.slow
+    ),
+    pytest.param("faults/stuck_elbow", [], Outcome.REACHED, marks=pytest.mark.slow),
+    pytest.param("faults/late_poses", [], Outcome.REACHED, marks=pytest.mark.slow),
+    pytest.param("faults/weak_motors", [], Outcome.REACHED, marks=pytest.mark.slow),
+    pytest.param("faults/wrong_masses", [], Outcome.REACHED, marks=pytest.mark.slow),
+    pytest.param("faults/noisy_sensors", [], Outcome.REACHED, marks=pytest.mark.slow),
+    pytest.param("planar_chain", [], Outcome.REACHED, marks=pytest.mark.slow),
+    pytest.param("servicer", [], Outcome.REACHED, marks=pytest.mark.slow),
+    pytest.param("servicer_thrusters", [], Outcome.REACHED, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.usefixtures("own_domain")
+@pytest.mark.parametrize(("name", "settings", "outcome"), BY_ROS)
+def test_a_flight_is_the_one_through_the_nodes(
+    name: str, settings: list[str], outcome: Outcome, tmp_path: Path
+) -> None:
+    """To the last bit: plans, corrections, lost poses, noise, faults, stuck joints."""
+    scenario = load_scenario(name).with_settings(settings)
+    run_scenario(scenario, tmp_path / "ros.mcap")
+    through_ros, flight = recorded_flight(tmp_path / "ros.mcap"), fly_scenario(scenario)
+    assert flight.outcome is outcome
+    assert_same(flight, through_ros)
+    assert flight.sentence == through_ros.sentence
+    told = [(event.kind, event.sentence) for event in flight.events if event.goal_id]
+    assert told == [(e.kind, e.sentence) for e in through_ros.events if e.goal_id]
+
+
+def chain(**settings: float) -> Scenario:
+    """Return a short flight of a planner and a controller."""
+    scenario = load_scenario("planar_chain")
+    for node in (*scenario.commanders, "plant"):
+        scenario = scenario.with_overrides(node, {"tick_rate": 25.0})
+    return scenario.with_overrides("plant", settings)
+
+
+def test_what_is_saved_is_verified_and_read_back(tmp_path: Path) -> None:
+    flight = fly_scenario(chain(**{"sensors.joint_noise": 1e-7}))
+    flight.save(tmp_path / "saved.mcap")
+    verified = verify_bag(tmp_path / "saved.mcap")
+    assert verified.difference is None
+    assert verified.ticks == len(flight.time) - 1
+    read = recorded_flight(tmp_path / "saved.mcap")
+    assert_same(flight, read)
+    assert [e.sentence for e in read.events] == [e.sentence for e in flight.events]
+    with pytest.raises(RecordingError, match="exists"):
+        flight.save(tmp_path / "saved.mcap")
+
+
+def test_a_saved_flight_with_another_number_is_not_verified(tmp_path: Path) -> None:
+    flight = fly_scenario(chain())
+    flight.q[20, 1] += 1e-6
+    flight.save(tmp_path / "saved.mcap")
+    difference = verify_bag(tmp_path / "saved.mcap").difference
+    assert difference is not None
+    assert (difference.topic, difference.time) == ("/joint_states", 20 / 25)
+
+
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [
+        (["plant.time_mode=realtime"], "time_mode"),
+        (["planner.plan_in_background=true"], "plan_in_background"),
+        (["plant.resume_bag=some.mcap"], "resume_bag"),
+        (["planner.resume_file=some.json"], "resume_file"),
+        (["planner.output=commands"], "both command"),
+    ],
+)
+def test_what_only_nodes_can_do_is_refused(settings: list[str], word: str) -> None:
+    with pytest.raises(ParameterError, match=word):
+        fly_scenario(load_scenario("planar_chain").with_settings(settings))
+
+
+def test_a_flight_that_is_longer_than_allowed_is_interrupted() -> None:
+    flight = fly_scenario(chain(), longest=2.0)
+    assert flight.outcome is Outcome.INTERRUPTED
+    assert flight.duration == 2.0
+    assert flight.sentence == "Interrupted after 2 s of simulated time."
+
+
+def test_a_plant_that_latches_ends_the_flight(tmp_path: Path) -> None:
+    """Its sliders are slower than the planner believes: a command is refused, and latches."""
+    text = (ROOT / "urdf" / "sliding_masses.urdf").read_text()
+    slow = re.sub(r'velocity="[^"]*"', 'velocity="0.02"', text)
+    (tmp_path / "slow.urdf").write_text(slow)
+    scenario = load_scenario("faults/stuck_slider").with_settings(
+        [f"plant.robot={tmp_path}/slow.urdf", "plant.beyond_limits=refuse", "plant.faults=[]",
+         "plant.latched_faults=beyond_limits"]
+    )  # fmt: skip
+    flight = fly_scenario(scenario)
+    assert flight.outcome is Outcome.ABORTED
+    assert "beyond the limits" in flight.sentence
+    (time, topic, refusal), *_ = flight.refusals
+    assert (topic, refusal.latches) == ("joint_commands", True)
+    assert flight.duration == pytest.approx(time + 0.05)  # The tick goes by at rest.
