@@ -74,15 +74,20 @@ class BufferedFunction:
     ``inputs`` and ``outputs`` are numpy arrays shaped like the function's arguments (vectors are
     1-D) that stay in place for the life of the object; a call costs well under a microsecond
     beside the computation itself.
+
+    ``held`` are the numbers of a last argument that stays the same: it is not among ``inputs``.
     """
 
-    def __init__(self, function: ca.Function) -> None:
+    def __init__(self, function: ca.Function, held: Array | None = None) -> None:
         self.function = function
         self._buffer, self.evaluate = function.buffer()
         self.inputs: tuple[Array, ...] = tuple(
             self._attach(function.size_in(i), function.sparsity_in(i), i, self._buffer.set_arg)
             for i in range(function.n_in())
         )
+        if held is not None:
+            *inputs, last = self.inputs
+            last[:], self.inputs, self._held = held, tuple(inputs), last
         self.outputs: tuple[Array, ...] = tuple(
             self._attach(function.size_out(i), function.sparsity_out(i), i, self._buffer.set_res)
             for i in range(function.n_out())

@@ -40,9 +40,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import casadi as ca
-import numpy as np
 
+from spacerobot_ros.model.body_weights import rotational, symmetric
 from spacerobot_ros.model.compilation import dense_function
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import inertia_matrix
 from spacerobot_ros.model.kinematics import TreeKinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
@@ -54,7 +55,7 @@ class SpatialInertia:
     (kg m), ``J`` (3, 3) second moment of mass (kg m^2; the rotational inertia is ``tr(J) 1 - J``).
     """
 
-    mass: float
+    mass: float | ca.SX
     h: ca.SX
     J: ca.SX
 
@@ -66,7 +67,7 @@ class SpatialInertia:
         """Return the momentum (6,) of a motion (6,) (Featherstone, eq. 2.61)."""
         omega, v = motion[:3], motion[3:]
         return ca.vertcat(
-            ca.cross(self.h, v) + _rotational(self.J) @ omega,
+            ca.cross(self.h, v) + rotational(self.J) @ omega,
             self.mass * v + ca.cross(omega, self.h),
         )
 
@@ -117,9 +118,9 @@ class Composites:
     rotational: ca.SX
 
     @property
-    def mass(self) -> float:
+    def mass(self) -> float | ca.SX:
         """Mass of the system, kg."""
-        return self.kin.robot.total_mass
+        return self.kin.total_mass
 
     @property
     def D(self) -> ca.SX:
@@ -157,18 +158,18 @@ class Composites:
 def composites(kin: TreeKinematics) -> Composites:
     """Add up the bodies inward (Featherstone, table 6.2)."""
     n, c = kin.moving, kin.r_BC_B
-    J = tuple(_second_moment(kin, k) for k in range(n + 1))
+    J = tuple(kin.second_moment(k) for k in range(n + 1))
     composite = []
     for k in range(n + 1):
         rho = kin.com[k] - c
         h = kin.mass(k) * rho
-        composite.append(SpatialInertia(kin.mass(k), h, J[k] + _symmetric(h @ rho.T)))
+        composite.append(SpatialInertia(kin.mass(k), h, J[k] + symmetric(h @ rho.T)))
     S, P = ([ca.SX(6, 1)] * (n + 1) for _ in range(2))
     for k in range(n, 0, -1):
         S[k] = _joint_motion(kin, k)
         P[k] = composite[k] @ S[k]
         composite[kin.parent(k)] += composite[k]
-    return Composites(kin, J, tuple(S), tuple(P), _rotational(composite[0].J))
+    return Composites(kin, J, tuple(S), tuple(P), rotational(composite[0].J))
 
 
 @dataclass(frozen=True)
@@ -203,7 +204,7 @@ def shape_system(kin: TreeKinematics) -> ShapeSystem:
     parts = composites(kin)
     S, P, n = parts.S, parts.P, kin.moving
     D = Factor(parts.rotational)
-    B = [ca.vertcat(D.solve(p[:3]), p[3:] * (1 / parts.mass)) for p in P]
+    B = [ca.vertcat(D.solve(p[:3]), p[3:] * kin.per_mass) for p in P]
     K = ca.SX(n, n)
     for j in range(1, n + 1):
         carriers = kin.ancestors(j)
@@ -251,7 +252,7 @@ def motion_forces(
 
     forces = []
     for k in range(kin.moving + 1):
-        arm = kin.R[k] @ _constant(kin.robot.bodies[k].inertia.com)
+        arm = kin.R[k] @ kin.center(k)
         force = kin.mass(k) * (accelerations[k] + A[k] @ arm)
         # The moment is the integral of rho x A rho over the body: the axial vector of A J.
         AJ = A[k] @ parts.J[k]
@@ -298,7 +299,7 @@ def joint_efforts(kin: TreeKinematics, qdot: ca.SX, qddot: ca.SX) -> ca.SX:
     parts = composites(kin)
     D = Factor(parts.rotational)
     f = motion_forces(parts, -D.solve(parts.D_q @ qdot), qdot, qddot)
-    base = ca.vertcat(D.solve(f[0][:3]), f[0][3:] * (1 / parts.mass))
+    base = ca.vertcat(D.solve(f[0][:3]), f[0][3:] * kin.per_mass)
     along = (
         ca.dot(S, force) - ca.dot(P, base)
         for S, P, force in zip(parts.S[1:], parts.P[1:], f[1:], strict=True)
@@ -324,7 +325,7 @@ def composite_dynamics(
     Q, moment = shape_forces(system, omega, qdot, external, tau)
     qddot = Factor(system.K).solve(Q)
     return ca.vertcat(
-        external[3:] / kin.robot.total_mass - ca.cross(omega, v_cm),
+        external[3:] / kin.total_mass - ca.cross(omega, v_cm),
         system.base_acceleration(moment, qddot),
         qddot,
     )
@@ -340,7 +341,7 @@ def shape_equations(kin: TreeKinematics) -> ca.Function:
     """Return the function ``(x, command) -> (K, Q)`` of ``K qddot = Q``."""
     x, command = _symbols(kin)
     system, _, _, Q = _equations(kin, x, command)
-    inputs = {"x": x, "command": command}
+    inputs = {"x": x, "command": command, **kin.weights.inputs}
     return dense_function("shape_equations", inputs, {"K": system.K, "Q": Q})
 
 
@@ -365,12 +366,13 @@ def state_rate(kin: TreeKinematics, *, holding: bool = False) -> ca.Function:
         Factor(K).solve(Q * free),
         R_WB @ external[3:],
         R_WB @ external[:3],
-        p_W / kin.robot.total_mass,
+        p_W / kin.total_mass,
     )
     inputs = {"x": x, "command": command}
     if holding:
-        return dense_function("holding_rate", {**inputs, "free": free}, {"x_dot": x_dot})
-    return dense_function("flight_rate", inputs, {"x_dot": x_dot})
+        inputs["free"] = free
+    inputs |= kin.weights.inputs
+    return dense_function("holding_rate" if holding else "flight_rate", inputs, {"x_dot": x_dot})
 
 
 def _symbols(kin: TreeKinematics) -> tuple[ca.SX, ca.SX]:
@@ -403,39 +405,11 @@ def _joint_motion(kin: TreeKinematics, k: int) -> ca.SX:
     return ca.vertcat(ca.SX(3, 1), kin.axis[k])
 
 
-def _second_moment(kin: TreeKinematics, k: int) -> ca.SX:
-    """Return the second moment of mass (3, 3) of body k about its centre, base components.
-
-    Along principal axes ``u``: ``J = lambda 1 + sum (lambda_u - lambda) u u'``. The middle
-    moment serves as ``lambda``: a body with an axis of symmetry is left with that axis alone.
-    """
-    about = kin.robot.bodies[k].inertia.about_com
-    moments, axes = np.linalg.eigh(np.trace(about) / 2 * np.eye(3) - about)
-    J = moments[1] * ca.SX.eye(3)
-    for moment, axis in ((moments[0], axes[:, 0]), (moments[2], axes[:, 2])):
-        u = kin.R[k] @ _constant(axis)
-        J = J + _symmetric(((moment - moments[1]) * u) @ u.T)
-    return J
-
-
-def _rotational(J: ca.SX) -> ca.SX:
-    """Return the rotational inertia ``tr(J) 1 - J`` of a second moment of mass."""
-    inertia = -J
-    for i in range(3):
-        inertia[i, i] = J[i - 2, i - 2] + J[i - 1, i - 1]
-    return inertia
-
-
 def _turning(omega: ca.SX, alpha: ca.SX) -> ca.SX:
     """Return ``hat(alpha) + hat(omega)^2`` (3, 3)."""
-    squares = _symmetric(omega @ omega.T)
-    return ca.skew(alpha) - _rotational(squares)
+    squares = symmetric(omega @ omega.T)
+    return ca.skew(alpha) - rotational(squares)
 
 
-def _symmetric(matrix: ca.SX) -> ca.SX:
-    """Return a symmetric matrix with one expression, not two equal ones, for each pair."""
-    return ca.tril2symm(ca.tril(matrix))
-
-
-def _constant(vector: np.ndarray) -> ca.DM:
+def _constant(vector: Array) -> ca.DM:
     return ca.sparsify(ca.DM(vector))

@@ -27,7 +27,7 @@ class BarycentricInertia:
     (n, n); ``v[i][k]`` are the barycentric vectors, each (3,).
     """
 
-    mass: float
+    mass: float | ca.SX
     D: ca.SX
     D_q: ca.SX
     D_qq: ca.SX
@@ -39,7 +39,7 @@ class BarycentricInertia:
         return inertia_matrix(self.mass, self.D, self.D_q, self.D_qq)
 
 
-def inertia_matrix(mass: float, D: ca.SX, D_q: ca.SX, D_qq: ca.SX) -> ca.SX:
+def inertia_matrix(mass: float | ca.SX, D: ca.SX, D_q: ca.SX, D_qq: ca.SX) -> ca.SX:
     """Return ``H+`` (6 + n, 6 + n) from its blocks, eq. (15)."""
     n = D_qq.shape[0]
     return ca.blockcat(
@@ -56,11 +56,11 @@ def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:
     from that of the system, base components.
     """
     bodies = range(kin.moving + 1)
-    M = kin.robot.total_mass
+    M = kin.total_mass
     outboard = [set(kin.outboard(k)) for k in bodies]
     # towards[i][j]: from the mass centre of i to the joint it shares with its neighbour j,
     # with the mass that lies beyond that joint.
-    towards: list[dict[int, tuple[ca.SX, float]]] = [{} for _ in bodies]
+    towards: list[dict[int, tuple[ca.SX, float | ca.SX]]] = [{} for _ in bodies]
     for k in bodies[1:]:
         i = kin.parent(k)
         beyond = sum(kin.mass(b) for b in outboard[k])
@@ -81,7 +81,7 @@ def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:
 
 def barycentric_inertia(kin: TreeKinematics) -> BarycentricInertia:
     """Return the blocks of ``H+`` (eqs 14-17), with the slide terms of prismatic joints."""
-    n, M = kin.moving, kin.robot.total_mass
+    n, M = kin.moving, kin.total_mass
     bodies = range(n + 1)
     v = barycentric_vectors(kin)
     one = ca.SX.eye(3)
@@ -157,7 +157,7 @@ def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
     Outward recursion of the velocity-product accelerations, inward sum of their inertia forces.
     Accelerations are taken relative to the system's centre of mass, whose own is ``omega x v_cm``.
     """
-    M, qdot = kin.robot.total_mass, kin.spread(qdot)
+    M, qdot = kin.total_mass, kin.spread(qdot)
     omegas, alphas, accelerations = [omega], [ca.SX(3, 1)], [ca.SX(3, 1)]
     for k in range(1, kin.moving + 1):
         i = kin.parent(k)

@@ -23,7 +23,7 @@ _ROUNDING = 1e-12
 PER_BODY = 10
 """Numbers a body in :attr:`InertialParameters.vector`."""
 
-_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Where the six second moments of a body stand in their matrix."""
 
 
@@ -142,7 +142,7 @@ class InertialParameters:
         Of each body its mass, its centre (3) and its second moments xx, yy, zz, xy, xz, yz.
         """
         moments = self.second_moments
-        six = np.stack([moments[..., i, j] for i, j in _PAIRS], axis=-1)
+        six = np.stack([moments[..., i, j] for i, j in PAIRS], axis=-1)
         rows = np.concatenate([self.masses[..., None], self.centers, six], axis=-1)
         return rows.reshape(*self.masses.shape[:-1], -1)
 

@@ -30,6 +30,8 @@ def steps_in(control_period: float, integration_step: float) -> int:
 def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
     """Return one step ``(x, held arguments of rate, h) -> x`` of Runge-Kutta 4.
 
+    A last argument ``p`` of the rate (what the bodies weigh) stays the last, after ``h``.
+
     ``attitude`` is where the quaternion is in ``x``: it is integrated in R^4, and normalised after
     the step. The four stages call one piece of code: written out four times it would be 6 % faster,
     and take six times as long to compile.
@@ -42,7 +44,9 @@ def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
     k4 = rate(x + h * k3, *held)
     x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     x_next[attitude] = x_next[attitude] / ca.norm_2(x_next[attitude])
-    return ca.Function(rate.name().replace("rate", "step"), [x, *held, h], [x_next])
+    weights = [held.pop()] if rate.name_in(rate.n_in() - 1) == "p" else []
+    inputs = [x, *held, h, *weights]
+    return ca.Function(rate.name().replace("rate", "step"), inputs, [x_next])
 
 
 def repeated(step: ca.Function, count: int) -> ca.Function:
@@ -69,14 +73,16 @@ def attitude_step(locked_inertia: ca.Function) -> ca.Function:
     ``R_WB_dot = R_WB hat(omega)``, ``omega = D^-1 (R_WB' L_W - D_q qdot)`` (paper 1, eq. 3, with an
     angular momentum that need not be zero), as a quaternion in R^4, normalised.
 
-    ``locked_inertia`` is the function ``q -> (D, D_q)``.
+    ``locked_inertia`` is the function ``q -> (D, D_q)``; if it takes a second argument ``p`` (what
+    the bodies weigh), so does the step, as its last.
     """
+    weights = [ca.SX.sym("p", locked_inertia.size1_in(1))] if locked_inertia.n_in() > 1 else []
     n = locked_inertia.size1_in(0)
     x = ca.SX.sym("x", n + 4)
     qdot, L_W, h = ca.SX.sym("qdot", n), ca.SX.sym("L_W", 3), ca.SX.sym("h")
     q, quaternion = x[:n], x[n:]
     # Start, middle and end of the step: the middle serves two of the four stages.
-    shapes = [locked_inertia(q + fraction * h * qdot) for fraction in (0.0, 0.5, 1.0)]
+    shapes = [locked_inertia(q + fraction * h * qdot, *weights) for fraction in (0.0, 0.5, 1.0)]
 
     def rate(at: ca.SX, shape: tuple[ca.SX, ca.SX]) -> ca.SX:
         D, D_q = shape
@@ -90,7 +96,7 @@ def attitude_step(locked_inertia: ca.Function) -> ca.Function:
     k4 = rate(quaternion + h * k3, shapes[2])
     turned = quaternion + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     x_next = ca.vertcat(q + h * qdot, turned / ca.norm_2(turned))
-    return ca.Function("attitude_step", [x, qdot, L_W, h], [ca.cse(x_next)])
+    return ca.Function("attitude_step", [x, qdot, L_W, h, *weights], [ca.cse(x_next)])
 
 
 def _arguments(function: ca.Function) -> tuple[ca.MX, list[ca.MX]]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from spacerobot_ros.model.body_weights import BodyWeights, DescribedWeights
 from spacerobot_ros.model.description import Array, JointKind, Pose, RobotDescription
 from spacerobot_ros.model.rotations import quaternion_from_matrix
 from spacerobot_ros.model.symbolic_rotations import matrix_about_axis, quaternion_multiply
@@ -23,6 +24,7 @@ class TreeKinematics:
     origin, ``com[k]`` centre of mass, ``inertia[k]`` inertia about that centre, ``axis[k]`` the
     unit vector of the joint that carries it (None for the base). ``theta`` (m,) are the positions
     of the joints that carry ``bodies[1:]``: q, unless joints follow others (URDF's mimic).
+    ``weights`` says what the bodies weigh: the numbers of the robot, or symbols.
     """
 
     robot: RobotDescription
@@ -34,6 +36,7 @@ class TreeKinematics:
     inertia: tuple[ca.SX, ...]
     axis: tuple[ca.SX | None, ...]
     r_BC_B: ca.SX
+    weights: BodyWeights
 
     @property
     def n(self) -> int:
@@ -57,9 +60,29 @@ class TreeKinematics:
     def _coupling(self) -> ca.DM:
         return ca.sparsify(ca.DM(self.robot.coupling[0]))
 
-    def mass(self, k: int) -> float:
+    def mass(self, k: int) -> float | ca.SX:
         """Mass of body k, kg."""
-        return self.robot.bodies[k].inertia.mass
+        return self.weights.masses[k]
+
+    @property
+    def total_mass(self) -> float | ca.SX:
+        """Mass of the system, kg."""
+        return self.weights.total
+
+    @property
+    def per_mass(self) -> float | ca.SX:
+        """One over the mass of the system, 1/kg."""
+        # CasADi rewrites x * (1/d) as x/d; it leaves |1/d| as it is.
+        per: float | ca.SX = 1 / self.weights.total
+        return per if isinstance(per, float) else ca.fabs(per)
+
+    def center(self, k: int) -> ca.DM | ca.SX:
+        """Centre of mass (3,) of body k in its own frame, m."""
+        return self.weights.centers[k]
+
+    def second_moment(self, k: int) -> ca.SX:
+        """Return the second moment of mass (3, 3) of body k about its centre, base components."""
+        return self.weights.second_moment(k, self.R[k])
 
     def parent(self, k: int) -> int:
         """Index of the body that body k moves on; -1 for the base."""
@@ -109,8 +132,17 @@ def joint_positions(robot: RobotDescription, q: ca.SX) -> ca.SX:
     return ca.sparsify(ca.DM(G)) @ q + ca.sparsify(ca.DM(b))
 
 
-def tree_kinematics(robot: RobotDescription) -> TreeKinematics:
-    """Build the symbolic kinematics of a robot."""
+def tree_kinematics(robot: RobotDescription, weights: BodyWeights | None = None) -> TreeKinematics:
+    """Build the symbolic kinematics of a robot.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    weights
+        What its bodies weigh; None: the numbers of its description.
+    """
+    weights = weights or DescribedWeights(robot)
     q = ca.SX.sym("q", len(robot.joint_names))
     theta = joint_positions(robot, q)
     R: list[ca.SX] = [ca.SX.eye(3)]
@@ -129,14 +161,13 @@ def tree_kinematics(robot: RobotDescription) -> TreeKinematics:
             p.append(p_joint)
         axis.append(direction)
     com, inertia = [], []
-    for k, body in enumerate(robot.bodies):
-        com.append(p[k] + R[k] @ ca.sparsify(ca.DM(body.inertia.com)))
-        inertia.append(R[k] @ ca.sparsify(ca.DM(body.inertia.about_com)) @ R[k].T)
-    r_BC_B = sum((b.inertia.mass * c for b, c in zip(robot.bodies, com, strict=True)), ca.SX(3, 1))
-    r_BC_B = r_BC_B / robot.total_mass
-    return TreeKinematics(
-        robot, q, theta, tuple(R), tuple(p), tuple(com), tuple(inertia), tuple(axis), r_BC_B
-    )
+    for k in range(len(robot.bodies)):
+        com.append(p[k] + R[k] @ weights.centers[k])
+        inertia.append(weights.inertia(k, R[k]))
+    r_BC_B = sum((m * c for m, c in zip(weights.masses, com, strict=True)), ca.SX(3, 1))
+    r_BC_B = r_BC_B / weights.total
+    frames = tuple(R), tuple(p), tuple(com), tuple(inertia), tuple(axis)
+    return TreeKinematics(robot, q, theta, *frames, r_BC_B, weights)
 
 
 def link_quaternion(description: RobotDescription, link: str, q: ca.SX) -> ca.SX:

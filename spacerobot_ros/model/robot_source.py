@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.model_functions import SymbolicModels
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.parameters import parameter
@@ -60,7 +61,7 @@ def robot_of(config: RobotConfig) -> SpaceRobot | None:
         path = robot_file(config.robot)
     except ParameterError as error:
         raise ParameterError(f"Parameter 'robot' is '{config.robot}'. {error}") from None
-    return SpaceRobot(config.believed(load_robot(path)))
+    return _believed(load_robot(path), config)
 
 
 def robot_from_text(text: str, config: RobotConfig) -> SpaceRobot:
@@ -71,4 +72,10 @@ def robot_from_text(text: str, config: RobotConfig) -> SpaceRobot:
     RobotDescriptionError
         The URDF is refused.
     """
-    return SpaceRobot(config.believed(parse_robot(text)))
+    return _believed(parse_robot(text), config)
+
+
+def _believed(true: RobotDescription, config: RobotConfig) -> SpaceRobot:
+    believed = config.believed(true)
+    # Robots that are believed to weigh something else share their compiled functions.
+    return SpaceRobot(believed, None if believed is true else SymbolicModels.of(true))

@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import BufferedFunction, compiled
 from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import repeated, steps_in
+from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.simulation.initial_state import InitialState
 from spacerobot_ros.simulation.joint_stops import JointStops
 from spacerobot_ros.simulation.plant import Flags
@@ -74,7 +74,9 @@ class EffortPlant:
         self.initial = initial or InitialState()
         n = robot.n
         self._stops = JointStops(robot, control_period / substeps)
-        self._advance = BufferedFunction(compiled(_tick_function(robot, substeps)))
+        self._advance = robot.composed(
+            f"effort_tick_{substeps}", lambda model: _tick_function(robot, model, substeps)
+        )
         self._state, self._command, self._h = self._advance.inputs
         self._next_state, self.pose, self.twist, self._realised = self._advance.outputs[:4]
         self.momentum, self.link_R, self.link_r, self._limited = self._advance.outputs[4:]
@@ -175,7 +177,7 @@ class EffortPlant:
         self._h[:] = self.control_period
 
 
-def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
+def _tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Function:
     """Compose the tick from the model's functions; see :class:`EffortPlant` for its results."""
     n = robot.n
     parts = state_slices(n)
@@ -183,21 +185,22 @@ def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
     h = ca.MX.sym("h")
     effort = ca.fmin(ca.fmax(command[:n], -robot.effort_limit), robot.effort_limit)
     realised = ca.vertcat(effort, command[n:])
-    march = repeated(_watched_step(robot), substeps)
-    marched = march(ca.vertcat(state, _touching(robot, state)), realised, h / substeps)
+    march = repeated(_watched_step(robot, model), substeps)
+    weights = list(model.inputs.values())
+    marched = march(ca.vertcat(state, _touching(robot, state)), realised, h / substeps, *weights)
     next_state = marched[:-1]
 
     q, quaternion, qdot, p_W, L_W, r_WC_W = (next_state[part] for part in parts)
-    v, omega = robot.function("base_twist", compile=False)(quaternion, q, qdot, p_W, L_W)
-    center = robot.function("center_of_mass", compile=False)(q)
-    r_WB_W = r_WC_W - robot.function("rotate", compile=False)(quaternion, center)
-    momentum = robot.function("momentum", compile=False)(quaternion, q, v, omega, qdot)
-    link_R, link_r = robot.function("link_poses", compile=False)(q)
+    v, omega = model("base_twist", quaternion, q, qdot, p_W, L_W)
+    center = model("center_of_mass", q)
+    r_WB_W = r_WC_W - model("rotate", quaternion, center)
+    momentum = model("momentum", quaternion, q, v, omega, qdot)
+    link_R, link_r = model("link_poses", q)
     clipped = command[:n] != effort
     # Comparisons with what is not a number are false.
     diverged = parts[-1].stop - ca.sum1(ca.fabs(next_state) < _DIVERGED)
     touched = marched[-1] + diverged
-    return ca.Function(
+    return model.function(
         f"effort_tick_{substeps}",
         [state, command, h],
         [
@@ -213,17 +216,16 @@ def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
     )
 
 
-def _watched_step(robot: SpaceRobot) -> ca.Function:
+def _watched_step(robot: SpaceRobot, model: Composition) -> ca.Function:
     """Return the step that also counts, in one more entry of the state, joints on or beyond stops.
 
     It looks at the end of each step: a joint cannot swing beyond its limit and back within one.
     """
-    step = robot.function("flight_step", compile=False)
-    watched = ca.MX.sym("x", step.size1_in(0) + 1)
+    watched = ca.MX.sym("x", state_slices(robot.n)[-1].stop + 1)
     command, h = ca.MX.sym("command", robot.n + 6), ca.MX.sym("h")
-    x = step(watched[:-1], command, h)
+    x = model("flight_step", watched[:-1], command, h)
     counted = ca.vertcat(x, watched[-1] + _touching(robot, x))
-    return ca.Function("watched_step", [watched, command, h], [counted])
+    return model.function("watched_step", [watched, command, h], [counted])
 
 
 def _touching(robot: SpaceRobot, state: ca.MX) -> ca.MX:

@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import BufferedFunction, compiled
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP, steps_in
+from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.simulation.initial_state import InitialState
 from spacerobot_ros.simulation.plant import Flags
 
@@ -55,7 +55,9 @@ class VelocityPlant:
         self.robot = robot
         self.control_period = control_period
         self.initial = initial or InitialState()
-        self._advance = BufferedFunction(compiled(_tick_function(robot, substeps)))
+        self._advance = robot.composed(
+            f"velocity_tick_{substeps}", lambda model: _tick_function(robot, model, substeps)
+        )
         inputs, outputs = self._advance.inputs, self._advance.outputs
         self._state, self._command, self._momenta, self._r_cm, self._h = inputs
         self._next_state, self.pose, self.twist, self.qdot = outputs[:4]
@@ -119,7 +121,7 @@ class VelocityPlant:
         return True
 
 
-def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
+def _tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Function:
     """Compose the tick from the model's functions; see :class:`VelocityPlant` for its results."""
     n = robot.n
     state, command = ca.MX.sym("state", n + 4), ca.MX.sym("command", n)
@@ -135,16 +137,15 @@ def _tick_function(robot: SpaceRobot, substeps: int) -> ca.Function:
     by_rate, by_stroke = command != rate, rate != qdot
     limited = ca.vertcat(ca.sum1(by_rate) + ca.sum1(by_stroke), by_rate, by_stroke)
 
-    step = robot.function(f"velocity_step:{substeps}", compile=False)
-    next_state = step(state, qdot, L_W, h)
+    next_state = model(f"velocity_step:{substeps}", state, qdot, L_W, h)
     q_next, quaternion = next_state[:n], next_state[n:]
-    v, omega = robot.function("base_twist", compile=False)(quaternion, q_next, qdot, p_W, L_W)
-    r_cm_next = r_cm + p_W * (h / robot.total_mass)
-    center = robot.function("center_of_mass", compile=False)(q_next)
-    r_WB = r_cm_next - robot.function("rotate", compile=False)(quaternion, center)
-    momentum = robot.function("momentum", compile=False)(quaternion, q_next, v, omega, qdot)
-    link_R, link_r = robot.function("link_poses", compile=False)(q_next)
-    return ca.Function(
+    v, omega = model("base_twist", quaternion, q_next, qdot, p_W, L_W)
+    r_cm_next = r_cm + p_W * (h / model.total_mass)
+    center = model("center_of_mass", q_next)
+    r_WB = r_cm_next - model("rotate", quaternion, center)
+    momentum = model("momentum", quaternion, q_next, v, omega, qdot)
+    link_R, link_r = model("link_poses", q_next)
+    return model.function(
         f"velocity_tick_{substeps}",
         [state, command, momenta, r_cm, h],
         [

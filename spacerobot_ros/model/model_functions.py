@@ -1,0 +1,338 @@
+"""The functions of a robot's model, by name: built when they are asked for, compiled once.
+
+A model has the numbers of its robot in it, or takes what the bodies weigh as the last argument
+``p`` of all its functions: then one compilation serves every robot of the same build.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.model.body_weights import SymbolicWeights, free_entries
+from spacerobot_ros.model.compilation import compiled, dense_function, kept_function, source_of
+from spacerobot_ros.model.composite_rigid_body import (
+    composite_dynamics,
+    composites,
+    joint_efforts,
+    shape_equations,
+    state_rate,
+    state_slices,
+)
+from spacerobot_ros.model.connection import base_twist, connection, curvature, momentum_of_bodies
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.dynamics import (
+    barycentric_inertia,
+    bias,
+    forward_dynamics,
+    generalised_forces,
+    point_jacobian,
+)
+from spacerobot_ros.model.inertial_parameters import InertialParameters
+from spacerobot_ros.model.integration import attitude_step, repeated, runge_kutta_step
+from spacerobot_ros.model.kinematics import tree_kinematics
+from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
+
+
+class ModelFunctions:
+    """All functions of one robot's model.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    weights
+        Symbols of what its bodies weigh; None: its numbers.
+    """
+
+    def __init__(self, robot: RobotDescription, weights: SymbolicWeights | None = None) -> None:
+        self.n = len(robot.joint_names)
+        self.link_names = tuple(link.name for link in robot.links)
+        self._kin = tree_kinematics(robot, weights)
+        self._inertia = composites(self._kin)
+        self._symbolic: dict[str, ca.Function] = {}
+        self._compiled: dict[str, ca.Function] = {}
+
+    def function(self, name: str, *, compile: bool = True) -> ca.Function:
+        """Return a function of the model by name (the keys of ``_builders``).
+
+        ``compile=False`` gives the symbolic function, to build larger ones from.
+        """
+        kind, _, argument = name.partition(":")
+        if name not in self._symbolic:
+            build = self._builders[kind]
+            self._symbolic[name] = build(argument) if argument else build()
+        # Curvature is wide and asked for once in a plan: compiling it would take longer than all
+        # its calls.
+        if not compile or kind == "curvature":
+            return self._symbolic[name]
+        return self.composed(name, lambda: self._symbolic[name])
+
+    def composed(self, name: str, build: Callable[[], ca.Function]) -> ca.Function:
+        """Return a function that is built from those of the model, compiled once for its name."""
+        if name not in self._compiled:
+            self._compiled[name] = compiled(build())
+        return self._compiled[name]
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of the system, kg, where it is a number."""
+        return float(self._kin.total_mass)
+
+    @property
+    def weight_inputs(self) -> dict[str, ca.SX]:
+        """The symbol ``p`` by its name; empty where the model has numbers."""
+        return self._kin.weights.inputs
+
+    @cached_property
+    def equations_key(self) -> str:
+        """A hash of the equations at zero momentum: equal for robots that move alike."""
+        digest = hashlib.sha256()
+        for name in ("locked_inertia", "center_of_mass"):
+            digest.update(self.function(name, compile=False).serialize().encode())
+        return digest.hexdigest()
+
+    def link_index(self, link: str) -> int:
+        """Return the number of a link.
+
+        Raises
+        ------
+        KeyError
+            There is no such link.
+        """
+        try:
+            return self.link_names.index(link)
+        except ValueError:
+            raise KeyError(
+                f"robot '{self._kin.robot.name}' has no link '{link}'; "
+                f"it has {', '.join(self.link_names)}"
+            ) from None
+
+    @cached_property
+    def _builders(self) -> dict[str, Callable[..., ca.Function]]:
+        return {
+            "center_of_mass": lambda: self._shape_function("center_of_mass", self._kin.r_BC_B),
+            "locked_inertia": self._locked_inertia,
+            "link_poses": self._link_poses,
+            "inertia_matrix": lambda: self._shape_function("inertia_matrix", self._inertia.H_plus),
+            "bias": self._bias,
+            "forward_dynamics": self._forward_dynamics,
+            "dynamics": self._dynamics,
+            "shape_equations": lambda: shape_equations(self._kin),
+            "flight_step": self._flight_step,
+            "holding_step": lambda: self._flight_step(holding=True),
+            "joint_efforts": self._joint_efforts,
+            "jacobian": self._jacobian,
+            "connection": lambda: self._shape_function("connection", self._A),
+            "curvature": self._curvature,
+            "momentum": self._momentum,
+            "base_twist": self._base_twist,
+            "rotate": self._rotate,
+            "velocity_step": self._velocity_step,
+            "total_mass": self._total_mass,
+        }
+
+    @cached_property
+    def _A(self) -> ca.SX:
+        return connection(self._kin, self._inertia)
+
+    def _dense(self, name: str, inputs: dict[str, ca.SX], outputs: dict[str, ca.SX]) -> ca.Function:
+        """Return a function of the model: what the bodies weigh, if symbols, is the last input."""
+        return dense_function(name, inputs | self._kin.weights.inputs, outputs)
+
+    def _shape_function(self, name: str, *outputs: ca.SX) -> ca.Function:
+        names = ["result"] if len(outputs) == 1 else [f"result_{i}" for i in range(len(outputs))]
+        return self._dense(name, {"q": self._kin.q}, dict(zip(names, outputs, strict=True)))
+
+    def _locked_inertia(self) -> ca.Function:
+        return self._shape_function("locked_inertia", self._inertia.D, self._inertia.D_q)
+
+    def _link_poses(self) -> ca.Function:
+        frames = [self._kin.frame(link) for link in self.link_names]
+        R = ca.horzcat(*(frame[0] for frame in frames))
+        r = ca.horzcat(*(frame[1] for frame in frames))
+        return self._dense("link_poses", {"q": self._kin.q}, {"R_BL": R, "r_BL_B": r})
+
+    def _state(self, v: str, *, quaternion: bool = False) -> dict[str, ca.SX]:
+        """Return symbols of the shape and the velocities, by name; ``v`` names the first."""
+        attitude = {"quaternion_WB": ca.SX.sym("quaternion", 4)} if quaternion else {}
+        return {
+            **attitude,
+            "q": self._kin.q,
+            v: ca.SX.sym("v", 3),
+            "omega_WB_B": ca.SX.sym("omega", 3),
+            "qdot": ca.SX.sym("qdot", self.n),
+        }
+
+    def _bias(self) -> ca.Function:
+        state = self._state("v_cm_B")
+        _, *velocities = state.values()
+        return self._dense("bias", state, {"C_plus": bias(self._kin, *velocities)})
+
+    def _forward_dynamics(self) -> ca.Function:
+        state = self._state("v_cm_B")
+        _, *velocities = state.values()
+        wrench, tau = ca.SX.sym("wrench_B", 6), ca.SX.sym("tau", self.n)
+        forces = generalised_forces(self._kin, wrench, tau)
+        inertia = barycentric_inertia(self._kin)
+        acceleration = forward_dynamics(inertia, bias(self._kin, *velocities), forces)
+        inputs = {**state, "wrench_B": wrench, "tau": tau}
+        return self._dense("forward_dynamics", inputs, {"z0ddot": acceleration})
+
+    def _dynamics(self) -> ca.Function:
+        """The same function as ``forward_dynamics``, by fewer operations."""
+        state = self._state("v_cm_B")
+        _, *velocities = state.values()
+        forces = {"wrench_B": ca.SX.sym("wrench_B", 6), "tau": ca.SX.sym("tau", self.n)}
+        acceleration = composite_dynamics(self._kin, *velocities, *forces.values())
+        return self._dense("dynamics", {**state, **forces}, {"z0ddot": acceleration})
+
+    def _flight_step(self, *, holding: bool = False) -> ca.Function:
+        rate = state_rate(self._kin, holding=holding)
+        return runge_kutta_step(rate, attitude=state_slices(self.n)[1])
+
+    def _joint_efforts(self) -> ca.Function:
+        rates = {"qdot": ca.SX.sym("qdot", self.n), "qddot": ca.SX.sym("qddot", self.n)}
+        efforts = joint_efforts(self._kin, *rates.values())
+        return self._dense("joint_efforts", {"q": self._kin.q, **rates}, {"tau": efforts})
+
+    def _jacobian(self, link: str) -> ca.Function:
+        index = self.link_index(link)
+        return self._shape_function(f"jacobian_{index}", point_jacobian(self._kin, link))
+
+    def _curvature(self) -> ca.Function:
+        def derived() -> ca.Function:
+            K = curvature(self._A, self._kin.q)
+            # Columns run over i fastest: reshaped in Fortran order this is (6, i, j).
+            stacked = ca.horzcat(*(K[i][j] for j in range(self.n) for i in range(self.n)))
+            return self._shape_function("curvature", stacked)
+
+        facts = f"{source_of(curvature.__module__)} {self.equations_key}"
+        key = hashlib.sha256(facts.encode()).hexdigest()
+        return kept_function("curvature", key, derived, compiling=False)
+
+    def _momentum(self) -> ca.Function:
+        state = self._state("v_WB_B", quaternion=True)
+        quaternion, _, *velocities = state.values()
+        R_WB = matrix_from_quaternion(quaternion)
+        p_B, L_B, energy = momentum_of_bodies(self._kin, *velocities)
+        outputs = {"p_W": R_WB @ p_B, "L_W": R_WB @ L_B, "energy": energy}
+        return self._dense("momentum", state, outputs)
+
+    def _base_twist(self) -> ca.Function:
+        qdot = ca.SX.sym("qdot", self.n)
+        quaternion, p_W, L_W = ca.SX.sym("quaternion", 4), ca.SX.sym("p", 3), ca.SX.sym("L", 3)
+        R_BW = matrix_from_quaternion(quaternion).T
+        v, omega = base_twist(self._kin, self._inertia, qdot, R_BW @ p_W, R_BW @ L_W)
+        inputs = {"quaternion_WB": quaternion, "q": self._kin.q, "qdot": qdot}
+        inputs |= {"p_W": p_W, "L_W": L_W}
+        return self._dense("base_twist", inputs, {"v_WB_B": v, "omega_WB_B": omega})
+
+    def _rotate(self) -> ca.Function:
+        quaternion, vector = ca.SX.sym("quaternion", 4), ca.SX.sym("vector", 3)
+        rotated = matrix_from_quaternion(quaternion) @ vector
+        inputs = {"quaternion_WB": quaternion, "vector_B": vector}
+        return self._dense("rotate", inputs, {"vector_W": rotated})
+
+    def _velocity_step(self, substeps: str) -> ca.Function:
+        count = int(substeps)
+        step = attitude_step(self._locked_inertia())
+        inputs = {
+            "x": ca.MX.sym("x", self.n + 4),
+            "qdot": ca.MX.sym("qdot", self.n),
+            "L_W": ca.MX.sym("L_W", 3),
+            "h": ca.MX.sym("h"),
+            **{name: ca.MX.sym(name, p.numel()) for name, p in self._kin.weights.inputs.items()},
+        }
+        x0, qdot, L_W, h, *p = inputs.values()
+        x = repeated(step, count)(x0, qdot, L_W, h / count, *p)
+        return ca.Function(
+            f"velocity_step_{count}", list(inputs.values()), [x], list(inputs), ["x_next"]
+        )
+
+    def _total_mass(self) -> ca.Function:
+        return dense_function("total_mass", self._kin.weights.inputs, {"M": self._kin.total_mass})
+
+
+class Composition:
+    """A larger function that is being built from those of a model, in symbols of one kind.
+
+    It hands on what the bodies weigh: calls of the model's functions are written without ``p``, and
+    :meth:`function` adds it as the last input.
+    """
+
+    def __init__(self, model: ModelFunctions, kind: type[ca.MX] | type[ca.SX]) -> None:
+        self.n, self.link_names = model.n, model.link_names
+        self._model = model
+        self.inputs = {name: kind.sym(name, p.numel()) for name, p in model.weight_inputs.items()}
+        """The symbol ``p`` by its name; empty where the model has numbers."""
+
+    def __call__(self, name: str, *arguments: ca.MX | ca.SX | ca.DM) -> ca.MX | ca.SX:
+        """Call a function of the model."""
+        function = self._model.function(name, compile=False)
+        return function(*arguments, *self.inputs.values())
+
+    @property
+    def total_mass(self) -> float | ca.MX | ca.SX:
+        """Mass of the system, kg."""
+        return self("total_mass") if self.inputs else self._model.total_mass
+
+    def function(
+        self, name: str, inputs: Sequence[ca.MX | ca.SX], outputs: Sequence[ca.MX | ca.SX]
+    ) -> ca.Function:
+        """Return the function of some inputs."""
+        return ca.Function(name, [*inputs, *self.inputs.values()], list(outputs))
+
+
+class SymbolicModels:
+    """The models of one build of robot that take what the bodies weigh as an argument.
+
+    All robots of a process that differ in masses, centres and inertias alone share one of these.
+    """
+
+    def __init__(self, robot: RobotDescription, free: npt.NDArray[np.bool_]) -> None:
+        self._robot, self._free = robot, free
+        self._models: dict[bool, ModelFunctions] = {}
+
+    @classmethod
+    def of(cls, robot: RobotDescription) -> SymbolicModels:
+        """Return those of a robot's build."""
+        free = free_entries(InertialParameters.of(robot))
+        key = _build_key(robot, free)
+        found = _builds.pop(key, None) or cls(robot, free)
+        _builds[key] = found
+        if len(_builds) > _MOST_BUILDS:
+            del _builds[next(iter(_builds))]
+        return found
+
+    def model(self, parameters: InertialParameters) -> tuple[ModelFunctions, Array]:
+        """Return the model for robots that weigh this (..., B), and its argument ``p`` (..., k).
+
+        Mostly entries that are zero in the nominal robot are zero in all, and no argument. Where
+        one is not, every entry is an argument.
+        """
+        vector = parameters.vector
+        usual = not vector[..., ~self._free].any()
+        free = self._free if usual else np.ones_like(self._free)
+        if usual not in self._models:
+            self._models[usual] = ModelFunctions(self._robot, SymbolicWeights(free))
+        return self._models[usual], np.ascontiguousarray(vector[..., free])
+
+
+_builds: dict[str, SymbolicModels] = {}
+
+_MOST_BUILDS = 8
+"""So many builds of robots are kept; the one that was used longest ago goes first."""
+
+
+def _build_key(robot: RobotDescription, free: npt.NDArray[np.bool_]) -> str:
+    """Return a hash of everything but the numbers of what the bodies weigh."""
+    bodies = [(body.name, body.joint, body.parent, body.origin) for body in robot.bodies]
+    facts = (robot.name, bodies, robot.frames, [link.name for link in robot.links], free)
+    return hashlib.sha256(pickle.dumps(facts)).hexdigest()
