@@ -317,15 +317,22 @@ def weld(
         if joint.child in parents:
             raise RobotDescriptionError(
                 f"Link '{joint.child}' is the child of two joints ('{parents[joint.child]}' and "
-                f"'{joint.name}'); a robot is a tree."
+                f"'{joint.name}'); a robot is a tree: leave one of the joints out."
             )
         parents[joint.child] = joint.name
         children[joint.parent].append(joint)
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
         found = ", ".join(f"'{name}'" for name in roots) or "none"
+        mend = (
+            f"Connect '{roots[1]}' by a joint, or remove it."
+            if roots
+            else "Leave out a joint of the ring: the base is the child of none."
+            if links
+            else "Give it a <link>."
+        )
         raise RobotDescriptionError(
-            f"A robot has exactly one root link (the base); found: {found}."
+            f"A robot has exactly one root link (the base); found: {found}. {mend}"
         )
 
     bodies = [Body(roots[0], links[roots[0]].inertia, None, -1, Pose())]
@@ -349,6 +356,7 @@ def weld(
     if len(frames) != len(links):
         lost = sorted(set(links) - set(frames))
         raise RobotDescriptionError(
-            f"Link '{lost[0]}' is not connected to the root: its joints form a ring."
+            f"Link '{lost[0]}' is not connected to the root: its joints form a ring. Leave out one "
+            "of them, and connect the others to the robot."
         )
     return bodies, frames

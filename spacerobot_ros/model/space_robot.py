@@ -22,6 +22,9 @@ from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions, SymbolicModels
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 
+_STANDS = 1e-6
+"""Share of a joint in a motion without inertia that is none."""
+
 
 class SpaceRobot:
     """Equations of a free-floating robot, built once from its description.
@@ -266,13 +269,27 @@ class SpaceRobot:
         return self._buffers[name](*(np.asarray(a, dtype=float) for a in arguments))
 
     def _require_positive_inertia(self) -> None:
+        """Refuse a robot that can move without a mass moving, and say what lacks inertia."""
         H = self._model.function("inertia_matrix", compile=False)
         p = [] if self._p is None else [self._p]
         middle = np.clip(np.zeros(self.n), self.lower, self.upper)
         shapes = (np.zeros(self.n), middle, 0.1 * np.arange(1, self.n + 1))
-        smallest = min(float(np.linalg.eigvalsh(np.array(H(shape, *p)))[0]) for shape in shapes)
-        if smallest <= 1e-12 * self.total_mass:
-            raise RobotDescriptionError(
-                f"The inertia matrix of robot '{self.description.name}' is not positive definite: "
-                "some part turns or moves without mass or without inertia about its axis."
+        found = [np.linalg.eigh(np.array(H(shape, *p))) for shape in shapes]
+        values, vectors = min(found, key=lambda each: float(each[0][0]))
+        if values[0] > 1e-12 * self.total_mass:
+            return
+        moved = np.abs(vectors[6:, 0])
+        box = "an <inertia>, for a box of sides a, b, c ixx = m (b^2 + c^2) / 12 and so on"
+        if not moved.size or moved.max() < _STANDS:
+            mend = f"it turns without any mass moving. Give '{self.description.base_link}' {box}."
+        else:
+            joint = self.description.movable_joints[int(moved.argmax())]
+            mend = (
+                f"its joint '{joint.name}' can move without any mass moving, as what it carries, "
+                f"or what carries it, has no inertia about its axis. Give '{joint.child}' and "
+                f"'{joint.parent}' {box}, or make the joint fixed."
             )
+        raise RobotDescriptionError(
+            f"The inertia matrix of robot '{self.description.name}' is not positive definite: "
+            f"{mend}"
+        )

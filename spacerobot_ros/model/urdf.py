@@ -31,6 +31,7 @@ from spacerobot_ros.model.description import (
 )
 from spacerobot_ros.model.inertial_parameters import TRIANGLE_SLACK
 from spacerobot_ros.model.rotations import matrix_from_rpy
+from spacerobot_ros.model.urdf_form import urdf_root
 from spacerobot_ros.resources import share_directory, suggestion
 
 _LARGEST = 1e12
@@ -42,9 +43,6 @@ _XACRO = re.compile(r"<xacro:|\$\{")
 _MESH = re.compile(
     r"""(?P<before><mesh\b[^>]*?\bfilename\s*=\s*["'])(?P<file>[^"']+)(?P<after>["'])"""
 )
-
-_OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model", "COLLADA": "a COLLADA file"}
-"""What files with another root element than <robot> are."""
 
 
 def load_robot(path: str | Path) -> RobotDescription:
@@ -65,7 +63,7 @@ def load_robot(path: str | Path) -> RobotDescription:
         raise RobotDescriptionError(f"The URDF {path} cannot be read: {error}.") from error
     except UnicodeDecodeError as error:
         raise RobotDescriptionError(
-            f"The URDF {path} cannot be read: it is no text ({error})."
+            f"The URDF {path} cannot be read: it is no text in UTF-8 ({error}). Save it as UTF-8."
         ) from error
     if path.suffix == ".xacro" or _XACRO.search(text):
         text = _expanded(path)
@@ -194,23 +192,11 @@ def parse_robot(text: str) -> RobotDescription:
 
 
 def _parse_xml(text: str) -> Any:
-    try:
-        root = ElementTree.fromstring(text).tag
-    except ElementTree.ParseError as error:
-        raise RobotDescriptionError(
-            f"The robot description is not valid URDF: it is no XML ({error})."
-        ) from error
-    if root != "robot":
-        found = _OTHER_FORMATS.get(root, "something else")
-        raise RobotDescriptionError(
-            f"The robot description is not valid URDF but {found}: its root element is <{root}>, "
-            "and that of a URDF is <robot>. Export or convert it to URDF."
-        )
-    # The parser reports elements it does not know (ros2_control, gazebo plugins) on standard
-    # error; they are none of ours.
+    root = urdf_root(text, ("prismatic", "revolute", "continuous", "fixed"))
+    # The parser reports attributes it does not know on standard error; they are none of ours.
     with contextlib.redirect_stderr(io.StringIO()):
         try:
-            return URDF.from_xml_string(text.encode("utf-8"))
+            return URDF.from_xml_string(ElementTree.tostring(root))
         except Exception as error:  # lxml, assertion, key, value and type errors, by what is broken
             reason = " ".join(str(error).split()) or type(error).__name__
             raise RobotDescriptionError(
@@ -238,7 +224,12 @@ def _finite(values: Any, where: str) -> Array:
 
 
 def _size(values: Any, where: str) -> tuple[float, ...]:
-    return tuple(_finite(values, f"the geometry of {where}").tolist())
+    size = _finite(values, f"the geometry of {where}")
+    if size.min() < 0:
+        raise RobotDescriptionError(
+            f"A size in a <geometry> of {where} is negative: {size.tolist()}. Give lengths in m."
+        )
+    return tuple(size.tolist())
 
 
 def _link(link: Any, colours: dict[str, Any]) -> Link:
@@ -285,7 +276,9 @@ def _shapes(link: Any, colours: dict[str, Any], where: str) -> list[Shape]:
         elif kind == "sphere":
             size = _size((geometry.radius,), where)
         elif kind == "mesh":
-            size = _size(geometry.scale or (1.0, 1.0, 1.0), where)
+            # A negative scale mirrors.
+            scale = _finite(geometry.scale or (1.0, 1.0, 1.0), f"the scale of a mesh of {where}")
+            size = tuple(scale.tolist())
             resource = str(geometry.filename)
         else:
             continue
@@ -309,13 +302,7 @@ def _joint(joint: Any, links: dict[str, Link]) -> Joint:
                 f"The {role} of {where} is '{name}', but there is no such link."
                 f"{suggestion(name, links)}"
             )
-    try:
-        kind = JointKind(joint.type)
-    except ValueError:
-        raise RobotDescriptionError(
-            f"The type of {where} is '{joint.type}'; a free-floating tree has "
-            "prismatic, revolute, continuous and fixed joints (the base floats by itself)."
-        ) from None
+    kind = JointKind(joint.type)
     axis = np.array([1.0, 0.0, 0.0])
     if joint.axis is not None:
         axis = _finite(joint.axis, where)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import quaternion_from_rotvec
+from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotvec_from_quaternion
 from spacerobot_ros.model.urdf import mesh_file
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -20,7 +21,22 @@ from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.trials import Problem, Trial
 
 _FIRST_TURN = math.radians(5.0)
-"""How far the base turns in the first scenario of a robot, rad."""
+"""How far the base turns at most in the first scenario of a robot, rad."""
+
+_MOST_TURNS = 4 * math.pi
+"""Limits of joints beyond that may be meant in degrees, rad."""
+
+_EASY = 0.5
+"""Share of the room to its limits that a joint goes through for a first turn."""
+
+_ROOM = 1.0
+"""Most room of a joint that counts, m or rad: beyond it the base turns otherwise."""
+
+_LEAST_TURN = math.radians(0.2)
+"""Smaller turns are not asked of the joints directly but by loops."""
+
+_PARTS = 50.0
+"""The tolerance of a small turn is this part of it."""
 
 _LIGHT_BASE, _HEAVY_BASE = 0.2, 500.0
 """Masses of the base, over that of all it carries, between which the base moves visibly and is no
@@ -64,6 +80,12 @@ def remarks(robot: RobotDescription) -> Iterator[str]:
             yield (
                 f"The joint '{joint.name}' moves at up to {limits.velocity:.4g} {joint.unit}/s: "
                 f"check the unit of its velocity limit."
+            )
+        reach = max(-limits.lower, limits.upper)
+        if joint.unit == "rad" and math.isfinite(reach) and reach > _MOST_TURNS:
+            yield (
+                f"The joint '{joint.name}' turns from {limits.lower:.4g} to {limits.upper:.4g} "
+                "rad: limits of a URDF are in rad, not in degrees."
             )
         if limits.effort == 0:
             yield (
@@ -125,11 +147,37 @@ def first_problem(name: str, robot: SpaceRobot, file: Path) -> Problem:
             f"The joints of '{robot.description.name}' turn its base {how}: there is no attitude "
             "to fly to, and so no scenario is written. `spacerobot analyze` says more."
         )
-    axis = turning.axes[0] if len(turning.axes) == 1 else np.array([0.0, 0.0, 1.0])
-    goal = Goal.checked([0.0, 0.0, 0.0], quaternion_from_rotvec(_FIRST_TURN * axis))
+    shape = first_shape(robot)
+    turn = first_turn(robot, shape, turning.axes)
+    angle = float(np.linalg.norm(turn))
+    goal = Goal.checked([0.0, 0.0, 0.0], quaternion_from_rotvec(turn))
     config = PlannerConfig(robot=str(file))
-    initial = InitialState(joint_positions=first_shape(robot))
-    return Problem(name, robot, initial, goal, config)
+    tolerance = min(config.attitude_tolerance, float(f"{angle / _PARTS:.1g}"))
+    config = replace(config, attitude_tolerance=tolerance)
+    return Problem(name, robot, InitialState(joint_positions=shape), goal, config)
+
+
+def first_turn(robot: SpaceRobot, shape: Array, axes: Array) -> Array:
+    """Return a turn (3,) of the base, rad, that its joints bring about without loops.
+
+    It is by 5 degrees about z, y or x, or about the only axis of ``axes`` (m, 3), if the joints
+    turn the base so within half of their room from a shape (n,), to first order. Where light arms
+    turn it less, it is smaller, about the axis that they turn it most about.
+    """
+    room = np.minimum(robot.upper - shape, shape - robot.lower)
+    F = robot.connection(shape)[3:] * np.minimum(room, _ROOM)
+    usual = _FIRST_TURN * (axes if len(axes) == 1 else np.eye(3)[::-1])
+    for turn in usual:
+        ways = np.linalg.pinv(F, rcond=1e-6) @ turn
+        if np.allclose(F @ ways, turn, atol=1e-9) and np.abs(ways).max() <= _EASY:
+            return np.asarray(turn)
+    U, sizes, _ = np.linalg.svd(F, full_matrices=False)
+    angle = min(_FIRST_TURN, _EASY * float(sizes[0]))
+    if angle < _LEAST_TURN:
+        return np.asarray(usual[0])
+    axis = np.round(U[:, 0] * np.sign(U[np.argmax(np.abs(U[:, 0])), 0]), 3) + 0.0
+    degrees = float(f"{math.degrees(angle):.2g}")
+    return np.asarray(math.radians(degrees) * axis / np.linalg.norm(axis))
 
 
 def fastest(found: Mapping[str, object]) -> Trial | None:
@@ -145,12 +193,16 @@ def scenario_text(problem: Problem, method: str, robot_path: str) -> str:
     shape = ", ".join(repr(float(q)) for q in problem.initial.joint_positions)
     joints = ", ".join(problem.robot.joint_names)
     rate, config = problem.config.tick_rate, problem.config
+    turn = rotvec_from_quaternion(problem.goal.quaternion)
+    angle = math.degrees(float(np.linalg.norm(turn)))
+    axis = ", ".join(f"{each:.3g}" for each in turn / np.linalg.norm(turn) + 0.0)
     lines = [
         f"# The first flight of {problem.robot.description.name}: its joints turn its base.",
         "",
         "scenario:",
         "  ros__parameters:",
         f"    description: The joints of {problem.robot.description.name} turn its base",
+        f"    # {angle:.3g} deg about ({axis})",
         f"    goal_orientation: [{x!r}, {y!r}, {z!r}, {w!r}]   # x y z w; or goal_rotvec, rad",
         "    # goal_position: [0.0, 0.0, 0.0]         # m",
         f"    # goal_joint_positions: [{shape}]   # the shape to end in",

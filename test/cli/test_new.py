@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
+from support.oracles import PinocchioOracle
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import JointLimits
+from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
 from spacerobot_ros.resources import resource_names, robot_file
-from spacerobot_ros.session.own_robot import first_shape, remarks
+from spacerobot_ros.session.own_robot import first_shape, first_turn, remarks
 from spacerobot_ros.simulation.trials import try_method
 
 
@@ -85,6 +87,29 @@ def test_the_first_shape_has_room_to_all_sides(lower: float, upper: float, first
     assert shape[0] == pytest.approx(first)
 
 
+@pytest.mark.parametrize("name", ["free_flyer", "surveyor", "planar_chain", "sliding_masses"])
+def test_the_first_turn_is_one_that_the_joints_make_without_loops(name: str) -> None:
+    """The shape goes straight somewhere within its room; Pinocchio integrates the turn."""
+    path = robot_file(name)
+    robot = SpaceRobot.from_file(path)
+    shape = first_shape(robot)
+    turn = first_turn(robot, shape, Turning.of(robot).axes)
+    if name == "sliding_masses":  # Only loops turn it.
+        assert turn == pytest.approx(np.radians([0.0, 0.0, 5.0]))
+        return
+    assert np.radians(0.2) <= np.linalg.norm(turn) <= np.radians(5.0) + 1e-12
+    oracle = PinocchioOracle(path.read_text("utf-8"), robot.joint_names)
+    F = np.column_stack([oracle.base_twist(shape, e)[3:] for e in np.eye(robot.n)])
+    room = np.minimum(np.minimum(robot.upper - shape, shape - robot.lower), 1.0)
+    way = room * (np.linalg.pinv(F * room, rcond=1e-6) @ turn)
+    assert np.all(np.abs(way) <= 0.6 * room)
+    end = Rotation.identity()
+    for part in (np.arange(20) + 0.5) / 20:
+        end = end * Rotation.from_rotvec(oracle.base_twist(shape + part * way, way / 20)[3:])
+    off = (end.inv() * Rotation.from_rotvec(turn)).magnitude()
+    assert off < 0.25 * np.linalg.norm(turn)
+
+
 @pytest.mark.parametrize(
     ("before", "after", "remark"),
     [
@@ -98,3 +123,10 @@ def test_what_to_mind_is_remarked(before: str, after: str, remark: str) -> None:
     text = robot_file("planar_chain").read_text("utf-8")
     assert before in text
     assert any(remark in each for each in remarks(parse_robot(text.replace(before, after))))
+
+
+def test_limits_in_degrees_are_remarked() -> None:
+    text = robot_file("surveyor").read_text("utf-8").replace('lower="-2.9"', 'lower="-166"')
+    found = [each for each in remarks(parse_robot(text)) if "not in degrees" in each]
+    assert len(found) == 1
+    assert "'shoulder_yaw' turns from -166 to 2.9 rad" in found[0]

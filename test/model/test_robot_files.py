@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError
-from spacerobot_ros.model import load_robot
+from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.urdf import mesh_file
 from spacerobot_ros.resources import robot_file
 
@@ -53,31 +53,291 @@ def test_a_xacro_file_that_cannot_be_expanded_is_refused(tmp_path: Path) -> None
         load_robot(path)
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("name:password:0:0\n", r"not valid URDF: it is no XML"),
-        ("<sdf version='1.9'><model name='a'/></sdf>", r"but an SDF model: .* <sdf>"),
-        ("<mujoco><worldbody/></mujoco>", r"but a MuJoCo model: .* <mujoco>"),
-        ("<html><body/></html>", r"but something else: .* <html>"),
-        (urdf(mass="0"), r"base link 'hull' has no mass; .*<mass value=\"100\"/>"),
-        (urdf(ixx="3"), r"inertia of link 'arm' is that of no body: .* 1, 1 and 3 kg m\^2"),
-        (urdf(limit=""), r"joint 'elbow' is revolute and has no <limit>: give lower, upper"),
-        (urdf(limit='<limit lower="-1" upper="1"/>'), r"not valid URDF: .*(effort|velocity)"),
-        (urdf(mass="-1"), r"mass of link 'hull' is negative"),
-        (urdf().replace('link="arm"', 'link="amr"'), r"is 'amr'.*mean 'arm'\?"),
-        (urdf().replace('type="revolute"', 'type="floating"'), r"type of joint 'elbow'"),
-        (urdf().replace("<joint", '<link name="hull"/><joint'), r"link name 'hull' is used twice"),
-    ],
-)
+NO_INERTIA = '<inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>'
+SOME_INERTIA = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+TOOL = '<link name="tool"><inertial><mass value="1"/>' + SOME_INERTIA + "</inertial></link>"
+MASSLESS = '<link name="tool"/>'
+
+
+def joint(name: str, parent: str, child: str, inner: str = "", kind: str = "revolute") -> str:
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<axis xyz="0 0 1"/>{LIMIT}{inner}</joint></robot>'
+    )
+
+
+def more(*parts: str) -> str:
+    """Return the robot with more links and joints at its end."""
+    return urdf().replace("</robot>", "".join(parts))
+
+
+def seen(geometry: str) -> str:
+    return urdf(visual=f"<visual><geometry>{geometry}</geometry></visual>")
+
+
+def limited(limit: str) -> str:
+    return urdf(limit=f"<limit {limit}/>")
+
+
+def changed(before: str, after: str, count: int = -1) -> str:
+    text = urdf()
+    assert before in text
+    return text.replace(before, after, count)
+
+
+BROKEN = {
+    # No URDF.
+    "a password file": ("name:password:0:0\n", r"not valid URDF: it is no XML"),
+    "nothing": ("", r"it is no XML \(no element found"),
+    "half a file": (urdf()[:300], r"it is no XML \("),
+    "SDF": ("<sdf version='1.9'><model name='a'/></sdf>", r"but an SDF model: .* <sdf>.* convert"),
+    "MuJoCo": ("<mujoco><worldbody/></mujoco>", r"but a MuJoCo model: .* <mujoco>.* convert"),
+    "a web page": ("<html><body/></html>", r"but something else: .* <html>"),
+    "a namespace": (changed("<robot ", '<robot xmlns="http://x" '), r"remove xmlns="),
+    "no name": (changed(' name="probe"', ""), r"the <robot> has no name; write <robot name="),
+    "no link": ('<robot name="a"/>', r"exactly one root link .* found: none\. Give it a <link>"),
+    # Masses and inertias.
+    "a base without mass": (
+        urdf(mass="0"),
+        r"base link 'hull' has no mass; .*<mass value=\"100\"/>",
+    ),
+    "a base without inertial": (
+        changed(INERTIAL.format(mass="9", ixx="1"), ""),
+        r"base link 'hull' has no mass; a free-floating base needs an <inertial>",
+    ),
+    "a massless root": (
+        changed('<link name="hull">', '<link name="world"/><link name="hull">').replace(
+            "</robot>", joint("mount", "world", "hull")
+        ),
+        r"base link 'world' has no mass",
+    ),
+    "an arm without mass": (
+        more(MASSLESS, joint("wrist", "arm", "tool")),
+        r"'wrist' moves link 'tool', which has no mass: .* <inertial> or make the joint fixed",
+    ),
+    "a point on a hinge": (
+        more(TOOL.replace(SOME_INERTIA, NO_INERTIA), joint("wrist", "arm", "tool")),
+        r"joint 'wrist' can move without any mass moving, .*'tool' and 'arm' an <inertia>.*fixed",
+    ),
+    "a point that carries": (
+        changed(SOME_INERTIA, NO_INERTIA, 1),
+        r"joint 'elbow' can move without any mass moving, .*'arm' and 'hull' an <inertia>",
+    ),
+    "a point alone": (
+        f'<robot name="probe"><link name="a"><inertial><mass value="2"/>{NO_INERTIA}</inertial>'
+        "</link></robot>",
+        r"not positive definite: it turns without any mass moving\. Give 'a' an <inertia>, for a",
+    ),
+    "no mass in inertial": (
+        changed('<mass value="2"/>', ""),
+        r"the <inertial> of link 'arm' has no <mass>; write <mass value=\"\.\.\.\"/> in kg",
+    ),
+    "a negative mass": (urdf(mass="-1"), r"mass of link 'hull' is negative \(-1\.0 kg\)"),
+    "a negative inertia": (
+        urdf(ixx="-1"),
+        r"of link 'arm' has a negative principal moment; .*signs",
+    ),
+    "an impossible inertia": (
+        urdf(ixx="3"),
+        r"inertia of link 'arm' is that of no body: .* 1, 1 and 3 kg m\^2, .* Check units",
+    ),
+    "five moments": (
+        changed(' ixz="0"', "", 1),
+        r"<inertia> of link 'hull' has no 'ixz'; write <inertia ixz=.*: a number, kg m",
+    ),
+    "a mass that is no number": (
+        urdf(mass="nan"),
+        r"A number in link 'hull' is not finite: nan",
+    ),
+    "an endless mass": (urdf(mass="inf"), r"A number in link 'hull' is not finite: inf"),
+    "a mass in no unit": (
+        urdf(mass="9e15"),
+        r"in link 'hull' is larger than 1e\+12 in its SI unit",
+    ),
+    "a comma": (
+        urdf(mass="9,5"),
+        r"<mass> of link 'hull' has '9,5', no number; write <mass value=",
+    ),
+    # Joints.
+    "no limits": (
+        urdf(limit=""),
+        r"joint 'elbow' is revolute and has no <limit>: give lower, upper",
+    ),
+    "no velocity": (
+        limited('lower="-1" upper="1" effort="3"'),
+        r"<limit> of joint 'elbow' has no 'velocity'; write <limit velocity=.*: a number, m/s",
+    ),
+    "no effort": (
+        limited('lower="-1" upper="1" velocity="3"'),
+        r"<limit> of joint 'elbow' has no 'effort'; write <limit effort=\"\.\.\.\"/>: .*N or N m",
+    ),
+    "no range": (
+        limited('velocity="1" effort="3"'),
+        r"lower limit of joint 'elbow' \(0\.0\) is not below .*; give it a range, or make it fixed",
+    ),
+    "limits the wrong way round": (
+        limited('lower="1" upper="-1" velocity="1" effort="3"'),
+        r"lower limit of joint 'elbow' \(1\.0\) is not below its upper limit \(-1\.0\)",
+    ),
+    "a limit that is no number": (
+        limited('lower="nan" upper="1" velocity="1" effort="3"'),
+        r"The limit 'lower' of joint 'elbow' is not a number",
+    ),
+    "a negative velocity": (
+        limited('lower="-1" upper="1" velocity="-2" effort="3"'),
+        r"The limit 'velocity' of joint 'elbow' is negative \(-2\.0\)",
+    ),
+    "an axis of zero length": (
+        changed('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>'),
+        r"The axis of joint 'elbow' is zero; give it a direction",
+    ),
+    "an axis that is no number": (
+        changed('<axis xyz="0 0 1"/>', '<axis xyz="0 nan 1"/>'),
+        r"A number in joint 'elbow' is not finite: \[0\.0, nan, 1\.0\]",
+    ),
+    "an axis of two numbers": (
+        changed('<axis xyz="0 0 1"/>', '<axis xyz="0 1"/>'),
+        r"<axis> of joint 'elbow' has 2 numbers instead of 3; write <axis xyz=.*: 3 numbers",
+    ),
+    "an empty axis": (
+        changed('<axis xyz="0 0 1"/>', "<axis/>"),
+        r"<axis> of joint 'elbow' has no 'xyz'; write <axis xyz=\"\.\.\.\"/>: 3 numbers",
+    ),
+    "commas in an origin": (
+        changed("<axis", '<origin xyz="1, 2, 3"/><axis'),
+        r"<origin> of joint 'elbow' has '1,', no number; write <origin xyz=.*: 3 numbers with",
+    ),
+    "no type": (
+        changed(' type="revolute"', ""),
+        r"joint 'elbow' has no type; write type=.*revolute",
+    ),
+    "an unknown type": (
+        changed('"revolute"', '"ball"'),
+        r"type of joint 'elbow' is 'ball'; .* fixed",
+    ),
+    "a floating joint": (
+        changed('"revolute"', '"floating"'),
+        r"type of joint 'elbow' is 'floating'; .* \(the base floats by itself\)",
+    ),
+    "no parent": (
+        changed('<parent link="hull"/>', ""),
+        r"the joint 'elbow' has no <parent>; write <parent link=\"\.\.\.\"/>",
+    ),
+    "a misspelt link": (changed('link="arm"', 'link="amr"'), r"is 'amr'.*mean 'arm'\?"),
+    "a link without a name": (
+        changed('<link name="arm">', "<link>"),
+        r"the link number 2 has no name; write <link name=\"\.\.\.\">",
+    ),
+    "a joint without a name": (
+        changed(' name="elbow"', ""),
+        r"the joint number 1 has no name; write <joint name=\"\.\.\.\">",
+    ),
+    "a link twice": (
+        changed("<joint", '<link name="hull"/><joint'),
+        r"link name 'hull' is used twice",
+    ),
+    "a joint twice": (
+        more(TOOL, joint("elbow", "arm", "tool")),
+        r"joint name 'elbow' is used twice; names are unique",
+    ),
+    # The tree.
+    "two parents": (
+        more(joint("other", "hull", "arm")),
+        r"Link 'arm' is the child of two joints \('elbow' and 'other'\); .* leave one .* out",
+    ),
+    "a ring": (
+        more(joint("back", "arm", "hull")),
+        r"exactly one root link .* found: none\. Leave out a joint of the ring",
+    ),
+    "a ring beside the robot": (
+        more(TOOL, joint("back", "tool", "tool")),
+        r"Link 'tool' is not connected to the root: its joints form a ring\. Leave out one",
+    ),
+    "two roots": (
+        more(TOOL, "</robot>"),
+        r"exactly one root link \(the base\); found: 'hull', 'tool'\. Connect 'tool' by a joint",
+    ),
+    # Joints that follow others.
+    "a follower of nobody": (
+        more(TOOL, joint("wrist", "arm", "tool", '<mimic joint="elbo"/>')),
+        r"'wrist' mimics 'elbo', but there is no such joint\. Did you mean 'elbow'\?",
+    ),
+    "a follower of itself": (
+        changed(LIMIT, LIMIT + '<mimic joint="elbow"/>'),
+        r"joint 'elbow' mimics itself",
+    ),
+    "a follower that stands": (
+        more(TOOL, joint("wrist", "arm", "tool", '<mimic joint="elbow" multiplier="0"/>')),
+        r"'wrist' mimics 'elbow' with the multiplier 0: it does not move; make it fixed",
+    ),
+    "a follower without a range": (
+        more(TOOL, joint("wrist", "arm", "tool", '<mimic joint="elbow" offset="7"/>')),
+        r"'elbow' and those that mimic it have no position in common: .* Check multiplier, offset",
+    ),
+    "a follower without a leader": (
+        more(TOOL, joint("wrist", "arm", "tool", "<mimic/>")),
+        r"<mimic> of joint 'wrist' has no 'joint'; write <mimic joint=.*the joint that it follows",
+    ),
+    # Looks.
+    "a capsule": (
+        seen('<capsule radius="1" length="2"/>'),
+        r"<geometry> of link 'hull' is a <capsule>; write one of <box>, <cylinder>, <sphere>",
+    ),
+    "no shape": (seen(""), r"<geometry> of link 'hull' has 0 shapes; write one of <box>"),
+    "no geometry": (
+        urdf(visual="<visual/>"),
+        r"the <visual> of link 'hull' has no <geometry>; write a <geometry> with one of box",
+    ),
+    "a flat box": (
+        seen('<box size="1 2"/>'),
+        r"<box> of link 'hull' has 2 numbers instead of 3; write <box size=",
+    ),
+    "a negative size": (
+        seen('<sphere radius="-1"/>'),
+        r"size in a <geometry> of link 'hull' is negative: \[-1\.0\]\. Give lengths in m",
+    ),
+    "a mesh without a file": (
+        seen("<mesh/>"),
+        r"<mesh> of link 'hull' has no 'filename'; write <mesh filename=",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "sentence"), BROKEN.values(), ids=BROKEN)
 def test_a_file_that_is_no_robot_says_what_to_mend(
     tmp_path: Path, text: str, sentence: str
 ) -> None:
     path = file_with(tmp_path, text)
     with pytest.raises(RobotDescriptionError, match=sentence) as refusal:
-        load_robot(path)
-    assert str(path) in str(refusal.value)
+        SpaceRobot.from_file(path)
+    assert str(path) in str(refusal.value) or "robot 'probe'" in str(refusal.value)
     assert str(refusal.value).count("\n") == 0
+    assert "urdf_parser" not in str(refusal.value)
+    assert "ParseError" not in str(refusal.value)
+
+
+def test_other_encodings_are_asked_for_as_utf_8(tmp_path: Path) -> None:
+    path = tmp_path / "probe.urdf"
+    path.write_bytes(urdf().replace("probe", "Süd").encode("latin-1"))
+    with pytest.raises(RobotDescriptionError, match=r"no text in UTF-8 .*\. Save it as UTF-8"):
+        load_robot(path)
+    path.write_bytes(b"\xef\xbb\xbf" + urdf().replace("probe", "Süd").encode())
+    assert load_robot(path).name == "Süd"
+
+
+def test_what_other_programs_have_written_is_passed_over(tmp_path: Path) -> None:
+    """Collision shapes, transmissions, plugins and safety controllers are nothing to a flight."""
+    collision = "<collision><geometry><capsule radius='1' length='2'/></geometry></collision>"
+    text = urdf(visual=collision, limit=LIMIT + '<safety_controller k_velocity="x"/>')
+    text = text.replace("</robot>", "<gazebo><a b='c'/></gazebo><transmission/></robot>")
+    found = load_robot(file_with(tmp_path, text))
+    assert (found.name, found.joint_names, found.total_mass) == ("probe", ("elbow",), 11.0)
+    assert "capsule" in found.urdf
+
+
+def test_of_a_fixed_joint_axis_and_limits_do_not_matter(tmp_path: Path) -> None:
+    text = urdf(limit='<limit lower="1"/><mimic joint="nobody"/>').replace("revolute", "fixed")
+    assert load_robot(file_with(tmp_path, text)).joint_names == ()
 
 
 @pytest.mark.parametrize("ixx", ["0.001", "2.0", "2.01"])
