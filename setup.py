@@ -58,7 +58,7 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=find_packages(include=["spacerobot_ros*"]),
-    package_data={NAME: ["py.typed", "report/*.css", "report/*.js"]},
+    package_data={NAME: ["py.typed", "report/*.css", "report/*.js", "report/*.mplstyle"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

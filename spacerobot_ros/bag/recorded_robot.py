@@ -100,8 +100,12 @@ class RecordedRobot:
     @property
     def joint_names(self) -> list[str]:
         """Names of the joints in the order of ``joint_states``; none where that is missing."""
-        joints = self.get("joint_states")
-        return list(map(str, next(joints.messages())[1].name)) if joints is not None else []
+        return self.names("joint_states")
+
+    def names(self, topic: str) -> list[str]:
+        """Return the names in the first joint states of a topic; none where it is missing."""
+        series = self.get(topic)
+        return list(map(str, next(series.messages())[1].name)) if series is not None else []
 
     @property
     def urdf(self) -> bytes | None:

@@ -214,8 +214,9 @@ def _objects(values: list[str]) -> NDArray[Any]:
 def _plain(value: Any) -> Any:
     """Return a part of a message as JSON has it."""
     if is_dataclass(value):
-        members = (each.name for each in fields(value))
-        return {name: _plain(getattr(value, name)) for name in members if name[0] != "_"}
+        # Constants are in capitals, and fields never are.
+        names = (each.name for each in fields(value) if not each.name.isupper())
+        return {name: _plain(getattr(value, name)) for name in names if name[0] != "_"}
     if isinstance(value, np.ndarray):
         return value.tolist()
     return [_plain(each) for each in value] if isinstance(value, list) else value

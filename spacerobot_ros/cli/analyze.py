@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from spacerobot_ros.cli.options import PATH, json_option, write, write_json
+from spacerobot_ros.cli.options import json_option, picture_option, write, write_json
 from spacerobot_ros.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ _MOST_ROWS = 12
 @click.command("analyze")
 @click.argument("robot")
 @click.option("--shape", metavar="'Q1 Q2 ...'", help="Shape to look at, m or rad [the best].")
-@click.option("--picture", type=PATH, help="PNG to draw [out/ROBOT_curvature.png].")
+@picture_option("Picture to draw (.png, .svg, .pdf) [out/ROBOT_curvature.png].")
 @json_option("Write the findings.")
 def command(robot: str, shape: str | None, picture: Path | None, json_file: Path | None) -> None:
     """Say what loops of the joints of ROBOT (a name or a URDF file) can do, and draw it."""
@@ -39,13 +39,14 @@ def command(robot: str, shape: str | None, picture: Path | None, json_file: Path
     if json_file is not None:
         write_json(json_file, json_of(found))
     from spacerobot_ros.report.analyze_figures import draw
+    from spacerobot_ros.report.style import PictureFormat
 
-    png = draw(found)
-    if png is None:
+    target = picture or Path("out") / f"{model.description.name}_curvature.png"
+    drawn = draw(found, PictureFormat.of(target))
+    if drawn is None:
         click.echo(f"{'picture':<13}none: no loops of the joints turn the base")
         return
-    target = picture or Path("out") / f"{model.description.name}_curvature.png"
-    write(target, png)
+    write(target, drawn)
     click.echo(f"{'picture':<13}{target}")
 
 

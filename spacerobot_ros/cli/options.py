@@ -124,6 +124,20 @@ def json_option(help: str) -> Any:
     return click.option("--json", "json_file", type=PATH, help=help)
 
 
+def picture_option(help: str) -> Any:
+    """Return the option ``--picture``, whose file is of a format that is written."""
+
+    def checked(context: click.Context, option: click.Parameter, path: Path | None) -> Path | None:
+        if path is not None:
+            # Imports matplotlib, which takes a while.
+            from spacerobot_ros.report.style import PictureFormat
+
+            PictureFormat.of(path)
+        return path
+
+    return click.option("--picture", type=PATH, callback=checked, help=help)
+
+
 def write(path: Path, content: bytes) -> None:
     """Write a file and the folders that it is in."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -16,11 +16,11 @@ import click
 from spacerobot_ros.cli.errors import fail
 from spacerobot_ros.cli.options import (
     METHODS,
-    PATH,
     GoalOptions,
     Registered,
     goal_options,
     json_option,
+    picture_option,
     settings_option,
     write,
     write_json,
@@ -46,7 +46,7 @@ _NO_GOAL = GoalOptions(None, None, None)
 )
 @settings_option
 @json_option("Write schedule, path.")
-@click.option("--picture", type=PATH, help="Draw both (PNG).")
+@picture_option("Draw both (.png, .svg, .pdf).")
 @click.option("--compare", "comparing", is_flag=True, help="Fly every method, print a table.")
 @click.option("--random", "count", type=click.IntRange(min=1), help="Fly so many random goals.")
 @click.option(
@@ -106,8 +106,9 @@ def command(
         click.echo(f"json        {json_file}")
     if picture is not None:
         from spacerobot_ros.report.plan_figures import draw
+        from spacerobot_ros.report.style import PictureFormat
 
-        write(picture, draw(problem, trial))
+        write(picture, draw(problem, trial, PictureFormat.of(picture)))
         click.echo(f"picture     {picture}")
     if not trial.reached:
         fail(f"The goal is not reached within the planner's tolerance: {left}.")

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import click
 
-from spacerobot_ros.cli.options import PATH, bag_argument
+from spacerobot_ros.cli.options import PATH, bag_argument, picture_option
 
 
 @click.command("report")
 @bag_argument
 @click.option("--output", "-o", type=PATH, help="HTML file [beside the bag].")
-@click.option("--picture", type=PATH, help="Also draw an overview (PNG).")
+@picture_option("Also draw an overview (.png, .svg, .pdf).")
 @click.option(
     "--beside",
     multiple=True,

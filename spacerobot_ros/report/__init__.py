@@ -1,5 +1,5 @@
 """Picture report of a bag: one HTML file that works offline, from what the bag holds alone."""
 
-from spacerobot_ros.report.writing import write_picture, write_report
+from spacerobot_ros.report.writing import write_figures, write_picture, write_report
 
-__all__ = ["write_picture", "write_report"]
+__all__ = ["write_figures", "write_picture", "write_report"]

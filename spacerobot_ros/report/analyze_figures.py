@@ -27,13 +27,13 @@ from spacerobot_ros.report.style import (
     MUTED,
     PALETTE,
     WIDTH,
+    PictureFormat,
+    drawing,
     new_figure,
     panel,
-    paper_style,
-    png_of,
+    picture_of,
 )
 
-_PIXELS = 1600
 _FINE, _COARSE = 61, 37
 """Points a side of a map, of robots with up to three joints and with more."""
 
@@ -46,19 +46,22 @@ _LEAST_ROOM = 0.25
 """Squares are drawn round a centre that is as far from the joint limits, rad."""
 
 _SIDES = 60
+_BAR = WIDTH - 0.86
+"""Where a bar of colours stands, inches."""
+
 _AXES = ("x", "y", "z")
 
 
-def draw(found: Analysis) -> bytes | None:
-    """Return the picture (PNG) that suits the robot; None where no loop turns its base."""
-    with paper_style():
+def draw(found: Analysis, format: PictureFormat = PictureFormat.PNG) -> bytes | None:
+    """Return the picture that suits the robot; None where no loop turns its base."""
+    with drawing():
         if found.planar.controllable:
             figure = _planar(found)
         elif found.nominal is not None:
             figure = _spatial(found)
         else:
             return None
-        return png_of(figure, _PIXELS)
+        return picture_of(figure, format)
 
 
 # -- planar robots ------------------------------------------------------------------------------
@@ -84,7 +87,7 @@ def _planar(found: Analysis) -> Figure:
     left.set_xlabel(f"{robot.joint_names[i]} (rad)")
     left.set_ylabel(f"{robot.joint_names[j]} (rad)")
     left.set_title("H: turn by small clockwise loops over area (1/rad)")
-    _bar(figure, bar, norm, "RdBu_r")
+    _bar(figure, bar, norm, "RdBu_r", "H (1/rad)")
     right = panel(figure, 5.9, 0.6, WIDTH - 6.2, 3.55)
 
     def room(point: Array) -> float:
@@ -139,7 +142,11 @@ def _spatial(found: Analysis) -> Figure:
             _mark(axes, found, pair)
             first, second = (_symbol(pair, k) for k in (0, 1))
             axes.set_title(f"turn about {_AXES[column]} by loops of {first}, {second}")
-        _bar(figure, panel(figure, WIDTH - 0.62, bottom, 0.12, high), norm, "RdBu_r")
+        # A turn in rad for an area in the plane of the two joints.
+        first, second = (_unit(found.robot, joints[k]) for k in pair)
+        area = f"{first}²" if first == second else f"({first} {second})"
+        label = f"curvature K (rad/{area})"
+        _bar(figure, panel(figure, _BAR, bottom, 0.12, high), norm, "RdBu_r", label)
     bottom -= high + (0.0 if sliding else gap)
     poor = BoundaryNorm(_CONDITIONS, 256, extend="max")
     for column, (pair, (x, y, _, condition)) in enumerate(zip(PLANES, maps, strict=True)):
@@ -147,7 +154,8 @@ def _spatial(found: Analysis) -> Figure:
         axes.contourf(x, y, condition, _CONDITIONS, norm=poor, cmap="viridis_r", extend="max")
         _mark(axes, found, pair)
         axes.set_title("condition number of M")
-    _bar(figure, panel(figure, WIDTH - 0.62, bottom, 0.12, high), poor, "viridis_r")
+    label = "condition number of M (1)"
+    _bar(figure, panel(figure, _BAR, bottom, 0.12, high), poor, "viridis_r", label)
     if sliding:
         _distribution(panel(figure, 0.7, 0.55, WIDTH - 1.0, 1.5), found.conditions)
     return figure
@@ -211,8 +219,8 @@ def _signed(peak: float) -> Normalize:
     return TwoSlopeNorm(0.0, -peak, peak)
 
 
-def _bar(figure: Figure, axes: Axes, norm: Any, colours: str) -> None:
-    bar = figure.colorbar(ScalarMappable(norm, colours), cax=axes)
+def _bar(figure: Figure, axes: Axes, norm: Any, colours: str, label: str) -> None:
+    bar = figure.colorbar(ScalarMappable(norm, colours), cax=axes, label=label)
     bar.outline.set_linewidth(0.0)
     axes.grid(False)
 

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from spacerobot_ros.bag import RecordedRobot
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.report.style import INK, MUTED, PALETTE, panel
+from spacerobot_ros.report.style import INK, MUTED, PALETTE, inches, panel
 
 LANE = 0.62
 """Room that a lane with its key takes below a time axis, inches."""
@@ -53,6 +53,8 @@ _MARKS = {
     EventKind.GOAL_REFUSED: _Mark("goal refused", "v", _BAD, 0, hollow=True),
     EventKind.PLAN_STARTED: _Mark("plan begun", "o", _PLAIN, 0, hollow=True),
     EventKind.PLAN_READY: _Mark("plan", "o", _PLAIN, 0),
+    EventKind.PLAN_TAKEN_OVER: _Mark("takeover", ">", _PLAIN, 0),
+    EventKind.PLAN_LATE: _Mark("plan late", ">", _WARN, 0, hollow=True),
     EventKind.CORRECTION: _Mark("correction", "s", _PLAIN, 0, hollow=True),
     EventKind.GOAL_REACHED: _Mark("goal reached", "*", _GOOD, 0),
     EventKind.GOAL_FAILED: _Mark("goal failed", "X", _BAD, 0),
@@ -113,7 +115,8 @@ def draw_events(axes: Axes, events: Sequence[FlightEvent]) -> None:
     across, up = figure.get_size_inches()
     box = axes.get_position()
     x, width = box.x0 * across, box.width * across
-    lane = panel(figure, x, box.y0 * up - _BELOW - _HEIGHT, width, _HEIGHT)
+    height = inches(_HEIGHT)
+    lane = panel(figure, x, box.y0 * up - inches(_BELOW) - height, width, height)
     lane.set_xlim(start, end)
     lane.set_ylim(-0.6, 1.6)
     lane.grid(False)
@@ -136,7 +139,7 @@ def draw_events(axes: Axes, events: Sequence[FlightEvent]) -> None:
             handles=keys,
             loc="upper left",
             bbox_to_anchor=(0.0, 0.02),
-            ncols=len(keys) if width > 4 else 4,
+            ncols=len(keys) if width > inches(4) else 4,
             borderaxespad=0.0,
             handletextpad=0.2,
             columnspacing=0.9,

@@ -16,19 +16,19 @@ from spacerobot_ros.report.figures_time import (
     power_of_ten,
 )
 from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.plates import Plate
 from spacerobot_ros.report.signals import Indices, Signal
 from spacerobot_ros.report.style import (
     COLUMNS,
     MUTED,
     PALETTE,
-    Plate,
     colour,
     end_labels,
     key,
     legend_above,
+    narrow,
     set_range,
     sheet,
-    svg_of,
 )
 
 _LOOP_JOINTS = 3
@@ -47,10 +47,14 @@ def loops_plate(flight: Flight) -> Plate | str:
     if cycles is not None:
         part = part.between(*cycles.last(SHOWN_CYCLES))
     one = len(pairs) == 1
-    figure, (row, *_) = sheet([[1.0] * (2 if one else _LOOP_JOINTS)], [3.4 if one else 2.35])
-    for axes in row[len(pairs) :]:
+    if narrow():
+        figure, panels = sheet([[1.0]] * len(pairs), [2.0] * len(pairs), gap=0.75)
+    else:
+        figure, panels = sheet([[1.0] * (2 if one else _LOOP_JOINTS)], [3.4 if one else 2.35])
+    places = [axes for row in panels for axes in row]
+    for axes in places[len(pairs) :]:
         axes.set_visible(False)
-    for axes, (i, j) in zip(row[: len(pairs)], pairs, strict=True):
+    for axes, (i, j) in zip(places[: len(pairs)], pairs, strict=True):
         x, y = part.values[:, i], part.values[:, j]
         axes.plot(x, y, color=colour(0), rasterized=len(part) > 4 * COLUMNS)
         axes.plot(x[:1], y[:1], "o", color=colour(0), mfc="white", ms=5, zorder=4)
@@ -79,7 +83,7 @@ def loops_plate(flight: Flight) -> Plate | str:
     if len(flight.joint_names) > _LOOP_JOINTS:
         caption += f" The first three of {len(flight.joint_names)} joints are shown."
     heading = "Path in shape space" if cycles is None else "Loops in shape space"
-    return Plate("loops", heading, caption, svg_of(figure))
+    return Plate("loops", heading, caption, figure)
 
 
 def _set_across(axes: Axes, values: Array) -> None:
@@ -161,7 +165,7 @@ def cycles_plate(flight: Flight) -> Plate | None:
     for axes in (row[0] for row in panels):
         axes.set_xlim(0, len(ends) - 1)
     panels[-1][0].set_xlabel("cycle")
-    return Plate("cycles", "Attitude cycle by cycle", f"{caption}.", svg_of(figure))
+    return Plate("cycles", "Attitude cycle by cycle", f"{caption}.", figure)
 
 
 def returns(shape: Signal) -> Indices:

@@ -13,6 +13,7 @@ from spacerobot_ros.model.description import Array, Pose
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.report.figures_time import DASHES, NO_STATES
 from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.plates import Plate
 from spacerobot_ros.report.solids import Canvas, Solids, View, base_outlines
 from spacerobot_ros.report.style import (
     COLUMNS,
@@ -20,11 +21,10 @@ from spacerobot_ros.report.style import (
     INK,
     MUTED,
     PALETTE,
-    Plate,
     key,
     legend_above,
+    narrow,
     sheet,
-    svg_of,
 )
 
 PIXELS = 420
@@ -40,10 +40,11 @@ def configurations_plate(flight: Flight) -> Plate | str:
         return "The bag does not hold base pose and joint positions for a picture of the robot."
     indices = _instants(flight)
     scenes = [flight.drawn.at(flight.joints[index], flight.base_at(index)) for index in indices]
-    across = min(len(indices), 3)
+    across = min(len(indices), 2 if narrow() else 3)
     rows = [[1.0] * across for _ in range(0, len(indices), across)]
     sizes = {"bottom": 0.15, "left": 0.2, "gap": 0.42}
-    figure, panels = sheet(rows, [2.9 if across > 2 else 3.9] * len(rows), **sizes)
+    height = 2.0 if narrow() else 2.9 if across > 2 else 3.9
+    figure, panels = sheet(rows, [height] * len(rows), **sizes)
     points = np.concatenate([scene.points() for scene in scenes])
     view = view_of(flight)
     places = [axes for row in panels for axes in row]
@@ -53,7 +54,9 @@ def configurations_plate(flight: Flight) -> Plate | str:
     for axes, scene, index in zip(places, scenes, indices, strict=True):
         draw_robot(axes, scene, points, view)
         axes.set_title(f"t = {flight.position.time[index]:.5g} s")
-    legend_above(places[-1], draw_goal_and_path(places[-1], flight, view))
+    keys = draw_goal_and_path(places[-1], flight, view)
+    if not narrow():
+        legend_above(places[-1], keys)
     caption = (
         "The robot at instants from the first recorded state to the last, to one scale, from the "
         "shapes of its URDF; each moving link in the color that its joint has in the other figures."
@@ -62,7 +65,7 @@ def configurations_plate(flight: Flight) -> Plate | str:
         caption += " Dashed in the last, the base link at the goal."
     if any(shape.kind == "mesh" for link in flight.robot.links for shape in link.shapes):
         caption += " Meshes are not drawn."
-    return Plate("configurations", "Configurations", caption, svg_of(figure))
+    return Plate("configurations", "Configurations", caption, figure)
 
 
 def view_of(flight: Flight) -> View:
@@ -178,9 +181,12 @@ def path_plate(flight: Flight, beside: Sequence[Flight] = ()) -> Plate | str:
     views = {"from above": (0, 1), "from the front": (0, 2), "from the side": (1, 2)}
     if float(np.ptp(everything[:, 2])) < 1e-9:
         views = {"from above": (0, 1)}
-    height = 2.35 if len(views) > 1 else 4.2
-    figure, (row, *_) = sheet([[1.0] * len(views)], [height])
-    for axes, (title, (i, j)) in zip(row, views.items(), strict=True):
+    if narrow():
+        figure, panels = sheet([[1.0]] * len(views), [2.6] * len(views), gap=0.75)
+    else:
+        figure, panels = sheet([[1.0] * len(views)], [2.35 if len(views) > 1 else 4.2])
+    places = [axes for row in panels for axes in row]
+    for axes, (title, (i, j)) in zip(places, views.items(), strict=True):
         for path, tint in paths:
             dense = len(path) > 2 * COLUMNS
             axes.plot(path[:, i], path[:, j], color=tint, lw=0.9, rasterized=dense)
@@ -195,7 +201,7 @@ def path_plate(flight: Flight, beside: Sequence[Flight] = ()) -> Plate | str:
         axes.set_ylabel(f"{'xyz'[j]} (m)")
         axes.set_title(title)
     if len(keys) > 1:
-        row[0].legend(handles=keys, loc="best", handlelength=1.6)
+        places[0].legend(handles=keys, loc="best", handlelength=1.6)
     caption = (
         "Path of the base origin"
         + (" and of the end-effector" if shows_tool else "")
@@ -205,7 +211,7 @@ def path_plate(flight: Flight, beside: Sequence[Flight] = ()) -> Plate | str:
         + ("; dashed, the path of the base that the planner published" if flight.planned else "")
         + ". Every recorded state is drawn."
     )
-    return Plate("path", "Paths", caption, svg_of(figure))
+    return Plate("path", "Paths", caption, figure)
 
 
 def _square(axes: Axes, middle: Array, half: float) -> None:

@@ -7,7 +7,7 @@ flight is of another kind.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,26 +20,27 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.report.events import LANE, draw_events
 from spacerobot_ros.report.flight import Flight, Target
-from spacerobot_ros.report.signals import Cycles, Signal
+from spacerobot_ros.report.plates import Group, Plate
+from spacerobot_ros.report.signals import Cycles, Signal, envelope
 from spacerobot_ros.report.style import (
+    COLUMNS,
     FAINT,
     INK,
     MUTED,
     PALETTE,
     SLICES,
-    Plate,
     colour,
     draw_traces,
     end_labels,
     key,
     legend_above,
+    narrow,
     room_for,
     scaled,
     set_range,
     set_time,
     sheet,
     short,
-    svg_of,
     upper_edge,
 )
 
@@ -48,6 +49,17 @@ SHOWN_CYCLES = 3
 
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 _DECADES = 4
+_ROW = 0.8
+"""Height of a trace that is always on, in its row."""
+
+_PEAKS = 0.02
+"""Part of the samples that may be beyond the axis."""
+
+_FAR = (3.0, 1e4)
+"""Where all values span so many times what the others do, the axis is for the others; where they
+span even more, the others are rest.
+"""
+
 _JOINTS_A_PANEL = 6
 _SMALLEST = 1e-9
 """Forces and torques that are rounding errors, N or N m."""
@@ -61,22 +73,6 @@ EVENTS = (
 )
 NO_STATES = "The bag holds no base poses (odom), so there is no picture of them."
 NO_JOINTS = "The robot has no joints in this bag."
-
-
-@dataclass
-class Group:
-    """Traces that share a panel, called by ``names``, ``label`` and ``unit``.
-
-    ``goals`` are (start, end, trace, value), ``limits`` (trace, value).
-    """
-
-    signal: Signal
-    names: Sequence[str]
-    label: str
-    unit: str
-    colours: Sequence[str]
-    goals: list[tuple[float, float, int, float]] = field(default_factory=list)
-    limits: list[tuple[int, float]] = field(default_factory=list)
 
 
 def position_group(flight: Flight) -> Group:
@@ -171,6 +167,15 @@ def position_plate(flight: Flight) -> Plate | str:
     return time_plate(flight, "position", "Base position", what, [position_group(flight)])
 
 
+def pose_plate(flight: Flight) -> Plate | str:
+    """Base position over base attitude, against the goal."""
+    if not len(flight.position):
+        return NO_STATES
+    what = "Position of the base link in the world frame, and its attitude as a rotation vector"
+    groups = [position_group(flight), attitude_group(flight)]
+    return time_plate(flight, "pose", "Base pose", what, groups)
+
+
 def attitude_plate(flight: Flight) -> Plate | str:
     """Base attitude against the goal."""
     if not len(flight.attitude):
@@ -203,7 +208,7 @@ def rates_plate(flight: Flight) -> Plate | str:
     lane = LANE if flight.events else 0.0
     bottom = 0.5 + lane
     figure, panels = sheet([widths] * len(names), [height] * len(names), gap=0.36, bottom=bottom)
-    dense = []
+    dense, groups = [], []
     for i, (row, name) in enumerate(zip(panels, names, strict=True)):
         signal = Signal(flight.rates.time, flight.rates.values[:, i : i + 1])
         spans = [(0.0, flight.end)]
@@ -212,6 +217,8 @@ def rates_plate(flight: Flight) -> Plate | str:
         joint = flight.joint(name)
         limit = joint.limits.velocity if joint is not None else np.inf
         unit = f"{joint_unit(flight, name)}/s"
+        bounds = [(0, limit), (0, -limit)]
+        groups.append(Group(signal, [name], short(name), unit, [colour(i)], limits=bounds))
         for axes, (start, end) in zip(row, spans, strict=True):
             set_range(axes, signal.values, [limit, -limit])
             low, high = axes.get_ylim()
@@ -229,8 +236,10 @@ def rates_plate(flight: Flight) -> Plate | str:
         if np.isfinite(limit) and limit > 0:
             text += f", {100 * peak / limit:.3g} % of the limit {limit:.4g} {unit}"
         row[0].set_title(name, color=colour(i))
-        row[0].set_title(text, loc="right", color=INK)
+        if not narrow():
+            row[0].set_title(text, loc="right", color=INK)
         row[0].set_ylabel(unit)
+    figure.align_ylabels([row[0] for row in panels])
     if cycles is not None:
         panels[0][1].set_title(f"last {SHOWN_CYCLES} cycles")
     if flight.events:
@@ -241,13 +250,19 @@ def rates_plate(flight: Flight) -> Plate | str:
         caption += f" Right: the last {SHOWN_CYCLES} of {cycles.count} cycles, to the same scale."
     caption += f" {BAND}" if any(dense) else ""
     caption += f" {EVENTS}" if flight.events else ""
-    return Plate("velocities", "Joint velocities", caption, svg_of(figure))
+    return Plate("velocities", "Joint velocities", caption, figure, groups)
 
 
 def draw_whole(axes: Axes, flight: Flight, group: Group, share: float = 1.0) -> bool:
     """Draw a group over the whole flight; return whether traces were summed up as bands."""
+    if group.rows:
+        return _draw_rows(axes, flight, group, share)
     colours = group.colours
     values = np.concatenate([group.signal.values.ravel(), [g[3] for g in group.goals]])
+    if group.window is not None:
+        text = f"peaks of {np.abs(values).max():.3g} {group.unit} are beyond the axis"
+        axes.set_title(text, loc="right" if group.limits else "left", color=MUTED)
+        values = np.array(group.window)
     set_range(axes, values, [bound for _, bound in group.limits])
     low, high = axes.get_ylim()
     keys = []
@@ -282,11 +297,19 @@ def time_plate(flight: Flight, name: str, heading: str, what: str, groups: list[
     """
     cycles = flight.cycles
     rows, heights = [[1.0]], [2.3]
-    if cycles is not None:
+    if any(group.rows for group in groups):
+        cycles = None
+        heights = [0.4 + 0.14 * len(group.names) if group.rows else 1.6 for group in groups]
+    elif cycles is not None and narrow():
+        rows, heights = [[1.0]] * 3, [2.0, 1.35, 1.35]
+    elif cycles is not None:
         rows, heights = [[1.0], [1.0, 1.0]], [2.0, 1.35]
+    if len(heights) != len(rows) * len(groups):
+        heights = heights * len(groups)
     right = room_for([name for group in groups for name in group.names])
     lane = LANE if flight.events else 0.0
-    figure, panels = sheet(rows * len(groups), heights * len(groups), right=right, lane=lane)
+    left = max([0.72, *(room_for(group.names) + 0.1 for group in groups if group.rows)])
+    figure, panels = sheet(rows * len(groups), heights, left=left, right=right, lane=lane)
     share = min(1.0, 4 / len(groups))
     dense = []
     for number, group in enumerate(groups):
@@ -294,8 +317,9 @@ def time_plate(flight: Flight, name: str, heading: str, what: str, groups: list[
         dense.append(draw_whole(whole[0], flight, group, share))
         if cycles is not None:
             whole[0].set_title("whole flight")
-            dense.append(_first_part(below[0][0], group, cycles))
-            _last_cycles(below[0][1], group, cycles)
+            first, last = (axes for row in below for axes in row)
+            dense.append(_first_part(first, group, cycles))
+            _last_cycles(last, group, cycles)
     if flight.events:
         for axes in (each for row in panels for each in row):
             draw_events(axes, flight.events)
@@ -312,7 +336,27 @@ def time_plate(flight: Flight, name: str, heading: str, what: str, groups: list[
         )
     caption += f" {BAND}" if any(dense) else ""
     caption += f" {EVENTS}" if flight.events else ""
-    return Plate(name, heading, caption, svg_of(figure))
+    return Plate(name, heading, caption, figure, groups)
+
+
+def _draw_rows(axes: Axes, flight: Flight, group: Group, share: float) -> bool:
+    """Draw each trace as a band in a row of its own, the first on top."""
+    columns = max(int(COLUMNS * share), 20)
+    count, signal = len(group.names), group.signal
+    dense = len(signal) > 2 * columns
+    for index, tint in enumerate(group.colours):
+        time, high = signal.time, signal.values[:, index]
+        if dense:
+            time, _, high = envelope(signal, index, columns)
+        foot = count - 1 - index
+        axes.fill_between(time, foot, foot + _ROW * high, step="pre", color=tint, linewidth=0.3)
+    axes.set_ylim(-0.2, count)
+    axes.set_yticks([count - 1 - k + _ROW / 2 for k in range(count)], group.names)
+    axes.tick_params(axis="y", length=0, labelsize="small")
+    axes.grid(axis="y", visible=False)
+    axes.set_title(f"{group.label} ({group.unit})")
+    set_time(axes, 0.0, flight.end)
+    return dense
 
 
 def _close_up(cycles: Cycles) -> str:
@@ -411,13 +455,16 @@ def efforts_plate(flight: Flight) -> Plate | None:
         limit = joint.limits.effort
         return [-limit, limit] if np.isfinite(limit) else []
 
+    def readable(groups: list[Group]) -> list[Group]:
+        return [replace(group, window=window_of(group.signal)) for group in groups]
+
     wrench = _axis_groups(flight.wrench, (("thruster force", "N"), ("thruster torque", "N m")))
     wrench = [g for g in wrench if np.abs(g.signal.values).max(initial=0.0) > _SMALLEST]
     joints: list[Group] = []
     if np.abs(flight.efforts.values).max(initial=0.0) > _SMALLEST:
         units, count = {"m": "N", "rad": "N m"}, len(flight.joint_names)
         joints = _joint_groups(flight, flight.efforts, "joints", units, bounds, most=count)
-    groups = wrench + joints
+    groups = readable(wrench + joints)
     if not groups:
         return None
     what = (
@@ -426,7 +473,44 @@ def efforts_plate(flight: Flight) -> Plate | None:
     )
     if not wrench:
         what = "Commanded efforts of the joints; the thrusters gave nothing"
+    if any(group.window is not None for group in groups):
+        what += ". Axes leave out short peaks, so that the rest can be read"
     return time_plate(flight, "efforts", "Wrench and efforts", what, groups)
+
+
+def window_of(signal: Signal) -> tuple[float, float] | None:
+    """Return lower and upper end of what can be read, where a few peaks are far beyond it."""
+    if not len(signal):
+        return None
+    low, high = (float(np.min(signal.values)), float(np.max(signal.values)))
+    inner = np.quantile(signal.values, (_PEAKS / 2, 1 - _PEAKS / 2), axis=0)
+    inner_low, inner_high = float(inner[0].min()), float(inner[1].max())
+    span = inner_high - inner_low
+    if not _FAR[0] * span < high - low < _FAR[1] * span:
+        return None
+    return max(low, inner_low - 0.3 * span), min(high, inner_high + 0.3 * span)
+
+
+def thrusters_plate(flight: Flight) -> Plate | None:
+    """When each thruster was on, and what that took."""
+    names = flight.thruster_names
+    if not len(flight.duty) or not flight.duty.values.any():
+        return None
+    used = [k for k in range(len(names)) if flight.duty.values[:, k].any()]
+    duty = Signal(flight.duty.time, flight.duty.values[:, used])
+    tints = [colour(k) for k in range(len(used))]
+    label, unit = "thrusters", "part of each tick that they are on"
+    groups = [Group(duty, [short(names[k]) for k in used], label, unit, tints, rows=True)]
+    impulse, propellant = flight.impulse, flight.propellant
+    groups.append(Group(impulse, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
+    what = "How much of each tick each thruster was on; below, the impulse that all gave"
+    if propellant is not None:
+        grams = Signal(propellant.time, 1e3 * propellant.values)
+        groups.append(Group(grams, ["propellant"], "propellant", "g", [PALETTE[1]]))
+        what += " and the propellant that they took, by their specific impulse"
+    if len(used) < len(names):
+        what += f". {len(names) - len(used)} of {len(names)} thrusters were never on"
+    return time_plate(flight, "thrusters", "Thruster firings", what, groups)
 
 
 def momentum_plate(flight: Flight) -> Plate | str:
@@ -454,7 +538,8 @@ def momentum_plate(flight: Flight) -> Plate | str:
             clip_on=False,
         )
     set_time(above, 0.0, flight.end, label=False)
-    above.set_title("change of the total momenta since the start")
+    if not narrow():
+        above.set_title("change of the total momenta since the start")
     above.set_ylabel("SI units")
     above.minorticks_off()
     above.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
@@ -477,7 +562,18 @@ def momentum_plate(flight: Flight) -> Plate | str:
     )
     caption += f" {BAND}" if dense else ""
     caption += f" {EVENTS}" if flight.events else ""
-    return Plate("momentum", "Momentum balance", caption, svg_of(figure))
+    groups = [
+        Group(
+            Signal(time, changes),
+            ["|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)"],
+            "change of the total momenta",
+            "SI units",
+            PALETTE[:2],
+            decades=_DECADES,
+        ),
+        Group(Signal(time, energy), ["energy"], "kinetic energy", "J", [colour(2)]),
+    ]
+    return Plate("momentum", "Momentum balance", caption, figure, groups)
 
 
 def power_of_ten(value: float) -> str:

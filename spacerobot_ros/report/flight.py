@@ -13,6 +13,7 @@ import numpy as np
 from spacerobot_ros.bag import Bag, RecordedRobot, TopicSeries, read_bag
 from spacerobot_ros.bag.recorded_robot import columns
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
+from spacerobot_ros.control.thrusters.table import IN_URDF, find_thrusters
 from spacerobot_ros.errors import PlanningError, RobotDescriptionError, SpaceRobotError
 from spacerobot_ros.flight.scenario import Published
 from spacerobot_ros.model import RobotDescription, parse_robot
@@ -133,6 +134,9 @@ class Flight:
         Pose of the end-effector in the world (N, 7).
     wrench
         Force and torque that were commanded of the thrusters, in the base link (N, 6), N and N m.
+    duty, thrust, thruster_names
+        For what part of each tick each thruster was on (N, m), its mean force in it (N, m), N, and
+        their names.
     statuses
         What the planner reported, or else the controller.
     sent, tool_goals
@@ -158,6 +162,9 @@ class Flight:
     tool: Signal
     wrench: Signal
     efforts: Signal
+    duty: Signal
+    thrust: Signal
+    thruster_names: list[str]
     statuses: list[Status]
     sent: list[SentGoal]
     tool_goals: list[SentGoal]
@@ -371,6 +378,32 @@ class Flight:
         part = self.momentum.values[:, first : first + 3]
         return float(np.nanmax(np.linalg.norm(part - part[0], axis=1)))
 
+    @cached_property
+    def impulse(self) -> Signal:
+        """Impulse that all thrusters together have given (N, 1), N s."""
+        return self._summed(np.ones(len(self.thruster_names)))
+
+    @cached_property
+    def propellant(self) -> Signal | None:
+        """Propellant that the thrusters have taken (N, 1), kg; None where their specific impulses
+        are not in the bag.
+        """
+        if self.robot is None or self.parameter("plant", "thrusters") != IN_URDF:
+            return None
+        try:
+            table = find_thrusters(IN_URDF, self.robot)
+        except SpaceRobotError:
+            return None
+        if list(table.names) != self.thruster_names:
+            return None
+        return self._summed(table.mass_flow / table.force)
+
+    def _summed(self, weights: Array) -> Signal:
+        """Return the sum over time and thrusters of their forces, each times its weight."""
+        ticks = np.diff(self.thrust.time, prepend=self.thrust.time[:1])
+        total = np.cumsum(ticks * (self.thrust.values @ weights))
+        return Signal(self.thrust.time, total[:, np.newaxis])
+
     def joint(self, name: str) -> Joint | None:
         """The joint of that name in the robot description."""
         joints = self.robot.movable_joints if self.robot is not None else ()
@@ -413,7 +446,7 @@ def read_flight(path: Path) -> Flight:
         if topic.endswith("/odom") and kind == TOPICS["odom"].type
     ]
     robot = _Recorded(bag, min(prefixes, default=""))
-    names = robot.joint_names
+    names, nozzles = robot.joint_names, robot.names("thrusters")
     base = robot.signal("odom", "pose.pose")
     position, quaternion = Signal(base.time, base.values[:, :3]), base.values[:, 3:]
     return Flight(
@@ -432,6 +465,9 @@ def read_flight(path: Path) -> Flight:
         tool=robot.signal("end_effector_pose", "pose"),
         wrench=robot.signal("base_wrench", "wrench"),
         efforts=_efforts(robot, names),
+        duty=robot.signal("thrusters", "velocity", len(nozzles)),
+        thrust=robot.signal("thrusters", "effort", len(nozzles)),
+        thruster_names=nozzles,
         statuses=_statuses(robot),
         sent=_goals(robot, "goal_pose"),
         tool_goals=_goals(robot, "end_effector/goal_pose"),

@@ -9,7 +9,7 @@ from importlib.resources import files
 
 from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.report.meshcat import Player
-from spacerobot_ros.report.style import Plate
+from spacerobot_ros.report.plates import Plate
 from spacerobot_ros.report.tables import (
     Table,
     headline,

@@ -10,9 +10,10 @@ from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.rotations import rotvec_from_quaternion, rotvecs_from_quaternions
 from spacerobot_ros.report.style import (
     FAINT,
+    PictureFormat,
     colour,
-    paper_style,
-    png_of,
+    drawing,
+    picture_of,
     room_for,
     set_range,
     set_time,
@@ -20,14 +21,13 @@ from spacerobot_ros.report.style import (
 )
 from spacerobot_ros.simulation.trials import Problem, Trial
 
-_PIXELS = 1600
 _COMPONENTS = ("x", "y", "z")
 
 
-def draw(problem: Problem, trial: Trial) -> bytes:
-    """Return the picture (PNG) of a plan and its goal."""
-    with paper_style():
-        return png_of(_figure(problem, trial), _PIXELS)
+def draw(problem: Problem, trial: Trial, format: PictureFormat = PictureFormat.PNG) -> bytes:
+    """Return the picture of a plan and its goal."""
+    with drawing():
+        return picture_of(_figure(problem, trial), format)
 
 
 def _figure(problem: Problem, trial: Trial) -> Figure:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import io
+import logging
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
+from contextvars import ContextVar
+from enum import Enum
+from importlib.resources import files
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -17,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.report.signals import Signal, envelope, simplified
 
@@ -30,7 +34,10 @@ GHOST = PALETTE[3]
 """Of goals in space."""
 
 WIDTH = 9.6
-"""Width of a figure, inches."""
+"""Width of a figure of a page, inches."""
+
+_NARROW = 6.0
+"""Inches for letters of 8.5 points."""
 
 COLUMNS = 960
 """Slices of time across a figure in which a dense trace is summed up."""
@@ -44,59 +51,91 @@ _UNSEEN = 5e-4
 _PATH_DATA = re.compile(rb' d="[^"]*"')
 _DECIMALS = re.compile(rb"(\.\d\d)\d+")
 
-_STYLE: Any = {
-    "font.family": "DejaVu Sans",
-    "font.size": 8.5,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "axes.labelsize": 8.5,
-    "axes.titlesize": 8.5,
-    "axes.titlelocation": "left",
-    "axes.titlepad": 6.0,
-    "axes.edgecolor": "#8a919c",
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.formatter.useoffset": False,
-    "axes.formatter.limits": (-4, 5),
-    "grid.color": "#e9ebee",
-    "grid.linewidth": 0.7,
-    "xtick.color": "#8a919c",
-    "ytick.color": "#8a919c",
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "xtick.labelsize": 8.0,
-    "ytick.labelsize": 8.0,
-    "xtick.major.size": 3.0,
-    "ytick.major.size": 3.0,
-    "lines.linewidth": 1.3,
-    "lines.solid_capstyle": "round",
-    "legend.frameon": False,
-    "legend.fontsize": 8.0,
-    # Names of joints are shown as they are, dollars included.
-    "text.parse_math": False,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "spacerobot",
-}
+_FONT_SIZE = 8.5
+"""Points, for which the distances of these modules are meant."""
 
 
-@dataclass(frozen=True)
-class Plate:
-    """A figure: a short name, its heading, what is to be seen, and the picture."""
-
-    name: str
-    heading: str
-    caption: str
-    svg: bytes
+_width = ContextVar("_width", default=WIDTH)
+_scale = ContextVar("_scale", default=1.0)
+"""How large letters are beside those of 8.5 points."""
 
 
 @contextmanager
-def paper_style() -> Iterator[None]:
-    """Draw in the style of these figures while the block lasts."""
-    with mpl.rc_context(_STYLE):
-        yield
+def drawing(width: float = WIDTH, style: str = "report", own: Path | None = None) -> Iterator[None]:
+    """Draw in the style of these figures while the block lasts.
+
+    Parameters
+    ----------
+    width
+        Of a figure, inches.
+    style
+        A style file of this package: ``report`` for pages, ``paper`` for papers.
+    own
+        A style file of matplotlib's, whose settings come after.
+
+    Raises
+    ------
+    SpaceRobotError
+        The style file cannot be read.
+    """
+    shipped = Path(str(files("spacerobot_ros.report").joinpath(f"{style}.mplstyle")))
+    with mpl.rc_context():
+        for path in (shipped, own) if own is not None else (shipped,):
+            _use(path)
+        # Names of joints are shown as they are, dollars included.
+        mpl.rcParams["text.parse_math"] = False
+        across = _width.set(width)
+        scale = _scale.set(float(mpl.rcParams["font.size"]) / _FONT_SIZE)
+        try:
+            yield
+        finally:
+            _width.reset(across)
+            _scale.reset(scale)
+
+
+def _use(path: Path) -> None:
+    said = _Said()
+    logger = logging.getLogger("matplotlib")
+    logger.addFilter(said)
+    try:
+        settings = mpl.rc_params_from_file(path, use_default_template=False)
+    except (OSError, ValueError, KeyError) as error:
+        raise SpaceRobotError(f"The style file {path} cannot be read: {error}.") from error
+    finally:
+        logger.removeFilter(said)
+    if said.sentences:
+        raise SpaceRobotError(f"The style file {path} is refused: {said.sentences[0]}.")
+    mpl.rcParams.update(settings)
+
+
+class _Said(logging.Filter):
+    """Keeps what matplotlib only logs: that it does not understand a line."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sentences: list[str] = []
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Keep the first line of a warning instead of showing it."""
+        if record.levelno < logging.WARNING:
+            return True
+        self.sentences.append(record.getMessage().strip().splitlines()[0].rstrip("."))
+        return False
+
+
+def width() -> float:
+    """Return the width of a figure, inches."""
+    return _width.get()
+
+
+def narrow() -> bool:
+    """Whether a figure is for one column of a paper."""
+    return _width.get() / _scale.get() < _NARROW
+
+
+def inches(length: float) -> float:
+    """Return a length that suits letters of 8.5 points for the letters that are drawn, inches."""
+    return length * _scale.get()
 
 
 def sheet(
@@ -115,20 +154,25 @@ def sheet(
     there is room for labels ``left`` and ``right`` of the panels, at the ``bottom``, and for titles
     in the ``gap`` between the rows, and for a ``lane`` below every row.
     """
-    bottom, gap = bottom + lane, gap + lane
-    top, between = 0.3, right + left - 0.1
+    scale = _scale.get()
+    if narrow() and left > 0.5:
+        # Panels are small, and their numbers have as many digits.
+        left = max(left, 0.95)
+    left, right, bottom, gap = (scale * x for x in (left, right, bottom + lane, gap + lane))
+    heights = [scale * each for each in heights]
+    top, between = 0.3 * scale, right + left - 0.1 * scale
     height = top + sum(heights) + gap * (len(heights) - 1) + bottom
     figure = new_figure(height)
     panels = []
     y = height - top
     for widths, row_height in zip(rows, heights, strict=True):
         y -= row_height
-        room = WIDTH - left - right - between * (len(widths) - 1)
+        room = width() - left - right - between * (len(widths) - 1)
         x, row = left, []
         for share in widths:
-            width = room * share / sum(widths)
-            row.append(panel(figure, x, y, width, row_height))
-            x += width + between
+            across = room * share / sum(widths)
+            row.append(panel(figure, x, y, across, row_height))
+            x += across + between
         panels.append(row)
         y -= gap
     return figure, panels
@@ -136,7 +180,7 @@ def sheet(
 
 def new_figure(height: float) -> Figure:
     """Return an empty figure of so many inches."""
-    figure = Figure(figsize=(WIDTH, height), facecolor="white")
+    figure = Figure(figsize=(width(), height), facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 
@@ -152,20 +196,52 @@ def room_for(names: Sequence[str]) -> float:
     return 0.15 + 0.075 * max(map(len, names), default=0)
 
 
-def svg_of(figure: Figure) -> bytes:
-    """Return a figure as SVG, the same bytes for the same figure."""
+class PictureFormat(str, Enum):
+    """A kind of picture file, by the end of its name."""
+
+    PNG = "png"
+    SVG = "svg"
+    PDF = "pdf"
+
+    @classmethod
+    def of(cls, path: Path) -> PictureFormat:
+        """Return the format of a file.
+
+        Raises
+        ------
+        SpaceRobotError
+            Its name ends otherwise.
+        """
+        try:
+            return cls(path.suffix[1:].lower())
+        except ValueError:
+            raise SpaceRobotError(
+                f"Pictures are written as .png, .svg or .pdf, and not as '{path.name}'."
+            ) from None
+
+
+def picture_of(figure: Figure, format: PictureFormat, pixels: int = 1600) -> bytes:
+    """Return a figure as a file, the same bytes for the same figure.
+
+    ``pixels`` is the width of a PNG, and half of that resolution what images in the others have.
+    """
+    across = float(figure.get_size_inches()[0])
+    about = {
+        PictureFormat.PNG: ("Software",),
+        PictureFormat.SVG: ("Date", "Creator", "Format", "Type"),
+        PictureFormat.PDF: ("CreationDate", "Creator", "Producer"),
+    }
     stream = io.BytesIO()
-    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-    figure.savefig(stream, format="svg", dpi=200, metadata=nothing)
+    figure.savefig(
+        stream,
+        format=format.value,
+        dpi=pixels / across if format is PictureFormat.PNG else 200,
+        metadata=dict.fromkeys(about[format]),
+    )
+    if format is not PictureFormat.SVG:
+        return stream.getvalue()
     # A hundredth of a point is finer than any screen.
     return _PATH_DATA.sub(lambda found: _DECIMALS.sub(rb"\1", found[0]), stream.getvalue())
-
-
-def png_of(figure: Figure, width: int) -> bytes:
-    """Return a figure as PNG, so many pixels wide."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=width / WIDTH, metadata={"Software": None})
-    return stream.getvalue()
 
 
 def colour(index: int) -> str:
@@ -263,7 +339,7 @@ def end_labels(axes: Axes, labels: Sequence[tuple[float, str, str]]) -> None:
     ordered = sorted(labels)
     wanted = np.clip([(value - low) / (high - low) for value, _, _ in ordered], 0.0, 1.0)
     height = axes.get_window_extent().height / axes.figure.dpi
-    gap = min(0.155 / height, 1.0 / max(len(ordered) - 1, 1))
+    gap = min(inches(0.155) / height, 1.0 / max(len(ordered) - 1, 1))
     for at, (_, text, tint) in zip(_spread(wanted, gap), ordered, strict=True):
         axes.annotate(
             text,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -24,32 +25,57 @@ from spacerobot_ros.report.figures_time import (
     efforts_plate,
     errors_plate,
     momentum_plate,
+    pose_plate,
     position_group,
     position_plate,
     rates_plate,
     shape_groups,
     shape_plate,
+    thrusters_plate,
     twist_plate,
 )
 from spacerobot_ros.report.flight import Flight, read_flight
 from spacerobot_ros.report.meshcat import player_of
 from spacerobot_ros.report.page import page
+from spacerobot_ros.report.plates import Plate
 from spacerobot_ros.report.scene import scene_of
 from spacerobot_ros.report.style import (
     WIDTH,
+    PictureFormat,
+    drawing,
     legend_above,
     new_figure,
     panel,
-    paper_style,
-    png_of,
+    picture_of,
     room_for,
 )
+
+_WIDTHS = (40.0, 400.0)
+"""Least and largest width of a figure for a paper, mm."""
 
 _PICTURE_WIDTH = 1000
 """Pixels."""
 
 _ROBOT_WIDTH = 3.9
 """Of the robot in the picture, inches."""
+
+FIGURES: dict[str, Callable[[Flight], Plate | str | None]] = {
+    "robot": configurations_plate,
+    "pose": pose_plate,
+    "position": position_plate,
+    "attitude": attitude_plate,
+    "cycles": cycles_plate,
+    "joints": shape_plate,
+    "velocities": rates_plate,
+    "loops": loops_plate,
+    "errors": errors_plate,
+    "efforts": efforts_plate,
+    "thrusters": thrusters_plate,
+    "twist": twist_plate,
+    "momentum": momentum_plate,
+    "path": path_plate,
+}
+"""What :func:`write_figures` draws, by name."""
 
 _PLATES = (
     configurations_plate,
@@ -61,6 +87,7 @@ _PLATES = (
     loops_plate,
     errors_plate,
     efforts_plate,
+    thrusters_plate,
     twist_plate,
     momentum_plate,
 )
@@ -80,25 +107,89 @@ def write_report(bag: Path, html: Path, beside: Sequence[Path] = ()) -> None:
     """
     flight = read_flight(bag)
     others = [read_flight(other) for other in beside]
-    with paper_style():
+    with drawing():
         plates = [*(plate(flight) for plate in _PLATES), path_plate(flight, others)]
         text = page(flight, player_of(scene_of(flight)), plates, others)
     _write(html, text.encode())
 
 
-def write_picture(bag: Path, png: Path) -> None:
-    """Write one picture of a flight, 1000 pixels wide: pose and shape over time, and the robot.
+def write_figures(
+    bag: Path,
+    folder: Path,
+    only: Sequence[str] = (),
+    *,
+    format: PictureFormat = PictureFormat.PDF,
+    width: float = 88.0,
+    style: Path | None = None,
+    events: bool = False,
+) -> dict[str, Path | str]:
+    """Write figures of a flight for a paper, each a file of its own.
+
+    Parameters
+    ----------
+    bag
+        The flight.
+    folder
+        Where the files go, ``pose.pdf`` and so on; older ones of these names are replaced.
+    only
+        Names of :data:`FIGURES`; none for all that the bag has something for, position and
+        attitude together.
+    format
+        Of the files. Text in PDF and SVG stays text.
+    width
+        Of a figure, mm.
+    style
+        A style file of matplotlib's, for fonts, sizes and colours of lines and axes.
+    events
+        Whether what happened is shown below time axes.
+
+    Returns
+    -------
+    For each figure its file, or a sentence on why the bag has none.
+
+    Raises
+    ------
+    SpaceRobotError
+        There is no such figure or bag, or a file cannot be read or written.
+    """
+    unknown = [name for name in only if name not in FIGURES]
+    if unknown:
+        known = ", ".join(FIGURES)
+        raise SpaceRobotError(f"There is no figure '{unknown[0]}': there are {known}.")
+    if not _WIDTHS[0] <= width <= _WIDTHS[1]:
+        least, most = _WIDTHS
+        raise SpaceRobotError(f"A figure is {least:g} to {most:g} mm wide, and not {width:g} mm.")
+    flight = read_flight(bag)
+    if not events:
+        flight = replace(flight, events=[])
+    made: dict[str, Path | str] = {}
+    with drawing(width / 25.4, "paper", style):
+        for name in only or [name for name in FIGURES if name not in ("position", "attitude")]:
+            plate = FIGURES[name](flight)
+            if isinstance(plate, Plate):
+                made[name] = folder / f"{name}.{format.value}"
+                _write(folder / f"{name}.{format.value}", picture_of(plate.figure, format))
+            else:
+                made[name] = plate or "The flight is of another kind."
+    return made
+
+
+def write_picture(bag: Path, picture: Path) -> None:
+    """Write one picture of a flight: pose and shape over time, and the robot.
+
+    It is a PNG 1000 pixels wide, or SVG or PDF, as the name of the file ends.
 
     Raises
     ------
     SpaceRobotError
         There is no such bag, it is damaged or holds no base poses, or the file cannot be written.
     """
+    format = PictureFormat.of(picture)
     flight = read_flight(bag)
     if not len(flight.position):
         raise SpaceRobotError(NO_STATES)
-    with paper_style():
-        _write(png, png_of(_overview(flight), _PICTURE_WIDTH))
+    with drawing():
+        _write(picture, picture_of(_overview(flight), format, _PICTURE_WIDTH))
 
 
 def _overview(flight: Flight) -> Figure:

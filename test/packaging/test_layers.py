@@ -173,7 +173,6 @@ MUTABLE = {
     "spacerobot_ros.nodes.common.state_times._Doubtful",
     "spacerobot_ros.planning.execution.outputs.Pursuit",
     "spacerobot_ros.planning.methods.optimal.search._Progress",
-    "spacerobot_ros.report.figures_time.Group",
     "spacerobot_ros.report.solids.Solids",
     "spacerobot_ros.simulation.trials.Record",
     "spacerobot_ros.verification.comparison._Resimulation",

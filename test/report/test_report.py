@@ -36,7 +36,8 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.report import figures_space, write_picture, write_report
 from spacerobot_ros.report.figures_time import shape_plate
 from spacerobot_ros.report.flight import read_flight
-from spacerobot_ros.report.style import Plate, paper_style
+from spacerobot_ros.report.plates import Plate
+from spacerobot_ros.report.style import drawing
 
 FIGURES = [
     "configurations",
@@ -198,7 +199,7 @@ def test_the_same_bag_makes_the_same_report(folder: Path, flown: Page) -> None:
 
 def test_dense_traces_become_bands_and_say_so(tmp_path: Path) -> None:
     bag = tell(tmp_path / "flight.mcap", Story(cyclic_shapes(cycles=70)))
-    with paper_style():
+    with drawing():
         plate = shape_plate(read_flight(bag))
     assert isinstance(plate, Plate)
     assert "the smallest and the largest value in each slice of time" in plate.caption
@@ -351,6 +352,6 @@ def test_refusals(tmp_path: Path) -> None:
 def test_leaves_the_style_of_others_alone(folder: Path, flown: Page) -> None:
     before = dict(mpl.rcParams)
     assert flown.figures
-    with paper_style():
+    with drawing():
         assert isinstance(shape_plate(read_flight(folder / "flight.mcap")), Plate)
     assert dict(mpl.rcParams) == before

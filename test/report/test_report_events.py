@@ -55,19 +55,6 @@ def story(tmp_path: Path, events: Any = EVENTS, **options: Any) -> Path:
     )
 
 
-@pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """Return the figures that are drawn in this test."""
-    drawn: list[Figure] = []
-
-    def keep(figure: Figure) -> bytes:
-        drawn.append(figure)
-        return b"<svg/>"
-
-    monkeypatch.setattr(figures_time, "svg_of", keep)
-    return drawn
-
-
 def lanes(figure: Figure) -> list[Any]:
     return [axes for axes in figure.axes if axes.get_label() == "events"]
 
@@ -90,11 +77,11 @@ def test_events_have_the_time_that_their_node_gave(tmp_path: Path) -> None:
     ],
 )
 def test_a_lane_below_every_time_axis_has_every_event(
-    tmp_path: Path, figures: list[Figure], plate: Callable[[Flight], Any]
+    tmp_path: Path, plate: Callable[[Flight], Any]
 ) -> None:
     made = plate(read_flight(story(tmp_path)))
     assert "Below the time axis" in made.caption
-    (figure,) = figures
+    figure = made.figure
     timed = [axes for axes in figure.axes if axes.get_xlabel() == "time (s)"]
     below = lanes(figure)
     assert len(below) == len(timed) >= 1
@@ -109,13 +96,11 @@ def test_a_lane_below_every_time_axis_has_every_event(
 
 
 @pytest.mark.parametrize("events", [[], EVENTS[6:]])
-def test_a_bag_without_events_has_no_lane(
-    tmp_path: Path, figures: list[Figure], events: list[Any]
-) -> None:
+def test_a_bag_without_events_has_no_lane(tmp_path: Path, events: list[Any]) -> None:
     made = figures_time.position_plate(read_flight(story(tmp_path, events)))
     assert not isinstance(made, str)
     assert "Below the time axis" not in made.caption
-    assert not lanes(figures[0])
+    assert not lanes(made.figure)
 
 
 def test_every_kind_is_a_mark_of_its_own() -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from matplotlib.figure import Figure
 from sensor_msgs.msg import JointState
 from support.made_bags import array, joint_states, made_bag, odometry, pose, stamped
 
@@ -30,7 +31,7 @@ from spacerobot_ros.report.figures_time import (
 from spacerobot_ros.report.flight import Flight, read_flight
 from spacerobot_ros.report.meshcat import Player
 from spacerobot_ros.report.page import page
-from spacerobot_ros.report.style import Plate
+from spacerobot_ros.report.plates import Plate
 from spacerobot_ros.report.tables import (
     headline,
     joint_table,
@@ -420,7 +421,7 @@ def test_what_the_page_says_of_a_flight(tmp_path: Path) -> None:
         "other": {"hidden": "nobody"},
     }
     found = flight(tmp_path, metadata=metadata)
-    text = page(found, Player("<p>player</p>"), [Plate("a", "Heading", "Caption.", b"<svg/>")])
+    text = page(found, Player("<p>player</p>"), [Plate("a", "Heading", "Caption.", Figure())])
     content = Reader(text)
     for words in (
         "a_scenario",
@@ -469,7 +470,7 @@ def test_whatever_a_bag_holds_is_text_on_the_page(tmp_path: Path) -> None:
     found = flight(
         tmp_path, statuses, metadata=metadata, urdf=urdf, names=[odd(2), "turn"], name="<i>13&.mcap"
     )
-    plates: list[Plate | str] = [Plate("a", odd(14), odd(15), b"<svg/>"), odd(16)]
+    plates: list[Plate | str] = [Plate("a", odd(14), odd(15), Figure()), odd(16)]
     content = Reader(page(found, Player(""), plates, [found]))
     assert "i" not in content.tags
     read = content.text + " ".join(content.values)

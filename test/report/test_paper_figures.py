@@ -1,0 +1,155 @@
+"""Figures for papers, and pictures by the ends of their names."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pypdf
+import pytest
+from click.testing import CliRunner
+from support.flight_bags import GOAL, Story, tell
+from support.sentences import assert_one_sentence
+
+from spacerobot_ros.cli.main import main
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.report import write_figures
+from spacerobot_ros.report.figures_time import window_of
+from spacerobot_ros.report.signals import Signal
+from spacerobot_ros.report.style import PictureFormat
+
+MAGIC = {"png": b"\x89PNG", "pdf": b"%PDF-", "svg": b"<?xml"}
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    t = np.linspace(0.0, 1.0, 60)[:, np.newaxis]
+    story = Story(np.sin(t * np.arange(1, 4)), goals=[(0.0, *GOAL)])
+    return tell(tmp_path_factory.mktemp("paper") / "flight.mcap", story)
+
+
+def test_text_in_a_pdf_can_be_read_and_edited(bag: Path, tmp_path: Path) -> None:
+    made = write_figures(bag, tmp_path, ["pose", "joints"], width=120.0)
+    assert made == {name: tmp_path / f"{name}.pdf" for name in ("pose", "joints")}
+    page = pypdf.PdfReader(tmp_path / "pose.pdf").pages[0]
+    text = page.extract_text()
+    for label in ("base position (m)", "rotation vector (rad)", "time (s)"):
+        assert label in text
+    assert float(page.mediabox.width) == pytest.approx(120.0 / 25.4 * 72, abs=0.01)
+    fonts: Any = page["/Resources"]["/Font"]  # type: ignore[index]
+    # TrueType in the PDF's own sense: Type 3 fonts are shapes, which editors cannot change.
+    kinds = {fonts[name]["/Subtype"] for name in fonts}
+    assert kinds == {"/Type0"}
+    assert "joint_0" in pypdf.PdfReader(tmp_path / "joints.pdf").pages[0].extract_text()
+
+
+def test_text_in_an_svg_is_text_of_the_size_of_a_style_file(bag: Path, tmp_path: Path) -> None:
+    style = tmp_path / "own.mplstyle"
+    style.write_text("font.size: 11\naxes.labelsize: 11\nfont.family: serif\n")
+    sizes = {}
+    for name, own in (("shipped", None), ("own", style)):
+        write_figures(bag, tmp_path / name, ["pose"], format=PictureFormat.SVG, style=own)
+        text = (tmp_path / name / "pose.svg").read_text("utf-8")
+        (label,) = re.findall(r"<text ([^>]*)>base position \(m\)</text>", text)
+        size = re.search(r"([\d.]+)px", label)
+        assert size is not None
+        sizes[name] = float(size[1])
+        assert f'width="{88 / 25.4 * 72:.6f}' in text
+        assert ("serif" in label) == (name == "own")
+    assert sizes == {"shipped": 7.0, "own": 11.0}
+
+
+@pytest.mark.slow
+def test_all_figures_of_a_bag_by_the_command(bag: Path, tmp_path: Path) -> None:
+    words = ["figures", str(bag), "--format", "png", "--width", "3.5in", "--out", str(tmp_path)]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 0, result.output
+    names = {path.stem for path in tmp_path.iterdir()}
+    assert names >= {"robot", "pose", "joints", "velocities", "momentum", "path"}
+    assert not names & {"position", "attitude", "efforts"}
+    assert all(path.read_bytes().startswith(MAGIC["png"]) for path in tmp_path.iterdir())
+    words = ["figures", str(bag), "--only", "efforts", "-o", str(tmp_path)]
+    asked = CliRunner().invoke(main, words)
+    assert asked.exit_code == 1
+    assert_one_sentence(asked.stderr, "efforts", "none")
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("--only", "pose,magic"), "magic"),
+        (("--width", "wide"), "'wide'"),
+        (("--width", "2mm"), "2 mm"),
+        (("--style", "nowhere.mplstyle"), "nowhere.mplstyle"),
+    ],
+)
+def test_what_is_refused_is_named(
+    words: tuple[str, ...], named: str, bag: Path, tmp_path: Path
+) -> None:
+    result = CliRunner().invoke(main, ["figures", str(bag), "-o", str(tmp_path / "x"), *words])
+    assert result.exit_code == 2
+    assert named in result.stderr
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("content", ["font.size large\n", "no.such.key: 1\n", "font.size: red\n"])
+def test_a_style_file_with_a_mistake_is_one_sentence(
+    content: str, bag: Path, tmp_path: Path
+) -> None:
+    style = tmp_path / "own.mplstyle"
+    style.write_text(content)
+    with pytest.raises(SpaceRobotError, match="style file"):
+        write_figures(bag, tmp_path, ["pose"], style=style)
+
+
+COMMANDS = {
+    "plan": ["plan", "planar_chain"],
+    "analyze": ["analyze", "planar_chain"],
+    "report": ["report"],
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_picture_of_another_kind_is_refused_before_anything_is_done(
+    command: str, bag: Path, tmp_path: Path
+) -> None:
+    words = [*COMMANDS[command], *([str(bag)] if command == "report" else [])]
+    result = CliRunner().invoke(main, [*words, "--picture", str(tmp_path / "a.jpg")])
+    assert result.exit_code == 2
+    assert_one_sentence(result.stderr, ".png, .svg or .pdf", "a.jpg")
+    assert list(tmp_path.iterdir()) == []
+    assert not bag.with_suffix(".html").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "kind"), [("plan", "pdf"), ("analyze", "svg"), ("report", "pdf")]
+)
+def test_a_picture_is_what_its_name_says(
+    command: str, kind: str, bag: Path, tmp_path: Path
+) -> None:
+    page = ["-o", str(tmp_path / "a.html")]
+    words = [*COMMANDS[command], *([str(bag), *page] if command == "report" else [])]
+    picture = tmp_path / f"deep/a.{kind}"
+    result = CliRunner().invoke(main, [*words, "--picture", str(picture)])
+    assert result.exit_code == 0, result.output
+    data = picture.read_bytes()
+    assert data.startswith(MAGIC[kind])
+    if command == "plan":
+        assert "time (s)" in pypdf.PdfReader(picture).pages[0].extract_text()
+
+
+def test_an_axis_is_for_what_can_be_read_beside_a_peak() -> None:
+    time = np.linspace(0.0, 10.0, 1001)
+    calm = np.sin(time)
+    peaked = calm + 70.0 * np.exp(-time / 0.01)
+    assert window_of(Signal(time, calm[:, np.newaxis])) is None
+    window = window_of(Signal(time, peaked[:, np.newaxis]))
+    assert window is not None
+    assert window[0] == pytest.approx(-1.0, abs=0.01)
+    assert 1.0 < window[1] < 2.0
+    # A flight that is mostly rest has no peaks: what happens is what is to be seen.
+    resting = np.where(np.abs(time - 5.0) < 0.05, 1.0, 1e-9 * calm)
+    assert window_of(Signal(time, resting[:, np.newaxis])) is None
+    assert window_of(Signal(time[:0], np.empty((0, 1)))) is None
