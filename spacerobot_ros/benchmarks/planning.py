@@ -24,7 +24,11 @@ Plans = Mapping[str, list[float]]
 
 
 def run_planning_benchmark(
-    goals: int, other: Path | None, starts: int | None, show: Callable[[str], None]
+    goals: int,
+    other: Path | None,
+    starts: int | None,
+    library: int | None,
+    show: Callable[[str], None],
 ) -> dict[str, Any]:
     """Plan goals of every robot and return the figures by its name.
 
@@ -38,6 +42,8 @@ def run_planning_benchmark(
         Folder of a checkout that plans the same goals; None: of none.
     starts
         Compare durations with those of a search from so many guesses; None: do not.
+    library
+        Plan with a library of the manoeuvres to so many other goals, too; None: do not.
     show
         Called with lines for people.
 
@@ -53,12 +59,20 @@ def run_planning_benchmark(
         plans = _plans(ours, name, goals, {})
         found: dict[str, Any] = {"median_cpu_s": statistics.median(plans["cpu_s"]), **plans}
         show(f"{name}: {found['median_cpu_s']:.3f} s of CPU time in the median of {goals} goals")
+        plain = found["median_cpu_s"]
         if theirs is not None:
             before = _plans(theirs, name, goals, {})
             median = statistics.median(before["cpu_s"])
             found |= {"there": before, "times_faster": median / found["median_cpu_s"]}
             show(f"... there {median:.3f} s: {found['times_faster']:.2f} times faster here")
+            plain = median
             found["durations_to_there"] = _compared(plans, before, "there", show)
+        if library is not None:
+            helped = _plans(ours, name, goals, {}, library)
+            median = statistics.median(helped["cpu_s"])
+            found |= {"with_library": helped, "library_times_faster": plain / median}
+            show(f"... with a library {median:.3f} s: {plain / median:.2f} times faster")
+            _compared(helped, plans, "without it", show)
         if starts is not None:
             options = {"starts": starts, "answers": starts, "agreeing": 0}
             long = _plans(ours, name, goals, options)
@@ -69,10 +83,12 @@ def run_planning_benchmark(
     return figures
 
 
-def _plans(checkout: Checkout, name: str, goals: int, options: Mapping[str, Any]) -> Plans:
+def _plans(
+    checkout: Checkout, name: str, goals: int, options: Mapping[str, Any], library: int = 0
+) -> Plans:
     """Return CPU times and durations of the plans that a checkout makes."""
     urdf = share_directory() / "urdf" / f"{name}.urdf"
-    words = [str(urdf), name, str(goals), str(_SEED), json.dumps(options)]
+    words = [str(urdf), name, str(goals), str(_SEED), json.dumps(options), str(library)]
     plans: Plans = checkout.run([str(planning_goals.__file__), *words])
     return plans
 

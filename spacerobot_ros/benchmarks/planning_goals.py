@@ -10,6 +10,7 @@ import json
 import math
 import os
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -83,11 +84,12 @@ def requests(robot: SpaceRobot, case: Case, count: int, seed: int) -> Iterator[P
 
 
 def measure(
-    urdf: Path, case: Case, count: int, seed: int, options: dict[str, Any]
+    urdf: Path, case: Case, count: int, seed: int, options: dict[str, Any], library: int = 0
 ) -> dict[str, list[float]]:
     """Return the CPU time (s) and the duration (s; NaN: refused) of every plan.
 
-    What is built for the first of all goals is not counted.
+    What is built for the first of all goals is not counted, nor is a library of the manoeuvres to
+    so many other goals.
     """
     robot = SpaceRobot.from_file(urdf)
     chosen = {**case.options, **options, "cache": 0}
@@ -96,6 +98,14 @@ def measure(
         chosen["time_budget"] = 1e6
     method = OptimalGait(robot, _PERIOD, options=OptimalOptions(**chosen))
     warm, *goals = requests(robot, case, count + 1, seed)
+    if library:
+        made = method.made_library(requests(robot, case, library, seed + 1))
+        assert made is not None
+        with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
+            file = Path(folder, "library.npz")
+            file.write_bytes(made.to_bytes())
+            chosen["library"] = str(file)
+            method = OptimalGait(robot, _PERIOD, options=OptimalOptions(**chosen))
     times: list[float] = []
     durations: list[float] = []
     for request in (warm, *goals):
@@ -110,6 +120,8 @@ def measure(
 
 
 if __name__ == "__main__":
-    urdf_of, name, number, first, more, result = sys.argv[1:]
-    found = measure(Path(urdf_of), CASES[name], int(number), int(first), json.loads(more))
+    urdf_of, name, number, first, more, others, result = sys.argv[1:]
+    found = measure(
+        Path(urdf_of), CASES[name], int(number), int(first), json.loads(more), int(others)
+    )
     Path(result).write_text(json.dumps(found), encoding="utf-8")

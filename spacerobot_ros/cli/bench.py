@@ -51,6 +51,12 @@ from spacerobot_ros.cli.options import PATH, json_option, write_json
     metavar="N",
     help="... and compare the durations with those of a search from N guesses.",
 )
+@click.option(
+    "--library",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="... and plan them with a library of the manoeuvres to N other goals, too.",
+)
 @json_option("Write the figures.")
 @click.option(
     "--against",
@@ -72,6 +78,7 @@ def command(
     soak: float | None,
     goals: int | None,
     starts: int | None,
+    library: int | None,
     json_file: Path | None,
     against: Path | None,
     rounds: int,
@@ -94,7 +101,7 @@ def command(
     if goals is not None:
         from spacerobot_ros.benchmarks.planning import run_planning_benchmark
 
-        figures = run_planning_benchmark(goals, against, starts, click.echo)
+        figures = run_planning_benchmark(goals, against, starts, library, click.echo)
     elif against is not None:
         from spacerobot_ros.benchmarks.against import compare_checkouts
 

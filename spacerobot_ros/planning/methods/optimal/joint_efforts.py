@@ -19,6 +19,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
+    TOLERANCE,
     DurationBounds,
     MultipleShooting,
     StopRule,
@@ -142,6 +143,8 @@ class EffortLimitedShooting(MultipleShooting):
         The number of intervals N.
     efforts
         The limits.
+    tolerance
+        That of :class:`MultipleShooting`.
     """
 
     def __init__(
@@ -149,9 +152,10 @@ class EffortLimitedShooting(MultipleShooting):
         stages: Callable[[Sequence[PathInequality]], Stages],
         intervals: int,
         efforts: JointEfforts,
+        tolerance: float = TOLERANCE,
     ) -> None:
-        super().__init__(stages(()), intervals)
-        self._stages, self._efforts = stages, efforts
+        super().__init__(stages(()), intervals, tolerance)
+        self._stages, self._efforts, self._tolerance = stages, efforts, tolerance
         self._limited: MultipleShooting | None = None
         self._last: MultipleShooting | None = None
 
@@ -183,6 +187,6 @@ class EffortLimitedShooting(MultipleShooting):
             guess = solution if duration.fixed else self._efforts.slowed(solution)
         if self._limited is None:
             stages = self._stages((self._efforts.inequality,))
-            self._limited = MultipleShooting(stages, self.intervals)
+            self._limited = MultipleShooting(stages, self.intervals, self._tolerance)
         self._last = self._limited
         return self._limited.solve(boundary, limits, guess, stop, duration)

@@ -22,6 +22,9 @@ from spacerobot_ros.planning.methods.optimal.transcription import Layout, Stages
 _FEASIBLE = 1e-4
 """Violation of the constraints below which an iterate counts as a trajectory, SI units."""
 
+TOLERANCE = 1e-5
+"""Durations within a thousandth of a control period, for manoeuvres of some seconds."""
+
 _OPTIONS = {
     "print_time": False,
     # Compiled functions have no derivatives beyond those that they are.
@@ -31,7 +34,6 @@ _OPTIONS = {
     "ipopt.sb": "yes",
     "ipopt.linear_solver": "mumps",
     "ipopt.mu_strategy": "monotone",
-    "ipopt.tol": 1e-4,
     "ipopt.constr_viol_tol": 1e-6,
 }
 
@@ -82,9 +84,11 @@ class MultipleShooting:
     ----------
     stages, intervals
         The functions of the problem, and the number of intervals N.
+    tolerance
+        Of the optimality conditions, where the solver ends.
     """
 
-    def __init__(self, stages: Stages, intervals: int) -> None:
+    def __init__(self, stages: Stages, intervals: int, tolerance: float = TOLERANCE) -> None:
         self.intervals = intervals
         self.turn = stages.turn
         self._program = program(stages, intervals)
@@ -97,6 +101,7 @@ class MultipleShooting:
             self._program.problem,
             {
                 **_OPTIONS,
+                "ipopt.tol": tolerance,
                 "jac_g": self._program.jac_g,
                 "hess_lag": self._program.hess_lag,
                 "iteration_callback": self._watch,

@@ -30,6 +30,7 @@ from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuess
 from spacerobot_ros.planning.methods.optimal.joint_efforts import EffortLimitedShooting
 from spacerobot_ros.planning.methods.optimal.library import SolutionLibrary
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
+    TOLERANCE,
     DurationBounds,
     MultipleShooting,
     StopRule,
@@ -63,6 +64,9 @@ fast as the limits allow."""
 _COARSER = 5
 """The coarse grid has so many times fewer intervals than the full one ..."""
 
+_COARSE_TOLERANCE = 1e-4
+"""The error of the coarse grid is larger than what a smaller tolerance would improve."""
+
 _FEWEST_INTERVALS = 8
 """... and at least so many; otherwise there is no coarse grid."""
 
@@ -75,6 +79,10 @@ grid overrates some solutions by more than others."""
 
 _SAME = 1e-3
 """Solutions whose costs are this near, relative, are taken for one."""
+
+_AGREEING = 3e-3
+"""Solutions whose costs are this near, relative, agree: the coarse grid and the tolerance of the
+solver leave as much between them."""
 
 _AGREEING_WITH_LIBRARY = 2
 """Solutions that are the best one and enough, where a library has the first guesses."""
@@ -200,7 +208,7 @@ class _Progress:
         if self.library is not None:
             # What was found for goals nearby has been agreed upon before.
             agreeing = min(agreeing, _AGREEING_WITH_LIBRARY)
-        same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _SAME)))
+        same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _AGREEING)))
         return 0 < agreeing <= same
 
     def cost(self, trajectory: Trajectory) -> float:
@@ -229,7 +237,7 @@ class ManoeuvreSearch:
         self._constraints, self._efforts = model.constraints, model.efforts
         self._holder = CommandHolder(model)
         self._stages: dict[tuple[bool, bool], Stages] = {}
-        self._solvers: dict[tuple[int, bool], MultipleShooting] = {}
+        self._solvers: dict[tuple[int, bool, float], MultipleShooting] = {}
 
     def search(
         self,
@@ -265,7 +273,7 @@ class ManoeuvreSearch:
         found: list[Manoeuvre] = []
         # A single answer is had at less cost without a detour.
         if budget.solutions > 1 and coarser >= _FEWEST_INTERVALS:
-            coarse = self.solver(coarser, boundary.center is not None)
+            coarse = self.solver(coarser, boundary.center is not None, _COARSE_TOLERANCE)
             found = self._manoeuvres(progress, coarse, full, budget.starts)
             if not found and not progress.cut_short(found=False):
                 found = self._manoeuvres(progress, full, full, min(budget.starts, _FULL_STARTS))
@@ -356,15 +364,17 @@ class ManoeuvreSearch:
         curvature = self._robot.function("curvature", compile=False)
         return InitialGuesses(solver.turn, curvature, intervals)
 
-    def solver(self, intervals: int, position: bool) -> MultipleShooting:
+    def solver(
+        self, intervals: int, position: bool, tolerance: float = TOLERANCE
+    ) -> MultipleShooting:
         """Return what solves the problem on so many intervals, with or without a position."""
-        key = intervals, position
+        key = intervals, position, tolerance
         if key not in self._solvers:
             of = partial(self._stages_of, position)
             self._solvers[key] = (
-                MultipleShooting(of(), intervals)
+                MultipleShooting(of(), intervals, tolerance)
                 if self._efforts is None
-                else EffortLimitedShooting(of, intervals, self._efforts)
+                else EffortLimitedShooting(of, intervals, self._efforts, tolerance)
             )
         return self._solvers[key]
 
