@@ -46,6 +46,9 @@ MESHES = ["pycollada", "trimesh"]
 # Tables for pandas and xarray, and in Parquet.
 DATA = ["pandas>=2.1", "pyarrow", "xarray"]
 
+# The live page.
+VIEWER = ["viser>=1.1"]
+
 setup(
     name=NAME,
     version=VERSION,
@@ -97,7 +100,7 @@ setup(
             "ros-jazzy-rclpy[fastrtps]",
         ],
         # The 3D view of reports is MeshCat's. Only its script is used, but the package brings much.
-        "viewer": ["meshcat", *MESHES],
+        "viewer": ["meshcat", *MESHES, *VIEWER],
         "data": DATA,
         "docs": DOCS,
         "test": [
@@ -108,6 +111,8 @@ setup(
             "mcap-ros2-support",
             "meshcat",
             *MESHES,
+            *VIEWER,
+            *VIEWER,
             'mujoco>=4; python_version >= "3.11"',
             "mypy",
             "pin",

@@ -337,6 +337,22 @@ _TABLE = (
         latched=True,
     ),
     Topic(
+        "replay/status",
+        _STATUS,
+        ("replay",),
+        "where a replay is: `state` is playing, paused or ended, `position_s` and `duration_s` "
+        "from its beginning, `rate`; on every change, and five times a second",
+        when="a bag is replayed",
+        latched=True,
+    ),
+    Topic(
+        "replay/seek",
+        "std_msgs/msg/Float64",
+        _USER,
+        "where a replay is to go on, s from its beginning",
+        when="a bag is replayed",
+    ),
+    Topic(
         "events",
         _STATUS,
         ("plant", "planner", "coordinated_control", "recorder", "replay"),

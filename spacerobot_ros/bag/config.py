@@ -65,4 +65,7 @@ class ReplayConfig:
         maximum=10000.0,
     )
     paused: bool = parameter(False, "begin paused")
+    hold: bool = parameter(
+        False, "stand still at the end, for a viewer that goes back in time, instead of ending"
+    )
     wait: float = parameter(3.0, "longest wall time to wait for readers", unit="s", minimum=0.0)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Generator, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from spacerobot_ros.bag.reader import Bag
 from spacerobot_ros.bag.rosbag2 import QosProfile
-from spacerobot_ros.errors import ParameterError, RecordingError
+from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 
 _SECOND = 10**9
 _END_OF_TIME = 2**63 - 1
+_RECENT_NS = _SECOND
+"""How old a message may be that is shown again after a jump."""
+
 _MOST_TOPICS = 1000
 """Each takes a publisher, which takes memory and discovery."""
 
@@ -28,6 +31,53 @@ class ReplayTopic:
     def latched(self) -> bool:
         """Whether a late subscriber gets the last message."""
         return self.qos.durability == "transient_local"
+
+
+@dataclass(frozen=True)
+class ReplayStatus:
+    """Where a replay is, as replay/status carries it.
+
+    Attributes
+    ----------
+    position_s, duration_s
+        Time since the first message that is replayed, and from there to the last, s.
+    paused, ended
+        Whether it stands still, and whether nothing is left.
+    rate
+        Seconds of the bag in a second of the wall clock.
+    """
+
+    position_s: float
+    duration_s: float
+    paused: bool
+    ended: bool
+    rate: float
+
+    def to_values(self) -> dict[str, str]:
+        """Return the status as the key-value pairs of a DiagnosticStatus."""
+        return {
+            "state": "ended" if self.ended else "paused" if self.paused else "playing",
+            "position_s": f"{self.position_s:.9f}",
+            "duration_s": f"{self.duration_s:.9f}",
+            "rate": f"{self.rate:.9g}",
+        }
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, str]) -> ReplayStatus:
+        """Return the status that :meth:`to_values` has turned into these pairs.
+
+        Raises
+        ------
+        SpaceRobotError
+            They are no status of a replay.
+        """
+        try:
+            state = values["state"]
+            position, duration = float(values["position_s"]), float(values["duration_s"])
+            rate = float(values["rate"])
+        except (KeyError, ValueError) as error:
+            raise SpaceRobotError(f"This is no status of a replay: {error}.") from error
+        return cls(position, duration, state != "playing", state == "ended", rate)
 
 
 @dataclass(frozen=True)
@@ -188,12 +238,13 @@ class Playback:
         self._start_ns = min(bag.start_time_ns + round(start * _SECOND), _END_OF_TIME)
         end_ns = self._start_ns + round(duration * _SECOND) if duration else _END_OF_TIME
         self._end_ns = min(end_ns, _END_OF_TIME)
+        self._last_ns = max(min(bag.end_time_ns, self._end_ns), self._start_ns)
         self.topics = [_topic(bag, name) for name in topics or bag.topics]
         self._names = {
             number: topic.name for topic in self.topics for number in bag.channel_ids(topic.name)
         }
         self._timeline = Timeline(rate, self._start_ns)
-        self._turn = self._messages()
+        self._turn = self._messages(self._start_ns)
         self._next = next(self._turn, None)
         if self._next is None:
             raise RecordingError(
@@ -254,6 +305,40 @@ class Playback:
         self._timeline.seek(max(self._next.log_time_ns, self._start_ns), clock_ns)
         return self._take()
 
+    def seek(self, bag_ns: int, clock_ns: int) -> list[ReplayMessage]:
+        """Be at ``bag_ns`` in the bag, or at its nearer end, running or not as before.
+
+        Returns what a subscriber would have by then: of each topic the last message, if that is
+        latched or no older than a second.
+
+        Raises
+        ------
+        RecordingError
+            The bag turns out damaged.
+        """
+        at = min(max(bag_ns, self._start_ns), self._last_ns)
+        recent = max(at - _RECENT_NS, self._start_ns)
+        last = {message.topic: message for message in self._latched_before(at)}
+        for message in self._between(set(self._names), recent, at - 1):
+            last[message.topic] = message
+        self._turn.close()
+        self._turn = self._between(set(self._names), at, self._end_ns)
+        self._timeline.seek(at, clock_ns)
+        self._next = next(self._turn, None)
+        # In the order in which they were published, and no later than what comes next.
+        ordered = sorted(last.values(), key=lambda message: message.log_time_ns)
+        return [replace(message, log_time_ns=at) for message in ordered]
+
+    @property
+    def start_ns(self) -> int:
+        """Where the replay begins, ns."""
+        return self._start_ns
+
+    @property
+    def duration_s(self) -> float:
+        """From there to the last message, s."""
+        return (self._last_ns - self._start_ns) / _SECOND
+
     def close(self) -> None:
         """Close the bag; nothing is left to play."""
         self._turn.close()
@@ -267,27 +352,31 @@ class Playback:
             # The next turn begins at the very time of the last message.
             last = max(message.log_time_ns, self._start_ns)
             self._timeline.seek(self._start_ns, self._timeline.clock_time(last))
-            self._turn = self._messages()
+            self._turn = self._messages(self._start_ns)
             self._next = next(self._turn, None)
         return message
 
-    def _messages(self) -> Generator[ReplayMessage, None, None]:
+    def _messages(self, start_ns: int) -> Generator[ReplayMessage, None, None]:
         earlier: dict[str, ReplayMessage] = {}
-        latched = {n for t in self.topics if t.latched for n in self._bag.channel_ids(t.name)}
-        if latched and self._start_ns > self._bag.start_time_ns:
-            for message in self._between(latched, 0, self._start_ns - 1):
-                earlier[message.topic] = message
-        in_time = self._between(set(self._names), self._start_ns, self._end_ns)
+        for message in self._latched_before(start_ns):
+            earlier[message.topic] = message
+        in_time = self._between(set(self._names), start_ns, self._end_ns)
         first = next(in_time, None)
         if first is None:
             return
-        yield from (replace(m, log_time_ns=self._start_ns) for m in earlier.values())
+        yield from (replace(m, log_time_ns=start_ns) for m in earlier.values())
         yield first
         yield from in_time
 
+    def _latched_before(self, time_ns: int) -> Iterator[ReplayMessage]:
+        """Yield the messages of latched topics before a time; the last of each is what counts."""
+        latched = {n for t in self.topics if t.latched for n in self._bag.channel_ids(t.name)}
+        if latched and time_ns > self._bag.start_time_ns:
+            yield from self._between(latched, 0, time_ns - 1)
+
     def _between(
         self, channel_ids: set[int], start_ns: int, end_ns: int
-    ) -> Iterator[ReplayMessage]:
+    ) -> Generator[ReplayMessage, None, None]:
         found = self._bag.raw_messages(channel_ids, start_ns, end_ns)
         for channel_id, log_time_ns, _, data in found:
             yield ReplayMessage(self._names[channel_id], log_time_ns, data)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, wraps
 from importlib import import_module
@@ -116,6 +117,23 @@ class Registered(_Choice):
 
 
 METHODS = "spacerobot_ros.planning.methods.registry:METHODS"
+view_option = click.option(
+    "--view", is_flag=True, help="Serve a page that shows the robot and steers it."
+)
+
+
+@contextmanager
+def viewing_if(view: bool, parameters: Mapping[str, Any]) -> Iterator[None]:
+    """Have the viewer run beside a command, if that is wanted; it says on stderr where it is."""
+    if not view:
+        yield
+        return
+    from spacerobot_ros.session.viewing import viewing
+
+    with viewing(parameters, lambda line: click.echo(line, err=True)):
+        yield
+
+
 LAWS = "spacerobot_ros.control.laws.registry:LAWS"
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from spacerobot_ros.cli.options import bag_argument
+from spacerobot_ros.cli.options import bag_argument, view_option, viewing_if
 
 
 @click.command("replay")
@@ -33,6 +33,7 @@ from spacerobot_ros.cli.options import bag_argument
     help="Publish bag time on /clock, 100 times a second unless told [what the bag has].",
 )
 @click.option("--paused", is_flag=True, help="Begin paused; see the services of the node.")
+@view_option
 @click.option("--wait", default=3.0, show_default=True, help="Longest wait for readers (s).")
 def command(
     bag: Path,
@@ -45,10 +46,12 @@ def command(
     clock: float,
     paused: bool,
     wait: float,
+    view: bool,
 ) -> None:
     """Publish what a BAG holds on its topics, in the rhythm in which it was recorded.
 
-    While it lasts, its services /replay/pause, /replay/resume and /replay/step steer it.
+    While it lasts, its services /replay/pause, /replay/resume and /replay/step steer it. With
+    --view it stands still at the end, until Ctrl-C, and can be played again.
     """
     values: dict[str, Any] = {
         "bag": str(bag),
@@ -61,6 +64,7 @@ def command(
         "clock": clock,
         "paused": paused,
         "wait": wait,
+        "hold": view,
     }
     from rclpy.parameter import Parameter
 
@@ -68,4 +72,6 @@ def command(
     from spacerobot_ros.nodes.common.process import run_node
 
     given = [Parameter(name, value=value) for name, value in values.items()]
-    sys.exit(run_node(lambda: ReplayNode(parameter_overrides=given), []))
+    with viewing_if(view, {}):
+        code = run_node(lambda: ReplayNode(parameter_overrides=given), [])
+    sys.exit(code)

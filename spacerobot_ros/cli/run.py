@@ -22,6 +22,8 @@ from spacerobot_ros.cli.options import (
     json_option,
     numbers,
     settings_option,
+    view_option,
+    viewing_if,
     write_json,
 )
 
@@ -46,6 +48,7 @@ if TYPE_CHECKING:
     help="Run on the wall clock, FACTOR times as fast.",
 )
 @click.option("--processes", is_flag=True, help="Give each node a process of its own.")
+@view_option
 def command(
     scenario: str,
     goal: GoalOptions,
@@ -56,6 +59,7 @@ def command(
     report: Path | None,
     realtime: float | None,
     processes: bool,
+    view: bool,
 ) -> None:
     """Fly SCENARIO (a name or a parameter file), or a ROBOT (a name or a URDF file), to its goal.
 
@@ -67,8 +71,10 @@ def command(
     from spacerobot_ros.bag import free_name
     from spacerobot_ros.session.run import run_scenario
 
+    if view and realtime is None:
+        raise click.UsageError("--view needs --realtime: what is flown in lockstep is over soon.")
     path = bag or free_name(Path("out") / f"{chosen.name}.mcap")
-    with _progress(chosen.name) as progress:
+    with viewing_if(view, chosen.parameters("viewer")), _progress(chosen.name) as progress:
         result = run_scenario(chosen, path, progress, processes=processes)
     path = Path(result.summary["bag"])
     if json_file is not None:

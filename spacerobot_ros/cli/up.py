@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from spacerobot_ros.cli.options import PATH, settings_option
+from spacerobot_ros.cli.options import PATH, settings_option, view_option, viewing_if
 
 
 @click.command("up")
@@ -21,8 +21,14 @@ from spacerobot_ros.cli.options import PATH, settings_option
     help="Simulated over wall time.",
 )
 @click.option("--processes", is_flag=True, help="Give each node a process of its own.")
+@view_option
 def command(
-    scenario: str, settings: tuple[str, ...], bag: Path | None, rate: float, processes: bool
+    scenario: str,
+    settings: tuple[str, ...],
+    bag: Path | None,
+    rate: float,
+    processes: bool,
+    view: bool,
 ) -> None:
     """Run the nodes of SCENARIO, or of a ROBOT (a name or a URDF file), in real time.
 
@@ -33,6 +39,7 @@ def command(
     chosen = scenario_or_robot(scenario).in_real_time(rate).with_settings(settings)
     from spacerobot_ros.session.live import keep_up
 
-    recorded = keep_up(chosen, bag, click.echo, processes=processes)
+    with viewing_if(view, chosen.parameters("viewer")):
+        recorded = keep_up(chosen, bag, click.echo, processes=processes)
     if recorded is not None:
         click.echo(f"bag         {recorded}")

@@ -35,12 +35,14 @@ from spacerobot_ros.resources import (
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.trials import Problem
+from spacerobot_ros.viewer.config import ViewerConfig
 
 CONFIGS: Mapping[str, type[Any]] = {
     "plant": PlantConfig,
     "planner": PlannerConfig,
     "coordinated_control": ControllerConfig,
     "recorder": RecorderConfig,
+    "viewer": ViewerConfig,
 }
 """The nodes that a scenario may set parameters of, and what declares these parameters."""
 

@@ -6,12 +6,14 @@ from spacerobot_ros.nodes.planner.node import PlannerNode
 from spacerobot_ros.nodes.plant.node import PlantNode
 from spacerobot_ros.nodes.recorder import RecorderNode
 from spacerobot_ros.nodes.replay import ReplayNode
+from spacerobot_ros.nodes.viewer.node import ViewerNode
 
 NODE_TYPES: dict[str, type[FlightNode]] = {
     "plant": PlantNode,
     "planner": PlannerNode,
     "coordinated_control": CoordinatedControlNode,
     "recorder": RecorderNode,
+    "viewer": ViewerNode,
 }
 """The nodes of a stack by their names in parameter files."""
 
@@ -23,4 +25,5 @@ __all__ = [
     "PlantNode",
     "RecorderNode",
     "ReplayNode",
+    "ViewerNode",
 ]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from typing import Any, ClassVar
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidTopicNameException
@@ -13,15 +15,16 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
+from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.bag import Playback, QosProfile, ReplayMessage, read_bag
 from spacerobot_ros.bag.config import ReplayConfig
-from spacerobot_ros.bag.playback import ReaderWait, renamed
+from spacerobot_ros.bag.playback import ReaderWait, ReplayStatus, renamed
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS, raw_publish
-from spacerobot_ros.nodes.common.messages import message_class
-from spacerobot_ros.nodes.common.node import STREAM, FlightNode
+from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.transforms import TRANSFORM_TYPE
 from spacerobot_ros.nodes.common.watchdog import Role
@@ -45,6 +48,11 @@ _DEEPEST_QUEUE = 10_000
 """The middleware takes memory for queues: what a bag says may be anything."""
 
 _CLOCK = "/clock"
+_STATUS, _SEEK = "replay/status", "replay/seek"
+
+_STATUS_PERIOD = 0.2
+"""Wall s between two statuses."""
+
 _BAD_BAG = 2
 
 
@@ -53,7 +61,8 @@ class ReplayNode(FlightNode):
 
     It waits for readers to be matched, keeps the spacing of the log times divided by ``rate``, and
     has its process end with the bag. Services: ``~/pause`` (SetBool), ``~/resume`` and, while
-    paused, ``~/step`` (Trigger): the next message.
+    paused, ``~/step`` (Trigger): the next message. A time on ``replay/seek`` is where it goes on,
+    and ``replay/status`` says where it is.
     """
 
     Config: ClassVar = ReplayConfig
@@ -92,6 +101,8 @@ class ReplayNode(FlightNode):
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/resume", self._on_resume)
         self.create_service(Trigger, "~/step", self._on_step)
+        self._status_topic = self.create_publisher(DiagnosticStatus, _STATUS, LATCHED)
+        self.create_subscription(Float64, _SEEK, self._on_seek, STREAM)
 
     def activate(self) -> None:
         """Wait for readers, then go on from where the replay is."""
@@ -102,7 +113,8 @@ class ReplayNode(FlightNode):
         self._timer = self.create_timer(1.0, self._play, clock=self._steady)
         self._timer.cancel()
         self._waiting = self.create_timer(_READER_CHECK, self._on_reader_check, clock=self._steady)
-        self._timers = [self._timer, self._waiting]
+        reports = self.create_timer(_STATUS_PERIOD, self._publish_status, clock=self._steady)
+        self._timers = [self._timer, self._waiting, reports]
         rate = self.config.clock
         if rate:
             self._timers.append(self.create_timer(1.0 / rate, self._on_clock, clock=self._steady))
@@ -133,9 +145,12 @@ class ReplayNode(FlightNode):
         if own_clock:
             self._clock_publisher = self.create_publisher(ClockMessage, _CLOCK, STREAM)
             self._last_clock = -1
+        own = {self.resolve_topic_name(name) for name in (_STATUS, _SEEK)}
         for topic in self._playback.topics:
             if own_clock and topic.name == _CLOCK:
                 continue
+            if topic.name in own:
+                continue  # Of a replay that was recorded; this one has its own.
             name = new_names.get(topic.name, topic.name)
             try:
                 publisher = self.create_publisher(
@@ -191,12 +206,15 @@ class ReplayNode(FlightNode):
             for message in self._playback.due(self._now(), _BURST):
                 self._send(message)
         except RecordingError as error:
-            self._timer.cancel()
-            self.get_logger().error(f"The replay has ended: {error}")
-            self.on_end(_BAD_BAG)
+            self._end_with(error)
             return
         self._set_timer()
         self._end_if_done()
+
+    def _end_with(self, error: RecordingError) -> None:
+        self._timer.cancel()
+        self.get_logger().error(f"The replay has ended: {error}")
+        self.on_end(_BAD_BAG)
 
     def _send(self, message: ReplayMessage) -> None:
         """Publish one message.
@@ -235,6 +253,11 @@ class ReplayNode(FlightNode):
         if not self._playback.ended:
             return
         self._timer.cancel()
+        if self.config.hold:
+            self._paused = True
+            self._playback.pause(self._now())
+            self._publish_status()
+            return
         for publisher in self._outputs:
             publisher.wait_for_all_acked(_ACKNOWLEDGED)
         self.get_logger().info(f"The replay has ended: {self.messages_replayed} messages.")
@@ -248,8 +271,11 @@ class ReplayNode(FlightNode):
             if paused:
                 self._playback.pause(self._now())
             else:
+                if self._playback.ended:
+                    self._seek(self._playback.start_ns)
                 self._playback.run(self._now())
             self._set_timer()
+        self._publish_status()
         return "paused" if paused else "running"
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
@@ -259,6 +285,39 @@ class ReplayNode(FlightNode):
     def _on_resume(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success, response.message = True, self._set_paused(False)
         return response
+
+    def _on_seek(self, message: Float64) -> None:
+        if not math.isfinite(message.data):
+            self.get_logger().warning(f"A replay cannot go to {message.data} s.")
+            return
+        if not self._begun:
+            return
+        offset = min(max(message.data, 0.0), self._playback.duration_s)
+        self._seek(self._playback.start_ns + round(offset * NANOSECONDS))
+        self._set_timer()
+        self._publish_status()
+
+    def _seek(self, bag_ns: int) -> None:
+        try:
+            for message in self._playback.seek(bag_ns, self._now()):
+                self._send(message)
+        except RecordingError as error:
+            self._end_with(error)
+
+    def _publish_status(self) -> None:
+        """Say where the replay is."""
+        playback = self._playback
+        position = playback.bag_time(self._now()) - playback.start_ns
+        status = ReplayStatus(
+            position_s=min(max(position / NANOSECONDS, 0.0), playback.duration_s),
+            duration_s=playback.duration_s,
+            paused=self._paused or not self._begun,
+            ended=playback.ended,
+            rate=self.config.rate,
+        )
+        sentence = f"The replay is at {status.position_s:.3f} s of {status.duration_s:.3f} s."
+        name = self.get_fully_qualified_name()
+        self._status_topic.publish(diagnostic_status(name, b"\0", sentence, status.to_values()))
 
     def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if not (self._paused and self._begun):

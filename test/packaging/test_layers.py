@@ -26,6 +26,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("flight",),  # above the bag and the plant, beside no ROS
         ("verification",),
         ("batch",),
+        ("viewer",),
         ("bag", "simulation"),
         ("control",),  # above planning, whose goals it takes
         ("planning",),
@@ -36,7 +37,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     f"{PACKAGE}.nodes": (
         ("__init__",),
-        ("plant", "planner", "controller", "recorder", "replay"),
+        ("plant", "planner", "controller", "recorder", "replay", "viewer"),
         ("common",),
     ),
     f"{PACKAGE}.planning": (
@@ -143,7 +144,7 @@ def test_everything_that_is_imported_is_known_to_these_tests() -> None:
     needed = {
         *("ament_index_python", "casadi", "click", "lz4", "matplotlib", "mcap", "meshcat"),
         *("mujoco", "numpy", "pandas", "rosbags", "rosidl_parser", "rpyutils", "scipy"),
-        *("urdf_parser_py", "xacro", "xarray", "yaml", "zstandard"),
+        *("urdf_parser_py", "viser", "websockets", "xacro", "xarray", "yaml", "zstandard"),
         *("collada", "trimesh"),
     }
     others = {name.split(".")[0] for module in sources() for name in imports(module)} - known

@@ -41,11 +41,15 @@ os.execv(sys.argv[3], sys.argv[3:])
 
 
 class Browser:
-    """One page; what it complains of is in ``complaints``, what it asked for in ``requests``."""
+    """One page; what it complains of is in ``complaints``, what it asked for in ``requests``.
+
+    ``frames`` counts what has come through websockets, as far as the browser was listened to.
+    """
 
     def __init__(self, program: str, profile: Path, *options: str) -> None:
         self.complaints: list[str] = []
         self.requests: list[str] = []
+        self.frames = 0
         self._number = 0
         self._unread = b""
         self._answers: dict[int, Any] = {}
@@ -116,9 +120,13 @@ class Browser:
 
     def open(self, page: Path, width: int = 1000, height: int = 800) -> None:
         """Open a file in a window of a size."""
+        self.visit(page.resolve().as_uri(), width, height)
+
+    def visit(self, url: str, width: int = 1000, height: int = 800) -> None:
+        """Open an address in a window of a size."""
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
         self.call("Emulation.setDeviceMetricsOverride", **size)
-        self.call("Page.navigate", url=page.resolve().as_uri())
+        self.call("Page.navigate", url=url)
         self.wait_for("document.readyState === 'complete'")
 
     def evaluate(self, expression: str) -> Any:
@@ -134,6 +142,15 @@ class Browser:
         end = time.monotonic() + _PATIENCE
         while not self.evaluate(condition):
             assert time.monotonic() < end, f"never true: {condition}"
+
+    def mouse(self, kind: str, x: float, y: float, *, held: bool = False) -> None:
+        """Move, press or release the left button: ``mouseMoved``, ``mousePressed``, ..."""
+        buttons = {"button": "left", "buttons": 1, "clickCount": 1} if held else {}
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **buttons)
+
+    def screenshot(self) -> bytes:
+        """Return the window as a PNG file."""
+        return base64.b64decode(self.call("Page.captureScreenshot")["data"])
 
     def picture(self, selector: str | None = None) -> npt.NDArray[np.float32]:
         """Return what is to be seen of an element, or of the whole page, as pixels (h, w, 3)."""
@@ -169,6 +186,10 @@ class Browser:
             self.complaints.append(str(details["entry"]))
         elif kind == "Network.requestWillBeSent":
             self.requests.append(details["request"]["url"].partition(",")[0])
+        elif kind == "Network.webSocketCreated":
+            self.requests.append(details["url"])
+        elif kind == "Network.webSocketFrameReceived":
+            self.frames += 1
 
 
 @contextmanager

@@ -33,6 +33,7 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.viewer.config import ViewerConfig
 
 FOLDER = Path(__file__).parents[1] / "expected"
 PARAMETERS, PLANS = FOLDER / "parameters.json", FOLDER / "plans.json"
@@ -43,6 +44,7 @@ _CONFIGURATIONS = {
     "coordinated_control": ControllerConfig,
     "recorder": RecorderConfig,
     "replay": ReplayConfig,
+    "viewer": ViewerConfig,
 }
 
 ARM, SERVICER = (0.0, -0.8, 1.5), (0.0, -1.2, 2.0, 0.0, 0.8, 0.0)

@@ -1,0 +1,275 @@
+"""What a viewer knows of the stack: topics in, one state of everything out.
+
+The plant publishes its state hundreds or thousands of times a second, and a page is drawn twenty
+times. So streams are subscribed by a node that nobody spins: the middleware keeps the last message
+of each, and only that one is taken and read, when the page is drawn. Readers that confirm nothing
+hold nobody up.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import Pose, PoseStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from spacerobot_ros.bag.playback import ReplayStatus
+from spacerobot_ros.control.status import ControllerStatus
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.nodes.common.cdr import NANOSECONDS
+from spacerobot_ros.nodes.common.messages import goal_of
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM
+from spacerobot_ros.nodes.common.watchdog import Pulse
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.simulation.status import PlantStatus
+from spacerobot_ros.viewer.port import Firing, Measured, Momenta, Part, StackState
+
+LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""The last message alone; no publisher waits for its confirmation."""
+
+_SILENT_AFTER = 1.5
+"""Wall s without a heartbeat after which a node that was active is silent."""
+
+_FORGOTTEN_AFTER = 60.0
+"""Wall s after which nothing more is said of it."""
+
+_MOST_POINTS = 1000
+"""Of a planned path."""
+
+M = TypeVar("M")
+
+
+class Latest(Generic[M]):
+    """The last message of a topic, read when it is asked for.
+
+    Parameters
+    ----------
+    node
+        Subscribes; nobody spins it.
+    kind, topic
+        Of the messages.
+    """
+
+    def __init__(self, node: Node, kind: type[M], topic: str) -> None:
+        self._kind = kind
+        self._subscription = node.create_subscription(
+            kind, topic, lambda raw: None, LATEST, raw=True
+        )
+
+    def take(self) -> M | None:
+        """Return the message that has come since the last time, None if none has."""
+        handle = self._subscription.handle
+        with handle:
+            taken = handle.take_message(self._kind, True)
+        if taken is None:
+            return None
+        try:
+            message: M = deserialize_message(taken[0], self._kind)
+        except RuntimeError:
+            return None  # No message of that type; what it was, its readers have to say.
+        return message
+
+
+class Listener:
+    """Keeps what is known of the stack.
+
+    Parameters
+    ----------
+    streams
+        A node that nobody spins.
+    node
+        The viewer's own, whose callbacks take what must not be missed.
+    frame
+        In which goals are.
+    on_status
+        Called with ``plant``, ``planner``, ``controller`` or ``replay`` and the full name of the
+        node that has reported, for every status.
+    """
+
+    def __init__(
+        self, streams: Node, node: Node, frame: str, on_status: Callable[[str, str], None]
+    ) -> None:
+        self._frame, self._on_status = frame, on_status
+        self._odom = Latest(streams, Odometry, "odom")
+        self._joints = Latest(streams, JointState, "joint_states")
+        self._tool = Latest(streams, PoseStamped, "end_effector_pose")
+        self._momentum = Latest(streams, Float64MultiArray, "momentum")
+        self._expected = Latest(streams, Float64MultiArray, "momentum_expected")
+        self._thrusters = Latest(streams, JointState, "thrusters")
+        self._names: Sequence[str] = ()
+        self._beats: dict[str, tuple[float, str]] = {}
+        self._statuses: dict[str, Any] = {}
+        self._planned: Array | None = None
+        self._goals: dict[Part, Goal] = {}
+        self.forget_state()
+        for topic, key, read in (
+            ("plant/status", "plant", PlantStatus.from_values),
+            ("planner/status", "planner", PlannerStatus.from_values),
+            ("controller/status", "controller", ControllerStatus.from_values),
+            ("replay/status", "replay", lambda values, _: ReplayStatus.from_values(values)),
+        ):
+            node.create_subscription(
+                DiagnosticStatus, topic, self._status_taker(key, read), LATCHED
+            )
+        node.create_subscription(Path, "planned_path", self._on_path, LATCHED)
+        node.create_subscription(DiagnosticStatus, "heartbeat", self._on_heartbeat, STREAM)
+        parts: dict[str, Part] = {"goal_pose": "base", "end_effector/goal_pose": "end_effector"}
+        for topic, part in parts.items():
+            node.create_subscription(
+                PoseStamped, topic, lambda message, part=part: self._on_goal(part, message), STREAM
+            )
+
+    def forget_state(self) -> None:
+        """Wait for a state of another robot."""
+        self._pose: Array | None = None
+        self._stamp_s, self._came_at = 0.0, -math.inf
+        self._q: tuple[Array, Array, Array] | None = None
+        self._measured: Measured | None = None
+        self._tool_pose: Array | None = None
+        self._momenta: Momenta | None = None
+        self._expected_now: Array | None = None
+        self._firing: Firing | None = None
+
+    def use(self, robot: RobotDescription) -> None:
+        """Read the joints of a robot."""
+        self._names = robot.joint_names
+        self.forget_state()
+
+    def state(self) -> StackState:
+        """Take what has come, and return what is known now."""
+        now = time.monotonic()
+        self._take_streams(now)
+        statuses = self._statuses
+        return StackState(
+            measured=self._measured,
+            tool=self._tool_pose,
+            age_s=now - self._came_at,
+            momenta=self._momenta,
+            firing=self._firing,
+            plant=statuses.get("plant"),
+            planner=statuses.get("planner"),
+            controller=statuses.get("controller"),
+            replay=statuses.get("replay"),
+            planned_path=self._planned,
+            goals=dict(self._goals),
+            silent=self._silent(now),
+        )
+
+    def time_ns(self) -> int:
+        """Return the simulated time of the last state, ns; the wall's before the first."""
+        if self._measured is None:
+            return time.time_ns()
+        return round(self._measured.time_s * NANOSECONDS)
+
+    # -- streams --------------------------------------------------------------------------------
+
+    def _take_streams(self, now: float) -> None:
+        odom, joints = self._odom.take(), self._joints.take()
+        if odom is not None:
+            pose = _pose_of(odom.pose.pose)
+            if pose is not None:
+                self._pose = pose
+        if joints is not None:
+            self._take_joints(joints)
+        if (odom is not None or joints is not None) and self._pose is not None and self._q:
+            self._came_at = now
+            self._measured = Measured(self._stamp_s, self._pose, *self._q)
+        tool, momentum, expected = self._tool.take(), self._momentum.take(), self._expected.take()
+        if tool is not None:
+            self._tool_pose = _pose_of(tool.pose)
+        if expected is not None and len(expected.data) >= 6:
+            self._expected_now = np.array(expected.data[:6])
+        if momentum is not None and len(momentum.data) >= 7:
+            numbers = np.array(momentum.data)
+            if np.all(np.isfinite(numbers)):
+                self._momenta = Momenta(numbers[:6], self._expected_now, float(numbers[6]))
+        thrusters = self._thrusters.take()
+        if thrusters is not None and len(thrusters.name) == len(thrusters.velocity):
+            self._firing = Firing(tuple(thrusters.name), np.array(thrusters.velocity))
+
+    def _take_joints(self, message: JointState) -> None:
+        places = {name: i for i, name in enumerate(message.name)}
+        if any(name not in places for name in self._names):
+            return  # Of another robot.
+        order = [places[name] for name in self._names]
+
+        def read(values: Any) -> Array:
+            numbers = np.array(values, float)
+            if len(numbers) != len(message.name):
+                return np.zeros(len(order))
+            return np.nan_to_num(numbers[order], nan=0.0, posinf=0.0, neginf=0.0)
+
+        if len(message.position) == len(message.name) and np.all(np.isfinite(message.position)):
+            self._q = read(message.position), read(message.velocity), read(message.effort)
+            self._stamp_s = _seconds(message.header.stamp)
+
+    # -- what must not be missed ----------------------------------------------------------------
+
+    def _status_taker(
+        self, key: str, read: Callable[[dict[str, str], str], Any]
+    ) -> Callable[[DiagnosticStatus], None]:
+        def take(message: DiagnosticStatus) -> None:
+            try:
+                values = {pair.key: pair.value for pair in message.values}
+                status = read(values, message.message)
+            except SpaceRobotError:
+                return  # Somebody else's; theirs is shown nowhere.
+            self._statuses[key] = status
+            if isinstance(status, PlannerStatus) and len(status.goal) == 7:
+                self._goals["base"] = Goal(np.array(status.goal[:3]), np.array(status.goal[3:]))
+            self._on_status(key, message.name)
+
+        return take
+
+    def _on_path(self, message: Path) -> None:
+        poses = message.poses
+        step = max(1, len(poses) // _MOST_POINTS)
+        kept = [*poses[:-1:step], *poses[-1:]]
+        points = [(p.pose.position.x, p.pose.position.y, p.pose.position.z) for p in kept]
+        path = np.array(points).reshape(-1, 3)
+        self._planned = path if np.all(np.isfinite(path)) else None
+
+    def _on_goal(self, part: Part, message: PoseStamped) -> None:
+        try:
+            self._goals[part] = goal_of(message, self._frame)
+        except SpaceRobotError:
+            self._goals.pop(part, None)  # What becomes of it, its commander says.
+
+    def _on_heartbeat(self, message: DiagnosticStatus) -> None:
+        self._beats[message.name] = time.monotonic(), message.message
+
+    def _silent(self, now: float) -> dict[str, float]:
+        self._beats = {
+            name: beat for name, beat in self._beats.items() if now - beat[0] < _FORGOTTEN_AFTER
+        }
+        return {
+            name: now - at
+            for name, (at, pulse) in self._beats.items()
+            if pulse == Pulse.ACTIVE.value and now - at > _SILENT_AFTER
+        }
+
+
+def _pose_of(pose: Pose) -> Array | None:
+    p, o = pose.position, pose.orientation
+    numbers = np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w])
+    length = float(np.linalg.norm(numbers[3:]))
+    if not np.all(np.isfinite(numbers)) or length < 1e-6:
+        return None
+    numbers[3:] /= length
+    return numbers
+
+
+def _seconds(stamp: Any) -> float:
+    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)

@@ -1,0 +1,104 @@
+"""The viewer beside a command, in a process of its own: it must not take time from the plant."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import yaml
+
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.nodes.common.process import use_loopback_discovery
+from spacerobot_ros.nodes.viewer import node
+from spacerobot_ros.parameters import Value
+from spacerobot_ros.termination import child_options
+from spacerobot_ros.viewer.server import require_viser
+
+_START = 30.0
+"""Wall s within which the page must be there."""
+
+_END = 1.5
+"""Wall s that the process has to end after a signal before it is killed."""
+
+_CHILD = "spacerobot_ros.session.child"
+
+
+@contextmanager
+def viewing(parameters: Mapping[str, Value], show: Callable[[str], None]) -> Iterator[None]:
+    """Have a viewer run while something else does; ``show`` is given the line with its address.
+
+    A viewer that ends by itself ends nothing else.
+
+    Parameters
+    ----------
+    parameters
+        Of the viewer, by name.
+    show
+        Shows a line to people.
+
+    Raises
+    ------
+    SpaceRobotError
+        viser is not installed, or the page cannot be served.
+    """
+    require_viser()
+    use_loopback_discovery()
+    with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
+        file, log = Path(folder, "viewer.yaml"), Path(folder, "viewer.txt")
+        file.write_text(yaml.safe_dump({"viewer": {"ros__parameters": dict(parameters)}}), "utf-8")
+        with log.open("wb") as errors:
+            process = subprocess.Popen(
+                [
+                    *(sys.executable, "-m", _CHILD, node.__name__),
+                    *("--ros-args", "-r", "__node:=viewer", "--log-level", "WARN"),
+                    *("--params-file", str(file)),
+                ],
+                **child_options(),
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                start_new_session=True,
+            )
+        try:
+            show(_announcement(process, log))
+            for line in log.read_text("utf-8", errors="replace").splitlines():
+                show(line)  # Of an address that others reach.
+            yield
+        finally:
+            _end(process)
+
+
+def _announcement(process: subprocess.Popen[bytes], log: Path) -> str:
+    """Return the line that the viewer writes once its page is there."""
+    assert process.stdout is not None
+    text, deadline = b"", time.monotonic() + _START
+    while not text.endswith(b"\n"):
+        ready, _, _ = select.select([process.stdout], [], [], 0.1)
+        if ready:
+            more = os.read(process.stdout.fileno(), 4096)
+            if not more:
+                lines = log.read_text("utf-8", errors="replace").strip().splitlines()
+                raise SpaceRobotError(lines[-1] if lines else "The viewer has ended at its start.")
+            text += more
+        elif time.monotonic() > deadline:
+            raise SpaceRobotError(f"The viewer has not served its page within {_START:g} s.")
+    return text.decode(errors="replace").strip()
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.send_signal(signal.SIGINT)
+    try:
+        process.wait(_END)
+    except subprocess.TimeoutExpired:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    if process.stdout is not None:
+        process.stdout.close()

@@ -1,0 +1,258 @@
+"""The goal that is about to be sent: gizmos, number fields, and the ghost of the robot there."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from spacerobot_ros.errors import GoalError
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.rotations import (
+    matrix_from_quaternion,
+    quaternion_inverse,
+    quaternion_multiply,
+)
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.viewer.content import (
+    COLORS,
+    goal_of,
+    quaternion_from_rpy,
+    rpy_from_quaternion,
+    verdict,
+)
+from spacerobot_ros.viewer.port import Part
+from spacerobot_ros.viewer.reachability import Check, Verdict
+from spacerobot_ros.viewer.scene import RobotDrawing, wxyz, xyzw
+
+if TYPE_CHECKING:
+    import viser
+
+Defer = Callable[[Callable[[], None]], None]
+"""Has something done in the thread that draws the page."""
+
+AT_REST_S = 0.3
+"""Wall s without a change after which a goal is checked."""
+
+_BASE, _TOOL = "/goal", "/end_effector_goal"
+_PART_OF: dict[str, Part] = {_BASE: "base", _TOOL: "end_effector"}
+
+
+class GoalEditor:
+    """Where the robot is to go; nothing is sent from here.
+
+    The gizmo of the end-effector moves along with that of the base, and can be moved alone.
+
+    Parameters
+    ----------
+    server
+        Of the page; the number fields are added where its GUI stands.
+    defer
+        Where users' changes are handed over.
+    on_note
+        Called with the sentence of what is refused.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, defer: Defer, on_note: Callable[[str], None]
+    ) -> None:
+        self._server, self._defer, self._on_note = server, defer, on_note
+        self._gizmos: dict[str, Any] = {}
+        self._poses: dict[str, Array] = {}
+        self._ghost: RobotDrawing | None = None
+        self._shape: Array | None = None
+        self._changed_at: float | None = None
+        self._check = Check(Verdict.UNCHECKED)
+        gui = server.gui
+        self._verdict = gui.add_html(verdict(self._check))
+        # Any: mypy takes viser's values for read-only.
+        self._position: Any = gui.add_vector3("Goal (m)", (0.0, 0.0, 0.0), step=0.01)
+        self._angles: Any = gui.add_vector3("Roll, pitch, yaw (deg)", (0.0, 0.0, 0.0), step=1.0)
+        self._tool_too = gui.add_checkbox("Goal for the end-effector", initial_value=True)
+        self._tool_too.visible = False
+        self._to_robot = gui.add_button("Goal to the robot", color="gray")
+        for field in (self._position, self._angles):
+            field.on_update(self._on_field)
+
+    @property
+    def placed(self) -> bool:
+        """Whether there is a goal."""
+        return _BASE in self._poses
+
+    @property
+    def has_tool(self) -> bool:
+        """Whether there is a goal of the end-effector."""
+        return _TOOL in self._poses
+
+    def add_tool(self, pose: Array | None) -> None:
+        """Put the goal of the end-effector to a pose (7,)."""
+        if pose is not None and self.placed:
+            self._add_gizmo(_TOOL, 0.2 * self._reach)
+            self._move(_TOOL, pose)
+
+    def on_to_robot(self, act: Callable[[], None]) -> None:
+        """Have the goal put where the robot is when its button is pressed."""
+
+        @self._to_robot.on_click
+        async def _(event: Any) -> None:
+            self._defer(act)
+
+    def show_robot(self, robot: RobotDescription | None, reach: float) -> None:
+        """Begin anew with another robot, whose scene is empty; None: there is none."""
+        self._gizmos.clear()
+        self._poses.clear()
+        self._ghost, self._shape, self._changed_at = None, None, None
+        self._reach, self._robot = reach, robot
+
+    def place(self, base: Array, tool: Array | None, q: Array, now: float) -> None:
+        """Put the goal to poses (7,), the ghost in a shape (n,)."""
+        assert self._robot is not None
+        if _BASE not in self._gizmos:
+            self._add_gizmo(_BASE, 0.45 * self._reach)
+            self._ghost = RobotDrawing(
+                self._server.scene, f"{_BASE}/ghost", self._robot, color=COLORS[Verdict.UNCHECKED]
+            )
+        self._move(_BASE, base)
+        if tool is not None and self.has_tool:
+            self._move(_TOOL, tool)
+        self.bend(q)
+        self._show_fields()
+        self._changed_at = now
+
+    def bend(self, q: Array) -> None:
+        """Give the ghost a shape (n,) as long as no plan has one."""
+        if self._ghost is not None and self._check.shape is None:
+            self._ghost.bend(q)
+
+    def show_tool(self, *, there: bool) -> None:
+        """Show or hide what is for the end-effector."""
+        self._tool_too.visible = there
+        if _TOOL in self._gizmos:
+            self._gizmos[_TOOL].visible = there and self._tool_too.value
+
+    def show(self, *, visible: bool) -> None:
+        """Show or hide everything: a replay takes no goals."""
+        fields = (self._verdict, self._position, self._angles, self._to_robot)
+        for handle in (*fields, *self._gizmos.values()):
+            handle.visible = visible
+
+    def goals(self) -> dict[Part, Goal]:
+        """Return the goals to send.
+
+        Raises
+        ------
+        GoalError
+            The numbers are no pose.
+        """
+        wanted = [_BASE]
+        if self._tool_too.visible and self._tool_too.value and _TOOL in self._poses:
+            wanted.append(_TOOL)
+        return {
+            _PART_OF[name]: goal_of(self._poses[name][:3], self._poses[name][3:])
+            for name in wanted
+            if name in self._poses
+        }
+
+    def goal_at_rest(self, now: float) -> Goal | None:
+        """Return the goal of the base once, when it has not been moved for a moment."""
+        if self._changed_at is None or now - self._changed_at < AT_REST_S or not self.placed:
+            return None
+        self._changed_at = None
+        try:
+            return self.goals()["base"]
+        except GoalError as error:
+            self.show_check(Check(Verdict.REFUSED, str(error)))
+            return None
+
+    @property
+    def moving(self) -> bool:
+        """Whether the goal has changed and is not checked yet."""
+        return self._changed_at is not None
+
+    def touch(self, now: float) -> None:
+        """Have the goal checked again: something that it depends on has changed."""
+        if self.placed:
+            self._changed_at = now
+
+    def show_check(self, check: Check) -> None:
+        """Show what is known of the goal."""
+        if check == self._check:
+            return
+        self._check = check
+        self._verdict.content = verdict(check)
+        if self._ghost is not None:
+            self._ghost.paint(COLORS[check.verdict])
+            if check.shape is not None:
+                self._ghost.bend(check.shape)
+
+    # -- what users change ----------------------------------------------------------------------
+
+    def _add_gizmo(self, name: str, scale: float) -> None:
+        gizmo = self._server.scene.add_transform_controls(name, scale=scale, depth_test=False)
+        self._gizmos[name] = gizmo
+        if name == _TOOL:
+            self._server.scene.add_icosphere(
+                f"{name}/mark", 0.12 * scale, color=COLORS[Verdict.UNCHECKED], opacity=0.6,
+                cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
+
+        @gizmo.on_update
+        async def _(event: Any) -> None:
+            pose = np.concatenate([event.target.position, xyzw(event.target.wxyz)])
+            self._defer(lambda: self._drag(name, pose))
+
+    async def _on_field(self, event: Any) -> None:
+        if event.client is not None:  # What the page itself has written is no wish of a user.
+            position, angles = self._position.value, self._angles.value
+            self._defer(lambda: self._type(position, angles))
+
+    def _drag(self, name: str, pose: Array) -> None:
+        if name not in self._gizmos or not np.all(np.isfinite(pose)):
+            return  # Of a robot that is gone, or of no browser.
+        self._set(name, pose)
+        self._show_fields()
+
+    def _type(self, position: tuple[float, ...], angles: tuple[float, ...]) -> None:
+        if not self.placed:
+            return
+        try:
+            goal = goal_of(position, quaternion_from_rpy([math.radians(angle) for angle in angles]))
+        except GoalError as error:
+            self._on_note(str(error))
+            self._show_fields()
+            return
+        self._set(_BASE, np.concatenate([goal.position, goal.quaternion]))
+        self._move(_BASE, self._poses[_BASE])
+
+    def _set(self, name: str, pose: Array) -> None:
+        before = self._poses.get(name, pose)
+        self._poses[name] = pose
+        if name == _BASE and _TOOL in self._poses:
+            self._move(_TOOL, carried(self._poses[_TOOL], before, pose))
+        self._changed_at = time.monotonic()
+        if self._check.verdict is not Verdict.UNCHECKED:
+            self.show_check(Check(Verdict.PLANNING, "The goal moves."))
+
+    def _move(self, name: str, pose: Array) -> None:
+        self._poses[name] = pose
+        self._gizmos[name].position = pose[:3]
+        self._gizmos[name].wxyz = wxyz(pose[3:])
+
+    def _show_fields(self) -> None:
+        pose = self._poses.get(_BASE)
+        if pose is not None:
+            x, y, z = (round(float(each), 4) for each in pose[:3])
+            self._position.value = (x, y, z)
+            turns = np.degrees(rpy_from_quaternion(pose[3:]))
+            roll, pitch, yaw = (round(float(each), 2) for each in turns)
+            self._angles.value = (roll, pitch, yaw)
+
+
+def carried(pose: Array, before: Array, after: Array) -> Array:
+    """Return a pose (7,) that moves along with another one, from ``before`` to ``after``."""
+    turn = quaternion_multiply(after[3:], quaternion_inverse(before[3:]))
+    position = after[:3] + matrix_from_quaternion(turn) @ (pose[:3] - before[:3])
+    return np.concatenate([position, quaternion_multiply(turn, pose[3:])])

@@ -1,0 +1,214 @@
+"""The viewer's page in Chromium, and the nodes of a stack beside it, each its own process."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+from support.chromium import Browser
+
+from spacerobot_ros.model.description import Array
+
+ROOT = Path(__file__).parents[2]
+
+FIELD_OF_VIEW = np.radians(75.0)
+"""Of the page's camera, from top to bottom."""
+
+
+class Processes:
+    """Nodes in processes of their own, as ``ros2 run`` starts them."""
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self._folder = folder
+        self._environment = {
+            **os.environ,
+            "ROS_DOMAIN_ID": str(domain),
+            "PYTHONPATH": str(ROOT),
+            # What a killed process leaves in shared memory holds its successor up.
+            "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+        }
+        self.running: dict[str, subprocess.Popen[str]] = {}
+
+    def start(self, name: str, *words: str, files: Sequence[str] = ()) -> subprocess.Popen[str]:
+        """Start a node with ``parameter:=value`` words, after those of parameter files."""
+        parameters = [part for word in words for part in ("-p", word)]
+        with (self._folder / f"{name}.txt").open("a") as log:
+            self.running[name] = subprocess.Popen(
+                [sys.executable, str(ROOT / "scripts" / name), "--ros-args", *files, *parameters],
+                env=self._environment,
+                cwd=self._folder,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+            )
+        return self.running[name]
+
+    def start_viewer(self, *words: str) -> str:
+        """Start a viewer, and return the address that it prints."""
+        viewer = self.start("viewer", "port:=0", *words)
+        assert viewer.stdout is not None
+        line = viewer.stdout.readline()
+        assert line.startswith("viewer"), self.log("viewer")
+        return line.split()[1]
+
+    def kill(self, name: str) -> None:
+        """End a node as a crash does."""
+        self.running[name].kill()
+        self.running[name].wait()
+
+    def log(self, name: str) -> str:
+        """Return what a node has written to standard error."""
+        return (self._folder / f"{name}.txt").read_text("utf-8")
+
+    def close(self) -> None:
+        """End what still runs."""
+        for process in self.running.values():
+            process.send_signal(signal.SIGINT)
+        for process in self.running.values():
+            try:
+                process.wait(5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+
+
+@contextmanager
+def processes(folder: Path, domain: int) -> Iterator[Processes]:
+    """Processes that end with the block."""
+    started = Processes(folder, domain)
+    try:
+        yield started
+    finally:
+        started.close()
+
+
+class Page:
+    """The viewer's page, by what its users see.
+
+    Parameters
+    ----------
+    window, url
+        The browser, and the address.
+    width, height
+        Of the window, pixels.
+    """
+
+    def __init__(self, window: Browser, url: str, width: int = 1200, height: int = 800) -> None:
+        self._window, self._url, self._size = window, url, (width, height)
+        window.visit(url, width, height)
+        self.wait_for_text("Log")
+
+    def text(self) -> str:
+        """Return all text on the page, as it is seen."""
+        return str(self._window.evaluate("document.body.innerText"))
+
+    def wait_for_text(self, *texts: str, without: str = "") -> None:
+        """Wait until all texts are there."""
+        there = [f"text.includes({json.dumps(text)})" for text in texts]
+        if without:
+            there.append(f"!text.includes({json.dumps(without)})")
+        # The page looks by itself, now and then: to ask it all the time would hold it up.
+        look = (
+            "new Promise(done => { const end = performance.now() + 60000; const look = () => {"
+            f"const text = document.body.innerText; if ({' && '.join(there)}) done(true);"
+            "else if (performance.now() > end) done(false); else setTimeout(look, 100); };"
+            "look(); })"
+        )
+        assert self._window.evaluate(look), (texts, without, self.text())
+
+    def press(self, label: str) -> None:
+        """Press the button with a label, or choose the tab."""
+        element = (
+            "[...document.querySelectorAll('button, [role=tab]')]"
+            f".find(each => each.textContent.trim() === {json.dumps(label)})"
+        )
+        self._window.wait_for(f"{element} !== undefined")
+        self._window.evaluate(f"{element}.scrollIntoView({{block: 'center'}})")
+        self.draw()
+        box = f"{element}.getBoundingClientRect()"
+        x, y = self._window.evaluate(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
+        self._window.mouse("mousePressed", x, y, held=True)
+        self._window.mouse("mouseReleased", x, y, held=True)
+
+    def numbers(self, label: str) -> list[float]:
+        """Return the numbers in the fields with a label."""
+        found = self._window.evaluate(f"{_fields(label)}.map(each => each.value)")
+        return [float(text) for text in found]
+
+    def type(self, label: str, values: Sequence[float | str]) -> None:
+        """Write into the fields with a label."""
+        for i, value in enumerate(values):
+            self._window.evaluate(f"{_fields(label)}[{i}].focus()")
+            self._window.evaluate(f"{_fields(label)}[{i}].select()")
+            self._window.call("Input.insertText", text=f"{value}")
+            self._window.evaluate(f"{_fields(label)}[{i}].blur()")
+
+    def pixel(self, point: Array, camera: Array) -> tuple[float, float]:
+        """Return where a point of the world is seen from a camera that looks at the origin."""
+        forward = -camera / np.linalg.norm(camera)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        up = np.cross(right, forward)
+        seen = np.array([right, up, forward]) @ (point - camera)
+        width, height = self._size
+        focal = 0.5 * height / np.tan(FIELD_OF_VIEW / 2)
+        return (
+            float(width / 2 + focal * seen[0] / seen[2]),
+            float(height / 2 - focal * seen[1] / seen[2]),
+        )
+
+    def drag(
+        self, start: tuple[float, float], end: tuple[float, float], *, release: bool = True
+    ) -> None:
+        """Drag the mouse from one pixel to another, in steps that the page draws."""
+        window, steps = self._window, 12
+        window.mouse("mouseMoved", *start)
+        self.draw()
+        window.mouse("mousePressed", *start, held=True)
+        for step in range(1, steps + 1):
+            x, y = (a + (b - a) * step / steps for a, b in zip(start, end, strict=True))
+            window.mouse("mouseMoved", x, y, held=True)
+            self.draw()
+        if release:
+            window.mouse("mouseReleased", *end, held=True)
+            self.draw()
+
+    def draw(self) -> None:
+        """Wait until the page has been drawn twice."""
+        self._window.evaluate(
+            "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+        )
+
+    def frames_per_s(self, seconds: float, clock: Callable[[], float]) -> float:
+        """Return how many messages of the viewer come a second."""
+        self.text()
+        before, began = self._window.frames, clock()
+        while clock() - began < seconds:
+            self.text()
+        return (self._window.frames - before) / (clock() - began)
+
+    def requests_outside(self) -> list[str]:
+        """Return what was asked of anybody but the viewer."""
+        own = urlsplit(self._url).netloc
+        inside = ("data:", "blob:", f"http://{own}/", f"ws://{own}/", f"ws://{own}")
+        return [url for url in self._window.requests if not url.startswith(inside)]
+
+
+def _fields(label: str) -> str:
+    """Return an expression: the inputs beside a label."""
+    return (
+        "(() => { let at = [...document.querySelectorAll('label, div, p, span')]"
+        f".filter(each => each.textContent.trim() === {json.dumps(label)}).pop();"
+        "while (at && !at.querySelector('input')) at = at.parentElement;"
+        "return [...at.querySelectorAll('input')]; })()"
+    )
