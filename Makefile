@@ -13,7 +13,7 @@ TESTED := $(BIN)/python3 -c 'import sys; print("-cconstraints.txt" * (sys.versio
 
 # What decides on the dependencies, and what is installed with the package. Directories are among
 # the latter because a deleted file changes nothing else.
-DECLARATION := setup.py setup.cfg constraints.txt
+DECLARATION := setup.py setup.cfg constraints.txt constraints-oldest.txt
 SOURCES := package.xml LICENSE $(shell find $(wildcard bags config foxglove launch meshes resource rviz \
     scripts spacerobot_ros urdf) -not -path bags -not -path '*/__pycache__*' -not -name '.*')
 
@@ -50,6 +50,16 @@ test: $(STAMP)/test ## check style and types, run the tests
 test-slow: $(STAMP)/test ## run the slow tests: long flights, builds with pip and colcon
 	$(BIN)/python3 -m pytest -m slow
 
+# With TESTED and VENV given here, the rules below make another environment.
+.PHONY: test-oldest
+test-oldest: ## run the quick tests with the versions of Ubuntu 24.04, in .venv-oldest; PYTHON=python3.12: its Python
+	@$(MAKE) --no-print-directory VENV=.venv-oldest TESTED='echo -cconstraints-oldest.txt' .venv-oldest/stamp/test
+	@.venv-oldest/bin/python3 --version
+	@.venv-oldest/bin/python3 -m pip freeze | grep -iE '^($(subst $() ,|,$(OLDEST)))=='
+	nice .venv-oldest/bin/python3 -m pytest -n 1 -p no:cacheprovider
+
+OLDEST := click lxml lz4 matplotlib numpy pin PyYAML scipy zstandard
+
 .PHONY: fuzz
 fuzz: $(STAMP)/test ## try more than ten thousand inputs that nobody would send, and count them
 	SPACEROBOT_FUZZ=long $(BIN)/python3 -m pytest -q test/fuzz
@@ -80,6 +90,10 @@ ONLY ?= many
 actions: $(STAMP)/test ## do COUNT random actions in lockstep and as many in real time, from SEED
 	SPACEROBOT_ACTIONS=$(COUNT) SPACEROBOT_ACTIONS_SEED=$(SEED) \
 	    $(BIN)/python3 -m pytest -q -s -m slow -k "$(ONLY)" test/nodes/test_random_actions.py
+
+.PHONY: first-flights
+first-flights: $(STAMP)/test ## fly robots of others from their URDFs to a goal by `spacerobot new`, with minutes taken
+	$(BIN)/python3 -m pytest -q -s -m slow test/cli/test_first_flights.py
 
 GOALS ?= 100
 .PHONY: foreign-robots
@@ -134,7 +148,7 @@ structure: ## count lines and modules of the package; AGAINST=PATH: of another c
 
 .PHONY: clean
 clean: ## remove .venv, caches, the site, and the demo's bag and report
-	rm -rf $(VENV) build/lib build/bdist.* spacerobot_ros.egg-info
+	rm -rf $(VENV) .venv-oldest build/lib build/bdist.* spacerobot_ros.egg-info
 	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	rm -rf out/docs
 	rm -f out/sliding_masses.mcap out/sliding_masses_paper.mcap out/sliding_masses.html
