@@ -3,29 +3,17 @@
 import json
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from catkin_pkg.package import Package, parse_package
+from support.colcon import colcon_program, new_environment, run
 
 import spacerobot_ros
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = sorted(path.name for path in (ROOT / "scripts").iterdir() if path.is_file())
-COLCON = [
-    "catkin_pkg",
-    "colcon-core",
-    "colcon-library-path",
-    "colcon-metadata",
-    "colcon-package-information",
-    "colcon-parallel-executor",
-    "colcon-python-setup-py",
-    "colcon-recursive-crawl",
-    "colcon-ros",
-    "setuptools<80",
-]
 # That of Ubuntu 24.04, the last that colcon takes, the newest.
 SETUPTOOLS = ["setuptools==68.1.*", "setuptools<80", "setuptools"]
 
@@ -37,28 +25,6 @@ import sys
 def main():
     print(json.dumps({"module": __name__, "prefix": sys.prefix, "arguments": sys.argv[1:]}))
 """
-
-
-def run(command: list[str | Path], cwd: Path | None = None, path: str = "") -> str:
-    """Return the output of `command` in an environment that nothing has been sourced in."""
-    kept = {"HOME", "LANG", "LC_ALL", "TMPDIR"}
-    environment = {
-        name: value
-        for name, value in os.environ.items()
-        if name in kept or name.startswith(("PIP_", "SSL_"))
-    }
-    environment["PATH"] = os.pathsep.join(filter(None, [path, os.defpath]))
-    done = subprocess.run(
-        [str(word) for word in command], cwd=cwd, env=environment, capture_output=True, text=True
-    )
-    assert done.returncode == 0, f"{command}:\n{done.stdout}\n{done.stderr}"
-    return done.stdout
-
-
-def new_environment(prefix: Path) -> Path:
-    """Create a virtual environment and return its Python."""
-    run([sys.executable, "-m", "venv", prefix])
-    return prefix / "bin" / "python3"
 
 
 def module_of(node: str) -> str:
@@ -171,13 +137,7 @@ def test_pip_installs_nodes_that_run_outside_an_active_environment(
 
 @pytest.fixture(scope="module")
 def colcon(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the machine's colcon, or else one in an environment that lasts for these tests."""
-    found = shutil.which("colcon")
-    if found:
-        return Path(found)
-    prefix = tmp_path_factory.mktemp("colcon")
-    run([new_environment(prefix), "-m", "pip", "install", *COLCON])
-    return prefix / "bin" / "colcon"
+    return colcon_program(tmp_path_factory.mktemp("colcon"))
 
 
 @pytest.mark.slow
