@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -21,15 +23,29 @@ SOON = 2.0
 PLANS = ("plan", "sliding_masses", "--random", "100000")
 
 
-def command(*words: str, options: tuple[str, ...] = (), **more: object) -> subprocess.Popen[str]:
-    """Start the command in a session of its own."""
-    return subprocess.Popen(
-        [sys.executable, *options, "-m", "spacerobot_ros", *words],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        text=True,
-        start_new_session=True,
-        **more,  # type: ignore[call-overload]
-    )
+@contextmanager
+def command(
+    *words: str, options: tuple[str, ...] = (), **more: object
+) -> Iterator[subprocess.Popen[str]]:
+    """Run the command in a session of its own, which is killed if it is left behind."""
+    # Tests that run under nohup would have the command ignore SIGHUP, as it should there.
+    inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        process = subprocess.Popen(
+            [sys.executable, *options, "-m", "spacerobot_ros", *words],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            text=True,
+            start_new_session=True,
+            **more,  # type: ignore[call-overload]
+        )
+    finally:
+        signal.signal(signal.SIGHUP, inherited)
+    with process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +104,7 @@ def test_a_terminal_that_is_closed_ends_a_robot_that_is_up_in_order(
 ) -> None:
     ours, theirs = pty.openpty()
     words = ("up", "sliding_masses", "--processes", "--bag", "up.mcap")
-    process = command(
+    with command(
         *words,
         cwd=tmp_path,
         stdin=theirs,
@@ -96,8 +112,7 @@ def test_a_terminal_that_is_closed_ends_a_robot_that_is_up_in_order(
         stderr=theirs,
         # The terminal of its session is ours: closing it hangs up.
         preexec_fn=lambda: os.close(os.open(os.ttyname(0), os.O_RDWR)),
-    )
-    try:
+    ) as process:
         os.close(theirs)
         said = b""
         while b"is up" not in said:
@@ -106,7 +121,3 @@ def test_a_terminal_that_is_closed_ends_a_robot_that_is_up_in_order(
         assert process.wait(PATIENCE) in (0, 129)
         # Complete: nothing had to be killed.
         assert read_bag(tmp_path / "up.mcap").message_count("/clock") > 0
-    finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()

@@ -7,13 +7,13 @@ import random
 import signal
 import subprocess
 import sys
-import time
 import uuid
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.awaited import await_end, await_size
 from support.killed_flight import whole
 
 from spacerobot_ros.bag import RecordingError
@@ -64,20 +64,13 @@ class Supervisor:
 
     def await_flight(self) -> None:
         """Wait until states of a robot that moves are in the bag."""
-        deadline = time.monotonic() + PATIENCE
-        while not self.bag.exists() or self.bag.stat().st_size < 30_000:
-            assert self.process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
+        await_size(self.bag, 30_000, self.process, PATIENCE)
 
     def kill(self) -> None:
         """End the supervisor as by a crash, and require that everything ends with it."""
         self.process.send_signal(signal.SIGKILL)
-        began = time.monotonic()
         self.process.wait()
-        while self.left() and time.monotonic() - began < SOON:
-            time.sleep(0.02)
-        left = self.left()
+        left = await_end(self.left, SOON)
         for each in left:
             with suppress(ProcessLookupError):
                 os.kill(each, signal.SIGKILL)
