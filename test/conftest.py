@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.warm_python import WarmPython
 
 if TYPE_CHECKING:
     import rclpy
@@ -84,6 +85,14 @@ def ros_context(ros_domain: int) -> Iterator[rclpy.Context]:
 def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the test's nodes in a ROS domain of its own."""
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
+
+
+@pytest.fixture(scope="session")
+def warm_python(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WarmPython]:
+    """Return what runs Python programs without starting an interpreter for each."""
+    python = WarmPython(tmp_path_factory.mktemp("warm_python"), Path(__file__).parents[1])
+    yield python
+    python.close()
 
 
 @pytest.fixture(params=["transposed_jacobian", "model_based"])

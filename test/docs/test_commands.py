@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.warm_python import WarmPython
 
 from docs_build.blocks import Block, blocks
 
@@ -22,7 +23,7 @@ NEEDED = ("bags", "config", "examples", "foxglove", "launch", "rviz", "urdf")
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path: Path, warm_python: WarmPython) -> Path:
     """Return a folder as a reader has it who has cloned the repository and run `make demo`."""
     for name in NEEDED:
         if (ROOT / name).exists():
@@ -30,16 +31,15 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "out").mkdir()
     programs = tmp_path / ".venv" / "bin"
     programs.mkdir(parents=True)
-    for name, call in (("spacerobot", "-m spacerobot_ros.cli.main"), ("python3", "")):
-        program = programs / name
-        program.write_text(f'#!/bin/sh\nexec "{sys.executable}" {call} "$@"\n')
-        program.chmod(0o755)
+    warm_python.script(programs / "spacerobot", "-m", "spacerobot_ros.cli.main")
+    warm_python.script(programs / "python3")
     (programs / "python").symlink_to("python3")
     return tmp_path
 
 
 def run(block: Block, folder: Path, page: str) -> None:
-    program = ["sh", "-e"] if block.language in ("sh", "bash") else [sys.executable]
+    # Python has an interpreter of its own: it may decide on what is imported first.
+    program = ["sh", "-e"] if block.language in ("sh", "bash") else [sys.executable, "-"]
     programs = folder / ".venv" / "bin"
     environment = {
         **os.environ,
@@ -48,7 +48,7 @@ def run(block: Block, folder: Path, page: str) -> None:
         "MPLBACKEND": "agg",
     }
     done = subprocess.run(
-        [*program, "-"] if program[0] == sys.executable else program,
+        program,
         input=block.text,
         cwd=folder,
         env=environment,

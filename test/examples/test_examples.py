@@ -9,26 +9,22 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.warm_python import WarmPython
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 
-def run(folder: Path, *arguments: str | Path) -> str:
-    environment = {
-        **os.environ,
-        "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
-        "PYTHONWARNINGS": "error,ignore:module 'sre_:DeprecationWarning",
-    }
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+ENVIRONMENT = {
+    "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
+    "PYTHONWARNINGS": "error,ignore:module 'sre_:DeprecationWarning",
+    # An example of a test needs no plugin.
+    "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
+}
+
+
+def run(python: WarmPython, folder: Path, *arguments: str | Path) -> str:
+    done = python.run(arguments, folder, {**os.environ, **ENVIRONMENT}, timeout=300.0)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -47,17 +43,27 @@ def test_an_example_is_short_and_says_what_it_is(example: Path) -> None:
 
 @pytest.mark.usefixtures("own_domain")
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_runs(example: Path, tmp_path: Path) -> None:
+def test_an_example_runs(example: Path, tmp_path: Path, warm_python: WarmPython) -> None:
     if example.stem.startswith("test_"):
-        said = run(tmp_path, "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "-c", os.devnull,
-                   example)  # fmt: skip
-        assert "1 passed" in said
+        words = ("-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "-c", os.devnull)
+        done = subprocess.run(
+            [sys.executable, *words, example],
+            cwd=tmp_path,
+            env={**os.environ, **ENVIRONMENT},
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "1 passed" in done.stdout
         return
-    said = run(tmp_path, example)
+    said = run(warm_python, tmp_path, example)
     assert len(said.splitlines()) >= 3
 
 
-def test_the_bag_example_draws_a_picture(tmp_path: Path) -> None:
+def test_the_bag_example_draws_a_picture(tmp_path: Path, warm_python: WarmPython) -> None:
     bag = ROOT / "bags" / "planar_chain.mcap"
-    run(tmp_path, ROOT / "examples" / "read_bag_and_plot.py", bag, tmp_path / "mine.png")
+    example = ROOT / "examples" / "read_bag_and_plot.py"
+    run(warm_python, tmp_path, example, bag, tmp_path / "mine.png")
     assert (tmp_path / "mine.png").stat().st_size > 10_000

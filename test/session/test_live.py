@@ -6,17 +6,17 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.warm_python import WarmProcess, WarmPython
 
 from spacerobot_ros.bag import read_bag
 
 ROOT = Path(__file__).parents[2]
-COMMAND = (sys.executable, "-m", "spacerobot_ros.cli.main")
+COMMAND = ("-m", "spacerobot_ros.cli.main")
 GAIT = (
     *("--set", "planner.method=lie_bracket"),
     *("--set", "planner.lie_bracket.t1=4", "--set", "planner.lie_bracket.cycles=0"),
@@ -25,37 +25,43 @@ GAIT = (
 PATIENCE = 120.0
 
 
+class Command:
+    """The command ``spacerobot`` in a folder and a ROS domain."""
+
+    def __init__(self, python: WarmPython, environment: dict[str, str], folder: Path) -> None:
+        self._python, self._environment, self._folder = python, environment, folder
+
+    def __call__(self, *words: str) -> subprocess.CompletedProcess[str]:
+        return self._python.run(
+            [*COMMAND, *words], self._folder, self._environment, timeout=PATIENCE
+        )
+
+    def start(self, *words: str) -> WarmProcess:
+        return self._python.start(
+            [*COMMAND, *words],
+            self._folder,
+            self._environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+
+
 @pytest.fixture
-def environment(ros_domain: int) -> dict[str, str]:
+def spacerobot(warm_python: WarmPython, ros_domain: int, tmp_path: Path) -> Command:
     # The commands run elsewhere, where their files are to go.
-    return {**os.environ, "ROS_DOMAIN_ID": str(ros_domain), "PYTHONPATH": str(ROOT)}
-
-
-def spacerobot(
-    *words: str, environment: dict[str, str], folder: Path
-) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*COMMAND, *words],
-        env=environment,
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain), "PYTHONPATH": str(ROOT)}
+    return Command(warm_python, environment, tmp_path)
 
 
 @pytest.mark.slow
 def test_each_node_in_a_process_of_its_own_flies_the_same_manoeuvre(
-    environment: dict[str, str], tmp_path: Path
+    spacerobot: Command, tmp_path: Path
 ) -> None:
     results = []
     for name, words in (("one", ()), ("many", ("--processes",))):
         json_file = tmp_path / f"{name}.json"
         run = spacerobot(
             *("run", "planar_chain", *words, "--bag", f"{name}.mcap", "--json", str(json_file)),
-            environment=environment,
-            folder=tmp_path,
         )
         assert run.returncode == 0, run.stderr
         results.append(json.loads(json_file.read_text("utf-8")))
@@ -72,41 +78,25 @@ def test_each_node_in_a_process_of_its_own_flies_the_same_manoeuvre(
 
 
 @pytest.fixture
-def robot(environment: dict[str, str], tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+def robot(spacerobot: Command) -> Iterator[WarmProcess]:
     """Sliding masses that are up, twenty times as fast as real time."""
-    process = subprocess.Popen(
-        [*COMMAND, "up", "sliding_masses", "--rate", "20", "--bag", "up.mcap", *GAIT],
-        env=environment,
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
-    try:
+    words = ("up", "sliding_masses", "--rate", "20", "--bag", "up.mcap", *GAIT)
+    with spacerobot.start(*words) as process:
         yield process
-    finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait(PATIENCE)
-        assert process.stdout is not None
-        process.stdout.close()
 
 
 def test_goals_are_sent_to_a_robot_that_is_up(
-    robot: subprocess.Popen[str], environment: dict[str, str], tmp_path: Path
+    robot: WarmProcess, spacerobot: Command, tmp_path: Path
 ) -> None:
-    refused = spacerobot("goal", "5", "0", "0", environment=environment, folder=tmp_path)
+    refused = spacerobot("goal", "5", "0", "0")
     assert refused.returncode == 1, refused.stdout + refused.stderr
     assert "stroke" in refused.stdout
-    reached = spacerobot("goal", "-0.05", "0.02", "0", environment=environment, folder=tmp_path)
+    reached = spacerobot("goal", "-0.05", "0.02", "0")
     assert reached.returncode == 0, reached.stdout + reached.stderr
     assert "The goal is reached" in reached.stdout
     # What is latched of the goal before is no answer to the next.
     again = spacerobot(
         *("goal", "0.02", "0", "0", "--rotvec", "0", "0", "0.01"),
-        environment=environment,
-        folder=tmp_path,
     )
     assert again.returncode == 0, again.stdout + again.stderr
     assert "Executing" in again.stdout
@@ -119,11 +109,9 @@ def test_goals_are_sent_to_a_robot_that_is_up(
     np.testing.assert_allclose(last, [0.02, 0.0, 0.0], atol=1e-3)
 
 
-def test_a_goal_that_nobody_takes_is_one_sentence(
-    environment: dict[str, str], tmp_path: Path
-) -> None:
+def test_a_goal_that_nobody_takes_is_one_sentence(spacerobot: Command) -> None:
     words = ("goal", "0", "0", "0", "--timeout", "0.5")
-    run = spacerobot(*words, environment=environment, folder=tmp_path)
+    run = spacerobot(*words)
     assert run.returncode == 2
     assert run.stderr.count("\n") == 1
     assert "after 0.5 s" in run.stderr
@@ -140,10 +128,8 @@ def test_a_goal_that_nobody_takes_is_one_sentence(
         (("run", "sliding_masses", "--processes", "--set", "plant.tick_rate=-1"), "tick_rate"),
     ],
 )
-def test_bad_words_are_refused(
-    environment: dict[str, str], tmp_path: Path, words: tuple[str, ...], mention: str
-) -> None:
-    run = spacerobot(*words, environment=environment, folder=tmp_path)
+def test_bad_words_are_refused(spacerobot: Command, words: tuple[str, ...], mention: str) -> None:
+    run = spacerobot(*words)
     assert run.returncode == 2, run.stdout + run.stderr
     assert mention in run.stderr
     assert "Traceback" not in run.stderr
