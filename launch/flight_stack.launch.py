@@ -12,6 +12,7 @@ from launch_ros.actions import Node
 from launch import LaunchContext, LaunchDescription
 from spacerobot_ros.flight.scenario import load_scenario, read_sections
 from spacerobot_ros.resources import robot_file, share_directory
+from spacerobot_ros.topics import GLOBAL_TOPICS
 
 PACKAGE = "spacerobot_ros"
 
@@ -28,9 +29,6 @@ ARGUMENTS = (
     ("respawn", "false", "whether a node that dies is started again; else everything ends with it"),
     ("rviz", "false", "whether to start RViz"),
 )
-
-GLOBAL_TOPICS = ("/clock", "/tf", "/tf_static")
-"""Absolute names; in a namespace each stack has its own."""
 
 VIEWED = 0.1
 """Longest time between transforms that are recorded in real time, s."""

@@ -371,6 +371,9 @@ _TABLE = (
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 """Every topic of the stack by its name; those of the plant in the order of publication."""
 
+GLOBAL_TOPICS = ("/clock", "/tf", "/tf_static")
+"""Absolute names; where a stack is in a namespace they are put into it, so that it has its own."""
+
 NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event", "/heartbeat")
 """Ends of topics that tell nothing of a flight: recorded only where they are asked for."""
 

@@ -26,7 +26,7 @@ def command(robot: str, out: Path | None) -> None:
     from spacerobot_ros.cli.plan import progress, table
     from spacerobot_ros.model import SpaceRobot
     from spacerobot_ros.planning.analysis import analyze
-    from spacerobot_ros.resources import robot_file
+    from spacerobot_ros.resources import is_path, robot_file
     from spacerobot_ros.session.own_robot import fastest, first_problem, remarks, scenario_text
     from spacerobot_ros.simulation.trials import compare
 
@@ -49,7 +49,8 @@ def command(robot: str, out: Path | None) -> None:
     target = free_name(out or Path(f"{name}.yaml"))
     # Beside the scenario the robot is found by its name from anywhere.
     from_there = os.path.relpath(file.resolve(), target.resolve().parent)
+    named = from_there if is_path(robot) else robot
     target.parent.mkdir(parents=True, exist_ok=True)
-    target.write_text(scenario_text(problem, best.method, from_there), encoding="utf-8")
+    target.write_text(scenario_text(problem, best.method, named), encoding="utf-8")
     click.echo(f"\n{best.method} is the fastest: {best.duration:.4g} s. The scenario is {target}:")
     click.echo(f"  spacerobot run {shlex.quote(str(target))}")

@@ -123,14 +123,14 @@ view_option = click.option(
 
 
 @contextmanager
-def viewing_if(view: bool, parameters: Mapping[str, Any]) -> Iterator[None]:
+def viewing_if(view: bool, parameters: Mapping[str, Any], namespace: str = "") -> Iterator[None]:
     """Have the viewer run beside a command, if that is wanted; it says on stderr where it is."""
     if not view:
         yield
         return
     from spacerobot_ros.session.viewing import viewing
 
-    with viewing(parameters, lambda line: click.echo(line, err=True)):
+    with viewing(parameters, lambda line: click.echo(line, err=True), namespace):
         yield
 
 

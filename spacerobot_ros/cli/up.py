@@ -21,6 +21,7 @@ from spacerobot_ros.cli.options import PATH, settings_option, view_option, viewi
     help="Simulated over wall time.",
 )
 @click.option("--processes", is_flag=True, help="Give each node a process of its own.")
+@click.option("--namespace", default="", help="Of all nodes and topics, /clock and /tf among them.")
 @view_option
 def command(
     scenario: str,
@@ -28,6 +29,7 @@ def command(
     bag: Path | None,
     rate: float,
     processes: bool,
+    namespace: str,
     view: bool,
 ) -> None:
     """Run the nodes of SCENARIO, or of a ROBOT (a name or a URDF file), in real time.
@@ -39,7 +41,7 @@ def command(
     chosen = scenario_or_robot(scenario).in_real_time(rate).with_settings(settings)
     from spacerobot_ros.session.live import keep_up
 
-    with viewing_if(view, chosen.parameters("viewer")):
-        recorded = keep_up(chosen, bag, click.echo, processes=processes)
+    with viewing_if(view, chosen.parameters("viewer"), namespace):
+        recorded = keep_up(chosen, bag, click.echo, processes=processes, namespace=namespace)
     if recorded is not None:
         click.echo(f"bag         {recorded}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from rclpy.experimental import EventsExecutor
@@ -43,7 +44,12 @@ class _Sentences:
 
 
 def keep_up(
-    scenario: Scenario, bag: Path | None, show: Callable[[str], None], *, processes: bool
+    scenario: Scenario,
+    bag: Path | None,
+    show: Callable[[str], None],
+    *,
+    processes: bool,
+    namespace: str = "",
 ) -> Path | None:
     """Run the nodes of a scenario in real time until SIGINT, SIGTERM or SIGHUP; goals by topic.
 
@@ -55,12 +61,13 @@ def keep_up(
         A node cannot start, or has ended by itself.
     """
     with ros(private=False):
-        stack = make_stack(scenario, bag, processes=processes)
+        stack = make_stack(scenario, bag, processes=processes, namespace=namespace)
         try:
             with ended_on_request(at_once=stack.interrupt) as stopped:
                 stack.start(None)
                 with suppress(OSError):
-                    show(f"{scenario.name} is up; goals on 'goal_pose', Ctrl-C ends it.")
+                    topic = f"{stack.namespace}/goal_pose" if stack.namespace else "goal_pose"
+                    show(f"{scenario.name} is up; goals on '{topic}', Ctrl-C ends it.")
                 sentences = _Sentences(stack.client, show)
 
                 def look() -> bool:
@@ -89,23 +96,25 @@ def send_goal(
     """
     with ros(private=False):
         executor = EventsExecutor()
-        clock = 0
+        clocks = {"own": 0, "global": 0}
 
-        def on_clock(message: Clock) -> None:
-            nonlocal clock
-            clock = message.clock.sec * _SECOND + message.clock.nanosec
+        def on_clock(message: Clock, which: str) -> None:
+            clocks[which] = message.clock.sec * _SECOND + message.clock.nanosec
 
         clients = [
             MissionClient(
                 decider,
                 "",
-                lambda: clock or time.time_ns(),
+                lambda: clocks["own"] or clocks["global"] or time.time_ns(),
                 namespace=namespace,
                 name=f"goal_{decider}",
             )
             for decider in ("planner", "coordinated_control")
         ]
-        clients[0].node.create_subscription(Clock, "/clock", on_clock, 10)
+        # In a namespace the clock is that of its stack, unless nobody has moved it there.
+        node = clients[0].node
+        for topic, which in {"/clock": "global", node.resolve_topic_name("clock"): "own"}.items():
+            node.create_subscription(Clock, topic, partial(on_clock, which=which), 10)
         try:
             for each in clients:
                 executor.add_node(each.node)

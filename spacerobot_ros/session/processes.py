@@ -33,7 +33,7 @@ from spacerobot_ros.nodes.common.connections import Connections, unconnected
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.session.mission_client import MissionClient
-from spacerobot_ros.session.stack import Stack
+from spacerobot_ros.session.stack import Stack, namespace_words
 from spacerobot_ros.termination import child_options
 from spacerobot_ros.topics import NOT_RECORDED
 
@@ -86,7 +86,7 @@ class MultiProcessStack(Stack):
 
     Parameters
     ----------
-    scenario, bag
+    scenario, bag, namespace
         As of every stack.
 
     Raises
@@ -97,8 +97,8 @@ class MultiProcessStack(Stack):
 
     can_kill: ClassVar[bool] = True
 
-    def __init__(self, scenario: Scenario, bag: Path | None) -> None:
-        super().__init__(scenario, bag)
+    def __init__(self, scenario: Scenario, bag: Path | None, namespace: str = "") -> None:
+        super().__init__(scenario, bag, namespace)
         self._timeline = KillTimeline(scenario.kills)
         self._time_ns = 0
         self._clock_seen = math.inf
@@ -116,9 +116,10 @@ class MultiProcessStack(Stack):
             lambda: self._time_ns,
             joint_names=None if names is None else lambda: names,
             end_effector=scenario.end_effector_goal is not None,
+            namespace=self.namespace,
         )
         node = self.client.node
-        node.create_subscription(Clock, "/clock", self._on_clock, 10)
+        node.create_subscription(Clock, f"{self.namespace}/clock", self._on_clock, 10)
         self._change_state = {
             name: node.create_client(ChangeState, f"{name}/change_state") for name in self.names
         }
@@ -155,12 +156,13 @@ class MultiProcessStack(Stack):
         overrides |= parameters
         overrides = {k: list(v) if isinstance(v, tuple) else v for k, v in overrides.items()}
         file = Path(self._folder.name, f"{name}.yaml")
-        file.write_text(yaml.safe_dump({name: {"ros__parameters": overrides}}), "utf-8")
+        own = f"{self.namespace}/{name}" if self.namespace else name
+        file.write_text(yaml.safe_dump({own: {"ros__parameters": overrides}}), "utf-8")
         with self._log_of(name).open("wb") as log:
             self.processes[name] = subprocess.Popen(
                 [
                     *(sys.executable, "-m", _CHILD, NODE_TYPES[name].__module__),
-                    *("--ros-args", "-r", f"__node:={name}"),
+                    *("--ros-args", "-r", f"__node:={name}", *namespace_words(self.namespace)),
                     *("--params-file", str(file)),
                 ],
                 **child_options(self._environment()),

@@ -62,7 +62,9 @@ def ros(*, private: bool) -> Iterator[None]:
         rclpy.try_shutdown()
 
 
-def make_stack(scenario: Scenario, bag: Path | None, *, processes: bool) -> Stack:
+def make_stack(
+    scenario: Scenario, bag: Path | None, *, processes: bool, namespace: str = ""
+) -> Stack:
     """Return the stack of a scenario, in this process or with a process for each node.
 
     Raises
@@ -70,7 +72,8 @@ def make_stack(scenario: Scenario, bag: Path | None, *, processes: bool) -> Stac
     SpaceRobotError
         A parameter or the robot is refused, or a node does not start.
     """
-    return MultiProcessStack(scenario, bag) if processes else InProcessStack(scenario, bag)
+    stack = MultiProcessStack if processes else InProcessStack
+    return stack(scenario, bag, namespace)
 
 
 def run_scenario(

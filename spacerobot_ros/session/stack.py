@@ -10,10 +10,12 @@ from typing import ClassVar
 
 import rclpy
 from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidNamespaceException
 from rclpy.experimental import EventsExecutor
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.validate_namespace import validate_namespace
 
 from spacerobot_ros.bag import free_name
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
@@ -29,9 +31,33 @@ from spacerobot_ros.nodes import (
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.session.mission_client import MissionClient
-from spacerobot_ros.topics import NOT_RECORDED
+from spacerobot_ros.topics import GLOBAL_TOPICS, NOT_RECORDED
 
 _DISCOVERY_TIMEOUT = 10.0
+
+
+def namespace_words(namespace: str) -> list[str]:
+    """Return the ROS arguments that put a node, and the clock and frames of its stack, into it."""
+    if not namespace:
+        return []
+    moved = [word for topic in GLOBAL_TOPICS for word in ("-r", f"{topic}:={topic[1:]}")]
+    return ["-r", f"__ns:={namespace}", *moved]
+
+
+def checked_namespace(name: str) -> str:
+    """Return a namespace as ROS writes it, with a slash before it; empty for none.
+
+    Raises
+    ------
+    ParameterError
+        ROS takes no such name.
+    """
+    namespace = f"/{name.strip('/')}" if name.strip("/") else ""
+    try:
+        validate_namespace(namespace or "/")
+    except InvalidNamespaceException as error:
+        raise ParameterError(f"The namespace '{name}' is none of ROS: {error}.") from error
+    return namespace
 
 
 class Stack(ABC):
@@ -43,11 +69,13 @@ class Stack(ABC):
         What to run.
     bag
         File to record into; None records nothing.
+    namespace
+        Of all nodes and topics, the clock and the frames among them; empty for none.
 
     Raises
     ------
     ParameterError
-        A parameter is refused, or the scenario kills nodes and this stack cannot.
+        A parameter or the namespace is refused, or the scenario kills nodes and this stack cannot.
     """
 
     can_kill: ClassVar[bool] = False
@@ -56,7 +84,8 @@ class Stack(ABC):
     client: MissionClient
     executor: EventsExecutor
 
-    def __init__(self, scenario: Scenario, bag: Path | None) -> None:
+    def __init__(self, scenario: Scenario, bag: Path | None, namespace: str = "") -> None:
+        self.namespace = checked_namespace(namespace)
         if scenario.kills and (not self.can_kill or scenario.lockstep):
             raise ParameterError(
                 f"The scenario '{scenario.name}' kills nodes on the way: fly it with --processes "
@@ -130,7 +159,7 @@ class InProcessStack(Stack):
 
     Parameters
     ----------
-    scenario, bag
+    scenario, bag, namespace
         As of every stack.
     context
         rclpy context to live in; None is the default one.
@@ -142,9 +171,14 @@ class InProcessStack(Stack):
     """
 
     def __init__(
-        self, scenario: Scenario, bag: Path | None, context: rclpy.Context | None = None
+        self,
+        scenario: Scenario,
+        bag: Path | None,
+        namespace: str = "",
+        *,
+        context: rclpy.Context | None = None,
     ) -> None:
-        super().__init__(scenario, bag)
+        super().__init__(scenario, bag, namespace)
         self.executor = EventsExecutor(context=context) if context else EventsExecutor()
         self._nodes: list[Node] = []
         try:
@@ -166,6 +200,7 @@ class InProcessStack(Stack):
                 end_effector=scenario.end_effector_goal is not None,
                 # In lockstep here and now: a run ends at the same tick every time.
                 on_end=self.plant.trigger_deactivate if scenario.lockstep else lambda: None,
+                namespace=self.namespace,
                 context=context,
             )
             self._nodes.append(self.client.node)
@@ -263,6 +298,7 @@ class InProcessStack(Stack):
                 autostart=False,
                 context=context,
                 use_global_arguments=False,
+                cli_args=["--ros-args", *namespace_words(self.namespace)],
                 parameter_overrides=[
                     Parameter(key, value=list(value) if isinstance(value, tuple) else value)
                     for key, value in overrides.items()

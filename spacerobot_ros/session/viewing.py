@@ -19,6 +19,7 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes.common.process import use_loopback_discovery
 from spacerobot_ros.nodes.viewer import node
 from spacerobot_ros.parameters import Value
+from spacerobot_ros.session.stack import checked_namespace, namespace_words
 from spacerobot_ros.termination import child_options
 from spacerobot_ros.viewer.server import require_viser
 
@@ -32,7 +33,9 @@ _CHILD = "spacerobot_ros.session.child"
 
 
 @contextmanager
-def viewing(parameters: Mapping[str, Value], show: Callable[[str], None]) -> Iterator[None]:
+def viewing(
+    parameters: Mapping[str, Value], show: Callable[[str], None], namespace: str = ""
+) -> Iterator[None]:
     """Have a viewer run while something else does; ``show`` is given the line with its address.
 
     A viewer that ends by itself ends nothing else.
@@ -43,6 +46,8 @@ def viewing(parameters: Mapping[str, Value], show: Callable[[str], None]) -> Ite
         Of the viewer, by name.
     show
         Shows a line to people.
+    namespace
+        Of the stack that it shows.
 
     Raises
     ------
@@ -51,14 +56,17 @@ def viewing(parameters: Mapping[str, Value], show: Callable[[str], None]) -> Ite
     """
     require_viser()
     use_loopback_discovery()
+    namespace = checked_namespace(namespace)
     with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
         file, log = Path(folder, "viewer.yaml"), Path(folder, "viewer.txt")
-        file.write_text(yaml.safe_dump({"viewer": {"ros__parameters": dict(parameters)}}), "utf-8")
+        own = f"{namespace}/viewer" if namespace else "viewer"
+        file.write_text(yaml.safe_dump({own: {"ros__parameters": dict(parameters)}}), "utf-8")
         with log.open("wb") as errors:
             process = subprocess.Popen(
                 [
                     *(sys.executable, "-m", _CHILD, node.__name__),
                     *("--ros-args", "-r", "__node:=viewer", "--log-level", "WARN"),
+                    *namespace_words(namespace),
                     *("--params-file", str(file)),
                 ],
                 **child_options(),

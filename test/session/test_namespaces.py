@@ -1,0 +1,114 @@
+"""Stacks in namespaces: each has a clock and a bag of its own, in one domain."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+
+from spacerobot_ros.bag import read_bag
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.flight.arrays import Outcome
+from spacerobot_ros.flight.scenario import load_scenario
+from spacerobot_ros.session.stack import InProcessStack, checked_namespace
+from spacerobot_ros.verification.comparison import verify_bag
+
+ROOT = Path(__file__).parents[2]
+COMMAND = (sys.executable, "-m", "spacerobot_ros.cli.main")
+GAIT = (
+    *("--set", "planner.method=lie_bracket"),
+    *("--set", "planner.lie_bracket.t1=4", "--set", "planner.lie_bracket.cycles=0"),
+    *("--set", "planner.attitude_tolerance=0.001", "--set", "planner.position_tolerance=0.001"),
+)
+PATIENCE = 120.0
+
+
+def test_a_stack_in_a_namespace_has_a_clock_and_a_bag_of_its_own(
+    ros_context: rclpy.Context, tmp_path: Path
+) -> None:
+    scenario = load_scenario("planar_chain")
+    stack = InProcessStack(scenario, tmp_path / "a.mcap", "/fleet/one/", context=ros_context)
+    try:
+        stack.start(scenario.goal)
+        stack.spin(lambda: False)
+        stack.finish()
+        assert stack.client.outcome is Outcome.REACHED
+    finally:
+        stack.close()
+    bag = read_bag(tmp_path / "a.mcap")
+    outside = {topic for topic in bag.topics if not topic.startswith("/fleet/one/")}
+    assert outside <= {"/diagnostics"}
+    assert {"/fleet/one/clock", "/fleet/one/tf", "/fleet/one/odom"} <= set(bag.topics)
+    assert verify_bag(tmp_path / "a.mcap").difference is None
+
+
+@pytest.mark.slow
+def test_two_stacks_of_the_command_fly_side_by_side(ros_domain: int, tmp_path: Path) -> None:
+    """One in a process, one in many; each takes its own goal and records its own topics."""
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain), "PYTHONPATH": str(ROOT)}
+    flown = {"one": ("0.05", ()), "two": ("-0.04", ("--processes",))}
+    started = {
+        name: subprocess.Popen(
+            [
+                *(*COMMAND, "up", "sliding_masses", "--rate", "20", "--bag", f"{name}.mcap"),
+                *("--namespace", name, *words, *GAIT),
+            ],
+            env=environment,
+            cwd=tmp_path,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        for name, (_, words) in flown.items()
+    }
+    try:
+        for name, (x, _) in flown.items():
+            sent = subprocess.run(
+                [*COMMAND, "goal", x, "0", "0", "--namespace", name, "--timeout", "60"],
+                env=environment,
+                cwd=tmp_path,
+                capture_output=True,
+                text=True,
+                timeout=PATIENCE,
+                check=False,
+            )
+            assert sent.returncode == 0, sent.stdout + sent.stderr
+            assert "The goal is reached" in sent.stdout
+        for process in started.values():
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=PATIENCE)
+            assert process.returncode == 0, errors
+    finally:
+        for process in started.values():
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait(PATIENCE)
+    for name, (x, _) in flown.items():
+        bag = read_bag(tmp_path / f"{name}.mcap")
+        outside = {topic for topic in bag.topics if not topic.startswith(f"/{name}/")}
+        assert outside <= {"/diagnostics"}
+        end = bag[f"/{name}/odom"].field("pose.pose.position.x")[-1]
+        assert abs(end - float(x)) < 1e-3
+        # One clock: time goes on in steps of one tick, and never back.
+        steps = np.unique(np.diff(bag[f"/{name}/clock"].time_ns))
+        assert steps.min() > 0
+        assert steps.max() <= 2 * steps.min()
+
+
+@pytest.mark.parametrize("name", ["my robot", "1", "a//b", "a-b", "~", "."])
+def test_what_ros_does_not_take_as_a_namespace_is_refused(name: str) -> None:
+    with pytest.raises(ParameterError, match="namespace"):
+        checked_namespace(name)
+
+
+@pytest.mark.parametrize("name", ["a/b", "/a/b", "a/b/", "/a/b/"])
+def test_slashes_at_the_ends_of_a_namespace_do_not_matter(name: str) -> None:
+    assert checked_namespace(name) == "/a/b"
+    assert checked_namespace("") == checked_namespace("/") == ""
