@@ -61,7 +61,9 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=find_packages(include=["spacerobot_ros*"]),
-    package_data={NAME: ["py.typed", "report/*.css", "report/*.js", "report/*.mplstyle"]},
+    package_data={
+        NAME: ["py.typed", "batch/*.hpp", "report/*.css", "report/*.js", "report/*.mplstyle"]
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

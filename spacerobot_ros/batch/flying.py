@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from spacerobot_ros.batch.flights import BatchResult, Flights
+from spacerobot_ros.batch.lanes import fly_in_lanes
 from spacerobot_ros.batch.scalar import fly_one_by_one
+from spacerobot_ros.model.compilation import NoLibraryError
+from spacerobot_ros.private_files import warn_once
 
 
 def fly_lanes(flights: Flights) -> BatchResult:
@@ -13,4 +16,8 @@ def fly_lanes(flights: Flights) -> BatchResult:
     (1e-12 over the flights of the benchmark). Without a C++ compiler the plant flies them one by
     one; :attr:`BatchResult.engine` says so.
     """
-    return fly_one_by_one(flights)
+    try:
+        return fly_in_lanes(flights)
+    except NoLibraryError as reason:
+        warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
+        return fly_one_by_one(flights)

@@ -45,18 +45,19 @@ def _fly(flights: Flights, row: int, result: BatchResult) -> None:
     commands = _Commands(flights, row)
     wanted = iter(flights.instants)
     next_instant, column = next(wanted), 0
-    for tick in range(flights.ticks + 1):
-        sensors.measure()
-        if tick == next_instant:
-            _report(plant, sensors, result, row, column)
-            column += 1
-            next_instant = next(wanted, -1)
-        if tick == flights.ticks:
-            break
-        plant.step(*commands.at(tick, sensors.q if sensors.used else plant.q))
-        _account(plant, flights.control_period, result, row)
-    for name, counts in plant.limit_counts.items():
-        result.limited[name][row] = counts
+    try:
+        for tick in range(flights.ticks + 1):
+            sensors.measure()
+            if tick == next_instant:
+                _report(plant, sensors, result, row, column)
+                column += 1
+                next_instant = next(wanted, -1)
+            if tick < flights.ticks:
+                plant.step(*commands.at(tick, sensors.q if sensors.used else plant.q))
+                _account(plant, flights.control_period, result, row)
+    finally:
+        for name, counts in plant.limit_counts.items():
+            result.limited[name][row] = counts
 
 
 def plant_of(flights: Flights, row: int) -> Plant:

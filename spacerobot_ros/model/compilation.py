@@ -12,6 +12,7 @@ The compiler runs under a time limit, ``SPACEROBOT_COMPILE_TIMEOUT``.
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import json
 import math
@@ -31,7 +32,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.private_files import Cache, warn_once
 from spacerobot_ros.termination import tool
@@ -66,6 +67,10 @@ _hung: set[str] = set()
 
 class _CompilationError(Exception):
     """There is no usable object; the text is a clause that says why."""
+
+
+class NoLibraryError(SpaceRobotError):
+    """There is no compiled library; the text is a clause that says why."""
 
 
 class BufferedFunction:
@@ -220,11 +225,85 @@ def kept_function(
     return function
 
 
+def native_library(
+    name: str,
+    source: str,
+    flags: Sequence[str],
+    libraries: Sequence[str],
+    tried: Sequence[ca.Function],
+) -> ctypes.CDLL:
+    """Return a C++ source as a library that is compiled once, under all that holds for functions.
+
+    Parameters
+    ----------
+    name
+        For the file in the cache.
+    source
+        C++, which has the functions ``tried`` by their names with CasADi's interface.
+    flags, libraries
+        Of the compiler; what the processor must understand is among the flags, and so in the key.
+    tried
+        Functions whose numbers a new library has to give, in a process of its own.
+
+    Raises
+    ------
+    NoLibraryError
+        There is none; the text is a clause that says why.
+    ParameterError
+        ``SPACEROBOT_COMPILE_TIMEOUT`` is not a number of seconds.
+    """
+    compiler, limit = cxx_compiler(), _time_limit()
+    if compiler is None:
+        raise NoLibraryError("no C++ compiler (c++, g++, clang++ or $CXX) was found")
+    flags = [*flags, *_COMMON_FLAGS]
+    key = _hash(f"{_built_for(compiler, flags)} {' '.join(libraries)}\n{source}")
+    cache = Cache(cache_directory())
+    if kept := cache.load(_file(name, key), key):
+        with suppress(OSError):
+            return ctypes.CDLL(str(kept[0]))
+    if compiler in _hung:
+        raise NoLibraryError(f"{compiler} did not end before, and is not called again")
+    try:
+        with tempfile.TemporaryDirectory(prefix="spacerobot_ros_") as folder:
+            work = Path(folder)
+            built = _built(source, compiler, flags, work, limit, libraries, "function.cpp")
+            for function in tried:
+                _try(function, built)
+            kept_at = cache.store(_file(name, key), key, built.read_bytes())
+            for path in (kept_at, built):
+                with suppress(OSError):
+                    if path is not None:
+                        return ctypes.CDLL(str(path))
+    except _CompilationError as reason:
+        raise NoLibraryError(str(reason)) from None
+    except OSError as error:
+        raise NoLibraryError(error.strerror or str(error)) from None
+    raise NoLibraryError("the compiled library cannot be loaded")
+
+
+def vector_source(functions: Sequence[ca.Function], kind: str) -> str:
+    """Return C++ of functions in which every number is of a type of the caller's, ``kind``."""
+    options = {"with_header": False, "cpp": True, "casadi_real": kind}
+    generator = ca.CodeGenerator(functions[0].name(), options)
+    for function in functions:
+        generator.add(function)
+    return str(generator.dump())
+
+
 def c_compiler() -> str | None:
     """Return the C compiler in use: ``$CC``, ``cc``, ``gcc`` or ``clang``; None without one."""
+    return _compiler(os.environ.get("CC"), "cc", "gcc", "clang")
+
+
+def cxx_compiler() -> str | None:
+    """Return the C++ compiler in use: ``$CXX``, ``c++``, ``g++`` or ``clang++``, or None."""
+    return _compiler(os.environ.get("CXX"), "c++", "g++", "clang++")
+
+
+def _compiler(*candidates: str | None) -> str | None:
     if not _is_wanted():
         return None
-    for candidate in (os.environ.get("CC"), "cc", "gcc", "clang"):
+    for candidate in candidates:
         found = shutil.which(candidate) if candidate else None
         if found:
             return found
@@ -327,11 +406,19 @@ def _c_library() -> str:
     return ""
 
 
-def _built(source: str, compiler: str, flags: Sequence[str], folder: Path, limit: float) -> Path:
+def _built(
+    source: str,
+    compiler: str,
+    flags: Sequence[str],
+    folder: Path,
+    limit: float,
+    libraries: Sequence[str] = (),
+    file: str = "function.c",
+) -> Path:
     """Return the object that the compiler makes of a source in a folder."""
-    c_file, built, output = (folder / name for name in ("function.c", "function.so", "output"))
+    c_file, built, output = (folder / name for name in (file, "function.so", "output"))
     c_file.write_text(source, encoding="utf-8")
-    command = [compiler, *flags, "-o", str(built), str(c_file), "-lm"]
+    command = [compiler, *flags, "-o", str(built), str(c_file), *libraries, "-lm"]
     code = _run(command, output, limit)
     if code is None:
         _hung.add(compiler)

@@ -75,7 +75,7 @@ class EffortPlant:
         n = robot.n
         self._stops = JointStops(robot, control_period / substeps)
         self._advance = robot.composed(
-            f"effort_tick_{substeps}", lambda model: _tick_function(robot, model, substeps)
+            f"effort_tick_{substeps}", lambda model: tick_function(robot, model, substeps)
         )
         self._state, self._command, self._h = self._advance.inputs
         self._next_state, self.pose, self.twist, self._realised = self._advance.outputs[:4]
@@ -114,6 +114,15 @@ class EffortPlant:
         )
         self._command[:] = 0.0
         self._report()
+
+    @property
+    def state(self) -> Array:
+        """The state (2 n + 13,) of :mod:`spacerobot_ros.model.composite_rigid_body` now."""
+        return self._next_state
+
+    def place(self, state: Array) -> None:
+        """Put the robot into another state (2 n + 13,); the next step goes on from there."""
+        self._next_state[:] = state
 
     def hold(self, joints: Flags) -> None:
         """Hold these joints (n,) where they are from now on, by inner forces.
@@ -177,7 +186,7 @@ class EffortPlant:
         self._h[:] = self.control_period
 
 
-def _tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Function:
+def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Function:
     """Compose the tick from the model's functions; see :class:`EffortPlant` for its results."""
     n = robot.n
     parts = state_slices(n)

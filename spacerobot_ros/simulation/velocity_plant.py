@@ -56,7 +56,7 @@ class VelocityPlant:
         self.control_period = control_period
         self.initial = initial or InitialState()
         self._advance = robot.composed(
-            f"velocity_tick_{substeps}", lambda model: _tick_function(robot, model, substeps)
+            f"velocity_tick_{substeps}", lambda model: tick_function(robot, model, substeps)
         )
         inputs, outputs = self._advance.inputs, self._advance.outputs
         self._state, self._command, self._momenta, self._r_cm, self._h = inputs
@@ -121,7 +121,7 @@ class VelocityPlant:
         return True
 
 
-def _tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Function:
+def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Function:
     """Compose the tick from the model's functions; see :class:`VelocityPlant` for its results."""
     n = robot.n
     state, command = ca.MX.sym("state", n + 4), ca.MX.sym("command", n)

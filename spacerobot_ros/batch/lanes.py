@@ -1,0 +1,536 @@
+"""Flights on vector registers: blocks of groups, each lane of a group a flight.
+
+A block's memory is one array (groups, rows, lanes); a row is a number of each flight of a group.
+``driver.hpp`` loops over the ticks; what no lane can do, it hands back: a flight whose joint
+touches a stop has that tick taken by the scalar plant, and goes on in its lane.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.batch.flights import (
+    BatchResult,
+    Counts,
+    Flights,
+    FollowedSchedule,
+    HeldCommands,
+    SensorErrors,
+)
+from spacerobot_ros.batch.native import Driver, Job, Span
+from spacerobot_ros.batch.scalar import fly_one_by_one, plant_of
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.model_functions import Composition, ModelFunctions
+from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
+from spacerobot_ros.simulation import effort_plant, velocity_plant
+from spacerobot_ros.simulation.effort_plant import EffortPlant
+
+_BLOCK_BYTES = 32 * 2**20
+"""Memory of a block of flights, noise and commands among it."""
+
+_MOST_GROUPS = 64
+"""Groups of a block: more gain nothing."""
+
+_CHUNK_TICKS = 2000
+"""So many ticks are flown between two looks at signals, and noise is drawn for them."""
+
+_HELD, _FOLLOWED = 0, 1
+
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """How the tick of a plant is laid out.
+
+    ``inputs`` and ``outputs`` are the names of the arguments and results of its function,
+    ``flight`` those results that every tick needs, ``copies`` what a tick hands to the next.
+    """
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    flight: tuple[str, ...]
+    copies: Mapping[str, str]
+
+    @property
+    def reported(self) -> tuple[str, ...]:
+        """Results that reports need too: all but the poses of links."""
+        return tuple(name for name in self.outputs if not name.startswith("link"))
+
+
+_KINDS = {
+    "velocity": _Kind(
+        ("state", "command", "momenta", "r_cm", "h"),
+        (
+            *("next_state", "pose", "twist", "qdot", "momentum"),
+            *("link_R", "link_r", "limited", "next_r_cm"),
+        ),
+        ("next_state", "qdot", "limited", "next_r_cm"),
+        {"next_state": "state", "next_r_cm": "r_cm"},
+    ),
+    "effort": _Kind(
+        ("state", "command", "h"),
+        (
+            *("next_state", "pose", "twist", "realised"),
+            *("momentum", "link_R", "link_r", "limited"),
+        ),
+        ("next_state", "realised", "limited"),
+        {"next_state": "state"},
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Engine:
+    """The compiled tick of flights that are alike, and where its numbers stand in rows.
+
+    Attributes
+    ----------
+    driver
+        The loop.
+    kind
+        The layout of the tick.
+    sizes
+        Rows of each name.
+    """
+
+    driver: Driver
+    kind: _Kind
+    sizes: Mapping[str, int]
+
+    @classmethod
+    def of(cls, flights: Flights, model: ModelFunctions) -> Engine:
+        """Compile the tick of flights, or find it compiled.
+
+        Raises
+        ------
+        NoLibraryError
+            It cannot be compiled here.
+        """
+        kind, robot = _KINDS[flights.actuation], flights.robot
+        make = {"velocity": velocity_plant, "effort": effort_plant}[flights.actuation].tick_function
+        whole = make(robot, Composition(model, ca.MX), flights.substeps)
+        inputs = whole.mx_in()
+        outputs = dict(zip(kind.outputs, whole.call(inputs, True, False), strict=True))
+        flight, report = (
+            ca.Function(f"{flights.actuation}_{name}", inputs, [outputs[each] for each in chosen])
+            for name, chosen in (("flight", kind.flight), ("report", kind.reported))
+        )
+        sizes = {
+            **{n: whole.nnz_in(i) for i, n in enumerate((*kind.inputs, "p"))},
+            **{n: whole.nnz_out(i) for i, n in enumerate(kind.outputs)},
+        }
+        return cls(Driver(flight, report), kind, sizes)
+
+
+def fly_in_lanes(flights: Flights) -> BatchResult:
+    """Fly on vector registers.
+
+    Raises
+    ------
+    NoLibraryError
+        The tick cannot be compiled for them here.
+    """
+    inertial = flights.inertial
+    if inertial is None:
+        inertial = flights.robot.inertial.scaled(np.ones((len(flights), 1)))
+    model, p = flights.robot.symbolic_model(inertial)
+    engine = Engine.of(flights, model)
+    fit = _regular_starts(flights)
+    result = fly_one_by_one(flights, np.flatnonzero(~fit).tolist())
+    failures = dict(result.failures)
+    rows = np.flatnonzero(fit)
+    size = _block_size(flights, engine)
+    for first in range(0, len(rows), size):
+        block = _Block(flights, engine, model, p, rows[first : first + size])
+        block.fly(result, failures)
+    lanes, unit = engine.driver.unit.lanes, engine.driver.unit.name
+    return replace(result, engine=f"{lanes} lanes ({unit})", failures=failures)
+
+
+def _regular_starts(flights: Flights) -> Flags:
+    """Return which flights (N,) start where a plant can; the others have it say why not."""
+    starts, robot = flights.starts, flights.robot
+    fit = np.isfinite(starts.position).all(axis=1) & np.isfinite(starts.momenta).all(axis=1)
+    fit &= np.isfinite(starts.qdot).all(axis=1)
+    fit &= ((starts.q >= robot.lower) & (starts.q <= robot.upper)).all(axis=1)
+    with np.errstate(invalid="ignore"):
+        size = np.linalg.norm(starts.quaternion, axis=1)
+        return np.asarray(fit & np.isfinite(size) & (size > 1e-3) & (size < 1e3))
+
+
+def _block_size(flights: Flights, engine: Engine) -> int:
+    """Return how many flights fit into a block."""
+    n, chunk = flights.robot.n, min(flights.ticks, _CHUNK_TICKS)
+    each = 8 * (2 * sum(engine.sizes.values()) + 60 * len(flights.instants))
+    if flights.sensors is not None:
+        each += 8 * chunk * (12 + 2 * n) * 2
+    program = flights.program
+    tables = [program.positions] if isinstance(program, FollowedSchedule) else [program.joints]
+    each += sum(2 * table[0].nbytes for table in tables if table.ndim == 3)
+    lanes = engine.driver.unit.lanes
+    groups = max(1, min(_MOST_GROUPS, _BLOCK_BYTES // (each * lanes)))
+    return int(groups * lanes)
+
+
+class _Rows:
+    """Names for the rows of a group's memory."""
+
+    def __init__(self, sizes: Mapping[str, int]) -> None:
+        self.slices: dict[str, slice] = {}
+        end = 0
+        for name, size in sizes.items():
+            self.slices[name] = slice(end, end + size)
+            end += size
+        self.count = end
+
+    def __getitem__(self, name: str) -> slice:
+        return self.slices[name]
+
+    def first(self, name: str, offset: int = 0) -> int:
+        return self.slices[name].start + offset
+
+    def span(self, from_: str, to: str) -> Span:
+        at = self.slices[from_]
+        return Span(at.start, self.slices[to].start, at.stop - at.start)
+
+
+class _Block:
+    """The memory of flights that are in lanes at the same time, and their flying.
+
+    Lanes that are left over fly the last flight again; what they give is dropped.
+    """
+
+    def __init__(
+        self, flights: Flights, engine: Engine, model: ModelFunctions, p: Array, rows: Counts
+    ) -> None:
+        self._flights, self._engine, self._flown = flights, engine, rows
+        self._lanes = engine.driver.unit.lanes
+        self._groups = -(-len(rows) // self._lanes)
+        wanted = self._groups * self._lanes
+        self._rows_of_lanes = np.concatenate([rows, np.repeat(rows[-1:], wanted - len(rows))])
+        n = flights.robot.n
+        effort = flights.actuation == "effort"
+        self._rows = rows_ = _Rows(
+            {
+                **engine.sizes,
+                **{"alive": 1, "measured": n, "joint_bias": n, "joint_noise": 1},
+                **{"limits": n if effort else 2 * n, "peak_rate": n, "peak_effort": n},
+                **{"peak_wrench": 2, "impulse": 2},
+            }
+        )
+        self._memory = _aligned((self._groups, rows_.count, self._lanes))
+        self._memory[:, rows_.first("alive")] = 1.0
+        self._set("p", p[self._rows_of_lanes])
+        self._noise = _Noise(flights, self._rows_of_lanes)
+        self._stopped: dict[int, EffortPlant] = {}
+        """The scalar plants of flights that have touched a stop, by their lane in the block."""
+        self._ended: dict[int, int] = {}
+        """The ticks that flights could not take, by their lane in the block."""
+        self._place(model, p)
+        self._job, self._kept = self._prepared()
+
+    def _set(self, name: str, values: Array) -> None:
+        """Write rows (flights of the block, size) of a name."""
+        part = values.reshape(self._groups, self._lanes, -1)
+        self._memory[:, self._rows[name]] = np.swapaxes(part, 1, 2)
+
+    def _get(self, name: str) -> Array:
+        """Return rows (flights of the block, size) of a name."""
+        part = np.swapaxes(self._memory[:, self._rows[name]], 1, 2)
+        return part.reshape(len(self._rows_of_lanes), -1)
+
+    def _place(self, model: ModelFunctions, p: Array) -> None:
+        """Put the flights where they start."""
+        starts, at = self._flights.starts, self._rows_of_lanes
+        quaternion = starts.quaternion[at]
+        quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+        q, r = starts.q[at], starts.position[at]
+        centers = model.function("center_of_mass", compile=False)(q.T, p[at].T).full().T
+        of_base = r + _rotated(quaternion, centers)
+        r_cm = np.where(starts.of_center[at][:, None], r, of_base)
+        if self._flights.actuation == "velocity":
+            state = np.concatenate([q, quaternion], axis=1)
+            self._set("momenta", starts.momenta[at])
+            self._set("r_cm", r_cm)
+        else:
+            state = np.concatenate(
+                [q, quaternion, starts.qdot[at], starts.momenta[at], r_cm], axis=1
+            )
+        self._set("state", state)
+        if self._flights.sensors is not None:
+            self._set("joint_bias", self._flights.sensors.joint_bias[at])
+            self._set("joint_noise", self._flights.sensors.noise[at, 4:5])
+
+    def _prepared(self) -> tuple[Job, list[Any]]:
+        """Return what the driver takes, and the memory that it points to."""
+        flights, kind, rows = self._flights, self._engine.kind, self._rows
+        n, effort = flights.robot.n, flights.actuation == "effort"
+        kept: list[Any] = []
+
+        def pointer(array: Any) -> int:
+            kept.append(array)
+            return int(array.ctypes.data) if isinstance(array, np.ndarray) else _address(array)
+
+        def spans(each: Sequence[Span]) -> Any:
+            return (Span * len(each))(*each)
+
+        state, limited = rows.first("next_state"), rows.first("limited", 1)
+        rates = rows.first("qdot") if not effort else state + n + 4
+        copies = [rows.span(a, b) for a, b in kind.copies.items()]
+        sums = [Span(limited, rows.first("limits"), n if effort else 2 * n)]
+        peaks = [Span(rates, rows.first("peak_rate"), n)]
+        if effort:
+            peaks.append(Span(rows.first("realised"), rows.first("peak_effort"), n))
+        reported = [Span(state, 0, n), Span(rates, n, n)]
+        width = 2 * n
+        for name, size in (("pose", 7), ("twist", 6), ("momentum", 7)):
+            reported.append(Span(rows.first(name), width, size))
+            width += size
+        instants = np.array(flights.instants, dtype=np.int64)
+        self._at = np.zeros(self._groups, np.int64)
+        self._pending = np.zeros(self._groups, np.uint8)
+        self._reports = _aligned((self._groups, len(instants), width, self._lanes))
+        arguments = _numbers([rows.first(name) for name in (*kind.inputs, "p")])
+        flight = _numbers([rows.first(name) for name in kind.flight])
+        report = _numbers([rows.first(name) for name in kind.reported])
+        table, program = self._table()
+        each_table = table.ndim == 4
+        follows = isinstance(program, FollowedSchedule)
+        job = Job(
+            memory=pointer(self._memory),
+            groups=self._groups,
+            rows=rows.count,
+            at=pointer(self._at),
+            pending=pointer(self._pending),
+            arguments=pointer(arguments),
+            flight_results=pointer(flight),
+            report_results=pointer(report),
+            argument_count=len(arguments),
+            flight_result_count=len(flight),
+            report_result_count=len(report),
+            copies=pointer(spans(copies)),
+            sums=pointer(spans(sums)),
+            peaks=pointer(spans(peaks)),
+            copy_count=len(copies),
+            sum_count=len(sums),
+            peak_count=len(peaks),
+            stop_row=rows.first("limited", 1 + n) if effort else -1,
+            alive_row=rows.first("alive"),
+            wrench_row=rows.first("realised", n) if effort else -1,
+            wrench_peak_row=rows.first("peak_wrench"),
+            impulse_row=rows.first("impulse"),
+            period=flights.control_period,
+            program=_FOLLOWED if follows else _HELD,
+            command_row=rows.first("command"),
+            command_count=table.shape[2] if each_table else table.shape[1],
+            table=pointer(table),
+            table_ticks=table.shape[1] if each_table else table.shape[0],
+            each_table=each_table,
+            q_row=rows.first("state"),
+            measured_row=rows.first("measured"),
+            bias_row=rows.first("joint_bias"),
+            noise_row=rows.first("joint_noise"),
+            n=n,
+            noisy=flights.sensors is not None,
+            gain=0.0,
+            deadband=0.0,
+            instants=pointer(instants),
+            instant_count=len(instants),
+            reports=pointer(self._reports),
+            reported=pointer(spans(reported)),
+            reported_count=len(reported),
+            report_rows=width,
+        )
+        if isinstance(program, FollowedSchedule):
+            job.gain = min(program.shape_gain, 1.0 / flights.control_period)
+            job.deadband = program.deadband
+        return job, kept
+
+    def _table(self) -> tuple[Array, FollowedSchedule | HeldCommands]:
+        """Return the commands, (ticks, width), or (groups, ticks, width, lanes) where they differ,
+        and the program that they are of.
+        """
+        program = self._flights.program
+        match program:
+            case FollowedSchedule():
+                table = self._of_lanes(program.positions)
+            case HeldCommands():
+                parts = [self._of_lanes(program.joints)]
+                if self._flights.actuation == "effort":
+                    wrench = program.wrench
+                    parts.append(np.zeros((1, 6)) if wrench is None else self._of_lanes(wrench))
+                ticks = max(part.shape[-2] for part in parts)
+                each = max(part.ndim for part in parts)
+                table = np.concatenate(
+                    [_lengthened(part, ticks, each, len(self._rows_of_lanes)) for part in parts],
+                    axis=-1,
+                )
+        if table.ndim == 3:
+            grouped = table.reshape(self._groups, self._lanes, *table.shape[1:])
+            table = np.moveaxis(grouped, 1, 3)
+        return np.ascontiguousarray(table), program
+
+    def _of_lanes(self, table: Array) -> Array:
+        return table if table.ndim == 2 else np.asarray(table[self._rows_of_lanes])
+
+    # -- flying -------------------------------------------------------------------------------
+
+    def fly(self, result: BatchResult, failures: dict[int, str]) -> None:
+        """Fly the flights and write what comes of them."""
+        flights, job, driver = self._flights, self._job, self._engine.driver
+        # A tick of no duration under no command reports the start.
+        driver.start(job)
+        self._set("h", np.full(len(self._rows_of_lanes), flights.control_period))
+        for begin in range(0, flights.ticks, _CHUNK_TICKS):
+            end = min(begin + _CHUNK_TICKS, flights.ticks)
+            # The state at the end is measured too.
+            normals = self._noise.drawn(begin, end + (end == flights.ticks), self._lanes)
+            job.normals = 0 if normals is None else normals.ctypes.data
+            job.normals_from, job.normals_ticks = begin, 0 if normals is None else normals.shape[1]
+            while driver.fly_until(job, end):
+                self._take_stopped(result, failures)
+        self._write(result)
+
+    def _take_stopped(self, result: BatchResult, failures: dict[int, str]) -> None:
+        """Have the scalar plant take the ticks of lanes that wait, and put them back."""
+        stop, alive = self._rows.first("limited", 1 + self._flights.robot.n), self._rows["alive"]
+        for group in np.flatnonzero(self._pending):
+            lanes = self._memory[group, stop] * self._memory[group, alive][0]
+            for lane in np.flatnonzero(lanes):
+                index = int(group * self._lanes + lane)
+                try:
+                    self._take(int(group), int(lane), index, result)
+                except SpaceRobotError as error:
+                    self._memory[group, alive, lane] = 0.0
+                    if index < len(self._flown):
+                        failures[int(self._flown[index])] = str(error)
+                        self._ended[index] = int(self._at[group])
+
+    def _take(self, group: int, lane: int, index: int, result: BatchResult) -> None:
+        row, n = int(self._rows_of_lanes[index]), self._flights.robot.n
+        if index not in self._stopped:
+            plant = plant_of(self._flights, row)
+            assert isinstance(plant, EffortPlant)
+            self._stopped[index] = plant
+        plant = self._stopped[index]
+        memory = {name: self._memory[group, at, lane] for name, at in self._rows.slices.items()}
+        plant.place(memory["state"])
+        before = plant.stroke_limited.copy()
+        plant.step(memory["command"][:n], memory["command"][n:])
+        memory["next_state"][:] = plant.state
+        memory["pose"][:], memory["twist"][:] = plant.pose, plant.twist
+        memory["momentum"][:], memory["limited"][1 + n] = plant.momentum, 0.0
+        if index < len(self._flown):
+            result.limited["stroke"][row] += plant.stroke_limited - before
+            result.fallback_ticks[row] += 1
+
+    def _write(self, result: BatchResult) -> None:
+        count, n, rows = len(self._flown), self._flights.robot.n, self._flown
+        reports = np.moveaxis(self._reports, 3, 1).reshape(-1, *self._reports.shape[1:3])
+        for index, tick in self._ended.items():
+            if index < count:
+                reports[index, np.array(self._flights.instants) > tick] = np.nan
+        ends = np.cumsum([n, n, 7, 6, 7])
+        names = ("q", "qdot", "pose", "twist", "momentum")
+        for name, part in zip(names, np.split(reports[:count], ends[:-1], axis=2), strict=True):
+            getattr(result, name)[rows] = part
+        for name in ("peak_rate", "peak_effort", "peak_wrench", "impulse"):
+            getattr(result, name)[rows] = self._get(name)[:count]
+        limits = self._get("limits")[:count].astype(np.int64)
+        first = "effort" if self._flights.actuation == "effort" else "rate"
+        result.limited[first][rows] = limits[:, :n]
+        if first == "rate":
+            result.limited["stroke"][rows] = limits[:, n:]
+        pose, q = self._noise.measured(result.pose[rows], result.q[rows])
+        result.measured_pose[rows], result.measured_q[rows] = pose, q
+
+
+class _Noise:
+    """The random numbers of the sensors of a block's flights, as :class:`.Sensors` draws them."""
+
+    def __init__(self, flights: Flights, rows: Counts) -> None:
+        self._errors: SensorErrors | None = flights.sensors
+        self._instants = flights.instants
+        self._n = flights.robot.n
+        self._rows = rows
+        if self._errors is None:
+            return
+        self._used = self._errors.used[rows] & self._errors.noise[rows].any(axis=1)
+        self._generators = [
+            np.random.default_rng(int(seed)) if used else None
+            for seed, used in zip(self._errors.seeds[rows], self._used, strict=True)
+        ]
+        self._at_instants = np.zeros((len(rows), len(self._instants), 12 + 2 * self._n))
+
+    def drawn(self, begin: int, end: int, lanes: int) -> Array | None:
+        """Draw for the states at the ticks from ``begin`` to before ``end``; return what falls to
+        joint positions, (groups, ticks, n, lanes). None where nothing errs.
+        """
+        if self._errors is None:
+            return None
+        ticks, width = end - begin, 12 + 2 * self._n
+        joints = np.zeros((len(self._rows), ticks, self._n))
+        chosen = [(i, tick - begin) for i, tick in enumerate(self._instants) if begin <= tick < end]
+        for index, generator in enumerate(self._generators):
+            if generator is None:
+                continue
+            drawn = generator.standard_normal((ticks, width))
+            joints[index] = drawn[:, 12 : 12 + self._n]
+            for instant, tick in chosen:
+                self._at_instants[index, instant] = drawn[tick]
+        grouped = joints.reshape(-1, lanes, ticks, self._n)
+        return np.ascontiguousarray(np.moveaxis(grouped, 1, 3))
+
+    def measured(self, pose: Array, q: Array) -> tuple[Array, Array]:
+        """Return what is measured of poses (count, I, 7) and shapes (count, I, n)."""
+        if self._errors is None:
+            return pose, q
+        rows, count = self._rows[: len(pose)], len(pose)
+        noise = self._errors.noise[rows][:, None]
+        bias, drawn = self._errors.pose_bias[rows][:, None], self._at_instants[:count]
+        measured = pose.copy()
+        measured[..., :3] += bias[..., :3] + noise[..., :1] * drawn[..., :3]
+        turns = bias[..., 3:] + noise[..., 1:2] * drawn[..., 3:6]
+        for index in np.argwhere(turns.any(axis=2)):
+            at = tuple(index)
+            measured[at][3:] = quaternion_multiply(pose[at][3:], quaternion_from_rotvec(turns[at]))
+        of_joints = noise[..., 4:5] * drawn[..., 12 : 12 + self._n]
+        return measured, q + self._errors.joint_bias[rows][:, None] + of_joints
+
+
+def _rotated(quaternion: Array, vectors: Array) -> Array:
+    """Return ``R v`` of quaternions (N, 4) and vectors (N, 3)."""
+    x, w = quaternion[:, :3], quaternion[:, 3:]
+    return np.asarray(vectors + 2 * np.cross(x, np.cross(x, vectors) + w * vectors))
+
+
+def _lengthened(table: Array, ticks: int, dimensions: int, count: int) -> Array:
+    """Return commands with zeros after their last, and a copy for each flight where wanted."""
+    rest = np.zeros((*table.shape[:-2], ticks - table.shape[-2], table.shape[-1]))
+    whole = np.concatenate([table, rest], axis=-2)
+    return np.broadcast_to(whole, (count, *whole.shape)) if dimensions > whole.ndim else whole
+
+
+def _aligned(shape: tuple[int, ...]) -> Array:
+    """Return zeros that begin where a vector register can be loaded from."""
+    count = int(np.prod(shape))
+    memory = np.zeros(count + 8)
+    offset = (-memory.ctypes.data % 64) // 8
+    return memory[offset : offset + count].reshape(shape)
+
+
+def _numbers(values: Sequence[int]) -> npt.NDArray[np.int64]:
+    return np.array(values, dtype=np.int64)
+
+
+def _address(array: Any) -> int:
+    return ctypes.addressof(array)

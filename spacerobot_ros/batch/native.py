@@ -1,0 +1,211 @@
+"""The tick of a plant compiled for vector registers: a flight in each lane."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import casadi as ca
+
+from spacerobot_ros.model.compilation import NoLibraryError, native_library, vector_source
+
+_HERE = Path(__file__).resolve().parent
+
+_SELECTION = re.compile(r"\((\w+)\?(\w+):0\)")
+"""How CasADi writes a number that is zero unless a condition holds."""
+
+
+@dataclass(frozen=True)
+class VectorUnit:
+    """A kind of vector registers.
+
+    Attributes
+    ----------
+    name
+        For people.
+    lanes
+        Numbers of 64 bits in a register.
+    flags
+        What tells the compiler.
+    libmvec
+        Letter of its functions in the vector library of the C library; empty: none.
+    """
+
+    name: str
+    lanes: int
+    flags: tuple[str, ...]
+    libmvec: str
+
+
+UNITS: dict[str, VectorUnit] = {
+    "avx512f": VectorUnit("AVX-512", 8, ("-mavx512f", "-mprefer-vector-width=512"), "e"),
+    "avx2": VectorUnit("AVX2", 4, ("-mavx2",), "d"),
+    "sse2": VectorUnit("SSE2", 2, ("-msse2",), "b"),
+}
+"""By the name of the processor's flag, the widest first."""
+
+_PLAIN = VectorUnit("two at a time", 2, (), "")
+"""For processors of other kinds: the compiler makes of it what there is."""
+
+
+@lru_cache(maxsize=1)
+def vector_unit() -> VectorUnit:
+    """Return the widest kind that this processor and its kernel have."""
+    try:
+        text = Path("/proc/cpuinfo").read_text("utf-8", errors="replace")
+    except OSError:
+        return _PLAIN
+    found = re.search(r"^flags\s*:(.*)$", text, re.MULTILINE)
+    flags = found[1].split() if found else []
+    return next((unit for flag, unit in UNITS.items() if flag in flags), _PLAIN)
+
+
+class Span(ctypes.Structure):
+    """Rows that are copied, added or compared: from, to, count."""
+
+    _fields_ = [(name, ctypes.c_longlong) for name in ("start", "to", "count")]
+
+
+_POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_longlong, ctypes.c_double
+
+
+class Job(ctypes.Structure):
+    """What ``driver.hpp`` takes, in its order."""
+
+    _fields_ = [
+        ("memory", _POINTER),
+        *((name, _WHOLE) for name in ("groups", "rows")),
+        *((name, _POINTER) for name in ("at", "pending")),
+        *((name, _POINTER) for name in ("arguments", "flight_results", "report_results")),
+        *((f"{name}_count", _WHOLE) for name in ("argument", "flight_result", "report_result")),
+        *((name, _POINTER) for name in ("copies", "sums", "peaks")),
+        *((f"{name}_count", _WHOLE) for name in ("copy", "sum", "peak")),
+        *((name, _WHOLE) for name in ("stop_row", "alive_row")),
+        *((name, _WHOLE) for name in ("wrench_row", "wrench_peak_row", "impulse_row")),
+        ("period", _REAL),
+        *((name, _WHOLE) for name in ("program", "command_row", "command_count")),
+        ("table", _POINTER),
+        *((name, _WHOLE) for name in ("table_ticks", "each_table")),
+        *((name, _WHOLE) for name in ("q_row", "measured_row", "bias_row", "noise_row")),
+        *((name, _WHOLE) for name in ("n", "noisy")),
+        ("normals", _POINTER),
+        *((name, _WHOLE) for name in ("normals_from", "normals_ticks")),
+        *((name, _REAL) for name in ("gain", "deadband")),
+        ("instants", _POINTER),
+        ("instant_count", _WHOLE),
+        ("reports", _POINTER),
+        ("reported", _POINTER),
+        *((name, _WHOLE) for name in ("reported_count", "report_rows")),
+    ]
+
+
+class Driver:
+    """The compiled loop over ticks and groups of lanes.
+
+    Parameters
+    ----------
+    flight, report
+        The tick with the results that every tick needs, and with those of reports as well.
+
+    Raises
+    ------
+    NoLibraryError
+        It cannot be compiled here.
+    """
+
+    def __init__(self, flight: ca.Function, report: ca.Function) -> None:
+        self.unit = vector_unit()
+        self._library = _library(flight, report, self.unit)
+        self._start = self._library.start_flights
+        self._fly = self._library.fly_until
+        for function in (self._start, self._fly):
+            function.argtypes = [ctypes.POINTER(Job)]
+        self._start.restype = None
+        self._fly.argtypes = [ctypes.POINTER(Job), _WHOLE]
+        self._fly.restype = _WHOLE
+
+    def start(self, job: Job) -> None:
+        """Fill what is reported at the start."""
+        self._start(ctypes.byref(job))
+
+    def fly_until(self, job: Job, tick: int) -> int:
+        """Fly to a tick; return how many groups wait for one of their lanes before it."""
+        return int(self._fly(ctypes.byref(job), tick))
+
+
+def _library(flight: ca.Function, report: ca.Function, unit: VectorUnit) -> ctypes.CDLL:
+    """Return the library, with the vector functions of the C library if it has them."""
+    try:
+        return _compiled(flight, report, unit, unit.libmvec)
+    except NoLibraryError:
+        if not unit.libmvec:
+            raise
+        return _compiled(flight, report, unit, "")
+
+
+def _compiled(
+    flight: ca.Function, report: ca.Function, unit: VectorUnit, libmvec: str
+) -> ctypes.CDLL:
+    renamed = [_renamed(function, f"vector_{function.name()}") for function in (flight, report)]
+    body = _SELECTION.sub(r"where(\1,\2)", vector_source(renamed, "V"))
+    parts = [_definitions(flight, report, unit, libmvec), _file("lanes.hpp"), body]
+    parts.append(f"#define FLIGHT {renamed[0].name()}\n#define REPORT {renamed[1].name()}\n")
+    parts += [_file("driver.hpp"), *(_trial(function) for function in (flight, report))]
+    # Vectors as arguments between functions of this file: no other is called with them.
+    flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *unit.flags)
+    libraries = ("-lmvec",) if libmvec else ()
+    return native_library(
+        f"lanes_{flight.name()}", "\n".join(parts), flags, libraries, [flight, report]
+    )
+
+
+def _renamed(function: ca.Function, name: str) -> ca.Function:
+    inputs = function.mx_in()
+    outputs = function.call(inputs, True, False)
+    return ca.Function(name, inputs, outputs, function.name_in(), function.name_out())
+
+
+def _definitions(flight: ca.Function, report: ca.Function, unit: VectorUnit, libmvec: str) -> str:
+    both = flight, report
+    numbers = {
+        "LANES": unit.lanes,
+        "WORK_SIZE": max(function.sz_w() for function in both) + 1,
+        "ARGUMENT_POINTERS": max(function.sz_arg() for function in both) + 1,
+        "RESULT_POINTERS": max(function.sz_res() for function in both) + 1,
+        "INTEGER_SIZE": max(function.sz_iw() for function in both) + 1,
+        "TRIAL_SIZE": max(function.nnz_in() + function.nnz_out() for function in both) + 1,
+    }
+    lines = [f"#define {name} {value}" for name, value in numbers.items()]
+    if libmvec:
+        # The names of the x86-64 vector ABI: kind of registers, lanes, one vector argument.
+        lines += ["#define LIBMVEC"]
+        lines += [
+            f"#define VECTOR_{name.upper()} _ZGV{libmvec}N{unit.lanes}v_{name}"
+            for name in ("sin", "cos")
+        ]
+    return "\n".join(lines)
+
+
+def _trial(function: ca.Function) -> str:
+    """Return the C++ that gives the vector function CasADi's interface for single numbers."""
+    name = function.name()
+    inputs = [function.nnz_in(i) for i in range(function.n_in())]
+    outputs = [function.nnz_out(i) for i in range(function.n_out())]
+    return (
+        f'extern "C" int {name}(const double **arguments, double **results, long long *, double *, '
+        f"int) {{\n  static const long long in[] = {_braces(inputs)}, out[] = {_braces(outputs)};\n"
+        f"  return trial(vector_{name}, in, {len(inputs)}, out, {len(outputs)}, arguments, "
+        "results);\n}\n"
+    )
+
+
+def _braces(numbers: Sequence[int]) -> str:
+    return "{" + ", ".join(map(str, numbers)) + "}"
+
+
+def _file(name: str) -> str:
+    return (_HERE / name).read_text("utf-8")
