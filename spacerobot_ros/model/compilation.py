@@ -267,10 +267,10 @@ def native_library(
         with tempfile.TemporaryDirectory(prefix="spacerobot_ros_") as folder:
             work = Path(folder)
             built = _built(source, compiler, flags, work, limit, libraries, "function.cpp")
-            for function in tried:
-                _try(function, built)
-            kept_at = cache.store(_file(name, key), key, built.read_bytes())
-            for path in (kept_at, built):
+            for each in tried:
+                _try(each, built)
+            stored = cache.store(_file(name, key), key, built.read_bytes())
+            for path in (stored, built):
                 with suppress(OSError):
                     if path is not None:
                         return ctypes.CDLL(str(path))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from spacerobot_ros.model.composite_rigid_body import Composites
+from spacerobot_ros.model.composite_rigid_body import Composites, Factor
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.kinematics import TreeKinematics
 
@@ -56,7 +56,11 @@ def base_twist(
 
     With both zero it is ``-A(q) qdot``.
     """
-    omega = solve_positive_definite(inertia.D, L_B - inertia.D_q @ qdot)
+    excess = L_B - inertia.D_q @ qdot
+    if kin.weights.inputs:
+        omega = Factor(inertia.D).solve(excess)
+    else:
+        omega = solve_positive_definite(inertia.D, excess)
     c = kin.r_BC_B
     v = p_B / inertia.mass - ca.cross(omega, c) - ca.jtimes(c, kin.q, qdot)
     return v, omega
