@@ -62,7 +62,14 @@ setup(
     python_requires=">=3.10",
     packages=find_packages(include=["spacerobot_ros*"]),
     package_data={
-        NAME: ["py.typed", "batch/*.hpp", "report/*.css", "report/*.js", "report/*.mplstyle"]
+        NAME: [
+            "py.typed",
+            "batch/*.hpp",
+            "report/*.css",
+            "report/*.js",
+            "report/*.mplstyle",
+            "report/vendor/*",
+        ]
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -144,3 +144,22 @@ _NUMBERS = (
     "lost_effort",
 )
 """Values of a command report that are one number each."""
+
+
+def tracking_time(states: Iterable[tuple[float, ControllerState]]) -> float | None:
+    """Return how long a controller flew, s: from the first state that it tracked to the last end
+    of a goal that it named.
+
+    Parameters
+    ----------
+    states
+        Time (s) and state of its statuses. None of them need be there; then it is None.
+    """
+    given = list(states)
+    began = [time for time, state in given if state is ControllerState.TRACKING]
+    ended = [
+        time
+        for time, state in given
+        if state.decided and state is not ControllerState.REFUSED and began and time >= began[0]
+    ]
+    return ended[-1] - began[0] if ended else None

@@ -36,6 +36,17 @@ class FlightEvent:
     node: str
     event: Event
 
+    @property
+    def text(self) -> str:
+        """What has happened in a few words, such as ``fault on: joint_stuck elbow at 5``."""
+        label, about = _MARKS[self.event.kind].label, self.event.about
+        details = [about[key] for key in _DETAILS if about.get(key)]
+        return f"{label}: {', '.join(details)}" if details else label
+
+
+_DETAILS = ("fault", "joints", "reason", "method", "node")
+"""What tells an event from others of its kind."""
+
 
 @dataclass(frozen=True)
 class _Mark:
@@ -77,6 +88,40 @@ _MARKS = {
     EventKind.NODE_BACK: _Mark("node back", "h", _GOOD, 1, hollow=True),
 }
 """Kinds that are drawn; the others are about the life of nodes."""
+
+
+_GLYPHS = {
+    "v": "▼▽",
+    "^": "▲△",
+    ">": "▶▷",
+    "o": "●○",
+    "s": "■□",
+    "D": "◆◇",
+    "d": "◆◇",
+    "h": "⬢⬡",
+    "*": "★☆",
+    "X": "✖✖",
+    "|": "❙❙",
+    "P": "✚✚",
+}
+"""The markers of matplotlib as letters, full and hollow."""
+
+_FAULTS = frozenset((EventKind.FAULT_INJECTED, EventKind.FAULT_ENDED, EventKind.FAULTS_CLEARED))
+_STRONG = _FAULTS | {EventKind.STUCK_JOINT, EventKind.LATCHED, EventKind.GOAL_ABORTED}
+"""Kinds that are marked through the whole height of a chart."""
+
+
+def mark_of(kind: EventKind) -> dict[str, Any]:
+    """Return how events of a kind look on a page."""
+    mark = _MARKS[kind]
+    return {
+        "kind": kind.value,
+        "glyph": _GLYPHS[mark.marker][mark.hollow],
+        "colour": mark.colour,
+        # Faults have a row between, so that what found them does not stand in their words.
+        "row": 1 if kind in _FAULTS else 2 * mark.row,
+        "strong": kind in _STRONG,
+    }
 
 
 def read_events(robot: RecordedRobot, began: float, *, stamped: bool) -> list[FlightEvent]:

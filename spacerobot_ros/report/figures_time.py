@@ -246,11 +246,12 @@ def rates_plate(flight: Flight) -> Plate | str:
         for axes in panels[-1]:
             draw_events(axes, flight.events)
     caption = "Velocity of each joint; dotted, its limit in the URDF, where that is in range."
+    aside = ""
     if cycles is not None:
-        caption += f" Right: the last {SHOWN_CYCLES} of {cycles.count} cycles, to the same scale."
-    caption += f" {BAND}" if any(dense) else ""
-    caption += f" {EVENTS}" if flight.events else ""
-    return Plate("velocities", "Joint velocities", caption, figure, groups)
+        aside += f" Right: the last {SHOWN_CYCLES} of {cycles.count} cycles, to the same scale."
+    aside += f" {BAND}" if any(dense) else ""
+    caption += aside + (f" {EVENTS}" if flight.events else "")
+    return Plate("velocities", "Joint velocities", caption, figure, groups, aside)
 
 
 def draw_whole(axes: Axes, flight: Flight, group: Group, share: float = 1.0) -> bool:
@@ -329,14 +330,15 @@ def time_plate(flight: Flight, name: str, heading: str, what: str, groups: list[
     if any(group.limits for group in groups):
         caption += "; dotted, the limits of the URDF, where they are in range"
     caption += "."
+    aside = ""
     if cycles is not None:
-        caption += (
+        aside += (
             f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
             f"what comes before them, and {_close_up(cycles)}."
         )
-    caption += f" {BAND}" if any(dense) else ""
-    caption += f" {EVENTS}" if flight.events else ""
-    return Plate(name, heading, caption, figure, groups)
+    aside += f" {BAND}" if any(dense) else ""
+    caption += aside + (f" {EVENTS}" if flight.events else "")
+    return Plate(name, heading, caption, figure, groups, aside)
 
 
 def _draw_rows(axes: Axes, flight: Flight, group: Group, share: float) -> bool:
@@ -560,8 +562,8 @@ def momentum_plate(flight: Flight) -> Plate | str:
         f"what thrusters have put in taken off{largest_of}, on a logarithmic axis; less than it "
         "shows, and zero, lies on its lower edge. Bottom: kinetic energy."
     )
-    caption += f" {BAND}" if dense else ""
-    caption += f" {EVENTS}" if flight.events else ""
+    aside = f" {BAND}" if dense else ""
+    caption += aside + (f" {EVENTS}" if flight.events else "")
     groups = [
         Group(
             Signal(time, changes),
@@ -573,7 +575,7 @@ def momentum_plate(flight: Flight) -> Plate | str:
         ),
         Group(Signal(time, energy), ["energy"], "kinetic energy", "J", [colour(2)]),
     ]
-    return Plate("momentum", "Momentum balance", caption, figure, groups)
+    return Plate("momentum", "Momentum balance", caption, figure, groups, aside)
 
 
 def power_of_ten(value: float) -> str:

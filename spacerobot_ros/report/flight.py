@@ -12,7 +12,7 @@ import numpy as np
 
 from spacerobot_ros.bag import Bag, RecordedRobot, TopicSeries, read_bag
 from spacerobot_ros.bag.recorded_robot import columns
-from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
+from spacerobot_ros.control.status import CommandReport, ControllerStatus, tracking_time
 from spacerobot_ros.control.thrusters.table import IN_URDF, find_thrusters
 from spacerobot_ros.errors import PlanningError, RobotDescriptionError, SpaceRobotError
 from spacerobot_ros.flight.scenario import Published
@@ -302,15 +302,28 @@ class Flight:
 
     @property
     def manoeuvre_time(self) -> float | None:
-        """Time from the first schedule for the last goal to its end, s; of a controller, from the
-        first state that it flew to the end that it named.
+        """Duration of the schedules for the last goal that were flown, s, as the planner counts it,
+        or else :attr:`time_to_end`; of a controller, from the first state that it flew to the end
+        that it named.
+        """
+        if not self.executing:
+            return tracking_time(
+                (status.time, status.report.state)
+                for status in self.statuses
+                if isinstance(status.report, ControllerStatus)
+            )
+        last = self.statuses[-1].report
+        counted = last.manoeuvre_time_s if isinstance(last, PlannerStatus) else 0.0
+        return counted or self.time_to_end
+
+    @property
+    def time_to_end(self) -> float | None:
+        """Time from the first schedule for the last goal to its end, s, with what was waited in
+        between; None where no schedule was flown.
         """
         schedules = self.executing
         if not schedules:
-            tracking = ControllerState.TRACKING.value
-            flying = [s.time for s in self.statuses if s.state == tracking]
-            ended = [s.time for s in self.statuses if s.state in _FOLLOWED]
-            return ended[-1] - flying[0] if flying and ended else None
+            return None
         index = last = self.statuses.index(schedules[-1])
         while index and (before := self.statuses[index - 1]).executing:
             if before.goal != schedules[-1].goal:
@@ -372,6 +385,11 @@ class Flight:
         spans = list(zip(starts, [*starts[1:], self.end], strict=True))
         start, end = max(spans, key=lambda span: span[1] - span[0])
         return find_cycles(self.rates.between(start, end))
+
+    @property
+    def tick(self) -> float:
+        """Time from one recorded pose to the next, s; 0 with one or none."""
+        return float(np.median(np.diff(self.position.time))) if len(self.position) > 1 else 0.0
 
     def drift(self, first: int) -> float:
         """Largest change of linear (``first`` 0) or angular (3) momentum, SI."""

@@ -8,12 +8,10 @@ three.js in it. An object is in three.js' JSON object format.
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 from dataclasses import dataclass
 from html import escape
-from importlib.resources import files
+from importlib.metadata import distribution
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.model.description import Array, Pose, Shape
+from spacerobot_ros.report.live import Live, own_file
 from spacerobot_ros.report.solids import EDGE, is_rod, outline
 
 Command = dict[str, Any]
@@ -188,29 +187,29 @@ move it; click it first to zoom with the wheel.</p>
 """
 
 
-@dataclass(frozen=True)
-class Player:
-    """What goes into the page: ``markup``, ``scripts``, and what its security policy must allow."""
-
-    markup: str
-    scripts: str = ""
-    policy: str = ""
-
-
-def player_of(scene: Scene | str) -> Player:
+def player_of(scene: Scene | str) -> Live:
     """Return the player of a scene, or the sentence that stands for it."""
     viewer = viewer_script()
     if isinstance(scene, str) or viewer is None:
         sentence = scene if isinstance(scene, str) else NO_VIEWER
-        return Player(f'<p class="missing">{escape(sentence)}</p>')
+        return Live(f'<p class="missing">{escape(sentence)}</p>')
     parts = [{"name": name, "start": start, "end": end} for name, start, end in scene.parts]
-    data = json.dumps({"parts": parts, "commands": scene.commands}, separators=(",", ":"))
-    # A name of a link cannot end the script that it stands in.
-    data = data.replace("</", "<\\/").replace("<!--", "<\\u0021--")
-    own = files("spacerobot_ros.report").joinpath("player.js").read_text(encoding="utf-8")
-    programs = [viewer, own]
-    scripts = f'<script type="application/json" id="flight">{data}</script>\n'
-    scripts += "\n".join(f"<script>{program}</script>" for program in programs)
-    hashes = [hashlib.sha256(program.encode()).digest() for program in programs]
-    allowed = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in hashes)
-    return Player(_MARKUP.format(caption=escape(scene.caption)), scripts, f"script-src {allowed}")
+    return Live(
+        markup=_MARKUP.format(caption=escape(scene.caption)),
+        data={"flight": {"parts": parts, "commands": scene.commands}},
+        programs=(viewer, own_file("player.js")),
+        notices=_notices(),
+    )
+
+
+def _notices() -> tuple[tuple[str, str], ...]:
+    """Return the licences of MeshCat and of what is in its viewer, three.js above all."""
+    found = []
+    for file in distribution("meshcat").files or ():
+        if file.name in ("LICENSE.txt", "LICENSE", "LICENCE"):
+            found.append(("MeshCat", file.read_text()))
+        elif file.name.endswith("THIRD_PARTY_LICENSES.json"):
+            for each in json.loads(file.read_text()):
+                text = each.get("licenseText") or each.get("license", "")
+                found.append((f"{each.get('name', '')} {each.get('version', '')}", text))
+    return tuple(sorted(found, key=lambda notice: notice[0] != "MeshCat"))

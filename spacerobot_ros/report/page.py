@@ -5,10 +5,11 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from html import escape
-from importlib.resources import files
 
+from spacerobot_ros.report.charts import chart_numbers, charts_of
+from spacerobot_ros.report.events import FlightEvent
 from spacerobot_ros.report.flight import Flight
-from spacerobot_ros.report.meshcat import Player
+from spacerobot_ros.report.live import Live, notices_of, own_file, policy_of, scripts_of
 from spacerobot_ros.report.plates import Plate
 from spacerobot_ros.report.tables import (
     Table,
@@ -20,20 +21,30 @@ from spacerobot_ros.report.tables import (
 )
 
 _SCROLL = '<div class="scroll">'
+_HINT = '<p class="hint">Wider than this screen: scroll sideways →</p>'
+_USE = (
+    '<p class="facts" id="use">Drag across a chart to look at a part of the time in all of them, '
+    "click twice for the whole flight. Click once to see the robot at that instant above; the "
+    "upright line is the instant that is shown there. Click a name to hide its trace.</p>"
+)
+_MOST_ROWS = 60
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
 def page(
     flight: Flight,
-    player: Player,
+    player: Live,
     plates: Sequence[Plate | str | None],
     beside: Sequence[Flight] = (),
 ) -> str:
     """Return the whole page; flights ``beside`` this one get a row in a table."""
+    charts, controls = charts_of(flight, plates), Live(programs=(own_file("page.js"),))
+    parts = (player, charts, controls)
     name = flight.scenario
     title = ", ".join(filter(None, (name, flight.method, flight.robot_name)))
     body = [
         "<header>",
+        '<button id="theme" type="button" hidden>Dark</button>',
         f"<h1>{escape(name)}</h1>",
         f"<p>{escape(flight.description)}</p>" if flight.description else "",
         _facts(flight),
@@ -44,13 +55,16 @@ def page(
         player.markup,
         *_numbers(flight),
         *_published(flight),
+        *_events(flight.events),
         "<h2>Figures</h2>",
+        _USE if charts.data else "",
         *_figures(plates),
         *_parameters(flight),
+        notices_of(parts),
         _footer(flight),
     ]
-    css = files("spacerobot_ros.report").joinpath("page.css").read_text(encoding="utf-8")
-    policy = "; ".join(filter(None, (_POLICY, player.policy)))
+    css = charts.style + own_file("page.css")
+    policy = "; ".join(filter(None, (_POLICY, policy_of(parts))))
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
@@ -58,7 +72,7 @@ def page(
         '<link rel="icon" href="data:,">\n'
         f"<title>{escape(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n<main>\n"
         + "\n".join(part for part in body if part)
-        + f"\n</main>\n{player.scripts}\n</body>\n</html>\n"
+        + f"\n</main>\n{scripts_of(parts)}\n</body>\n</html>\n"
     )
 
 
@@ -113,7 +127,7 @@ def _numbers(flight: Flight) -> list[str]:
             f'<tr><th scope="row">{escape(label)}</th><td>{escape(value)}</td></tr>\n'
             for label, value in result.rows
         )
-        parts.append(f'{_SCROLL}<table id="numbers"><tbody>\n{rows}</tbody></table></div>')
+        parts.append(f'{_HINT}{_SCROLL}<table id="numbers"><tbody>\n{rows}</tbody></table></div>')
     if joints is not None:
         parts.append(_table("joints", joints))
     return parts
@@ -142,13 +156,13 @@ def _table(identity: str, table: Table) -> str:
 
     body = "".join(row(cells, "td") for cells in table.rows)
     return (
-        f'{_SCROLL}<table id="{identity}"><thead>\n{row(table.head, "th")}</thead>'
+        f'{_HINT}{_SCROLL}<table id="{identity}"><thead>\n{row(table.head, "th")}</thead>'
         f"<tbody>\n{body}</tbody></table></div>"
     )
 
 
 def _figures(plates: Sequence[Plate | str | None]) -> list[str]:
-    parts, number = [], 0
+    parts, number, numbers = [], 0, chart_numbers(plates)
     for sentence in dict.fromkeys(plate for plate in plates if isinstance(plate, str)):
         parts.append(f'<p class="missing">{escape(sentence)}</p>')
     for plate in plates:
@@ -157,12 +171,38 @@ def _figures(plates: Sequence[Plate | str | None]) -> list[str]:
         number += 1
         data = base64.b64encode(plate.svg).decode()
         parts.append(
-            f'<figure id="{plate.name}"><div class="scroll">'
-            f'<img src="data:image/svg+xml;base64,{data}" alt="{escape(plate.heading)}"></div>\n'
-            f"<figcaption><b>Figure {number}. {escape(plate.heading)}.</b> {escape(plate.caption)}"
+            f'<figure id="{plate.name}"{_charts(numbers.get(plate.name))}>{_HINT}'
+            f'<div class="scroll"><img src="data:image/svg+xml;base64,{data}" '
+            f'alt="{escape(plate.heading)}"></div>\n'
+            f"<figcaption><b>Figure {number}. {escape(plate.heading)}.</b> {_caption(plate)}"
             "</figcaption></figure>"
         )
     return parts
+
+
+def _caption(plate: Plate) -> str:
+    if not plate.of_picture:
+        return escape(plate.caption)
+    before, aside, after = plate.caption.partition(plate.of_picture)
+    return f'{escape(before)}<span class="still">{escape(aside)}</span>{escape(after)}'
+
+
+def _charts(numbers: str | None) -> str:
+    return "" if numbers is None else f' data-charts="{numbers}"'
+
+
+def _events(events: Sequence[FlightEvent]) -> list[str]:
+    """What happened, in the order of time: all of it, or the first rows of very much."""
+    if not events:
+        return []
+    rows = [
+        (f"{each.time:.6g}", each.text, each.event.sentence, each.node.strip("/"))
+        for each in sorted(events, key=lambda each: each.time)
+    ]
+    more = len(rows) - _MOST_ROWS
+    table = Table(("Time (s)", "What", "In words", "Node"), rows[:_MOST_ROWS], (0,))
+    note = f'<p class="facts">{more} more are in the bag.</p>' if more > 0 else ""
+    return ["<h2>What happened</h2>", _table("events", table), note]
 
 
 def _parameters(flight: Flight) -> list[str]:

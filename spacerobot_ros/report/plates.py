@@ -50,7 +50,8 @@ class Group:
 class Plate:
     """A figure: a short name, its heading, what is to be seen, and the picture.
 
-    ``groups`` are its panels where they are over the time of the flight, each over all of it.
+    ``groups`` are its panels where they are over the time of the flight, each over all of it;
+    ``of_picture`` is the part of the caption that is about the picture and no chart of them.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Plate:
     caption: str
     figure: Figure
     groups: Sequence[Group] = ()
+    of_picture: str = ""
 
     @cached_property
     def svg(self) -> bytes:

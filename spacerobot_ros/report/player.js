@@ -38,6 +38,7 @@
     viewer.animator.seek(time);
     slider.value = (time - span.start) / (span.end - span.start || 1);
     now.textContent = `${seconds(time)} of ${seconds(span.end)}`;
+    document.dispatchEvent(new CustomEvent("flight:time", { detail: time }));
   }
 
   function setPlaying(wanted) {
@@ -78,6 +79,20 @@
     show(span.start + Number(slider.value) * (span.end - span.start));
   };
   play.onclick = () => setPlaying(!playing);
+  document.addEventListener("flight:seek", ({ detail }) => {
+    setPlaying(false);
+    if (detail < span.start || detail > span.end) {
+      part.value = 0;
+      choose(0);
+    }
+    show(detail);
+  });
+  document.addEventListener("flight:theme", ({ detail: dark }) => {
+    const value = dark ? [22 / 255, 25 / 255, 31 / 255] : [246 / 255, 247 / 255, 249 / 255];
+    for (const property of ["top_color", "bottom_color"]) {
+      viewer.handle_command({ type: "set_property", path: "/Background", property, value });
+    }
+  });
   choose(0);
   box.className = "ready";
   window.flightViewer = viewer;

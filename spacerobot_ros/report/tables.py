@@ -15,6 +15,8 @@ from spacerobot_ros.report.figures_time import joint_unit
 from spacerobot_ros.report.flight import Flight
 
 _ABSENT = "–"
+_TICKS = 1.5
+"""Control periods by which times may differ that are one to people."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ def headline(flight: Flight) -> list[tuple[str, str, str]]:
         note = f"{tool.angle:.3g} rad" if turned else ""
         rows.append(("End-effector error", f"{tool.distance:.3g} m", note))
     if flight.manoeuvre_time is not None:
-        rows.append(("Manoeuvre", f"{flight.manoeuvre_time:.6g} s", ""))
+        rows.append(("Manoeuvre", f"{flight.manoeuvre_time:.6g} s", _to_end(flight)))
     if flight.method:
         rows.append(("Method", flight.method, ""))
     if len(flight.momentum):
@@ -86,6 +88,8 @@ def result_table(flight: Flight) -> Table:
         rows += _tool_rows(flight, flight.tool_error)
     if flight.manoeuvre_time is not None:
         rows.append(("Manoeuvre time", f"{flight.manoeuvre_time:.6g} s{_schedules(flight)}"))
+        if to_end := _to_end(flight):
+            rows.append(("First schedule to the end", to_end.partition(" from ")[0]))
     if len(flight.position):
         rows.append(("Recorded", _recorded(flight)))
     if len(flight.momentum):
@@ -203,9 +207,17 @@ def _schedules(flight: Flight) -> str:
     return f", {count} schedules in the whole flight" if count > 1 else ""
 
 
+def _to_end(flight: Flight) -> str:
+    """Return the time to the end where it is not that of the schedules."""
+    whole, flown = flight.time_to_end, flight.manoeuvre_time
+    if whole is None or flown is None or abs(whole - flown) < _TICKS * flight.tick:
+        return ""
+    return f"{whole:.6g} s from the first schedule to the end"
+
+
 def _recorded(flight: Flight) -> str:
     time = flight.position.time
     if len(time) < 2:
         return "1 state"
-    tick = float(np.median(np.diff(time)))
+    tick = flight.tick
     return f"{time[-1] - time[0]:.6g} s, {len(time) - 1} ticks of {tick:.4g} s"

@@ -15,8 +15,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
 from spacerobot_ros.bag.recorded_robot import columns
-from spacerobot_ros.control.status import ControllerStatus
-from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.control.status import ControllerState, ControllerStatus, tracking_time
+from spacerobot_ros.errors import RecordingError, SpaceRobotError
 from spacerobot_ros.flight.arrays import Outcome, Status
 from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.model.description import Array
@@ -152,7 +152,7 @@ def _summary(stack: Stack, wall_time: float) -> dict[str, Any]:
         "position_error_m": error.distance,
         "attitude_error_rad": error.angle,
         "sim_time_s": sim_time,
-        "manoeuvre_time_s": planner.manoeuvre_time_s or sim_time,
+        "manoeuvre_time_s": planner.manoeuvre_time_s or _tracking_time(robots) or sim_time,
         "plan_time_s": stack.statistics.plan_time_s,
         "wall_time_s": wall_time,
         "ticks": ticks,
@@ -199,6 +199,17 @@ def _files(path: Path) -> list[Bag]:
     while (part := path.with_name(f"{path.stem}_{len(parts)}{path.suffix}")).exists():
         parts.append(part)
     return [read_bag(part) for part in ([path] if path.exists() or not parts else parts)]
+
+
+def _tracking_time(robots: Sequence[RecordedRobot]) -> float | None:
+    """Return how long a controller flew, None where none did."""
+    states: list[tuple[float, ControllerState]] = []
+    for series in filter(None, (robot.get("controller/status") for robot in robots)):
+        for time_ns, message in series.messages():
+            values = {pair.key: pair.value for pair in message.values}
+            with suppress(SpaceRobotError):
+                states.append((time_ns / 1e9, ControllerStatus.from_values(values).state))
+    return tracking_time(states)
 
 
 def _truth(

@@ -651,6 +651,18 @@ def test_times_and_corrections_are_those_of_the_goal() -> None:
     assert status.manoeuvre_time_s == pytest.approx(8 * 0.05)
 
 
+def test_what_is_cut_off_a_schedule_is_no_time_of_the_manoeuvre() -> None:
+    loop = executing(ticks=400, stuck_ticks=5)
+    quick_without_joints(loop)
+    stuck(loop)
+    until(loop, Phase.EXECUTING)
+    first, second = loop.starts[-2:]
+    flown = (second.stamp_ns - first.stamp_ns) / 1e9
+    assert flown < 0.5 * first.schedule.duration
+    expected = flown + second.schedule.duration
+    assert loop.statuses[-1].manoeuvre_time_s == pytest.approx(expected)
+
+
 def test_a_state_that_is_not_finite_ends_no_goal_silently() -> None:
     loop = measuring()
     loop.measured.broken = True

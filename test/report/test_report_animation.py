@@ -157,7 +157,8 @@ def test_without_the_viewer_a_sentence_says_so(
     write_report(bag, tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "pip install meshcat" in text
-    assert "<script" not in text
+    assert "MeshCat.Viewer" not in text
+    assert 'id="flight"' not in text
 
 
 # -- in a browser -----------------------------------------------------------------------------

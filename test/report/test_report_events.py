@@ -22,6 +22,7 @@ EVENTS = [
     (0.90, {"event": "fault_injected", "time": "0.4"}),
     (0.60, {"event": "latched"}),
     (0.70, {"event": "rearmed", "time": "0.7"}),
+    (0.72, {"event": "plan_taken_over", "time": "0.72"}),
     (0.75, {"event": "goal_aborted", "time": "0.75"}),
     (0.80, {"event": "activated", "time": "0.8"}),
     (0.80, {"event": "of another version", "time": "0.8"}),
@@ -35,6 +36,7 @@ TIMES = {
     "fault_injected": 0.4,
     "latched": 0.6,
     "rearmed": 0.7,
+    "plan_taken_over": 0.72,
     "goal_aborted": 0.75,
 }
 
@@ -95,7 +97,7 @@ def test_a_lane_below_every_time_axis_has_every_event(
         assert labels == {_MARKS[EventKind(kind)].label for kind in TIMES}
 
 
-@pytest.mark.parametrize("events", [[], EVENTS[6:]])
+@pytest.mark.parametrize("events", [[], EVENTS[7:]])
 def test_a_bag_without_events_has_no_lane(tmp_path: Path, events: list[Any]) -> None:
     made = figures_time.position_plate(read_flight(story(tmp_path, events)))
     assert not isinstance(made, str)

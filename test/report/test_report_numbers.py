@@ -29,7 +29,7 @@ from spacerobot_ros.report.figures_time import (
     shape_groups,
 )
 from spacerobot_ros.report.flight import Flight, read_flight
-from spacerobot_ros.report.meshcat import Player
+from spacerobot_ros.report.live import Live
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.plates import Plate
 from spacerobot_ros.report.tables import (
@@ -277,6 +277,22 @@ def test_the_time_is_that_of_the_schedules_for_the_last_goal(tmp_path: Path) -> 
     assert cut.manoeuvre_time == 1.25
 
 
+def test_the_time_is_what_the_planner_counts_and_the_time_to_the_end_is_beside_it(
+    tmp_path: Path,
+) -> None:
+    """Between two schedules, a robot in real time waits for the plan."""
+    statuses = [
+        planner(PlannerState.EXECUTING, 5.0, method="optimal", manoeuvre_time_s="0.5"),
+        planner(PlannerState.EXECUTING, 5.75, method="optimal", manoeuvre_time_s="1"),
+        planner(PlannerState.REACHED, 6.25, manoeuvre_time_s="1"),
+    ]
+    found = flight(tmp_path, statuses)
+    assert (found.manoeuvre_time, found.time_to_end) == (1.0, 1.25)
+    tiles = {label: (value, note) for label, value, note in headline(found)}
+    assert tiles["Manoeuvre"] == ("1 s", "1.25 s from the first schedule to the end")
+    assert rows_of(found)["First schedule to the end"] == "1.25 s"
+
+
 def test_a_goal_that_is_refused_in_flight_is_not_the_one_flown_to(tmp_path: Path) -> None:
     other = (9.0, 9.0, 9.0, *GOAL[3:])
     statuses = [
@@ -421,7 +437,7 @@ def test_what_the_page_says_of_a_flight(tmp_path: Path) -> None:
         "other": {"hidden": "nobody"},
     }
     found = flight(tmp_path, metadata=metadata)
-    text = page(found, Player("<p>player</p>"), [Plate("a", "Heading", "Caption.", Figure())])
+    text = page(found, Live("<p>player</p>"), [Plate("a", "Heading", "Caption.", Figure())])
     content = Reader(text)
     for words in (
         "a_scenario",
@@ -441,7 +457,7 @@ def test_what_the_page_says_of_a_flight(tmp_path: Path) -> None:
     assert "nobody" not in content.text
     assert "<title>a_scenario, lie_bracket, tester</title>" in text
     cut = flight(tmp_path, FLOWN[:2], name="cut.mcap")
-    assert "The recording ends before that is decided." in page(cut, Player(""), [])
+    assert "The recording ends before that is decided." in page(cut, Live(""), [])
 
 
 def test_whatever_a_bag_holds_is_text_on_the_page(tmp_path: Path) -> None:
@@ -471,7 +487,7 @@ def test_whatever_a_bag_holds_is_text_on_the_page(tmp_path: Path) -> None:
         tmp_path, statuses, metadata=metadata, urdf=urdf, names=[odd(2), "turn"], name="<i>13&.mcap"
     )
     plates: list[Plate | str] = [Plate("a", odd(14), odd(15), Figure()), odd(16)]
-    content = Reader(page(found, Player(""), plates, [found]))
+    content = Reader(page(found, Live(""), plates, [found]))
     assert "i" not in content.tags
     read = content.text + " ".join(content.values)
     for n in (*range(1, 13), 14, 15, 16):

@@ -120,10 +120,6 @@ class ScheduleExecution:
         self._desk.ready = None
         if ticket.reason.for_new_goal:
             self._accept(Pursuit(ticket.identified, schedule, begins_ns))
-        else:
-            assert self._pursuit is not None
-            # What the schedule before had yet to do is not done.
-            self._pursuit.manoeuvre_time -= self._pursuit.ends_at - begins_ns / 1e9
         reason = ticket.reason.value
         self._out.happened(
             EventKind.PLAN_TAKEN_OVER,
@@ -178,6 +174,9 @@ class ScheduleExecution:
         pursuit = self._pursuit
         assert pursuit is not None
         begins = self._stamp_ns if start_ns is None else start_ns
+        # What the schedule before had yet to do is not done.
+        remainder = pursuit.ends_at - begins / 1e9
+        pursuit.manoeuvre_time -= min(max(remainder, 0.0), pursuit.schedule.duration)
         pursuit.schedule = schedule
         average = self._in_motion.begin_schedule(self.config, schedule, begins)
         self._tracker.start(schedule, begins, average)

@@ -56,7 +56,7 @@ class PlannerStatus:
     position_error_m, attitude_error_rad
         Remaining error of the measured base pose; None where it was not evaluated.
     manoeuvre_time_s
-        Duration of all schedules for the goal so far; 0: none.
+        Duration of all schedules for the goal so far, without what a later one cut off; 0: none.
     ends_at_s
         Simulated time at which the latest schedule ends; 0: none.
     method

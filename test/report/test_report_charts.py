@@ -1,0 +1,229 @@
+"""Charts of a report in a browser: values, events, zoom, the instant that is shown, dark, phone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.chromium import Browser, browser, chromium
+from support.flight_bags import GOAL, TICK, Story, goal_value, tell
+from support.html_page import leave_blank
+
+from spacerobot_ros.report import write_report
+from spacerobot_ros.report.charts import thinned
+from spacerobot_ros.report.flight import Flight, read_flight
+from spacerobot_ros.report.signals import Signal
+
+with_browser = pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with")
+
+COUNT = 400
+END = TICK * (COUNT - 1)
+EVENTS = [
+    (0.5, {"event": "goal_accepted", "time": "0.5"}, "goal"),
+    (4.0, {"event": "fault_injected", "time": "4", "fault": "joint_stuck j at 4"}, "fault on"),
+    (6.0, {"event": "stuck_joint", "time": "6", "joints": "j"}, "stuck joint: j"),
+    (7.0, {"event": "plan_taken_over", "time": "7", "reason": "stuck joints"}, "takeover"),
+    (9.0, {"event": "fault_ended", "time": "9", "fault": "joint_stuck j at 4"}, "fault off"),
+    (11.0, {"event": "correction", "time": "11"}, "correction"),
+    (12.0, {"event": "goal_aborted", "time": "12"}, "aborted"),
+]
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    t = np.linspace(0.0, 1.0, COUNT)[:, np.newaxis]
+    executing = {"state": "executing", "method": "lie_bracket", **goal_value()}
+    story = Story(
+        0.9 * np.sin(2.0 * t * np.arange(1, 4)) + 0.1 * t,
+        statuses=[(0.1, "Executing.", executing)],
+        goals=[(0.0, *GOAL)],
+        events=[(time, values) for time, values, _ in EVENTS],
+    )
+    return tell(tmp_path_factory.mktemp("charts") / "flight.mcap", story)
+
+
+@pytest.fixture(scope="module")
+def flight(bag: Path) -> Flight:
+    return read_flight(bag)
+
+
+@pytest.fixture(scope="module")
+def window(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """One browser for all these tests, on the page."""
+    html = bag.with_suffix(".html")
+    with pytest.MonkeyPatch.context() as patch:
+        leave_blank(patch)
+        write_report(bag, html)
+    with browser(tmp_path_factory.mktemp("profile")) as opened:
+        opened.open(html, 1280, 900)
+        opened.wait_for("document.getElementById('animation').className === 'ready'")
+        yield opened
+        assert opened.complaints == []
+        outside = [url for url in opened.requests if not url.startswith("data:")]
+        assert outside == [html.as_uri()]
+
+
+def chart(window: Browser, number: int, expression: str) -> Any:
+    return window.evaluate(f"(chart => {expression})(flightCharts.charts[{number}])")
+
+
+@with_browser
+def test_charts_have_the_numbers_of_the_bag(window: Browser, flight: Flight) -> None:
+    assert window.evaluate("flightCharts.charts.length") == 9
+    assert window.evaluate("document.querySelectorAll('figure.live').length") == 5
+    assert window.evaluate("getComputedStyle(document.querySelector('.live .scroll')).display") == (
+        "none"
+    )
+    time, *columns = chart(window, 0, "chart.plot.data")
+    np.testing.assert_allclose(time, flight.position.time, atol=1e-12)
+    np.testing.assert_allclose(np.transpose(columns), flight.position.values, rtol=1e-6, atol=1e-7)
+    # What stands below a chart when the cursor is on it.
+    chart(window, 0, "chart.plot.setCursor({left: chart.plot.valToPos(4.0, 'x'), top: 5})")
+    words = window.evaluate("document.querySelector('.u-legend').innerText")
+    k = int(np.argmin(np.abs(flight.position.time - 4.0)))
+    for value in flight.position.values[k]:
+        assert f"{float(f'{value:.4g}'):g}"[:5] in words
+
+
+@with_browser
+def test_what_happened_stands_below_every_chart(window: Browser) -> None:
+    for number in range(9):
+        left, width = chart(window, number, "[0, chart.lane.clientWidth]")
+        marks = chart(
+            window,
+            number,
+            "chart.marks.map(({event, mark, words}) => "
+            "[event.time, words.textContent, parseFloat(mark.style.left), event.row])",
+        )
+        assert [mark[0] for mark in marks] == [time for time, _, _ in EVENTS]
+        for (_, _, words), (time, text, x, _) in zip(EVENTS, marks, strict=True):
+            assert words in text
+            assert x == pytest.approx(left + width * time / END, abs=0.5)
+    rows = {mark[1].split(":")[0]: mark[3] for mark in marks}
+    assert rows["fault on"] == rows["fault off"] != rows["stuck joint"] != rows["takeover"]
+    seen = window.evaluate("document.querySelector('.lane').innerText")
+    for words in ("fault on: joint_stuck j at 4", "stuck joint: j", "fault off", "takeover"):
+        assert words in seen
+    table = window.evaluate("document.getElementById('events').innerText")
+    assert all(words in table for _, _, words in EVENTS)
+
+
+@with_browser
+def test_the_instant_of_the_3d_view_is_that_of_the_charts(window: Browser) -> None:
+    slider = "document.getElementById('time')"
+    window.evaluate(f"{slider}.value = 0.25; {slider}.dispatchEvent(new Event('input'))")
+    assert window.evaluate("flightCharts.now") == pytest.approx(END / 4)
+    for number in (0, 8):
+        x, width = chart(
+            window, number, "[parseFloat(chart.hand.style.left), chart.plot.over.clientWidth]"
+        )
+        assert x == pytest.approx(width / 4, abs=0.5)
+    press(window, 0, 0.5)
+    assert window.evaluate("flightCharts.now") == pytest.approx(END / 2, abs=0.02)
+    assert window.evaluate(f"Number({slider}.value)") == pytest.approx(0.5, abs=2e-3)
+    assert window.evaluate("document.getElementById('now').textContent").startswith("9.9")
+
+
+def press(window: Browser, number: int, *shares: float, clicks: int = 1) -> None:
+    """Press the mouse on a chart at a part of its width, and let it go at the last one given."""
+    window.evaluate(
+        f"flightCharts.charts[{number}].plot.root.scrollIntoView({{block: 'center'}});"
+        "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    )
+    box = "chart.plot.over.getBoundingClientRect()"
+    x, y, width = chart(window, number, f"(b => [b.x, b.y + b.height / 2, b.width])({box})")
+    kinds = ["mousePressed", *["mouseMoved"] * (len(shares) - 1), "mouseReleased"]
+    places = [shares[0], *shares[1:], shares[-1]]
+    move = {"type": "mouseMoved", "x": x + width * shares[0], "y": y, "button": "none"}
+    window.call("Input.dispatchMouseEvent", **move)
+    for kind, share in zip(kinds, places, strict=True):
+        event = {"type": kind, "x": x + width * share, "y": y, "button": "left"}
+        window.call("Input.dispatchMouseEvent", **event, clickCount=clicks, buttons=1)
+
+
+@with_browser
+def test_a_drag_zooms_all_charts_and_two_clicks_show_all(window: Browser) -> None:
+    press(window, 1, 0.25, 0.4, 0.5)
+    low, high = window.evaluate("flightCharts.span")
+    assert (low, high) == (pytest.approx(END / 4, abs=0.1), pytest.approx(END / 2, abs=0.1))
+    for number in (0, 1, 8):
+        scale = "[chart.plot.scales.x.min, chart.plot.scales.x.max, chart.reset.hidden]"
+        assert chart(window, number, scale) == [low, high, False]
+        shown = chart(window, number, "chart.marks.filter(m => !m.mark.hidden).length")
+        assert shown == sum(low <= time <= high for time, _, _ in EVENTS)
+    press(window, 1, 0.5, clicks=1)
+    press(window, 1, 0.5, clicks=2)
+    assert window.evaluate("flightCharts.span") == [0, pytest.approx(END)]
+    assert chart(window, 0, "chart.reset.hidden")
+
+
+@with_browser
+def test_dark_and_light(window: Browser) -> None:
+    def brightness(of: str) -> float:
+        text = window.evaluate(f"getComputedStyle(document.body).{of}")
+        return float(np.mean([float(x) for x in text[4:-1].split(",")]))
+
+    assert brightness("backgroundColor") == 255.0
+    window.evaluate("document.getElementById('theme').click()")
+    assert brightness("backgroundColor") < 30.0
+    assert brightness("color") > 200.0
+    assert window.evaluate("document.getElementById('theme').textContent") == "Light"
+    assert window.picture("#pane").mean() < 0.5
+    assert window.picture(".uplot").mean() < 0.3
+    window.evaluate("document.getElementById('theme').click()")
+    assert window.picture("#pane").mean() > 0.7
+    dark = [{"name": "prefers-color-scheme", "value": "dark"}]
+    window.call("Emulation.setEmulatedMedia", features=dark)
+    # Chosen by hand counts more than what the system wishes.
+    assert brightness("backgroundColor") == 255.0
+    window.evaluate("delete document.documentElement.dataset.theme")
+    assert brightness("backgroundColor") < 30.0
+    window.call("Emulation.setEmulatedMedia", features=[])
+
+
+@with_browser
+def test_on_a_phone_what_is_wide_says_so(window: Browser) -> None:
+    size = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    window.call("Emulation.setDeviceMetricsOverride", **size)
+    window.wait_for("document.querySelector('.hint.needed') !== null")
+    assert window.evaluate("document.documentElement.scrollWidth") <= 390
+    shown = window.evaluate(
+        "[...document.querySelectorAll('.hint')].filter(h => h.offsetHeight > 0).map(h => "
+        "h.nextElementSibling.scrollWidth > h.nextElementSibling.clientWidth)"
+    )
+    assert len(shown) >= 2
+    assert all(shown)
+    window.wait_for("flightCharts.charts[0].plot.width < 390")
+    assert "stuck joint: j" in window.evaluate("document.querySelector('.lane').innerText")
+
+
+@with_browser
+def test_licences_of_the_programs_are_with_them(window: Browser) -> None:
+    text = window.evaluate("document.getElementById('licences').textContent")
+    for name in ("MeshCat", "three", "dat.gui", "uPlot", "Leon Sorokin", "Robin Deits"):
+        assert name in text
+    assert text.count("Permission is hereby granted") >= 4
+
+
+def test_fewer_samples_look_alike() -> None:
+    time = np.linspace(0.0, 100.0, 30_001)
+    smooth = Signal(time, np.column_stack([np.sin(time), np.exp(-time)]))
+    few = thinned(smooth)
+    assert len(few) < 2600
+    for k in range(2):
+        between = np.interp(time, few.time, few.values[:, k])
+        assert np.abs(between - smooth.values[:, k]).max() < 2e-3
+    noise = np.random.default_rng(1).normal(size=(30_001, 3))
+    few = thinned(Signal(time, noise))
+    assert len(few) < 6200
+    assert (few.time[0], few.time[-1]) == (0.0, 100.0)
+    np.testing.assert_array_equal(few.values.max(axis=0), noise.max(axis=0))
+    np.testing.assert_array_equal(few.values.min(axis=0), noise.min(axis=0))
+    for low in range(0, 100, 10):
+        part, all_of = few.between(low, low + 10).values, Signal(time, noise).between(low, low + 10)
+        np.testing.assert_allclose(part.max(axis=0), all_of.values.max(axis=0), atol=0.6)
+    short = Signal(time[:50], noise[:50])
+    assert thinned(short) is short
