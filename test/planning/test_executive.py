@@ -652,9 +652,11 @@ def test_times_and_corrections_are_those_of_the_goal() -> None:
 
 
 def test_what_is_cut_off_a_schedule_is_no_time_of_the_manoeuvre() -> None:
-    loop = executing(ticks=400, stuck_ticks=5)
+    loop = executing(held=True, ticks=400, stuck_ticks=5)
     quick_without_joints(loop)
     stuck(loop)
+    until(loop, Phase.PLANNING)
+    loop.held.release()
     until(loop, Phase.EXECUTING)
     first, second = loop.starts[-2:]
     flown = (second.stamp_ns - first.stamp_ns) / 1e9
