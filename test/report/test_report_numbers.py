@@ -282,9 +282,9 @@ def test_the_time_is_what_the_planner_counts_and_the_time_to_the_end_is_beside_i
 ) -> None:
     """Between two schedules, a robot in real time waits for the plan."""
     statuses = [
-        planner(PlannerState.EXECUTING, 5.0, method="optimal", manoeuvre_time_s=0.5),
-        planner(PlannerState.EXECUTING, 5.75, method="optimal", manoeuvre_time_s=1.0),
-        planner(PlannerState.REACHED, 6.25, manoeuvre_time_s=1.0),
+        planner(PlannerState.EXECUTING, 5.0, method="a", manoeuvre_time_s=0.5, ends_at_s=5.5),
+        planner(PlannerState.EXECUTING, 5.75, method="b", manoeuvre_time_s=1.0, ends_at_s=6.25),
+        planner(PlannerState.REACHED, 6.25, manoeuvre_time_s=1.0, ends_at_s=6.25),
     ]
     found = flight(tmp_path, statuses)
     assert (found.manoeuvre_time, found.time_to_end) == (1.0, 1.25)
