@@ -282,15 +282,15 @@ def test_the_time_is_what_the_planner_counts_and_the_time_to_the_end_is_beside_i
 ) -> None:
     """Between two schedules, a robot in real time waits for the plan."""
     statuses = [
-        planner(PlannerState.EXECUTING, 5.0, method="a", manoeuvre_time_s=0.5, ends_at_s=5.5),
-        planner(PlannerState.EXECUTING, 5.75, method="b", manoeuvre_time_s=1.0, ends_at_s=6.25),
-        planner(PlannerState.REACHED, 6.25, manoeuvre_time_s=1.0, ends_at_s=6.25),
+        planner(PlannerState.EXECUTING, 5.0, method="a", manoeuvre_time_s=0.25, ends_at_s=5.25),
+        planner(PlannerState.EXECUTING, 6.25, method="b", manoeuvre_time_s=0.5, ends_at_s=6.5),
+        planner(PlannerState.REACHED, 6.5, manoeuvre_time_s=0.5, ends_at_s=6.5),
     ]
     found = flight(tmp_path, statuses)
-    assert (found.manoeuvre_time, found.time_to_end) == (1.0, 1.25)
+    assert (found.manoeuvre_time, found.time_to_end) == (0.5, 1.5)
     tiles = {label: (value, note) for label, value, note in headline(found)}
-    assert tiles["Manoeuvre"] == ("1 s", "1.25 s from the first schedule to the end")
-    assert rows_of(found)["First schedule to the end"] == "1.25 s"
+    assert tiles["Manoeuvre"] == ("0.5 s", "1.5 s from the first schedule to the end")
+    assert rows_of(found)["First schedule to the end"] == "1.5 s"
 
 
 def test_a_goal_that_is_refused_in_flight_is_not_the_one_flown_to(tmp_path: Path) -> None:
