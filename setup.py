@@ -49,6 +49,9 @@ DATA = ["pandas>=2.1", "pyarrow", "xarray"]
 # The live page.
 VIEWER = ["viser>=1.1"]
 
+# Many flights: workers on this machine or on others, datasets, Sobol indices.
+CAMPAIGN = ["dask", "distributed", "pandas>=2.1", "pyarrow", "SALib"]
+
 setup(
     name=NAME,
     version=VERSION,
@@ -110,9 +113,11 @@ setup(
         ],
         # The 3D view of reports is MeshCat's. Only its script is used, but the package brings much.
         "viewer": ["meshcat", *MESHES, *VIEWER],
+        "campaign": CAMPAIGN,
         "data": DATA,
         "docs": DOCS,
         "test": [
+            *CAMPAIGN,
             *DATA,
             *DOCS,
             "catkin_pkg",

@@ -12,8 +12,8 @@ from spacerobot_ros.cli import start
 from spacerobot_ros.cli.errors import sentences
 
 COMMANDS = (
-    *("analyze", "bench", "export", "figures", "goal", "library", "new", "plan", "replay"),
-    *("report", "robots", "run", "salvage", "scenarios", "up", "verify"),
+    *("analyze", "bench", "campaign", "export", "figures", "goal", "library", "new", "plan"),
+    *("replay", "report", "robots", "run", "salvage", "scenarios", "up", "verify"),
 )
 """Each is the attribute ``command`` of the module of its name in this folder."""
 

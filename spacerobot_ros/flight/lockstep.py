@@ -41,7 +41,7 @@ from spacerobot_ros.flight.plant_listener import Change, PlantListener, Stopped
 from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.flight.state_synchroniser import Pairing, StateSynchroniser
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.robot_source import RobotConfig, robot_from_text, robot_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -82,19 +82,27 @@ class Robots:
     plant: SpaceRobot
     planner: SpaceRobot
     controller: SpaceRobot
+    description: RobotDescription | None = None
+    """Of the plant, with the URDF that is recorded; None: as its model has it."""
 
     @classmethod
     def of(
-        cls, scenario: Scenario, built: Callable[[RobotConfig], SpaceRobot | None] = robot_of
+        cls,
+        scenario: Scenario,
+        built: Callable[[str, RobotConfig], SpaceRobot | None] = lambda node, config: robot_of(
+            config
+        ),
     ) -> Robots:
         """Build the models that a scenario names; a commander that names none has the plant's URDF.
+
+        ``built`` returns the robot of a node's configuration, None where that names none.
 
         Raises
         ------
         ParameterError
             The plant has no robot, or one is refused.
         """
-        plant = built(scenario.plant)
+        plant = built("plant", scenario.plant)
         if plant is None:
             raise ParameterError(
                 f"The scenario '{scenario.name}' names no robot for its plant: set plant.robot."
@@ -103,8 +111,9 @@ class Robots:
         for name, node in (("planner", "planner"), ("controller", "coordinated_control")):
             if node in scenario.commanders:
                 config = scenario.config(node)
-                robots[name] = built(config) or robot_from_text(plant.description.urdf, config)
-        return cls(**robots)
+                own = built(node, config)
+                robots[name] = own or robot_from_text(plant.description.urdf, config)
+        return cls(robots["plant"], robots["planner"], robots["controller"])
 
 
 def require_flyable(scenario: Scenario) -> None:
@@ -446,7 +455,7 @@ class _LockstepFlight:
             plan_time = self._planner.executive.statistics.plan_time_s
         return self._log.flight(
             self._scenario,
-            self._robots.plant.description,
+            self._robots.description or self._robots.plant.description,
             outcome=outcome,
             sentence=sentence,
             status=self._status,

@@ -346,6 +346,30 @@ class Scenario:
             )
 
 
+def scenario_text(scenario: Scenario) -> str:
+    """Return the parameter file of a scenario: what its file has, with what was set since.
+
+    Published figures and kills of nodes are not in it.
+    """
+    about: dict[str, Any] = {"description": scenario.description}
+    goals = {"goal": scenario.goal, "end_effector_goal": scenario.end_effector_goal}
+    for name, goal in goals.items():
+        if goal is not None:
+            about[f"{name}_position"] = goal.position.tolist()
+            about[f"{name}_orientation"] = goal.quaternion.tolist()
+    if scenario.goal.joint_positions is not None:
+        about["goal_joint_positions"] = scenario.goal.joint_positions.tolist()
+    content = {"scenario": {"ros__parameters": about}}
+    for node in ("plant", *scenario.commanders, "recorder"):
+        values = {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in scenario.parameters(node).items()
+        }
+        if values or node != "recorder":
+            content[f"/**/{node}"] = {"ros__parameters": values}
+    return str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+
+
 def load_scenario(name: str) -> Scenario:
     """Return a scenario of this package by name, or of any parameter file by path.
 

@@ -1,0 +1,1 @@
+"""Campaigns: one scenario flown many times, with masses, sensors, starts and goals that differ."""

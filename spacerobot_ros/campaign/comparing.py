@@ -1,0 +1,124 @@
+"""Two designs on the same draws: what differs, with intervals."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+
+from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.report import STYLE, Results, named, panels, picture, table, write_page
+from spacerobot_ros.campaign.statistics import Paired, paired, paired_success
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.report.style import INK, PALETTE
+
+
+def require_same_draws(first: Campaign, second: Campaign) -> None:
+    """Refuse two campaigns whose flights are not drawn alike.
+
+    Raises
+    ------
+    ParameterError
+        Seed, sampler, number of flights or what is dispersed differs; the sentence says which.
+    """
+
+    def drawn(campaign: Campaign) -> dict[str, object]:
+        return {
+            "seed": campaign.seed,
+            "sampler": campaign.sampler,
+            "flights": campaign.flights,
+            "disperse": [(each.name, str(each.distribution)) for each in campaign.dispersions],
+        }
+
+    ours, theirs = drawn(first), drawn(second)
+    for key, value in ours.items():
+        if theirs[key] != value:
+            raise ParameterError(
+                f"The campaigns '{first.name}' and '{second.name}' do not have the same draws: "
+                f"'{key}' is {value} and {theirs[key]}."
+            )
+
+
+def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
+    """Write the report of two datasets with the same draws; return lines for people.
+
+    Raises
+    ------
+    ParameterError
+        A folder holds no flights, or their draws differ.
+    SpaceRobotError
+        The file cannot be written.
+    """
+    first, second = (Results.of(folder) for folder in folders)
+    require_same_draws(first.campaign, second.campaign)
+    common = np.intersect1d(first.numbers, second.numbers)
+    rows_a = np.searchsorted(first.numbers, common)
+    rows_b = np.searchsorted(second.numbers, common)
+    names = [name for name in first.shown if name in second.shown]
+    found = []
+    for name in names:
+        difference = paired(name, first.columns[name][rows_a], second.columns[name][rows_b])
+        if difference is not None:
+            found.append(difference)
+    passed_a, passed_b = first.passed[rows_a], second.passed[rows_b]
+    only_a, only_b, p = paired_success(passed_a, passed_b)
+    a, b = first.campaign.name, second.campaign.name
+    sentence = (
+        f"{a} passes {int(passed_a.sum())} and {b} {int(passed_b.sum())} of {len(common)} draws; "
+        f"{only_a} only {a}, {only_b} only {b} (McNemar's exact test: p = {p:.2g})."
+    )
+    with mpl.rc_context(STYLE):
+        body = [
+            f"<header><h1>{escape(a)} and {escape(b)}</h1>",
+            f'<p class="facts"><span>{len(common)} draws that both have flown</span></p>',
+            f'<p class="outcome">{escape(sentence)}</p></header>',
+            "<h2>Paired differences</h2>",
+            _table(found, a, b),
+            _figure(first, second, rows_a, rows_b, names[:6]),
+        ]
+    write_page(path, f"{a} and {b}", body)
+    return [sentence, *(_line(each, b, a) for each in found)]
+
+
+def _line(each: Paired, second: str, first: str) -> str:
+    return (
+        f"{each.metric}: {second} minus {first} is {each.difference:.4g} "
+        f"({each.low:.4g} to {each.high:.4g})"
+    )
+
+
+def _table(found: list[Paired], first: str, second: str) -> str:
+    rows = [
+        [
+            named(each.metric),
+            str(each.count),
+            f"{each.first:.5g}",
+            f"{each.second:.5g}",
+            f"{each.difference:+.4g}",
+            f"{each.low:+.4g} to {each.high:+.4g}",
+            "yes" if each.certain else "no",
+        ]
+        for each in found
+    ]
+    head = ["metric", "pairs", f"mean of {first}", f"mean of {second}", "difference"]
+    return table([*head, "95 % interval", "leaves out zero"], rows, "paired")
+
+
+def _figure(
+    first: Results, second: Results, rows_a: np.ndarray, rows_b: np.ndarray, names: list[str]
+) -> str:
+    if not names:
+        return ""
+    figure, axes = panels(len(names), 3, 2.6)
+    for panel, name in zip(axes, names, strict=True):
+        x, y = first.columns[name][rows_a], second.columns[name][rows_b]
+        panel.plot(x, y, ".", ms=3, alpha=0.5, color=PALETTE[0], rasterized=True)
+        both = np.concatenate([x[np.isfinite(x)], y[np.isfinite(y)]])
+        if both.size:
+            ends = [both.min(), both.max()]
+            panel.plot(ends, ends, color=INK, linewidth=0.8, linestyle=":")
+        panel.set_xlabel(f"{first.campaign.name}: {name}")
+        panel.set_ylabel(second.campaign.name)
+    return picture(figure, "pairs", "Every draw in both designs; dotted: no difference.")

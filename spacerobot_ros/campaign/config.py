@@ -1,0 +1,384 @@
+"""The file of a campaign: what is flown how often, what differs, and what is required."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from spacerobot_ros.campaign.metrics import METRICS, is_metric
+from spacerobot_ros.campaign.targets import Target, targets_of
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.flight.scenario import CONFIGS, Scenario, scenario_or_robot
+from spacerobot_ros.resources import suggestion
+
+SAMPLERS = ("random", "latin_hypercube", "sobol", "halton", "saltelli")
+"""How draws are spread: the last one, for indices of all orders, is SALib's, the others scipy's."""
+
+OF_ALL = ("latin_hypercube", "saltelli")
+"""Samplers whose draws depend on how many there are."""
+
+_KEYS = (
+    *("scenario", "flights", "seed", "sampler", "method", "set", "longest", "disperse"),
+    *("criteria", "engine", "description"),
+)
+_MOST_FLIGHTS = 10_000_000
+ENGINES = ("auto", "lanes", "flights", "ros")
+"""What may fly a campaign."""
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """How a number is spread: a distribution of scipy.stats with its arguments, or a choice.
+
+    Attributes
+    ----------
+    name
+        Of ``scipy.stats``, or ``choice``.
+    arguments
+        By name, as ``scipy.stats`` takes them.
+    choices
+        Values of which each is as likely as the others; of a ``choice`` only.
+    """
+
+    name: str
+    arguments: Mapping[str, float] = field(default_factory=dict)
+    choices: tuple[Any, ...] = ()
+
+    @property
+    def texts(self) -> bool:
+        """Whether texts are drawn."""
+        return any(isinstance(choice, str) for choice in self.choices)
+
+    def at(self, u: float) -> Any:
+        """Return the value below which a share ``u`` (0 to 1) of all lies."""
+        if self.choices:
+            return self.choices[min(int(u * len(self.choices)), len(self.choices) - 1)]
+        return float(_scipy(self.name)(**self.arguments).ppf(u))
+
+    def __str__(self) -> str:
+        if self.choices:
+            return f"one of {', '.join(map(str, self.choices))}"
+        given = ", ".join(f"{name} {value:g}" for name, value in self.arguments.items())
+        return f"{self.name} ({given})"
+
+
+@dataclass(frozen=True)
+class Dispersion:
+    """What differs from flight to flight, and how."""
+
+    target: Target
+    distribution: Distribution
+
+    @property
+    def name(self) -> str:
+        """Of the target."""
+        return self.target.name
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """What is required of a metric: from ``minimum`` to ``maximum``."""
+
+    metric: str
+    minimum: float = -math.inf
+    maximum: float = math.inf
+
+    def __str__(self) -> str:
+        unit = METRICS[self.metric.partition(".")[0]].unit
+        parts = [f"at least {self.minimum:g}"] if math.isfinite(self.minimum) else []
+        parts += [f"at most {self.maximum:g}"] if math.isfinite(self.maximum) else []
+        return f"{self.metric} {' and '.join(parts)} {unit}".rstrip()
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A campaign.
+
+    Attributes
+    ----------
+    name
+        Of its file.
+    scenario
+        What is flown, with the parameters that all flights have in common.
+    flights, seed, sampler
+        How many draws, from what they are made, and how they are spread.
+    longest
+        Simulated time after which a flight is interrupted, s.
+    dispersions
+        What differs.
+    criteria
+        What is required beside a goal that is reached.
+    engine
+        What flies it: ``auto``, ``lanes``, ``flights`` or ``ros``.
+    description
+        For people.
+    section
+        The content of the file.
+    """
+
+    name: str
+    scenario: Scenario
+    flights: int
+    seed: int
+    sampler: str
+    longest: float
+    dispersions: tuple[Dispersion, ...]
+    criteria: tuple[Criterion, ...]
+    engine: str = "auto"
+    description: str = ""
+    section: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is drawn, in the order of the columns."""
+        return tuple(dispersion.name for dispersion in self.dispersions)
+
+
+def load_campaign(path: Path, flights: int | None = None) -> Campaign:
+    """Read the file of a campaign; ``flights`` replaces its number of flights.
+
+    Raises
+    ------
+    ParameterError
+        It cannot be read, or something in it is refused; the sentence says what and where.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise ParameterError(f"The campaign file {path} cannot be read: {reason}.") from error
+    section = content.get("campaign") if isinstance(content, dict) else None
+    if not isinstance(section, dict):
+        raise ParameterError(f"The campaign file {path} has no section 'campaign:'.")
+    if flights is not None:
+        section = {**section, "flights": flights}
+    try:
+        return parse_campaign(path.stem, section, path.parent)
+    except ParameterError as error:
+        raise ParameterError(f"The campaign file {path} is refused: {error}") from error
+
+
+def parse_campaign(
+    name: str,
+    section: Mapping[str, Any],
+    folder: Path = Path(),
+    scenario: Scenario | None = None,
+) -> Campaign:
+    """Return a campaign from the content of its file.
+
+    Parameters
+    ----------
+    name
+        Of the campaign.
+    section
+        What is under ``campaign:``.
+    folder
+        Where the file of a scenario is looked for.
+    scenario
+        What is flown, with what is under ``set``; None: what the section names.
+
+    Raises
+    ------
+    ParameterError
+        Something is refused; the sentence says what.
+    """
+    for key in section:
+        if key not in _KEYS:
+            raise ParameterError(
+                f"there is no key '{key}'; there are {', '.join(_KEYS)}."
+                f"{suggestion(str(key), _KEYS)}"
+            )
+    scenario = scenario or _scenario(section, folder)
+    flights = _whole(section, "flights", 100, 1, _MOST_FLIGHTS)
+    sampler = str(section.get("sampler", "random"))
+    if sampler not in SAMPLERS:
+        known = ", ".join(SAMPLERS)
+        raise ParameterError(
+            f"there is no sampler '{sampler}'; there are {known}.{suggestion(sampler, SAMPLERS)}"
+        )
+    engine = str(section.get("engine", "auto"))
+    if engine not in ENGINES:
+        known = ", ".join(ENGINES)
+        raise ParameterError(
+            f"there is no engine '{engine}'; there are {known}.{suggestion(engine, ENGINES)}"
+        )
+    dispersions = _dispersions(_mapping(section, "disperse"), scenario)
+    if sampler == "saltelli" and not dispersions:
+        raise ParameterError("the sampler 'saltelli' needs something that is dispersed.")
+    return Campaign(
+        name=name,
+        scenario=scenario,
+        flights=flights,
+        seed=_whole(section, "seed", 0, 0, 2**63 - 1),
+        sampler=sampler,
+        longest=_real("longest", section.get("longest", 100_000.0), 0.0),
+        dispersions=dispersions,
+        criteria=_criteria(_mapping(section, "criteria"), scenario),
+        engine=engine,
+        description=str(section.get("description", "")),
+        section=dict(section),
+    )
+
+
+def _scenario(section: Mapping[str, Any], folder: Path) -> Scenario:
+    given = section.get("scenario")
+    if not isinstance(given, str):
+        raise ParameterError("'scenario' must be the name or the file of a scenario.")
+    beside = folder / given
+    scenario = scenario_or_robot(str(beside) if beside.is_file() else given)
+    scenario.require_goal()
+    for key, value in _mapping(section, "set").items():
+        node, _, parameter = str(key).partition(".")
+        if node not in CONFIGS or not parameter:
+            raise ParameterError(
+                f"'{key}' under 'set' is no parameter: it is called node.parameter with one of the "
+                f"nodes {', '.join(CONFIGS)}."
+            )
+        scenario = scenario.with_overrides(node, {parameter: value})
+    if "method" in section:
+        scenario = scenario.with_method(str(section["method"]))
+    for node in ("plant", *scenario.commanders):
+        scenario.config(node)  # Refused here, before anything is flown.
+    if not scenario.lockstep:
+        raise ParameterError("campaigns are flown in lockstep: leave plant.time_mode out.")
+    return scenario
+
+
+def _mapping(section: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = section.get(key) or {}
+    if not isinstance(value, dict):
+        raise ParameterError(f"'{key}' must have names with values under it.")
+    return value
+
+
+def _whole(section: Mapping[str, Any], key: str, default: int, least: int, most: int) -> int:
+    value = section.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        raise ParameterError(
+            f"'{key}' is {value!r}; it must be a whole number from {least} to {most}."
+        )
+    return value
+
+
+def _real(key: str, value: Any, least: float = -math.inf) -> float:
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and number >= least):
+        bound = f" of at least {least:g}" if math.isfinite(least) else ""
+        raise ParameterError(f"'{key}' is {value!r}; it must be a finite number{bound}.")
+    return number
+
+
+# -- what differs -----------------------------------------------------------------------------
+
+
+def _dispersions(section: Mapping[str, Any], scenario: Scenario) -> tuple[Dispersion, ...]:
+    found: dict[str, Dispersion] = {}
+    for name, given in section.items():
+        for target in targets_of(str(name), scenario):
+            distribution = _distribution(target.name, given)
+            if distribution.texts is not target.text:
+                what = "a text" if target.text else "a number"
+                raise ParameterError(f"'{target.name}' is {what}; {given} draws another thing.")
+            if target.name in found:
+                raise ParameterError(f"'{target.name}' is dispersed twice.")
+            found[target.name] = Dispersion(target, distribution)
+    for name, dispersion in found.items():
+        whole = dispersion.target.replaces
+        if whole in found and whole != name:
+            raise ParameterError(f"'{name}' and '{whole}' set the same numbers: leave one out.")
+    return tuple(found.values())
+
+
+def _distribution(name: str, given: Any) -> Distribution:
+    if not isinstance(given, dict) or len(given) != 1:
+        raise ParameterError(
+            f"'{name}' must have one distribution, such as 'norm: {{loc: 1, scale: 0.05}}'."
+        )
+    ((kind, arguments),) = given.items()
+    if kind == "choice":
+        if not isinstance(arguments, list) or not arguments:
+            raise ParameterError(f"'{name}' must have a list of values to choose from.")
+        return Distribution("choice", {}, tuple(arguments))
+    distribution = _scipy(str(kind))
+    shapes = (distribution.shapes or "").replace(" ", "").split(",")
+    words = [*filter(None, shapes), "loc", *(["scale"] if hasattr(distribution, "pdf") else [])]
+    if isinstance(arguments, list):
+        if len(arguments) > len(words):
+            raise ParameterError(
+                f"'{name}': {kind} takes {', '.join(words)}, not {len(arguments)} numbers."
+            )
+        arguments = dict(zip(words, arguments, strict=False))
+    if not isinstance(arguments, dict):
+        raise ParameterError(f"'{name}': {kind} must have its arguments: {', '.join(words)}.")
+    for word in arguments:
+        if word not in words:
+            raise ParameterError(
+                f"'{name}': {kind} has no argument '{word}'; it takes {', '.join(words)}."
+                f"{suggestion(str(word), words)}"
+            )
+    missing = [word for word in filter(None, shapes) if word not in arguments]
+    if missing:
+        raise ParameterError(f"'{name}': {kind} needs its argument '{missing[0]}'.")
+    values = {word: _real(f"{name}: {word}", value) for word, value in arguments.items()}
+    if not math.isfinite(float(distribution(**values).ppf(0.5))):
+        raise ParameterError(
+            f"'{name}': {kind} takes no such arguments: "
+            f"{', '.join(f'{word} {value:g}' for word, value in values.items())}."
+        )
+    return Distribution(str(kind), values)
+
+
+def _scipy(name: str) -> Any:
+    """Return a distribution of scipy.stats, which takes a second to load."""
+    from scipy import stats
+
+    found = getattr(stats, name, None)
+    if not isinstance(found, (stats.rv_continuous, stats.rv_discrete)):
+        known = [
+            each
+            for each, value in vars(stats).items()
+            if isinstance(value, (stats.rv_continuous, stats.rv_discrete))
+        ]
+        raise ParameterError(
+            f"scipy.stats has no distribution '{name}'.{suggestion(name, [*known, 'choice'])}"
+        )
+    return found
+
+
+# -- what is required -------------------------------------------------------------------------
+
+
+def _criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Criterion, ...]:
+    found = []
+    for name, given in section.items():
+        if not is_metric(str(name), scenario):
+            raise ParameterError(
+                f"there is no metric '{name}'; there are {', '.join(METRICS)}."
+                f"{suggestion(str(name), METRICS)}"
+            )
+        if not isinstance(given, dict) or not given or set(given) - {"min", "max"}:
+            raise ParameterError(f"the criterion of '{name}' must have 'min' or 'max', or both.")
+        least = _real(f"{name}: min", given["min"]) if "min" in given else -math.inf
+        most = _real(f"{name}: max", given["max"]) if "max" in given else math.inf
+        if least > most:
+            raise ParameterError(f"the criterion of '{name}' is met by nothing: {least} > {most}.")
+        found.append(Criterion(str(name), least, most))
+    return tuple(found)
+
+
+def passed(criteria: Sequence[Criterion], outcome: str, metrics: Mapping[str, float]) -> bool:
+    """Whether a flight has reached its goal and met every criterion."""
+    return outcome == "reached" and all(meets(criterion, metrics) for criterion in criteria)
+
+
+def meets(criterion: Criterion, metrics: Mapping[str, float]) -> bool:
+    """Whether a metric is within its criterion; one that is not there is not."""
+    return criterion.minimum <= metrics.get(criterion.metric, math.nan) <= criterion.maximum

@@ -1,0 +1,223 @@
+"""The results of a campaign: a Parquet dataset that grows as flights end, and what it is of."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from spacerobot_ros import __version__
+from spacerobot_ros.campaign.config import OF_ALL, Campaign, parse_campaign
+from spacerobot_ros.campaign.engines import Row
+from spacerobot_ros.campaign.extras import needed
+from spacerobot_ros.campaign.metrics import joint_names, metric_names
+from spacerobot_ros.errors import ParameterError, RecordingError
+from spacerobot_ros.flight.scenario import load_scenario, scenario_text
+from spacerobot_ros.model.urdf import load_robot
+from spacerobot_ros.resources import is_path
+
+DRAWN = "draw."
+"""Before the names of columns that were drawn."""
+
+_ABOUT, _CAMPAIGN, _SCENARIO, _FLIGHTS = "about.json", "campaign.yaml", "scenario.yaml", "flights"
+
+_FLUSH_PERIOD, _FLUSH_ROWS = 5.0, 2000
+"""Wall s, and rows, after which rows are written: a campaign that is killed loses no more."""
+
+VERSIONS = json.dumps(
+    {"spacerobot_ros": __version__, "numpy": np.__version__, "python": platform.python_version()}
+)
+
+
+class Dataset:
+    """The folder of a campaign: ``campaign.yaml`` and ``scenario.yaml`` say what is flown,
+    ``flights/*.parquet`` has a row a flight.
+
+    Parameters
+    ----------
+    folder
+        Where it is.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._rows: list[Row] = []
+        self._written = time.monotonic()
+        self._schema: Any = None
+        self._part = 0
+
+    # -- what it is of ------------------------------------------------------------------------
+
+    def begin(self, campaign: Campaign) -> set[int]:
+        """Make the folder, or go on in it; return the numbers of the flights that are in it.
+
+        Raises
+        ------
+        ParameterError
+            It holds another campaign.
+        SpaceRobotError
+            pyarrow is not installed.
+        """
+        self._schema = _schema(campaign)
+        about = self.folder / _ABOUT
+        fingerprint = _fingerprint(campaign)
+        if about.exists():
+            known = json.loads(about.read_text(encoding="utf-8"))
+            if known["fingerprint"] != fingerprint:
+                raise ParameterError(
+                    f"The folder {self.folder} holds another campaign, '{known['name']}': name "
+                    "another folder, or remove it."
+                )
+        elif self.folder.exists() and any(self.folder.iterdir()):
+            raise ParameterError(
+                f"The folder {self.folder} is not empty and holds no campaign: name another one."
+            )
+        (self.folder / _FLIGHTS).mkdir(parents=True, exist_ok=True)
+        for left in (self.folder / _FLIGHTS).glob(".*"):
+            left.unlink()  # What was being written when an earlier process ended.
+        section = {**campaign.section, "scenario": _SCENARIO, "flights": campaign.flights}
+        for key in ("set", "method"):
+            section.pop(key, None)
+        text = scenario_text(self_contained(campaign).scenario)
+        (self.folder / _SCENARIO).write_text(text, encoding="utf-8")
+        (self.folder / _CAMPAIGN).write_text(
+            yaml.safe_dump({"campaign": section}, sort_keys=False, allow_unicode=True),
+            encoding="utf-8",
+        )
+        facts = {"name": campaign.name, "fingerprint": fingerprint, "versions": VERSIONS}
+        about.write_text(json.dumps(facts, indent=1), encoding="utf-8")
+        return self.done()
+
+    def campaign(self) -> Campaign:
+        """Return the campaign that the folder is of.
+
+        Raises
+        ------
+        ParameterError
+            It holds none.
+        """
+        try:
+            facts = json.loads((self.folder / _ABOUT).read_text(encoding="utf-8"))
+            content = yaml.safe_load((self.folder / _CAMPAIGN).read_text(encoding="utf-8"))
+        except (OSError, ValueError, yaml.YAMLError) as error:
+            raise ParameterError(f"The folder {self.folder} holds no campaign: {error}.") from error
+        scenario = load_scenario(str(self.folder / _SCENARIO))
+        return parse_campaign(facts["name"], content["campaign"], self.folder, scenario)
+
+    # -- rows ---------------------------------------------------------------------------------
+
+    def done(self) -> set[int]:
+        """Return the numbers of the flights that are there."""
+        parquet = needed("pyarrow.parquet")
+        found: set[int] = set()
+        for part in self._parts():
+            found.update(parquet.read_table(part, columns=["flight"])["flight"].to_pylist())
+        return found
+
+    def add(self, rows: Iterable[Row]) -> None:
+        """Take rows; they are written after some seconds, or with :meth:`flush`."""
+        self._rows += rows
+        late = time.monotonic() - self._written > _FLUSH_PERIOD
+        if self._rows and (late or len(self._rows) >= _FLUSH_ROWS):
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what was taken: a file of its own, there as a whole or not at all.
+
+        Raises
+        ------
+        RecordingError
+            The disk refuses it.
+        """
+        self._written = time.monotonic()
+        if not self._rows:
+            return
+        arrow, parquet = needed("pyarrow"), needed("pyarrow.parquet")
+        records = [_record(row) for row in self._rows]
+        table = arrow.Table.from_pylist(records, schema=self._schema)
+        folder = self.folder / _FLIGHTS
+        while (path := folder / f"part-{self._part:06d}.parquet").exists():
+            self._part += 1
+        try:
+            parquet.write_table(table, folder / f".{path.name}")
+            os.replace(folder / f".{path.name}", path)
+        except OSError as error:
+            raise RecordingError(f"The flights cannot be written to {path}: {error}.") from error
+        self._rows.clear()
+
+    def table(self) -> Any:
+        """Return all rows as a pyarrow table, by the number of the flight.
+
+        Raises
+        ------
+        ParameterError
+            There are none.
+        """
+        arrow, parquet = needed("pyarrow"), needed("pyarrow.parquet")
+        parts = [parquet.read_table(part) for part in self._parts()]
+        if not parts:
+            raise ParameterError(f"The folder {self.folder} has no flights yet.")
+        return arrow.concat_tables(parts).sort_by("flight")
+
+    def _parts(self) -> Sequence[Path]:
+        return sorted((self.folder / _FLIGHTS).glob("part-*.parquet"))
+
+
+def _schema(campaign: Campaign) -> Any:
+    arrow = needed("pyarrow")
+    real, text = arrow.float64(), arrow.string()
+    fields = [("flight", arrow.int64()), ("seed", arrow.int64()), ("passed", arrow.bool_())]
+    fields += [("outcome", text), ("reason", text)]
+    for each in campaign.dispersions:
+        fields.append((f"{DRAWN}{each.name}", text if each.target.text else real))
+    fields += [(name, real) for name in metric_names(joint_names(campaign.scenario))]
+    fields += [("wall_time_s", real), ("plan_time_s", real), ("engine", text), ("versions", text)]
+    return arrow.schema(fields)
+
+
+def _record(row: Row) -> dict[str, Any]:
+    return {
+        "flight": row.draw.number,
+        "seed": row.draw.seed,
+        "passed": row.passed,
+        "outcome": row.outcome,
+        "reason": row.reason,
+        **{f"{DRAWN}{name}": value for name, value in row.draw.values.items()},
+        **row.metrics,
+        "wall_time_s": row.wall_time,
+        "plan_time_s": row.plan_time,
+        "engine": row.engine,
+        "versions": VERSIONS,
+    }
+
+
+def _fingerprint(campaign: Campaign) -> str:
+    """Return what is the same for campaigns whose draws are the same flights."""
+    own = {"flights", "engine", "description", "scenario", "set", "method"}
+    section = {key: value for key, value in campaign.section.items() if key not in own}
+    section |= {"seed": campaign.seed, "sampler": campaign.sampler, "longest": campaign.longest}
+    if campaign.sampler in OF_ALL:
+        section["flights"] = campaign.flights
+    text = json.dumps(section, sort_keys=True, default=str)
+    flown = scenario_text(self_contained(campaign).scenario)
+    return hashlib.sha256(f"{text}{flown}".encode()).hexdigest()
+
+
+def self_contained(campaign: Campaign) -> Campaign:
+    """Return the campaign with robots as texts where they are files, which others do not have."""
+    scenario = campaign.scenario
+    for node in ("plant", *scenario.commanders):
+        config = scenario.config(node)
+        if config.robot and is_path(config.robot) and not config.robot_description:
+            text = {"robot_description": load_robot(config.robot).urdf, "robot": ""}
+            scenario = scenario.with_overrides(node, text)
+    return replace(campaign, scenario=scenario)

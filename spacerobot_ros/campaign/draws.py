@@ -1,0 +1,134 @@
+"""The draws of a campaign: which values each flight has.
+
+A draw is known by its number alone: it depends neither on the number of workers nor on the order in
+which flights end, and with the samplers ``random``, ``sobol`` and ``halton`` not on the number of
+flights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.targets import DrawnFlight
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model.description import Array
+
+_SMALLEST = 1e-12
+"""Shares are at least so far from 0 and 1, where many distributions are infinite."""
+
+
+@dataclass(frozen=True)
+class Draw:
+    """What is drawn for one flight.
+
+    Attributes
+    ----------
+    number
+        Which flight.
+    seed
+        Of the noise of its sensors and actuators.
+    values
+        By the names of what is dispersed.
+    """
+
+    number: int
+    seed: int
+    values: Mapping[str, Any]
+
+
+class Draws:
+    """All draws of a campaign.
+
+    Raises
+    ------
+    ParameterError
+        The sampler cannot make so few.
+    """
+
+    def __init__(self, campaign: Campaign) -> None:
+        self._campaign = campaign
+        self.shares = self._spread()
+        """(N, D) the shares of their distributions below the values; none is drawn that way where
+        each flight draws its own."""
+
+    def __len__(self) -> int:
+        return self._campaign.flights if self.shares is None else len(self.shares)
+
+    def __getitem__(self, number: int) -> Draw:
+        """Return a draw by its number."""
+        campaign = self._campaign
+        own = np.random.SeedSequence(campaign.seed, spawn_key=(number,))
+        seed = int(own.generate_state(1)[0] >> 1)
+        if self.shares is None:
+            shares = np.random.default_rng(own.spawn(1)[0]).random(len(campaign.dispersions))
+        else:
+            shares = self.shares[number]
+        shares = np.clip(shares, _SMALLEST, 1.0 - _SMALLEST)
+        values = {
+            each.name: each.distribution.at(float(u))
+            for each, u in zip(campaign.dispersions, shares, strict=True)
+        }
+        return Draw(number, seed, values)
+
+    def __iter__(self) -> Iterator[Draw]:
+        return (self[number] for number in range(len(self)))
+
+    def _spread(self) -> Array | None:
+        campaign, size = self._campaign, len(self._campaign.dispersions)
+        if campaign.sampler == "random" or not size:
+            return None
+        if campaign.sampler == "saltelli":
+            return self._saltelli(size)
+        from scipy.stats import qmc
+
+        kinds = {
+            "latin_hypercube": qmc.LatinHypercube,
+            "sobol": qmc.Sobol,
+            "halton": qmc.Halton,
+        }
+        rng = np.random.default_rng(np.random.SeedSequence(campaign.seed))
+        engine = kinds[campaign.sampler](d=size, rng=rng)
+        if campaign.sampler == "sobol":
+            # Any number of them: balance is asked for by a power of two, and told in the docs.
+            power = int(np.ceil(np.log2(max(1, campaign.flights))))
+            return np.asarray(engine.random_base2(power))[: campaign.flights]
+        return np.asarray(engine.random(campaign.flights))
+
+    def _saltelli(self, size: int) -> Array:
+        from spacerobot_ros.campaign.extras import salib
+
+        base = self._campaign.flights // (size + 2)
+        if base < 2:
+            raise ParameterError(
+                f"the sampler 'saltelli' needs at least {2 * (size + 2)} flights for {size} "
+                "dispersion(s)."
+            )
+        base = 2 ** int(np.log2(base))
+        problem = {"num_vars": size, "names": list(self._campaign.names), "bounds": [[0, 1]] * size}
+        sample = salib("sample.sobol").sample
+        seed = int(np.random.SeedSequence(self._campaign.seed).generate_state(1)[0] >> 1)
+        return np.asarray(sample(problem, base, calc_second_order=False, seed=seed))
+
+
+def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = None) -> DrawnFlight:
+    """Return the flight of a draw; ``common`` is what :meth:`.DrawnFlight.of` has of the scenario.
+
+    Raises
+    ------
+    ParameterError
+        A parameter refuses its value.
+    RobotDescriptionError
+        No body weighs what was drawn.
+    """
+    flight = common or DrawnFlight.of(campaign.scenario)
+    flight = replace(
+        flight, scenario=flight.scenario.with_overrides("plant", {"sensors.seed": draw.seed})
+    )
+    for dispersion in campaign.dispersions:
+        flight = dispersion.target.apply(flight, draw.values[dispersion.name])
+    return flight.finished()

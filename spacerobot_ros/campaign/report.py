@@ -1,0 +1,490 @@
+"""The report of a campaign: one HTML file that needs nothing besides itself."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import numpy.typing as npt
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from spacerobot_ros import __version__
+from spacerobot_ros.campaign.config import Campaign, Criterion, meets
+from spacerobot_ros.campaign.dataset import DRAWN, Dataset
+from spacerobot_ros.campaign.draws import Draws
+from spacerobot_ros.campaign.metrics import METRICS
+from spacerobot_ros.campaign.statistics import (
+    PERCENTILES,
+    Influence,
+    Share,
+    influences,
+    percentiles,
+    share,
+    sobol_indices,
+)
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.report.style import FAINT, INK, PALETTE
+
+_WORST = 10
+_SHOWN = 6
+"""Metrics with figures of their own."""
+
+Flags = npt.NDArray[np.bool_]
+
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
+_ALWAYS = ("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "propellant_kg")
+
+STYLE: Any = {
+    "font.size": 8.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e9ebee",
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "svg.hashsalt": "spacerobot",
+    "svg.fonttype": "path",
+    "text.parse_math": False,
+}
+"""Of all figures of campaigns."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """The rows of a campaign as columns.
+
+    Attributes
+    ----------
+    campaign
+        What was flown.
+    folder
+        Where the dataset is.
+    numbers
+        (N,) of the flights.
+    columns
+        Every column by name: arrays of numbers, lists of texts.
+    total
+        How many flights there are to be.
+    """
+
+    campaign: Campaign
+    folder: Path
+    numbers: Array
+    columns: Mapping[str, Any]
+    total: int
+
+    @classmethod
+    def of(cls, folder: Path) -> Results:
+        """Read a dataset.
+
+        Raises
+        ------
+        ParameterError
+            The folder holds no campaign, or no flights yet.
+        """
+        dataset = Dataset(folder)
+        campaign, table = dataset.campaign(), dataset.table()
+        columns: dict[str, Any] = {}
+        for name in table.column_names:
+            values = table[name].to_pylist()
+            if name in ("outcome", "reason", "engine", "versions") or _is_text(values):
+                columns[name] = values
+            else:
+                columns[name] = np.array([np.nan if v is None else v for v in values], dtype=float)
+        return cls(campaign, folder, columns["flight"], columns, len(Draws(campaign)))
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    @property
+    def passed(self) -> Flags:
+        """(N,) whether each flight has reached its goal and met every criterion."""
+        return np.asarray(self.columns["passed"] > 0)
+
+    @property
+    def success(self) -> Share:
+        """The share of those."""
+        return share(int(self.passed.sum()), len(self))
+
+    @property
+    def drawn(self) -> dict[str, Array]:
+        """(N,) what was drawn, by name; numbers only."""
+        names = [each.name for each in self.campaign.dispersions]
+        found = {name: self.columns[f"{DRAWN}{name}"] for name in names}
+        return {name: x for name, x in found.items() if isinstance(x, np.ndarray)}
+
+    @property
+    def shown(self) -> list[str]:
+        """The metrics that matter here: those with a criterion, and others that vary."""
+        names = [criterion.metric for criterion in self.campaign.criteria]
+        names += [name for name in _ALWAYS if name not in names]
+        return [name for name in names if np.isfinite(self.columns[name]).any()]
+
+    def metrics(self) -> dict[str, Array]:
+        """Return the columns of those metrics."""
+        return {name: self.columns[name] for name in self.shown}
+
+    def requirement(self, criterion: Criterion) -> Share:
+        """Return how many flights meet a criterion."""
+        values = self.columns[criterion.metric].tolist()
+        met = sum(meets(criterion, {criterion.metric: value}) for value in values)
+        return share(met, len(self))
+
+    def influences(self) -> list[Influence]:
+        """Return what drives the metrics, the strongest first; Sobol indices where they can be."""
+        found = influences(self.drawn, self.metrics())
+        whole = self.campaign.sampler == "saltelli" and len(self) == self.total
+        if whole and len(self.drawn) == len(self.campaign.dispersions):
+            names, with_indices = list(self.drawn), []
+            indices = {name: sobol_indices(names, x) for name, x in self.metrics().items()}
+            for each in found:
+                known = indices[each.metric].get(each.cause)
+                if known is not None:
+                    a, b, c, d = known
+                    each = Influence(
+                        each.cause, each.metric, each.correlation, each.p, (a, b), (c, d)
+                    )
+                with_indices.append(each)
+            found = with_indices
+        return sorted(found, key=lambda each: -abs(each.correlation))
+
+    def worst(self) -> list[int]:
+        """Return the rows of the worst flights: those that were not flown or did not pass first."""
+        badness = np.zeros(len(self))
+        for criterion in self.campaign.criteria:
+            x = self.columns[criterion.metric]
+            spread = np.nanstd(x) or 1.0
+            over = np.maximum(x - criterion.maximum, criterion.minimum - x) / spread
+            badness = np.fmax(badness, np.where(np.isfinite(over), over, -np.inf))
+        if not self.campaign.criteria:
+            badness = np.nan_to_num(self.columns["position_error_m"])
+        badness += 1e6 * (np.array(self.columns["outcome"]) != "reached")
+        badness += 1e3 * ~self.passed
+        order = np.lexsort((self.numbers, -badness))
+        return [int(row) for row in order[:_WORST]]
+
+
+def _is_text(values: Sequence[Any]) -> bool:
+    return any(isinstance(value, str) for value in values)
+
+
+def write_campaign_report(folder: Path, path: Path) -> list[str]:
+    """Write the report of a dataset; return lines for people.
+
+    Raises
+    ------
+    ParameterError
+        The folder holds no campaign, or no flights yet.
+    SpaceRobotError
+        The file cannot be written.
+    """
+    results = Results.of(folder)
+    write_page(path, f"Campaign {results.campaign.name}", _body(results))
+    lines = [f"success     {results.success}"]
+    lines += [f"required    {c}: {results.requirement(c)}" for c in results.campaign.criteria]
+    for each in results.influences()[:3]:
+        lines.append(f"driver      {each.cause} of {each.metric}: {each.correlation:+.2f}")
+    return lines
+
+
+def write_page(path: Path, title: str, body: Sequence[str]) -> None:
+    """Write a page in the style of the reports of flights.
+
+    Raises
+    ------
+    SpaceRobotError
+        The file cannot be written.
+    """
+    css = files("spacerobot_ros.report").joinpath("page.css").read_text(encoding="utf-8")
+    text = (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{escape(_POLICY)}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<link rel="icon" href="data:,">\n'
+        f"<title>{escape(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n<main>\n"
+        + "\n".join(part for part in body if part)
+        + f"\n<footer><p>Made by spacerobot_ros {__version__}.</p></footer>\n"
+        + "</main>\n</body>\n</html>\n"
+    )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise SpaceRobotError(f"The report {path} cannot be written: {error}.") from error
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]], identity: str) -> str:
+    """Return a table; every column but the first has numbers to the right."""
+
+    def line(cells: Sequence[str], tag: str) -> str:
+        made = [f'<th scope="row">{escape(cells[0])}</th>' if tag == "td" else ""]
+        rest = cells[1:] if tag == "td" else cells
+        made += [f"<{tag}>{escape(cell)}</{tag}>" for cell in rest]
+        return f"<tr>{''.join(made)}</tr>\n"
+
+    body = "".join(line(cells, "td") for cells in rows)
+    return (
+        f'<div class="scroll"><table id="{identity}"><thead>\n{line(head, "th")}</thead>'
+        f"<tbody>\n{body}</tbody></table></div>"
+    )
+
+
+def picture(figure: Figure, name: str, caption: str) -> str:
+    """Return a figure for the page."""
+    stream = io.BytesIO()
+    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    figure.savefig(stream, format="svg", metadata=nothing)
+    data = base64.b64encode(stream.getvalue()).decode()
+    return (
+        f'<figure id="{name}"><div class="scroll"><img src="data:image/svg+xml;base64,{data}" '
+        f'alt="{escape(caption)}"></div>\n<figcaption>{escape(caption)}</figcaption></figure>'
+    )
+
+
+def panels(count: int, across: int, height: float = 2.2) -> tuple[Figure, list[Any]]:
+    """Return a figure of so many panels."""
+    rows = -(-count // across)
+    figure = Figure(figsize=(9.6, height * rows + 0.2), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    axes = list(np.ravel(figure.subplots(rows, across, squeeze=False)))
+    for unused in axes[count:]:
+        unused.set_visible(False)
+    return figure, axes[:count]
+
+
+def named(metric: str) -> str:
+    """Return a metric with its unit."""
+    unit = METRICS[metric.partition(".")[0]].unit
+    return (
+        metric
+        if not unit or metric.endswith(("_m", "_rad", "_s", "_kg", "_N", "_Nm"))
+        else (f"{metric}, {unit}")
+    )
+
+
+# -- parts of the page ------------------------------------------------------------------------
+
+
+def _body(results: Results) -> list[str]:
+    campaign, found = results.campaign, results.influences()
+    with mpl.rc_context(STYLE):
+        return [
+            f"<header><h1>{escape(campaign.name)}</h1>",
+            f"<p>{escape(campaign.description)}</p>" if campaign.description else "",
+            _facts(results),
+            _headline(results),
+            "</header>",
+            "<h2>Requirements</h2>",
+            _requirements(results),
+            "<h2>Outcomes</h2>",
+            _outcomes(results),
+            "<h2>Distributions</h2>",
+            _percentiles(results),
+            _histograms(results),
+            "<h2>What drives the result</h2>",
+            _drivers(results, found),
+            _scatter(results, found),
+            "<h2>The worst flights</h2>",
+            _worst_table(results),
+            "<h2>Convergence</h2>",
+            _convergence(results),
+            "<h2>What was dispersed</h2>",
+            _dispersed(campaign),
+        ]
+
+
+def _facts(results: Results) -> str:
+    campaign = results.campaign
+    engines = Counter(results.columns["engine"])
+    facts = [
+        f"scenario {campaign.scenario.name}",
+        f"{len(results)} of {results.total} flights",
+        f"sampler {campaign.sampler}, seed {campaign.seed}",
+        "engine " + ", ".join(f"{name} ({count})" for name, count in engines.items()),
+    ]
+    spans = "".join(f"<span>{escape(fact)}</span>" for fact in facts)
+    return f'<p class="facts">{spans}</p>'
+
+
+def _headline(results: Results) -> str:
+    success = results.success
+    low, high = success.exact
+    wall = float(np.nansum(results.columns["wall_time_s"]))
+    tiles = [
+        ("success", f"{100 * success.value:.4g} %", f"{success.count} of {success.total}"),
+        ("95 % interval (Wilson)", f"{100 * success.low:.4g} to {100 * success.high:.4g} %", ""),
+        ("95 % interval (Clopper-Pearson)", f"{100 * low:.4g} to {100 * high:.4g} %", ""),
+        ("flown", f"{wall:.4g} s", "of workers' time"),
+    ]
+    made = []
+    for label, value, note in tiles:
+        small = f"<small>{escape(note)}</small>" if note else ""
+        made.append(f"<div><dt>{escape(label)}</dt><dd>{escape(value)}{small}</dd></div>")
+    return f'<dl class="tiles">{"".join(made)}</dl>'
+
+
+def _requirements(results: Results) -> str:
+    outcomes = results.columns["outcome"]
+    reached = share(sum(outcome == "reached" for outcome in outcomes), len(results))
+    rows = [["the goal is reached", *_shared(reached), "", ""]]
+    for criterion in results.campaign.criteria:
+        values = percentiles(results.columns[criterion.metric])
+        middle, high = values[PERCENTILES.index(50.0)], values[PERCENTILES.index(95.0)]
+        met = results.requirement(criterion)
+        rows.append([str(criterion), *_shared(met), f"{middle:.4g}", f"{high:.4g}"])
+    rows.append(["all together", *_shared(results.success), "", ""])
+    head = ["requirement", "met by", "95 % interval", "median", "95 percentile"]
+    return table(head, rows, "requirements")
+
+
+def _shared(met: Share) -> list[str]:
+    return [
+        f"{100 * met.value:.4g} % ({met.count} of {met.total})",
+        f"{100 * met.low:.4g} to {100 * met.high:.4g} %",
+    ]
+
+
+def _outcomes(results: Results) -> str:
+    kinds: dict[str, list[str]] = {}
+    for outcome, reason in zip(results.columns["outcome"], results.columns["reason"], strict=True):
+        kinds.setdefault(outcome, []).append(reason or "")
+    rows = []
+    for outcome, reasons in sorted(kinds.items(), key=lambda item: -len(item[1])):
+        # Sentences differ in their numbers alone.
+        counts = Counter(re.sub(r"-?\d[\d.e+-]*", "…", reason) for reason in reasons)
+        for sentence, count in counts.most_common(4):
+            rows.append([outcome, f"{count}", sentence])
+    return table(["outcome", "flights", "sentence"], rows, "outcomes")
+
+
+def _percentiles(results: Results) -> str:
+    rows = []
+    for name, values in results.metrics().items():
+        there = values[np.isfinite(values)]
+        numbers = [there.min(), *percentiles(values), there.max(), there.mean(), there.std()]
+        rows.append([named(name), *(f"{x:.4g}" for x in numbers)])
+    head = ["metric", "least", *(f"{p:g} %" for p in PERCENTILES), "most", "mean", "std"]
+    return table(head, rows, "percentiles")
+
+
+def _histograms(results: Results) -> str:
+    names = results.shown[:_SHOWN]
+    if not names:
+        return ""
+    figure, axes = panels(len(names), 2)
+    bounds = {criterion.metric: criterion for criterion in results.campaign.criteria}
+    for panel, name in zip(axes, names, strict=True):
+        values = results.columns[name]
+        there = values[np.isfinite(values)]
+        bins = min(60, max(8, int(np.sqrt(len(there)))))
+        panel.hist(there, bins=bins, color=PALETTE[0], alpha=0.75)
+        for level in (5, 50, 95):
+            panel.axvline(np.percentile(there, level), color=INK, linewidth=0.8, linestyle=":")
+        if name in bounds:
+            for bound in (bounds[name].minimum, bounds[name].maximum):
+                if np.isfinite(bound) and abs(bound) < 10 * (np.abs(there).max() + 1e-12):
+                    panel.axvline(bound, color=PALETTE[1], linewidth=1.5)
+        panel.set_xlabel(named(name))
+        panel.set_ylabel("flights")
+    caption = (
+        "Distributions of the metrics; dotted: 5, 50 and 95 percentiles, orange: what is required."
+    )
+    return picture(figure, "distributions", caption)
+
+
+def _drivers(results: Results, found: Sequence[Influence]) -> str:
+    if not found:
+        return '<p class="missing">Nothing that was drawn as a number varies with a metric.</p>'
+    sobol = any(each.total is not None for each in found)
+    rows = []
+    for each in found[:15]:
+        cells = [each.cause, each.metric, f"{each.correlation:+.3f}", f"{each.p:.2g}"]
+        if sobol:
+            for index in (each.first, each.total):
+                cells.append("" if index is None else f"{index[0]:.3f} ± {index[1]:.3f}")
+        rows.append(cells)
+    head = ["drawn", "metric", "rank correlation", "p"]
+    head += ["Sobol, first order", "Sobol, total"] if sobol else []
+    note = "Spearman's rank correlations, the strongest first; p: as large by chance."
+    if not sobol:
+        note += " The sampler 'saltelli' adds Sobol indices."
+    return f'<p class="facts">{escape(note)}</p>' + table(head, rows, "drivers")
+
+
+def _scatter(results: Results, found: Sequence[Influence]) -> str:
+    chosen = list(found[:_SHOWN])
+    if not chosen:
+        return ""
+    figure, axes = panels(len(chosen), 3, 2.4)
+    passed = results.passed
+    # A page shows no more points than these.
+    few = np.random.default_rng(0).permutation(len(results))[:2000]
+    for panel, each in zip(axes, chosen, strict=True):
+        x, y = results.drawn[each.cause][few], results.columns[each.metric][few]
+        for ok, colour in ((True, PALETTE[0]), (False, PALETTE[1])):
+            of = passed[few] == ok
+            panel.plot(x[of], y[of], ".", ms=3, alpha=0.5, color=colour, rasterized=True)
+        panel.set_xlabel(each.cause)
+        panel.set_ylabel(named(each.metric))
+        panel.set_title(f"{each.correlation:+.2f}", fontsize=8.5)
+    caption = "The strongest drivers; orange: flights that did not pass."
+    return picture(figure, "scatter", caption)
+
+
+def _worst_table(results: Results) -> str:
+    names = results.shown
+    rows = []
+    for row in results.worst():
+        number = int(results.numbers[row])
+        values = [f"{results.columns[name][row]:.4g}" for name in names]
+        command = f"spacerobot campaign rerun {results.folder} {number}"
+        rows.append([str(number), results.columns["outcome"][row], *values, command])
+    head = ["flight", "outcome", *map(named, names), "to fly it again, with a bag"]
+    return table(head, rows, "worst")
+
+
+def _convergence(results: Results) -> str:
+    count = len(results)
+    at = np.unique(np.geomspace(min(10, count), count, 60).astype(int))
+    passed = np.cumsum(results.passed)
+    shares = [share(int(passed[k - 1]), int(k)) for k in at]
+    figure, axes = panels(2, 2, 2.4)
+    axes[0].fill_between(
+        at, [s.low for s in shares], [s.high for s in shares], color=FAINT, alpha=0.6
+    )
+    axes[0].plot(at, [s.value for s in shares], color=PALETTE[0])
+    axes[0].set_ylabel("success, with 95 % interval")
+    for i, name in enumerate(results.shown[:3]):
+        values = results.columns[name]
+        final = percentiles(values)[PERCENTILES.index(95.0)] or 1.0
+        line = [percentiles(values[:k])[PERCENTILES.index(95.0)] / final for k in at]
+        axes[1].plot(at, line, color=PALETTE[i], label=name)
+    axes[1].set_ylabel("95 percentile over its last value")
+    axes[1].legend(fontsize=7, frameon=False)
+    for panel in axes:
+        panel.set_xlabel("flights")
+        panel.set_xscale("log")
+    return picture(figure, "convergence", "How the numbers settle with the number of flights.")
+
+
+def _dispersed(campaign: Campaign) -> str:
+    rows = [
+        [each.name, str(each.distribution), each.target.unit or ""] for each in campaign.dispersions
+    ]
+    if not rows:
+        return '<p class="missing">Nothing but the noise: every flight has another seed.</p>'
+    return table(["what", "distribution", "unit"], rows, "dispersed")

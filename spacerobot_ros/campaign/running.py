@@ -1,0 +1,363 @@
+"""Flies the draws of a campaign, here or on a cluster, and writes what comes of them."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from spacerobot_ros.campaign.config import Campaign, parse_campaign
+from spacerobot_ros.campaign.dataset import Dataset, self_contained
+from spacerobot_ros.campaign.draws import Draw, Draws
+from spacerobot_ros.campaign.engines import Row, chosen_engine, engine_called
+from spacerobot_ros.campaign.extras import needed
+from spacerobot_ros.errors import SpaceRobotError
+
+TASK_TIME = 2.0
+"""Wall s that a task shall take: what a scheduler does for one is then small."""
+
+_FIRST, _MOST = 4, 2000
+"""Flights of the first tasks, and of the largest."""
+
+_AHEAD = 2
+"""Tasks a worker that are submitted before others end."""
+
+_MOST_DEATHS = 2
+"""Workers that a flight may take with it before it is reported and not tried again."""
+
+_LOOK_PERIOD = 0.2
+
+KILLED = "killed"
+"""The outcome of a flight whose worker died with it, twice."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a campaign is.
+
+    Attributes
+    ----------
+    done, total
+        Flights.
+    rate
+        Flights a second of wall time, in this process.
+    seconds
+        Wall time so far.
+    """
+
+    done: int
+    total: int
+    rate: float
+    seconds: float
+
+    @property
+    def left(self) -> float:
+        """Wall time that is left, s; infinite before the first flight."""
+        return (self.total - self.done) / self.rate if self.rate else float("inf")
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Where flights are flown.
+
+    Attributes
+    ----------
+    workers
+        Processes on this machine; 0: this process alone.
+    scheduler
+        Address of a scheduler of dask.distributed whose workers fly; empty: those of this machine.
+    """
+
+    workers: int = 0
+    scheduler: str = ""
+
+
+def run_campaign(
+    campaign: Campaign,
+    folder: Path,
+    *,
+    engine: str = "auto",
+    cluster: Cluster = Cluster(),
+    show: Callable[[Progress], None] = lambda progress: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Progress:
+    """Fly every draw of a campaign that is not in its folder yet.
+
+    Parameters
+    ----------
+    campaign
+        What is flown.
+    folder
+        Of its dataset.
+    engine
+        What flies: a name, or ``auto``.
+    cluster
+        Where.
+    show
+        Told how far it is.
+    stopped
+        Asked a few times a second whether to end; what was flown until then is kept.
+
+    Returns
+    -------
+    Progress
+        How far it has come.
+
+    Raises
+    ------
+    SpaceRobotError
+        The engine cannot fly it, the folder holds another campaign, or a package is missing.
+    """
+    draws = Draws(campaign)
+    wanted = campaign.engine if engine == "auto" else engine
+    chosen = chosen_engine(campaign, wanted)
+    dataset = Dataset(folder)
+    done = dataset.begin(campaign)
+    numbers = [number for number in range(len(draws)) if number not in done]
+    began, before = time.monotonic(), len(draws) - len(numbers)
+
+    def progress(flown: int) -> Progress:
+        seconds = time.monotonic() - began
+        rate = flown / seconds if seconds > 0 else 0.0
+        return Progress(before + flown, len(draws), rate, seconds)
+
+    flown = 0
+    rows = _rows(campaign, draws, numbers, chosen.name, cluster, stopped)
+    try:
+        for batch in rows:
+            dataset.add(batch)
+            flown += len(batch)
+            show(progress(flown))
+    finally:
+        dataset.flush()
+    return progress(flown)
+
+
+def _rows(
+    campaign: Campaign,
+    draws: Draws,
+    numbers: list[int],
+    engine: str,
+    cluster: Cluster,
+    stopped: Callable[[], bool],
+) -> Iterator[list[Row]]:
+    if not numbers:
+        return
+    if not cluster.workers and not cluster.scheduler:
+        flying = engine_called(engine)
+        for row in flying.fly(campaign, _Chosen(draws, numbers), stopped):
+            yield [row]
+        return
+    specification = _Specification(self_contained(campaign))
+    with _client(cluster, len(numbers)) as client:
+        yield from _Distribution(client, specification, draws, engine, stopped).rows(numbers)
+
+
+class _Chosen(Sequence[Draw]):
+    """Some of the draws, made when they are asked for."""
+
+    def __init__(self, draws: Draws, numbers: list[int]) -> None:
+        self._draws, self._numbers = draws, numbers
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._draws[self._numbers[index]]
+
+
+# -- what a worker does -----------------------------------------------------------------------
+
+
+class _Specification:
+    """A campaign as it is sent to workers: the content of its file and its scenario."""
+
+    def __init__(self, campaign: Campaign) -> None:
+        self.name, self.section = campaign.name, dict(campaign.section)
+        self.scenario = campaign.scenario
+        self.key = os.urandom(8).hex()
+
+    def campaign(self) -> Campaign:
+        """Return the campaign, parsed once in each process."""
+        return _parsed(self)
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Specification) and other.key == self.key
+
+
+@lru_cache(maxsize=4)
+def _parsed(specification: _Specification) -> Campaign:
+    return parse_campaign(
+        specification.name, specification.section, scenario=specification.scenario
+    )
+
+
+def fly_task(specification: _Specification, draws: list[Draw], engine: str) -> list[Row]:
+    """Fly some draws in a worker: a task of the scheduler."""
+    campaign = specification.campaign()
+    return list(engine_called(engine).fly(campaign, draws, lambda: False))
+
+
+# -- the scheduler ----------------------------------------------------------------------------
+
+
+@contextmanager
+def _client(cluster: Cluster, flights: int) -> Iterator[Any]:
+    """Yield a client of dask.distributed, with workers on this machine unless there is a scheduler.
+
+    Raises
+    ------
+    SpaceRobotError
+        dask.distributed is not installed, or nobody is at the address.
+    """
+    needed("distributed")
+    import dask
+    from distributed import Client, LocalCluster
+
+    settings = {
+        "distributed.scheduler.allowed-failures": 0,  # Who is to blame is found out here.
+        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.worker.daemon": True,
+        "distributed.admin.tick.limit": "1h",
+    }
+    with dask.config.set(settings):
+        if cluster.scheduler:
+            try:
+                client = Client(cluster.scheduler, timeout="20s")
+            except (OSError, TimeoutError, ValueError) as error:
+                raise SpaceRobotError(
+                    f"There is no scheduler at {cluster.scheduler}: {error}."
+                ) from error
+            with client:
+                yield client
+            return
+        # Compilers and linear algebra of several workers would fight for the cores.
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+        with (
+            LocalCluster(
+                n_workers=min(cluster.workers, max(1, flights)),
+                threads_per_worker=1,
+                processes=True,
+                host="127.0.0.1",
+                dashboard_address=None,
+                worker_dashboard_address=None,
+                memory_limit=_memory(cluster.workers),
+                env=threads,
+                silence_logs=50,
+            ) as workers,
+            Client(workers) as client,
+        ):
+            yield client
+
+
+def _memory(workers: int) -> int:
+    """Return the memory of a worker, bytes: of this machine half, shared by all of them."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return max(512 * 2**20, total // (2 * max(1, workers)))
+
+
+class _Distribution:
+    """Deals draws out to workers.
+
+    A worker that dies takes the tasks with it that it has, the one that killed it and others. Their
+    flights are suspects: each is flown again in a task of its own, one suspect at a time. One that
+    dies with its worker then has killed it twice, and is reported.
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        specification: _Specification,
+        draws: Draws,
+        engine: str,
+        stopped: Callable[[], bool],
+    ) -> None:
+        self._client, self._specification, self._draws = client, specification, draws
+        self._engine, self._stopped = engine, stopped
+        self._size = float(_FIRST)
+        self._running: dict[Any, tuple[list[int], float]] = {}
+        self._suspects: deque[int] = deque()
+        self._deaths: Counter[int] = Counter()
+        self._suspected: Any = None
+        """The task of the suspect that is flown now."""
+
+    def rows(self, numbers: list[int]) -> Iterator[list[Row]]:
+        """Yield the rows of these draws as their tasks end."""
+        waiting = deque(numbers)
+        while (waiting or self._suspects or self._running) and not self._stopped():
+            self._submit(waiting)
+            for future in self._ended():
+                yield self._taken(future)
+        if self._running:
+            self._client.cancel(list(self._running), force=True)
+
+    def _submit(self, waiting: deque[int]) -> None:
+        """Keep the workers busy."""
+        if self._suspects and self._suspected is None:
+            self._suspected = self._task([self._suspects.popleft()])
+        workers = max(1, sum(self._client.nthreads().values()))
+        while waiting and len(self._running) < _AHEAD * workers:
+            # The last tasks are smaller, so that no worker is alone at the end.
+            size = min(self._size, max(1.0, len(waiting) / workers))
+            count = min(len(waiting), max(1, round(size)))
+            self._task([waiting.popleft() for _ in range(count)])
+
+    def _task(self, numbers: list[int]) -> Any:
+        draws = [self._draws[number] for number in numbers]
+        future = self._client.submit(
+            fly_task, self._specification, draws, self._engine, pure=False, retries=0
+        )
+        self._running[future] = numbers, time.monotonic()
+        return future
+
+    def _ended(self) -> list[Any]:
+        """Return tasks that have ended, after a while none if there are none."""
+        from distributed import wait
+
+        try:
+            wait(list(self._running), timeout=_LOOK_PERIOD, return_when="FIRST_COMPLETED")
+        except TimeoutError:
+            return []
+        return [future for future in self._running if future.done()]
+
+    def _taken(self, future: Any) -> list[Row]:
+        """Return the rows of a task; none where its worker died."""
+        from distributed.client import FutureCancelledError
+        from distributed.scheduler import KilledWorker
+
+        numbers, _ = self._running.pop(future)
+        alone = future is self._suspected
+        if alone:
+            self._suspected = None
+        try:
+            rows: list[Row] = future.result()
+        except (KilledWorker, FutureCancelledError):
+            return self._mourned(numbers, alone)
+        if not alone and rows:
+            took = sum(row.wall_time for row in rows if row.wall_time == row.wall_time)
+            if took > 0:
+                self._size = min(_MOST, 0.5 * self._size + 0.5 * len(rows) * TASK_TIME / took)
+        return rows
+
+    def _mourned(self, numbers: list[int], alone: bool) -> list[Row]:
+        """Take the flights of a task whose worker died for suspects; report the guilty one."""
+        given_up = []
+        for number in numbers:
+            if alone or not self._deaths[number]:
+                self._deaths[number] += 1
+            if self._deaths[number] >= _MOST_DEATHS:
+                reason = f"The process that flew it died {_MOST_DEATHS} times."
+                row = Row(self._draws[number], KILLED, reason, engine=self._engine)
+                given_up.append(row)
+            else:
+                self._suspects.append(number)
+        return given_up

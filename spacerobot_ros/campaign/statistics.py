@@ -1,0 +1,184 @@
+"""What many flights say: shares with intervals, percentiles, what drives what."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.campaign.extras import salib
+from spacerobot_ros.model.description import Array
+
+Flags = npt.NDArray[np.bool_]
+
+CONFIDENCE = 0.95
+"""Of every interval."""
+
+PERCENTILES = (5.0, 50.0, 95.0, 99.0)
+
+
+@dataclass(frozen=True)
+class Share:
+    """A share of flights with its interval of confidence.
+
+    ``low`` and ``high`` are Wilson's; ``exact`` those of Clopper and Pearson.
+    """
+
+    count: int
+    total: int
+    low: float
+    high: float
+    exact: tuple[float, float]
+
+    @property
+    def value(self) -> float:
+        """The share itself."""
+        return self.count / self.total if self.total else float("nan")
+
+    def __str__(self) -> str:
+        return (
+            f"{100 * self.value:.4g} % ({self.count} of {self.total}; 95 % interval "
+            f"{100 * self.low:.4g} to {100 * self.high:.4g} %)"
+        )
+
+
+def share(count: int, total: int) -> Share:
+    """Return a share with its intervals; all of 0 to 1 where nothing was flown."""
+    if not total:
+        return Share(0, 0, 0.0, 1.0, (0.0, 1.0))
+    from scipy.stats import binomtest
+
+    test = binomtest(count, total)
+    wilson = test.proportion_ci(CONFIDENCE, "wilson")
+    exact = test.proportion_ci(CONFIDENCE, "exact")
+    return Share(
+        count,
+        total,
+        float(wilson.low),
+        float(wilson.high),
+        (float(exact.low), float(exact.high)),
+    )
+
+
+@dataclass(frozen=True)
+class Influence:
+    """How much a dispersion drives a metric.
+
+    Attributes
+    ----------
+    cause, metric
+        Names.
+    correlation
+        Spearman's rank correlation.
+    p
+        Probability of one as large by chance.
+    first, total
+        Sobol indices with their intervals (half widths), where the sampler allows for them.
+    """
+
+    cause: str
+    metric: str
+    correlation: float
+    p: float
+    first: tuple[float, float] | None = None
+    total: tuple[float, float] | None = None
+
+
+def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> list[Influence]:
+    """Return how dispersions (N,) and metrics (N,) go together, flight by flight.
+
+    Flights without a metric are left out; what does not vary has no correlation.
+    """
+    from scipy.stats import spearmanr
+
+    found = []
+    for metric, values in metrics.items():
+        there = np.isfinite(values)
+        if there.sum() < 3 or np.ptp(values[there]) == 0.0:
+            continue
+        for cause, drawn in causes.items():
+            if np.ptp(drawn[there]) == 0.0:
+                continue
+            result = spearmanr(drawn[there], values[there])
+            found.append(Influence(cause, metric, float(result.statistic), float(result.pvalue)))
+    return found
+
+
+def sobol_indices(
+    names: Sequence[str], values: Array
+) -> dict[str, tuple[float, float, float, float]]:
+    """Return first-order and total indices with their intervals, by the name of the dispersion.
+
+    ``values`` (N,) are those of a Saltelli sample, in its order; a metric that is missing in a
+    flight has none.
+    """
+    if not np.all(np.isfinite(values)) or np.ptp(values) == 0.0:
+        return {}
+    problem = {"num_vars": len(names), "names": list(names), "bounds": [[0, 1]] * len(names)}
+    result = salib("analyze.sobol").analyze(problem, values, calc_second_order=False, seed=0)
+    keys = ("S1", "S1_conf", "ST", "ST_conf")
+    columns = zip(*(np.asarray(result[key]).tolist() for key in keys), strict=True)
+    return {name: (a, b, c, d) for name, (a, b, c, d) in zip(names, columns, strict=True)}
+
+
+def percentiles(values: Array) -> list[float]:
+    """Return :data:`PERCENTILES` of what is there; NaN where nothing is."""
+    there = values[np.isfinite(values)]
+    if not there.size:
+        return [float("nan")] * len(PERCENTILES)
+    return [float(x) for x in np.percentile(there, PERCENTILES)]
+
+
+@dataclass(frozen=True)
+class Paired:
+    """A difference of two designs on the same draws: its mean, and an interval of that."""
+
+    metric: str
+    count: int
+    first: float
+    second: float
+    difference: float
+    low: float
+    high: float
+
+    @property
+    def certain(self) -> bool:
+        """Whether the interval leaves out zero."""
+        return self.low > 0.0 or self.high < 0.0
+
+
+def paired(metric: str, first: Array, second: Array) -> Paired | None:
+    """Return how a metric (N,) of a second design differs from that of a first one, draw by draw.
+
+    The interval is Student's, of the mean of the differences; None for fewer than two pairs.
+    """
+    there = np.isfinite(first) & np.isfinite(second)
+    count = int(there.sum())
+    if count < 2:
+        return None
+    from scipy.stats import t
+
+    difference = second[there] - first[there]
+    mean, spread = float(difference.mean()), float(difference.std(ddof=1))
+    half = float(t.ppf(0.5 + CONFIDENCE / 2, count - 1)) * spread / np.sqrt(count)
+    return Paired(
+        metric,
+        count,
+        float(first[there].mean()),
+        float(second[there].mean()),
+        mean,
+        mean - half,
+        mean + half,
+    )
+
+
+def paired_success(first: Flags, second: Flags) -> tuple[int, int, float]:
+    """Return how many draws only the first and only the second passes, and McNemar's exact p."""
+    from scipy.stats import binomtest
+
+    only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())
+    total = only_first + only_second
+    p = float(binomtest(only_first, total).pvalue) if total else 1.0
+    return only_first, only_second, p

@@ -1,0 +1,419 @@
+"""What a campaign can disperse, by name, and how a value that is drawn changes a flight."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.flight.scenario import CONFIGS, Scenario
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.inertial_parameters import InertialParameters
+from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
+from spacerobot_ros.model.urdf import load_robot, parse_robot
+from spacerobot_ros.parameters import Parameter, declared, values_of
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.resources import robot_file, suggestion
+from spacerobot_ros.simulation.faults import KINDS
+
+AXES = ("x", "y", "z")
+
+_INDEXED = re.compile(r"(.+)\[([^\]]+)\]")
+_FAULT = re.compile(r"faults\[(\d+)\]\.(at|until|value)")
+_POSES = ("goal", "end_effector_goal", "initial")
+
+KINDS_OF_TARGETS = (
+    ("NODE.PARAMETER", "a parameter of a node; NODE.PARAMETER[i] a number of a list, by joint too"),
+    ("mass, mass.BODY, mass.*", "factor on mass and inertia of all bodies alike, of one, of each"),
+    ("inertia, inertia.BODY, inertia.*", "factor on the inertia, likewise"),
+    ("com.BODY.AXIS, com.*", "offset of a centre of mass in the frame of its body, m"),
+    ("goal.position.AXIS, goal.rotvec.AXIS", "offset of the goal, m; turn of it in its frame, rad"),
+    ("end_effector_goal. ...", "likewise, of the end-effector"),
+    ("initial.position.AXIS, initial.rotvec.AXIS", "likewise, of the base at the start"),
+    ("initial.joints.JOINT", "offset of a joint at the start, m or rad"),
+    ("faults[i].at, .until, .value", "of the i-th fault of plant.faults"),
+)  # fmt: skip
+"""What there is, for people."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """One number (or text) that differs from flight to flight.
+
+    Attributes
+    ----------
+    name
+        Of its column.
+    apply
+        Changes a flight by a value that is drawn.
+    unit
+        For people.
+    text
+        Whether it is a text.
+    replaces
+        The name that would set the same number, or this one.
+    """
+
+    name: str
+    apply: Callable[[DrawnFlight, Any], DrawnFlight]
+    unit: str = ""
+    text: bool = False
+    replaces: str = ""
+
+
+@dataclass(frozen=True)
+class DrawnFlight:
+    """One flight of a campaign.
+
+    Attributes
+    ----------
+    scenario
+        What is flown; the plant's robot is in it as a URDF text where its masses differ.
+    nominal
+        The robot without dispersions.
+    mass, inertia
+        (B,) factors of the bodies; the inertia goes with the mass, and with a factor of its own.
+    com
+        (B, 3) offsets of the centres of mass, m.
+    """
+
+    scenario: Scenario
+    nominal: RobotDescription
+    mass: Array = field(default_factory=lambda: np.ones(0))
+    inertia: Array = field(default_factory=lambda: np.ones(0))
+    com: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> DrawnFlight:
+        """Return the flight without dispersions."""
+        robot = description_of(scenario)
+        count = len(robot.bodies)
+        return cls(scenario, robot, np.ones(count), np.ones(count), np.zeros((count, 3)))
+
+    @property
+    def inertial(self) -> InertialParameters | None:
+        """What the bodies weigh; None: what the robot's description says."""
+        if np.all(self.mass == 1.0) and np.all(self.inertia == 1.0) and not self.com.any():
+            return None
+        parameters = InertialParameters.of(self.nominal)
+        return parameters.scaled(self.mass, self.mass * self.inertia).shifted(self.com)
+
+    def finished(self) -> DrawnFlight:
+        """Return the flight with its masses in the URDF of the plant.
+
+        The commanders go on to believe in the robot as it was, unless they have one of their own.
+
+        Raises
+        ------
+        RobotDescriptionError
+            No body weighs that.
+        """
+        parameters = self.inertial
+        if parameters is None:
+            return self
+        parameters.require_physical([body.name for body in self.nominal.bodies])
+        text = urdf_with(self.nominal, parameters)
+        scenario = self.scenario.with_overrides("plant", {"robot_description": text})
+        for node in scenario.commanders:
+            config = scenario.config(node)
+            if not (config.robot or config.robot_description):
+                believed = {"robot_description": self.nominal.urdf}
+                scenario = scenario.with_overrides(node, believed)
+        return replace(self, scenario=scenario)
+
+
+def description_of(scenario: Scenario) -> RobotDescription:
+    """Return the robot of the plant.
+
+    Raises
+    ------
+    ParameterError
+        The scenario names none.
+    """
+    plant = scenario.plant
+    if not (plant.robot or plant.robot_description):
+        raise ParameterError(
+            f"the scenario '{scenario.name}' names no robot for its plant: set plant.robot."
+        )
+    return _description(plant.robot, plant.robot_description)
+
+
+@cache
+def _description(robot: str, text: str) -> RobotDescription:
+    return parse_robot(text) if text else load_robot(robot_file(robot))
+
+
+# -- names ------------------------------------------------------------------------------------
+
+
+def targets_of(name: str, scenario: Scenario) -> list[Target]:
+    """Return what a name means: one target, or one of each body.
+
+    Raises
+    ------
+    ParameterError
+        There is no such thing; the sentence asks for what may be meant.
+    """
+    kind, _, rest = name.partition(".")
+    if kind in CONFIGS:
+        return [_parameter(name, kind, rest, scenario)]
+    if kind in ("mass", "inertia"):
+        return _weights(kind, rest, scenario)
+    if kind == "com":
+        return _centers(rest, scenario)
+    if kind in _POSES:
+        return [_pose(name, kind, rest, scenario)]
+    match = _FAULT.fullmatch(name)
+    if match is not None:
+        return [_fault(name, int(match[1]), match[2], scenario)]
+    known = [f"{node}.{p.name}" for node in CONFIGS for p in declared(CONFIGS[node])]
+    known += ["mass", "inertia", "com", *_POSES, "faults[0].at", "faults[0].until"]
+    kinds = "; ".join(names for names, _ in KINDS_OF_TARGETS)
+    raise ParameterError(
+        f"'{name}' is nothing that can be dispersed; there are {kinds}.{suggestion(name, known)}"
+    )
+
+
+def _parameter(name: str, node: str, rest: str, scenario: Scenario) -> Target:
+    if node not in ("plant", *scenario.commanders):
+        raise ParameterError(
+            f"'{name}' is of a node that does not fly: the scenario '{scenario.name}' flies with "
+            f"{' and '.join(scenario.commanders)}."
+        )
+    match = _INDEXED.fullmatch(rest)
+    bare, index = (match[1], match[2]) if match else (rest, "")
+    known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
+    if bare not in known:
+        raise ParameterError(f"node '{node}' has no parameter '{bare}'.{suggestion(bare, known)}")
+    declaration = known[bare]
+    value = values_of(scenario.config(node))[bare]
+    if isinstance(value, bool) or declaration.texts:
+        raise ParameterError(f"'{name}' is neither a number nor a text: it cannot be dispersed.")
+    if isinstance(value, tuple) and bare.startswith("initial_orientation"):
+        raise ParameterError(f"'{name}' is a quaternion: disperse initial.rotvec.x, y and z.")
+    if isinstance(value, tuple) is not bool(index):
+        how = f"say which number of the list: {name}[0]" if not index else "it is no list"
+        raise ParameterError(f"'{name}': {how}.")
+    if not index:
+        return _plain(name, node, declaration, value)
+    nominal = value if isinstance(value, tuple) else ()
+    return _entry(name, node, declaration, _index(name, index, scenario), nominal)
+
+
+def _plain(name: str, node: str, declaration: Parameter, value: Any) -> Target:
+    whole = isinstance(declaration.default, int)
+
+    def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
+        given = round(drawn) if whole else drawn
+        scenario = flight.scenario.with_overrides(node, {declaration.name: given})
+        return replace(flight, scenario=scenario)
+
+    return Target(name, apply, declaration.unit, isinstance(value, str), name)
+
+
+def _entry(
+    name: str, node: str, declaration: Parameter, index: int, nominal: tuple[Any, ...]
+) -> Target:
+    length = declaration.length or len(nominal)
+
+    def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
+        values = list(values_of(flight.scenario.config(node))[declaration.name])  # type: ignore[arg-type]
+        count = length or len(flight.nominal.joint_names)
+        values = values or [0.0] * count
+        values[index] = float(drawn)
+        scenario = flight.scenario.with_overrides(node, {declaration.name: values})
+        return replace(flight, scenario=scenario)
+
+    return Target(name, apply, declaration.unit, replaces=f"{node}.{declaration.name}[{index}]")
+
+
+def _index(name: str, text: str, scenario: Scenario) -> int:
+    joints = list(description_of(scenario).joint_names)
+    if text in joints:
+        return joints.index(text)
+    if text.isdigit() and int(text) < max(3, len(joints)):
+        return int(text)
+    raise ParameterError(
+        f"'{name}': '{text}' is no place in a list, nor one of the joints {', '.join(joints)}."
+        f"{suggestion(text, joints)}"
+    )
+
+
+def _bodies(name: str, scenario: Scenario) -> list[tuple[int, str]]:
+    """Return the bodies that a name means: one, or all by ``*``."""
+    names = [body.name for body in description_of(scenario).bodies]
+    if name == "*":
+        return list(enumerate(names))
+    if name not in names:
+        raise ParameterError(
+            f"the robot has no body '{name}'; it has {', '.join(names)}.{suggestion(name, names)}"
+        )
+    return [(names.index(name), name)]
+
+
+def _weights(kind: str, rest: str, scenario: Scenario) -> list[Target]:
+    def target(indices: Sequence[int], name: str) -> Target:
+        def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
+            factors = getattr(flight, kind).copy()
+            factors[list(indices)] *= float(drawn)
+            return replace(flight, **{kind: factors})
+
+        return Target(name, apply, "1", replaces=kind)
+
+    if not rest:
+        return [target(range(len(description_of(scenario).bodies)), kind)]
+    return [target([index], f"{kind}.{name}") for index, name in _bodies(rest, scenario)]
+
+
+def _centers(rest: str, scenario: Scenario) -> list[Target]:
+    body, dot, axis = rest.rpartition(".")
+    if rest == "*":
+        body, dot, axis = "*", ".", "*"
+    if not dot or axis not in (*AXES, "*"):
+        raise ParameterError(f"'com.{rest}' must be com.BODY.x, y, z or *, or com.*.")
+    found = []
+    for index, name in _bodies(body, scenario):
+        for column, letter in enumerate(AXES):
+            if axis in (letter, "*"):
+                found.append(_center(index, column, f"com.{name}.{letter}"))
+    return found
+
+
+def _center(index: int, column: int, name: str) -> Target:
+    def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
+        com = flight.com.copy()
+        com[index, column] += float(drawn)
+        return replace(flight, com=com)
+
+    return Target(name, apply, "m", replaces=name)
+
+
+def _pose(name: str, kind: str, rest: str, scenario: Scenario) -> Target:
+    part, _, axis = rest.partition(".")
+    if kind == "initial" and part == "joints":
+        return _initial_joint(name, axis, scenario)
+    if part not in ("position", "rotvec") or axis not in AXES:
+        known = [f"{kind}.{p}.{a}" for p in ("position", "rotvec") for a in AXES]
+        raise ParameterError(f"'{name}' is none of {', '.join(known)}.{suggestion(name, known)}")
+    if kind == "end_effector_goal" and scenario.end_effector_goal is None:
+        raise ParameterError(f"'{name}': the scenario has no goal for the end-effector.")
+    column = AXES.index(axis)
+
+    def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
+        offset = np.zeros(3)
+        offset[column] = float(drawn)
+        if kind == "initial":
+            return replace(flight, scenario=_moved_start(flight.scenario, part, offset))
+        goal: Goal = getattr(flight.scenario, kind)
+        if part == "position":
+            goal = replace(goal, position=goal.position + offset)
+        else:
+            turned = quaternion_multiply(goal.quaternion, quaternion_from_rotvec(offset))
+            goal = replace(goal, quaternion=turned)
+        if kind == "goal":
+            return replace(flight, scenario=replace(flight.scenario, goal=goal))
+        return replace(flight, scenario=replace(flight.scenario, end_effector_goal=goal))
+
+    return Target(name, apply, "m" if part == "position" else "rad", replaces=name)
+
+
+def _moved_start(scenario: Scenario, part: str, offset: Array) -> Scenario:
+    plant = scenario.plant
+    if part == "position":
+        where = "initial_center_of_mass" if plant.initial_center_of_mass else "initial_position"
+        moved = np.array(getattr(plant, where) or (0.0, 0.0, 0.0)) + offset
+        return scenario.with_overrides("plant", {where: moved.tolist()})
+    attitude = np.array(plant.initial_orientation or (0.0, 0.0, 0.0, 1.0))
+    turned = quaternion_multiply(attitude, quaternion_from_rotvec(offset))
+    return scenario.with_overrides("plant", {"initial_orientation": turned.tolist()})
+
+
+def _initial_joint(name: str, joint: str, scenario: Scenario) -> Target:
+    joints = list(description_of(scenario).joint_names)
+    if joint not in joints:
+        raise ParameterError(
+            f"'{name}': the robot has no joint '{joint}'; it has {', '.join(joints)}."
+            f"{suggestion(joint, joints)}"
+        )
+    index = joints.index(joint)
+
+    def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
+        given = flight.scenario.plant.initial_joint_positions or (0.0,) * len(joints)
+        values = [q + float(drawn) * (i == index) for i, q in enumerate(given)]
+        scenario = flight.scenario.with_overrides("plant", {"initial_joint_positions": values})
+        return replace(flight, scenario=scenario)
+
+    return Target(name, apply, "m or rad", replaces=f"plant.initial_joint_positions[{index}]")
+
+
+def _fault(name: str, index: int, part: str, scenario: Scenario) -> Target:
+    faults = scenario.plant.faults
+    if index >= len(faults):
+        raise ParameterError(
+            f"'{name}': plant.faults has {len(faults)} fault(s); the first is faults[0]."
+        )
+    kind = faults[index].split()[0]
+    if part == "value" and not (kind in KINDS and KINDS[kind].value):
+        raise ParameterError(f"'{name}': a fault of the kind {kind} has no value.")
+
+    def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
+        lines = list(flight.scenario.plant.faults)
+        lines[index] = _line(lines[index].split(), part, repr(float(drawn)))
+        scenario = flight.scenario.with_overrides("plant", {"faults": lines})
+        return replace(flight, scenario=scenario)
+
+    return Target(name, apply, "" if part == "value" else "s", replaces=name)
+
+
+def _line(words: list[str], part: str, text: str) -> str:
+    """Return the line of a fault with another time or value."""
+    if part == "value":
+        return " ".join([*words[:2], text, *words[3:]])
+    if part in words:
+        words[words.index(part) + 1] = text
+    else:
+        place = words.index("until") if part == "at" and "until" in words else len(words)
+        words[place:place] = [part, text]
+    return " ".join(words)
+
+
+# -- the URDF of a robot with other masses ----------------------------------------------------
+
+
+def urdf_with(robot: RobotDescription, parameters: InertialParameters) -> str:
+    """Return the URDF of a robot with other masses, centres of mass and inertias.
+
+    The first link of each body has what the body weighs; those that fixed joints weld to it weigh
+    nothing.
+    """
+    root = ET.fromstring(robot.urdf)
+    weights: Iterable[Any] = zip(
+        parameters.masses, parameters.centers, parameters.inertias, strict=True
+    )
+    of_body = {body.name: weight for body, weight in zip(robot.bodies, weights, strict=True)}
+    for link in root.findall("link"):
+        for inertial in link.findall("inertial"):
+            link.remove(inertial)
+        if link.get("name") in of_body:
+            mass, center, tensor = of_body[link.get("name", "")]
+            inertial = ET.SubElement(link, "inertial")
+            ET.SubElement(inertial, "origin", xyz=_numbers(center), rpy="0 0 0")
+            ET.SubElement(inertial, "mass", value=repr(float(mass)))
+            entries = {
+                f"i{a}{b}": repr(float(tensor[i, j]))
+                for i, a in enumerate(AXES)
+                for j, b in enumerate(AXES)
+                if i <= j
+            }
+            ET.SubElement(inertial, "inertia", entries)
+    return ET.tostring(root, encoding="unicode")
+
+
+def _numbers(values: Array) -> str:
+    return " ".join(repr(float(x)) for x in values)

@@ -1,0 +1,193 @@
+"""The command ``spacerobot campaign``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from spacerobot_ros.cli.errors import end_if_requested, fail
+from spacerobot_ros.cli.options import PATH
+from spacerobot_ros.errors import ParameterError
+
+if TYPE_CHECKING:
+    from spacerobot_ros.campaign.running import Cluster, Progress
+
+_ENGINES = ("auto", "lanes", "flights", "ros")
+
+
+class _Campaigns(click.Group):
+    """A group whose first command, ``fly``, need not be named."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if args and args[0] not in (*self.commands, "--help"):
+            args = ["fly", *args]
+        return super().parse_args(ctx, args)
+
+
+@click.group("campaign", cls=_Campaigns)
+def command() -> None:
+    """Fly a scenario many times, with masses, sensors, starts, goals and faults that differ.
+
+    `spacerobot campaign FILE.yaml` is short for `spacerobot campaign fly FILE.yaml`.
+    """
+
+
+def _cluster_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    for option in (
+        click.option("--flights", type=click.IntRange(min=1), help="How many [as the file says]."),
+        click.option("--engine", type=click.Choice(_ENGINES), default="auto", help="What flies."),
+        click.option(
+            "--workers",
+            type=click.IntRange(min=0),
+            default=2,
+            show_default=True,
+            help="Processes on this machine; 0: this one.",
+        ),
+        click.option("--scheduler", default="", metavar="tcp://HOST:PORT", help="Of a cluster."),
+    ):
+        function = option(function)
+    return function
+
+
+@command.command("fly")
+@click.argument("file", type=PATH, required=False)
+@_cluster_options
+@click.option("--out", type=PATH, help="Folder of the results [out/NAME].")
+@click.option("--report", type=PATH, help="Where the report goes [OUT/report.html].")
+@click.option("--compare", type=PATH, nargs=2, metavar="A.yaml B.yaml", help="Fly two designs.")
+def fly(
+    file: Path | None,
+    flights: int | None,
+    engine: str,
+    workers: int,
+    scheduler: str,
+    out: Path | None,
+    report: Path | None,
+    compare: tuple[Path, Path] | None,
+) -> None:
+    """Fly the campaign of FILE and write the report; a campaign that was ended goes on.
+
+    Exit code 0: everything was flown; 2: bad input; 130 after Ctrl-C, which keeps what was flown.
+    """
+    from spacerobot_ros.campaign.running import Cluster
+
+    cluster = Cluster(0 if scheduler else workers, scheduler)
+    if compare:
+        if file is not None:
+            raise ParameterError("Give one FILE, or two after --compare.")
+        _compare(compare, flights, engine, cluster, out, report)
+        return
+    if file is None:
+        raise ParameterError("Give the FILE of a campaign, or two after --compare.")
+    folder = _flown(file, flights, engine, cluster, out)
+    _write_report(folder, report)
+    end_if_requested()
+
+
+@command.command("report")
+@click.argument("folder", metavar="DIR", type=PATH)
+@click.option("--report", type=PATH, help="Where it goes [DIR/report.html].")
+def report_command(folder: Path, report: Path | None) -> None:
+    """Write the report of the flights in DIR."""
+    _write_report(folder, report)
+
+
+@command.command("rerun")
+@click.argument("folder", metavar="DIR", type=PATH)
+@click.argument("number", metavar="N", type=click.IntRange(min=0))
+@click.option("--bag", type=PATH, help="Where its bag goes [DIR/flight_N.mcap].")
+def rerun(folder: Path, number: int, bag: Path | None) -> None:
+    """Fly flight N of DIR alone, through the whole ROS stack, with a bag of all topics."""
+    from spacerobot_ros.campaign.rerunning import rerun_flight
+
+    path = bag or folder / f"flight_{number}.mcap"
+    result = rerun_flight(folder, number, path)
+    for line in result.lines:
+        click.echo(line)
+    end_if_requested()
+    if not result.same:
+        fail("The flight is another one than that in the dataset.")
+
+
+def _flown(
+    file: Path, flights: int | None, engine: str, cluster: Cluster, out: Path | None
+) -> Path:
+    """Fly a campaign, say how far it has come, and return its folder."""
+    from spacerobot_ros.campaign.config import load_campaign
+    from spacerobot_ros.campaign.running import run_campaign
+    from spacerobot_ros.termination import ended_on_request
+
+    campaign = load_campaign(file, flights)
+    folder = out or Path("out") / campaign.name
+    with ended_on_request() as stopped, _shown(campaign.name) as show:
+        end = run_campaign(
+            campaign, folder, engine=engine, cluster=cluster, show=show, stopped=stopped
+        )
+    flown = f"{end.done} of {end.total} flights"
+    click.echo(f"{campaign.name}: {flown}, {end.rate:.3g} a second; {folder}")
+    return folder
+
+
+@contextmanager
+def _shown(label: str) -> Iterator[Callable[[Progress], None]]:
+    """Show how far a campaign is, with rate and time left, where somebody is looking."""
+    if not sys.stderr.isatty():
+        yield lambda progress: None
+        return
+    with click.progressbar(
+        length=1000, label=label, file=sys.stderr, show_eta=False, item_show_func=str
+    ) as bar:
+
+        def show(progress: Progress) -> None:
+            share = progress.done / progress.total
+            flown = f"{progress.done}/{progress.total}, {progress.rate:.3g}/s"
+            step = max(0, int(1000 * share) - bar.pos)
+            bar.update(step, f"{flown}, {_time(progress.left)} left")
+
+        yield show
+
+
+def _time(seconds: float) -> str:
+    if seconds == float("inf"):
+        return "?"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def _write_report(folder: Path, report: Path | None) -> None:
+    from spacerobot_ros.campaign.report import write_campaign_report
+
+    path = report or folder / "report.html"
+    for line in write_campaign_report(folder, path):
+        click.echo(line)
+    click.echo(f"report      {path}")
+
+
+def _compare(
+    files: tuple[Path, Path],
+    flights: int | None,
+    engine: str,
+    cluster: Cluster,
+    out: Path | None,
+    report: Path | None,
+) -> None:
+    """Fly two campaigns on the same draws, and write what differs."""
+    from spacerobot_ros.campaign.comparing import require_same_draws, write_comparison
+    from spacerobot_ros.campaign.config import load_campaign
+
+    require_same_draws(*(load_campaign(file, flights) for file in files))
+    base = out or Path("out") / "_".join(file.stem for file in files)
+    folders = []
+    for file in files:
+        folders.append(_flown(file, flights, engine, cluster, base / file.stem))
+        end_if_requested()
+    path = report or base / "report.html"
+    for line in write_comparison((folders[0], folders[1]), path):
+        click.echo(line)
+    click.echo(f"report      {path}")

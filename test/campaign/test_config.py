@@ -1,0 +1,134 @@
+"""The file of a campaign: what it takes, and what it answers to what it does not take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from scipy import stats
+from support.campaigns import campaign, section
+
+from spacerobot_ros.campaign.config import load_campaign
+from spacerobot_ros.campaign.draws import Draws
+from spacerobot_ros.errors import ParameterError
+
+NORM = {"norm": {"loc": 1.0, "scale": 0.05}}
+
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"flight": 3}, "there is no key 'flight'.*Did you mean 'flights'"),
+    ({"flights": 0}, "'flights' is 0; it must be a whole number from 1"),
+    ({"flights": True}, "'flights' is True"),
+    ({"seed": -1}, "'seed' is -1"),
+    ({"sampler": "sobl"}, "no sampler 'sobl'.*Did you mean 'sobol'"),
+    ({"engine": "flight"}, "no engine 'flight'.*Did you mean 'flights'"),
+    ({"scenario": "faults/stuck_slidr"}, "Did you mean"),
+    ({"set": {"plant.tick_rat": 1}}, "no parameter 'tick_rat'"),
+    ({"set": {"tick_rate": 1}}, "'tick_rate' under 'set' is no parameter"),
+    ({"set": {"plant.time_mode": "realtime"}}, "campaigns are flown in lockstep"),
+    ({"disperse": {"mas": NORM}}, "'mas' is nothing that can be dispersed.*Did you mean 'mass'"),
+    ({"disperse": {"mass.mass_7": NORM}}, "no body 'mass_7'.*Did you mean 'mass_"),
+    ({"disperse": {"mass": {"nrom": {}}}}, "no distribution 'nrom'.*Did you mean 'norm'"),
+    ({"disperse": {"mass": {"norm": {"scal": 1}}}}, "no argument 'scal'.*Did you mean 'scale'"),
+    ({"disperse": {"mass": {"norm": {"scale": -1}}}}, "norm takes no such arguments"),
+    ({"disperse": {"mass": {"norm": {"loc": "one"}}}}, "'mass: loc' is 'one'"),
+    ({"disperse": {"mass": {"beta": {"a": 1}}}}, "beta needs its argument 'b'"),
+    ({"disperse": {"mass": {"norm": [1, 2, 3]}}}, "norm takes loc, scale, not 3 numbers"),
+    ({"disperse": {"mass": 1.0}}, "must have one distribution"),
+    ({"disperse": {"mass": NORM, "mass.mass_1": NORM}}, "set the same numbers"),
+    ({"disperse": {"plant.sensors.noise": NORM}}, "no parameter 'sensors.noise'.*Did you mean"),
+    ({"disperse": {"coordinated_control.time_limit": NORM}}, "a node that does not fly"),
+    ({"disperse": {"plant.linear_momentum": NORM}}, "say which number of the list"),
+    ({"disperse": {"plant.tick_rate[0]": NORM}}, "it is no list"),
+    ({"disperse": {"plant.initial_orientation[0]": NORM}}, "disperse initial.rotvec"),
+    ({"disperse": {"initial.joints.slider": NORM}}, "no joint 'slider'.*Did you mean 'slider_"),
+    ({"disperse": {"goal.position.u": NORM}}, "none of goal.position.x"),
+    ({"disperse": {"end_effector_goal.position.x": NORM}}, "no goal for the end-effector"),
+    ({"disperse": {"faults[0].at": NORM}}, r"plant.faults has 0 fault\(s\)"),
+    ({"disperse": {"planner.method": NORM}}, "is a text"),
+    ({"disperse": {"mass": {"choice": ["a"]}}}, "is a number"),
+    ({"criteria": {"position_eror_m": {"max": 1}}}, "no metric.*Did you mean 'position_error_m'"),
+    ({"criteria": {"peak_rate.slider_9": {"max": 1}}}, "no metric 'peak_rate.slider_9'"),
+    ({"criteria": {"duration_s": {"most": 1}}}, "must have 'min' or 'max'"),
+    ({"criteria": {"duration_s": {"min": 2, "max": 1}}}, "is met by nothing"),
+    ({"sampler": "saltelli"}, "needs something that is dispersed"),
+]
+
+
+@pytest.mark.parametrize(("given", "sentence"), REFUSED, ids=lambda x: str(x)[:40])
+def test_what_is_wrong_is_said(given: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError, match=f"(?s){sentence}"):
+        campaign(**given)
+
+
+def test_a_file_names_its_scenario_beside_it(tmp_path: Path) -> None:
+    plant = {"robot": "sliding_masses"}
+    (tmp_path / "own.yaml").write_text(
+        yaml.safe_dump(
+            {
+                "scenario": {"ros__parameters": {"goal_position": [0.01, 0.0, 0.0]}},
+                "plant": {"ros__parameters": plant},
+                "planner": {"ros__parameters": plant},
+            }
+        )
+    )
+    file = tmp_path / "many.yaml"
+    content = {**section(scenario="own.yaml", flights=7), "method": "lie_bracket"}
+    file.write_text(yaml.safe_dump({"campaign": content}))
+    made = load_campaign(file)
+    assert (made.name, made.scenario.name, made.flights) == ("many", "own", 7)
+    assert made.scenario.planner.method == "lie_bracket"
+    assert load_campaign(file, 9).flights == 9
+    file.write_text("campaign: [1]")
+    with pytest.raises(ParameterError, match=f"{file} has no section"):
+        load_campaign(file)
+
+
+DISPERSED = {
+    "mass.*": {"norm": {"loc": 1.0, "scale": 0.05}},
+    "goal.position.x": {"triang": {"c": 0.25, "loc": -0.01, "scale": 0.02}},
+    "planner.method": {"choice": ["lie_bracket", "optimal"]},
+}
+
+
+@pytest.mark.parametrize("sampler", ["random", "latin_hypercube", "sobol", "halton"])
+def test_draws_have_the_distributions_that_were_asked_for(sampler: str) -> None:
+    """Kolmogorov and Smirnov's test, and for the choice a count."""
+    draws = Draws(campaign(disperse=DISPERSED, sampler=sampler, flights=256, seed=1))
+    values = [draw.values for draw in draws]
+    expected = {
+        "mass.mass_2": stats.norm(1.0, 0.05),
+        "goal.position.x": stats.triang(0.25, -0.01, 0.02),
+    }
+    for name, distribution in expected.items():
+        assert stats.kstest([v[name] for v in values], distribution.cdf).pvalue > 0.01, name
+    assert 100 < sum(v["planner.method"] == "optimal" for v in values) < 156
+    masses = np.array([[v[f"mass.mass_{i}"] for i in (1, 2, 3)] for v in values])
+    assert np.abs(np.corrcoef(masses.T) - np.eye(3)).max() < 0.2  # Each body by itself.
+
+
+@pytest.mark.parametrize("sampler", ["random", "sobol", "halton"])
+def test_a_draw_does_not_depend_on_how_many_there_are(sampler: str) -> None:
+    few, many = (
+        Draws(campaign(disperse=DISPERSED, sampler=sampler, flights=n, seed=4)) for n in (9, 40)
+    )
+    for number in (0, 5, 8):
+        assert few[number] == many[number]
+    other = Draws(campaign(disperse=DISPERSED, sampler=sampler, flights=9, seed=5))
+    assert other[5].values != few[5].values
+    assert other[5].seed != few[5].seed
+
+
+def test_a_latin_hypercube_has_one_draw_in_each_slice() -> None:
+    made = campaign(disperse={"mass": {"uniform": [0, 1]}}, sampler="latin_hypercube", flights=20)
+    slices = sorted(int(20 * draw.values["mass"]) for draw in Draws(made))
+    assert slices == list(range(20))
+
+
+def test_saltelli_draws_are_whole_blocks() -> None:
+    made = campaign(disperse={"mass.*": NORM}, sampler="saltelli", flights=60)
+    assert len(Draws(made)) == 8 * 6  # The largest power of two that 60 flights of 4 + 2 allow.
+    with pytest.raises(ParameterError, match="at least 12 flights for 4"):
+        Draws(campaign(disperse={"mass.*": NORM}, sampler="saltelli", flights=11))

@@ -1,0 +1,137 @@
+"""Campaigns flown here: what is kept, what goes on, what a flight that fails leaves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.campaigns import campaign
+
+from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.dataset import Dataset
+from spacerobot_ros.campaign.engines import ERROR, FlightsEngine, Row
+from spacerobot_ros.campaign.rerunning import TOLERANCE, largest_deviation, rerun_flight
+from spacerobot_ros.campaign.running import Progress, run_campaign
+from spacerobot_ros.errors import ParameterError
+
+MASSES: dict[str, Any] = {
+    "mass.*": {"norm": {"loc": 1.0, "scale": 0.03}},
+    "plant.sensors.position_noise": {"uniform": [0.0, 0.001]},
+    "com.base_link.x": {"norm": {"scale": 0.002}},
+    "inertia.mass_1": {"norm": {"loc": 1.0, "scale": 0.1}},
+}
+
+
+def small(**given: Any) -> Campaign:
+    wanted = {"position_error_m": {"max": 0.01}, "rate_margin.slider_2": {"min": 0.2}}
+    return campaign(**{"disperse": MASSES, "flights": 5, "seed": 2, "criteria": wanted, **given})
+
+
+def rows(folder: Path) -> list[dict[str, Any]]:
+    """Return the rows of a dataset without what depends on the wall clock."""
+    table: list[dict[str, Any]] = Dataset(folder).table().to_pylist()
+    return [{k: v for k, v in row.items() if not k.startswith(("wall_", "plan_"))} for row in table]
+
+
+def test_a_campaign_that_is_ended_goes_on_where_it_was(tmp_path: Path) -> None:
+    """Every draw once, with the same numbers as without the break."""
+    whole = run_campaign(small(), tmp_path / "whole")
+    assert (whole.done, whole.total) == (5, 5)
+    seen: list[Progress] = []
+    cut = run_campaign(small(), tmp_path / "cut", show=seen.append, stopped=lambda: len(seen) >= 2)
+    assert cut.done == 2
+    assert [progress.done for progress in seen] == [1, 2]
+    assert run_campaign(small(), tmp_path / "cut").done == 5
+    assert str(rows(tmp_path / "cut")) == str(rows(tmp_path / "whole"))
+    assert [row["flight"] for row in rows(tmp_path / "cut")] == list(range(5))
+    # And more flights of the same campaign are only those that are missing.
+    assert run_campaign(small(flights=6), tmp_path / "cut").done == 6
+    assert str(rows(tmp_path / "cut")[:5]) == str(rows(tmp_path / "whole"))
+
+
+def test_the_numbers_of_a_row_are_those_of_its_flight(tmp_path: Path) -> None:
+    made = small(flights=2)
+    run_campaign(made, tmp_path)
+    _, row = rows(tmp_path)
+    (again,) = FlightsEngine().fly(made, [_draw(made, 1)], lambda: False)
+    assert largest_deviation({name: row[name] for name in again.metrics}, again.metrics) == (
+        0.0,
+        "",
+    )
+    assert row["engine"] == "flights"
+    assert row["draw.mass.mass_2"] == again.draw.values["mass.mass_2"]
+    assert row["passed"] is (row["position_error_m"] <= 0.01 and row["rate_margin.slider_2"] >= 0.2)
+    assert '"spacerobot_ros"' in row["versions"]
+
+
+def _draw(made: Campaign, number: int) -> Any:
+    from spacerobot_ros.campaign.draws import Draws
+
+    return Draws(made)[number]
+
+
+def test_the_folder_of_another_campaign_is_refused(tmp_path: Path) -> None:
+    run_campaign(small(flights=1), tmp_path / "one")
+    for other in (small(flights=1, seed=3), small(flights=1, set={"planner.averaging": 3})):
+        with pytest.raises(ParameterError, match="holds another campaign"):
+            run_campaign(other, tmp_path / "one")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").write_text("1")
+    with pytest.raises(ParameterError, match="is not empty and holds no campaign"):
+        run_campaign(small(), tmp_path / "full")
+
+
+def test_a_flight_that_cannot_be_flown_ends_no_other(tmp_path: Path) -> None:
+    """Its initial shape is beyond the ends of a slider, in about half of the draws."""
+    spread = {"plant.initial_joint_positions[0]": {"uniform": [0.0, 5.0]}}
+    run_campaign(small(disperse=spread, flights=6), tmp_path)
+    found = rows(tmp_path)
+    errors = [row for row in found if row["outcome"] == ERROR]
+    beyond = [row for row in found if row["draw.plant.initial_joint_positions[0]"] > 2.5]
+    assert 0 < len(errors) < 6
+    assert errors == beyond
+    assert all("is outside its limits" in row["reason"] for row in errors)
+    assert all(np.isnan(row["position_error_m"] or np.nan) for row in errors)
+    assert not any(row["passed"] for row in errors)
+
+
+def test_what_is_half_written_is_not_there(tmp_path: Path) -> None:
+    run_campaign(small(flights=1), tmp_path)
+    (tmp_path / "flights" / ".part-000009.parquet").write_bytes(b"half")
+    run_campaign(small(flights=2), tmp_path)
+    assert [row["flight"] for row in rows(tmp_path)] == [0, 1]
+    assert not list((tmp_path / "flights").glob(".*"))
+
+
+@pytest.fixture
+def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
+
+
+@pytest.mark.usefixtures("own_domain")
+@pytest.mark.parametrize("count", [1, pytest.param(20, marks=pytest.mark.slow)])
+def test_rows_flown_again_through_ros_are_the_same(tmp_path: Path, count: int) -> None:
+    """Masses, inertias, centres of mass, noise: through a URDF, parameters and messages."""
+    made = small(flights=60 if count > 1 else 3)
+    run_campaign(made, tmp_path)
+    chosen = np.random.default_rng(6).permutation(made.flights)[:count]
+    for number in chosen.tolist():
+        again = rerun_flight(tmp_path, number, tmp_path / f"{number}.mcap")
+        assert again.same, again.lines
+        assert again.deviation is not None
+        assert again.deviation < TOLERANCE
+        assert again.row.draw.values["mass.mass_1"] != 1.0
+
+
+def test_a_row_that_is_another_flight_is_noticed(tmp_path: Path) -> None:
+    made = small(flights=1)
+    (row,) = FlightsEngine().fly(made, [_draw(made, 0)], lambda: False)
+    changed = {**row.metrics, "duration_s": row.metrics["duration_s"] * (1 + 1e-8)}
+    deviation, at = largest_deviation(row.metrics, changed)
+    assert at == "duration_s"
+    assert deviation == pytest.approx(1e-8, rel=1e-6)
+    lost = {**row.metrics, "duration_s": float("nan")}
+    assert not largest_deviation(row.metrics, lost)[0] <= 1.0
+    assert isinstance(row, Row)

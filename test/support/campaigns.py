@@ -1,0 +1,32 @@
+"""Small campaigns: a flight of four seconds that takes a tenth of one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from spacerobot_ros.campaign.config import Campaign, parse_campaign
+from spacerobot_ros.campaign.draws import Draws, drawn_flight
+from spacerobot_ros.campaign.engines import FlightsEngine
+from spacerobot_ros.flight.arrays import FlightArrays
+
+SHORT = {
+    "scenario": "faults/stuck_slider",
+    "set": {"plant.faults": [], "planner.position_tolerance": 0.05},
+}
+"""Three sliders move their base by 4 cm, without the fault of the scenario."""
+
+
+def section(**given: Any) -> dict[str, Any]:
+    """Return the content of a campaign's file; ``set`` adds to what the short flight has."""
+    return {**SHORT, **given, "set": {**SHORT["set"], **given.get("set", {})}}  # type: ignore[dict-item]
+
+
+def campaign(**given: Any) -> Campaign:
+    """Return a campaign of short flights."""
+    return parse_campaign("short", section(**given))
+
+
+def flown(made: Campaign, number: int = 0) -> tuple[FlightArrays, dict[str, Any]]:
+    """Fly one draw; return the flight and what was drawn."""
+    draw = Draws(made)[number]
+    return FlightsEngine().flown(made, drawn_flight(made, draw)), dict(draw.values)
