@@ -57,6 +57,12 @@ from spacerobot_ros.cli.options import PATH, json_option, write_json
     metavar="N",
     help="... and plan them with a library of the manoeuvres to N other goals, too.",
 )
+@click.option(
+    "--campaign",
+    is_flag=True,
+    help="Instead: thousands of flights in lanes against the plant's own tick and MuJoCo's rollout "
+    "in the same run; CPU time.",
+)
 @json_option("Write the figures.")
 @click.option(
     "--against",
@@ -79,6 +85,7 @@ def command(
     goals: int | None,
     starts: int | None,
     library: int | None,
+    campaign: bool,
     json_file: Path | None,
     against: Path | None,
     rounds: int,
@@ -98,7 +105,11 @@ def command(
         if not figures["flat"]:
             fail()
         return
-    if goals is not None:
+    if campaign:
+        from spacerobot_ros.benchmarks.lanes import lanes_benchmark
+
+        figures = lanes_benchmark(click.echo)
+    elif goals is not None:
         from spacerobot_ros.benchmarks.planning import run_planning_benchmark
 
         figures = run_planning_benchmark(goals, against, starts, library, click.echo)
