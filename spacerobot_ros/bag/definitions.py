@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*/(msg|srv|action)/[A-Za-z]\w*", re.ASCII)
 _LONGEST_TEXT = 262_144
@@ -50,22 +52,54 @@ class MessageTypes:
         ValueError
             The definition is refused.
         """
-        parsed = _parsed(type_name, text)
-        try:
-            self._store.register(parsed)
-            definition = self._store.get_msgdef(type_name)
-        # Generated code has no errors of its own: names, syntax, keys, whatever is in the text.
-        except Exception as error:
-            raise ValueError(_one_line(error)) from error
+        store, definition = _known(type_name, text)
+        self._take(store)
         little, big = definition.deserialize_cdr_le, definition.deserialize_cdr_be
 
         def decode(data: bytes) -> Any:
             # Not `Typestore.deserialize_cdr`: that one refuses what rclpy serialises with an empty
             # list of float64, which has some meaningless bytes at its end.
             deserialise = little if data[1] & 1 else big
-            return deserialise(data[4:], 0, definition.cls, self._store)[0]
+            return deserialise(data[4:], 0, definition.cls, store)[0]
 
         return decode
+
+    def _take(self, store: Typestore) -> None:
+        """Add the types of another store.
+
+        Raises
+        ------
+        ValueError
+            The bag has defined one of them otherwise.
+        """
+        own = self._store
+        for name, (_, fields) in store.fielddefs.items():
+            if name in own.fielddefs and _layout(own.fielddefs[name][1]) != _layout(fields):
+                raise ValueError(f"Type '{name}' is already present with different definition.")
+        for name in store.fielddefs.keys() - own.fielddefs.keys():
+            own.fielddefs[name], own.types[name] = store.fielddefs[name], store.types[name]
+
+
+def _layout(fields: Any) -> list[Any]:
+    return [(name.lower(), kind) for name, kind in fields]
+
+
+@lru_cache(maxsize=64)
+def _known(type_name: str, text: bytes) -> tuple[Typestore, Any]:
+    """Return a store of what a text defines, and the code for the type: made once for all bags.
+
+    Raises
+    ------
+    ValueError
+        The definition is refused.
+    """
+    parsed, store = _parsed(type_name, text), get_typestore(Stores.EMPTY)
+    try:
+        store.register(parsed)
+        return store, store.get_msgdef(type_name)
+    # Generated code has no errors of its own: names, syntax, keys, whatever is in the text.
+    except Exception as error:
+        raise ValueError(_one_line(error)) from error
 
 
 def _parsed(type_name: str, text: bytes) -> Any:

@@ -61,6 +61,11 @@ _SAME = 1e-6
 _BEYOND = 1e9
 """Results beyond it are near a singularity: rounding decides them."""
 
+_MOST_AT_HAND = 12
+
+_at_hand: dict[tuple[str, ...], ca.Function] = {}
+"""Kept functions that were asked for last, by their name, key and how they are compiled."""
+
 _hung: set[str] = set()
 """Compilers that have run into the time limit: the next function is not to wait as long again."""
 
@@ -182,8 +187,9 @@ def kept_function(
 ) -> ca.Function:
     """Return a function that takes long to derive, from the cache if it was derived before.
 
-    The same numbers come out whether it is compiled, read or derived: it is compiled without
-    optimisation, operation by operation.
+    This process has those at hand that it has used last. The same numbers come out whether a
+    function is compiled, read or derived: it is compiled without optimisation, operation by
+    operation.
 
     Parameters
     ----------
@@ -202,6 +208,17 @@ def kept_function(
     ParameterError
         ``SPACEROBOT_COMPILE_TIMEOUT`` is not a number of seconds.
     """
+    place = (name, key, str(compiling), *compilation_settings())
+    function = _at_hand.pop(place, None) or _kept_or_derived(name, key, build, compiling=compiling)
+    _at_hand[place] = function
+    if len(_at_hand) > _MOST_AT_HAND:
+        del _at_hand[next(iter(_at_hand))]
+    return function
+
+
+def _kept_or_derived(
+    name: str, key: str, build: Callable[[], ca.Function], *, compiling: bool
+) -> ca.Function:
     cache, compiler = Cache(cache_directory()), c_compiler()
     compiled_key = ""
     if compiler is not None:
@@ -288,6 +305,11 @@ def vector_source(functions: Sequence[ca.Function], kind: str) -> str:
     for function in functions:
         generator.add(function)
     return str(generator.dump())
+
+
+def compilation_settings() -> tuple[str, ...]:
+    """Return what decides how functions are compiled and where they are kept."""
+    return (c_compiler() or "", str(cache_directory()))
 
 
 def c_compiler() -> str | None:

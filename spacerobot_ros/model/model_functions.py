@@ -9,14 +9,21 @@ from __future__ import annotations
 import hashlib
 import pickle
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.model.body_weights import SymbolicWeights, free_entries
-from spacerobot_ros.model.compilation import compiled, dense_function, kept_function, source_of
+from spacerobot_ros.model.compilation import (
+    compilation_settings,
+    compiled,
+    dense_function,
+    kept_function,
+    source_of,
+)
 from spacerobot_ros.model.composite_rigid_body import (
     composite_dynamics,
     composites,
@@ -57,7 +64,12 @@ class ModelFunctions:
         self._kin = tree_kinematics(robot, weights)
         self._inertia = composites(self._kin)
         self._symbolic: dict[str, ca.Function] = {}
-        self._compiled: dict[str, ca.Function] = {}
+        self._compiled: dict[tuple[str, ...], ca.Function] = {}
+
+    @classmethod
+    def of(cls, robot: RobotDescription) -> ModelFunctions:
+        """Return those with the numbers of a robot, which all equal robots of a process share."""
+        return _of_equal(_Equal(hashlib.sha256(pickle.dumps(robot)).hexdigest(), robot))
 
     def function(self, name: str, *, compile: bool = True) -> ca.Function:
         """Return a function of the model by name (the keys of ``_builders``).
@@ -76,9 +88,10 @@ class ModelFunctions:
 
     def composed(self, name: str, build: Callable[[], ca.Function]) -> ca.Function:
         """Return a function that is built from those of the model, compiled once for its name."""
-        if name not in self._compiled:
-            self._compiled[name] = compiled(build())
-        return self._compiled[name]
+        key = (name, *compilation_settings())
+        if key not in self._compiled:
+            self._compiled[key] = compiled(build())
+        return self._compiled[key]
 
     @property
     def total_mass(self) -> float:
@@ -260,6 +273,23 @@ class ModelFunctions:
         return dense_function("total_mass", self._kin.weights.inputs, {"M": self._kin.total_mass})
 
 
+_MOST_BUILDS = 8
+"""So many builds of robots are kept; the one that was used longest ago goes first."""
+
+
+@dataclass(frozen=True)
+class _Equal:
+    """A robot by a hash of all that it is."""
+
+    key: str
+    robot: RobotDescription = field(compare=False)
+
+
+@lru_cache(maxsize=_MOST_BUILDS)
+def _of_equal(equal: _Equal) -> ModelFunctions:
+    return ModelFunctions(equal.robot)
+
+
 class Composition:
     """A larger function that is being built from those of a model, in symbols of one kind.
 
@@ -326,9 +356,6 @@ class SymbolicModels:
 
 
 _builds: dict[str, SymbolicModels] = {}
-
-_MOST_BUILDS = 8
-"""So many builds of robots are kept; the one that was used longest ago goes first."""
 
 
 def _build_key(robot: RobotDescription, free: npt.NDArray[np.bool_]) -> str:

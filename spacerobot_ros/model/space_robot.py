@@ -259,7 +259,7 @@ class SpaceRobot:
     @cached_property
     def _numbers(self) -> ModelFunctions:
         """The model with this robot's numbers in it."""
-        return ModelFunctions(self.description)
+        return ModelFunctions.of(self.description)
 
     # -- helpers ------------------------------------------------------------------------------
 

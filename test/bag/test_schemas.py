@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from spacerobot_ros.bag import RecordingError, message_definition, type_hash
+from spacerobot_ros.bag.definitions import MessageTypes, _known
 
 TYPES = [
     "diagnostic_msgs/msg/DiagnosticArray",
@@ -158,3 +160,20 @@ def _installed(path: str) -> Path:
     package = path.split("/")[0]
     module = Path(__import__(package).__file__ or "")
     return next(p for p in (q / "share" / path for q in module.parents) if p.is_file())
+
+
+def test_code_is_made_once_for_all_bags_and_types_of_a_bag_agree() -> None:
+    text = b"float64 x\nother/Part part\n" + b"=" * 80 + b"\nMSG: other/Part\nint32 %s\n"
+    first, second = MessageTypes(), MessageTypes()
+    data = bytes([0, 1, 0, 0]) + struct.pack("<di", 2.5, 7)
+    for types in (first, second):
+        message = types.decoder("own/msg/Whole", text % b"count")(data)
+        assert (message.x, message.part.count) == (2.5, 7)
+    with pytest.raises(ValueError, match="'other/msg/Part' is already present"):
+        first.decoder("own/msg/Another", text % b"number")
+    # Another bag may mean another type by the name.
+    third = MessageTypes()
+    assert third.decoder("own/msg/Another", text % b"number")(data).part.number == 7
+    made = _known.cache_info().misses
+    third.decoder("own/msg/Another", text % b"number")
+    assert _known.cache_info().misses == made

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import shutil
 import stat
 import subprocess
 import sys
@@ -16,8 +17,9 @@ import pytest
 
 from spacerobot_ros import private_files
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model import compilation
+from spacerobot_ros.model import SpaceRobot, compilation
 from spacerobot_ros.model.compilation import c_compiler, compiled
+from spacerobot_ros.resources import robot_file
 
 Compiler = Callable[[str], Path]
 
@@ -437,3 +439,22 @@ def test_two_processes_that_build_one_object_both_have_it(cache: Path, compiler:
     assert only_file(cache)
     compiler("exit 1")
     assert is_compiled()
+
+
+def test_equal_robots_share_functions_and_others_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    text = robot_file("planar_chain").read_text("utf-8")
+    first, again = SpaceRobot.from_urdf(text), SpaceRobot.from_urdf(text)
+    heavier = SpaceRobot.from_urdf(text.replace('mass value="', 'mass value="1'))
+    step = first.function("velocity_step:2")
+    assert again.function("velocity_step:2") is step
+    assert heavier.function("velocity_step:2") is not step
+    # Memory is a caller's own.
+    one, other = first.buffered("velocity_step:2"), again.buffered("velocity_step:2")
+    one.inputs[0][:] = 1.0
+    assert not other.inputs[0].any()
+    monkeypatch.delenv("CC")
+    if real := shutil.which("cc"):
+        monkeypatch.setenv("CC", real)
+        monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
+        assert again.function("velocity_step:2") is not step

@@ -27,6 +27,7 @@ class Derivation:
         return ca.Function("bent", [x], [rows, ca.jacobian(rows, x)])
 
     def kept(self, key: str = "a" * 64, *, compiling: bool) -> list[list[float]]:
+        compilation._at_hand.clear()  # As another process.
         function = kept_function("bent", key, self, compiling=compiling)
         return [each.nonzeros() for each in function.call([ca.DM(POINT)])]
 
@@ -81,3 +82,19 @@ def test_what_others_may_have_written_is_not_read(folder: Path) -> None:
     kept.chmod(0o666)
     derivation.kept(compiling=False)
     assert derivation.count == 2
+
+
+def test_a_process_reads_and_derives_a_function_once(folder: Path) -> None:
+    derivation = Derivation()
+    first = kept_function("bent", "c" * 64, derivation, compiling=False)
+    for file in folder.iterdir():
+        file.unlink()
+    assert kept_function("bent", "c" * 64, derivation, compiling=False) is first
+    assert derivation.count == 1
+    # Another function, another way of compiling, and what was used long ago.
+    assert kept_function("bent", "d" * 64, Derivation(2.0), compiling=False) is not first
+    assert kept_function("bent", "c" * 64, derivation, compiling=True) is not first
+    for number in range(compilation._MOST_AT_HAND):
+        kept_function("bent", f"{number:064}", derivation, compiling=False)
+    assert kept_function("bent", "c" * 64, derivation, compiling=False) is not first
+    assert len(compilation._at_hand) == compilation._MOST_AT_HAND

@@ -26,6 +26,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from enum import EnumMeta
+from functools import lru_cache
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
@@ -33,6 +34,8 @@ from typing import Any
 import _pytest.main
 import numpy as np
 import pytest
+
+from spacerobot_ros.model import compilation, model_functions
 
 WAITED = 120.0
 """Wall time (s) beyond which a test that does not use the processor hangs; a multiple of what it
@@ -45,6 +48,11 @@ _limits: dict[str, tuple[float, float]] = {}
 """CPU and wall time (s) that each test of a job may take."""
 
 _log = Path(os.devnull)
+
+_CACHED = type(lru_cache(int))
+
+_caches: list[Any] = []
+"""Functions of the package that remember results."""
 
 NOT_EXCHANGED = 4
 """The exit code where a module has to be imported anew."""
@@ -61,6 +69,8 @@ def pytest_runtestloop(session: pytest.Session) -> bool:
     for thing in gc.get_objects():
         if type(thing) is FunctionType:
             live[thing.__code__.co_filename][thing.__code__].append(thing)
+        elif isinstance(thing, _CACHED) and thing.__module__.startswith("spacerobot_ros."):
+            _caches.append(thing)
     gc.freeze()
     os.write(answers, b"ready\n")
     with os.fdopen(jobs) as lines:
@@ -90,6 +100,7 @@ def _run(
         resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
         os.environ.update(job["environment"])
         _log = Path(job["log"])
+        _forget()
         if job["exchange"]:
             path, before = job["exchange"]
             try:
@@ -112,6 +123,14 @@ def _run(
         sys.excepthook(*sys.exc_info())
     finally:
         os._exit(code)
+
+
+def _forget() -> None:
+    """Forget what was computed while tests were collected: an error is to show in it."""
+    for cached in _caches:
+        cached.cache_clear()
+    compilation._at_hand.clear()
+    model_functions._builds.clear()
 
 
 @pytest.hookimpl(wrapper=True)
