@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from enum import Enum
 from typing import NamedTuple
 
 from spacerobot_ros.bag.writer import BagWriter
-from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.errors import RecordingError, RobotDescriptionError
 
 _SECOND = 10**9
 
@@ -170,6 +171,18 @@ class Recording:
     def describe(self, name: str, values: dict[str, str]) -> None:
         """Put named values into the bag."""
         self._guarded(lambda: self.writer.add_metadata(name, values))
+
+    def attach_robot(self, name: str, urdf: bytes) -> None:
+        """Attach the description of a robot, and the meshes in it that are found here."""
+        # The model takes as long to import as everything else here.
+        from spacerobot_ros.model.urdf import parse_robot
+        from spacerobot_ros.model.visuals import carried_meshes
+
+        self.attach(name, urdf, "application/xml")
+        if b"<mesh" in urdf:
+            with suppress(RobotDescriptionError, UnicodeDecodeError):
+                for mesh, data in carried_meshes(parse_robot(urdf.decode())).items():
+                    self.attach(mesh, data, "model/stl")
 
     def attach(self, name: str, data: bytes, media_type: str) -> None:
         """Put a whole file into the bag."""

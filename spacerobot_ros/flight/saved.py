@@ -17,6 +17,7 @@ from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.flight.arrays import FlightArrays
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.visuals import carried_meshes
 from spacerobot_ros.planning import GaitSchedule, Goal
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.topics import TOPICS, Topic, state_topics
@@ -54,6 +55,8 @@ def save_flight(
             writer.add_metadata(title, values)
         urdf = flight.robot.urdf.encode()
         writer.add_attachment("robot_description.urdf", urdf, "application/xml", 0)
+        for name, mesh in carried_meshes(flight.robot).items():
+            writer.add_attachment(name, mesh, "model/stl", 0)
         entries = []
         for place, stream in enumerate(streams):
             name = stream.topic.name

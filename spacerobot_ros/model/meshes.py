@@ -151,6 +151,32 @@ def read_mesh(path: str | Path) -> TriangleMesh:
         raise MeshError(f"The mesh {path} cannot be read: {error}.") from error
 
 
+def mesh_of_stl(data: bytes, name: str) -> TriangleMesh:
+    """Read the triangles of STL from elsewhere than a file, such as a bag.
+
+    Raises
+    ------
+    MeshError
+        It is damaged or too large; the sentence calls it ``name``.
+    """
+    try:
+        return _checked(_read_stl(data))
+    except _DamagedError as error:
+        raise MeshError(f"The mesh {name} cannot be read: {error}.") from error
+
+
+def stl_of(mesh: TriangleMesh) -> bytes:
+    """Return a mesh as binary STL, which has no unit and whose numbers have seven digits."""
+    corners = mesh.vertices[mesh.faces]
+    made = np.zeros(len(corners), _TRIANGLE)
+    made["corners"] = corners
+    a, b, c = np.moveaxis(corners, 1, 0)
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    made["normal"] = normals / np.maximum(lengths, 1e-300)
+    return bytes(80) + len(made).to_bytes(4, "little") + made.tobytes()
+
+
 class _DamagedError(Exception):
     """What is wrong with the contents of a file, as the end of a sentence."""
 
@@ -187,7 +213,7 @@ def _read_stl(data: bytes) -> TriangleMesh:
             or len(data) == _HEADER + count * _TRIANGLE.itemsize
         ):
             triangles = np.frombuffer(data, _TRIANGLE, count, _HEADER)
-            return _joined(triangles["corners"].reshape(-1, 3))
+            return joined(triangles["corners"].reshape(-1, 3))
     if not data.lstrip().startswith(b"solid"):
         raise _DamagedError("it is no STL, or the file is cut")
     if b"endsolid" not in data:
@@ -195,10 +221,10 @@ def _read_stl(data: bytes) -> TriangleMesh:
     corners = _VERTEX.findall(data)
     if len(corners) % 3:
         raise _DamagedError("a triangle has not three corners")
-    return _joined(_numbers(corners).reshape(-1, 3))
+    return joined(_numbers(corners).reshape(-1, 3))
 
 
-def _joined(corners: npt.NDArray[Any]) -> TriangleMesh:
+def joined(corners: npt.NDArray[Any]) -> TriangleMesh:
     """Return the mesh of triangles that are given by their corners (3 M, 3): equal ones are one."""
     if not len(corners):
         return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))

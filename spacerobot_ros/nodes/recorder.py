@@ -474,7 +474,7 @@ def _take(
     def on_description(raw: bytes) -> None:
         if urdf_name not in recording.attached:
             urdf = deserialize_message(raw, String).data.encode()
-            recording.attach(urdf_name, urdf, "application/xml")
+            recording.attach_robot(urdf_name, urdf)
         record(channel, raw)
 
     if topic == clock:

@@ -14,7 +14,7 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.report.figures_time import DASHES, NO_STATES
 from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.report.plates import Plate
-from spacerobot_ros.report.solids import Canvas, Solids, View, base_outlines
+from spacerobot_ros.report.solids import Canvas, Solids, View
 from spacerobot_ros.report.style import (
     COLUMNS,
     GHOST,
@@ -63,8 +63,7 @@ def configurations_plate(flight: Flight) -> Plate | str:
     )
     if flight.goal is not None:
         caption += " Dashed in the last, the base link at the goal."
-    if any(shape.kind == "mesh" for link in flight.robot.links for shape in link.shapes):
-        caption += " Meshes are not drawn."
+    caption += flight.missing_meshes
     return Plate("configurations", "Configurations", caption, figure)
 
 
@@ -132,11 +131,11 @@ def draw_goal_and_path(axes: Axes, flight: Flight, view: View) -> list[Line2D]:
         dense = len(path) > 2 * COLUMNS
         axes.plot(flat[:, 0], flat[:, 1], color=INK, lw=0.8, zorder=5, rasterized=dense)
         keys.append(key(INK, "path of the base"))
-    if flight.goal is not None and flight.robot is not None:
+    if flight.goal is not None and flight.drawn is not None:
         # Where the position is not asked for, the ghost shows the attitude alone.
         r = flight.goal.position if flight.position_counts else path[-1]
         pose = Pose(matrix_from_quaternion(flight.goal.quaternion), r)
-        for line in base_outlines(flight.robot, pose):
+        for line in flight.drawn.base_outlines(pose):
             flat = view(line)
             axes.plot(flat[:, 0], flat[:, 1], color=GHOST, lw=0.9, ls=(0, DASHES), zorder=6)
         keys.append(key(GHOST, "goal", DASHES))

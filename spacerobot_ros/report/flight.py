@@ -18,7 +18,9 @@ from spacerobot_ros.errors import PlanningError, RobotDescriptionError, SpaceRob
 from spacerobot_ros.flight.scenario import Published
 from spacerobot_ros.model import RobotDescription, parse_robot
 from spacerobot_ros.model.description import Array, Joint, Pose
+from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
+from spacerobot_ros.model.visuals import meshes_in
 from spacerobot_ros.planning import METHODS, Goal, PoseError
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
@@ -145,6 +147,8 @@ class Flight:
         Planned positions of the base (K, 3), one array a schedule.
     events
         Changes of state of the nodes; none in bags of earlier versions.
+    meshes
+        Triangles of the meshes that the bag carries, by their URIs.
     """
 
     file_name: str
@@ -170,6 +174,7 @@ class Flight:
     tool_goals: list[SentGoal]
     planned: list[Array]
     events: list[FlightEvent] = field(default_factory=list)
+    meshes: dict[str, TriangleMesh] = field(default_factory=dict)
 
     # -- what it is called --------------------------------------------------------------------
 
@@ -343,7 +348,18 @@ class Flight:
             return None
         if not set(robot.joint_names) <= set(self.joint_names):
             return None
-        return None if robot.joint_names and not len(self.shape) else SolidRobot(robot)
+        return None if robot.joint_names and not len(self.shape) else SolidRobot(robot, self.meshes)
+
+    @property
+    def missing_meshes(self) -> str:
+        """A sentence for captions about meshes that the bag does not carry; empty for none."""
+        links = self.robot.links if self.robot is not None else ()
+        named = {each.resource for link in links for each in link.shapes if each.kind == "mesh"}
+        missing = named - self.meshes.keys()
+        if not missing:
+            return ""
+        count = f"{len(missing)} of {len(named)} meshes" if self.meshes else "Meshes"
+        return f" {count} are not drawn. The bag does not carry them."
 
     def base_at(self, index: int) -> Pose:
         """Pose of the base link in the world at a recorded state."""
@@ -470,11 +486,12 @@ def read_flight(path: Path) -> Flight:
     names, nozzles = robot.joint_names, robot.names("thrusters")
     base = robot.signal("odom", "pose.pose")
     position, quaternion = Signal(base.time, base.values[:, :3]), base.values[:, 3:]
+    description = _description(robot)
     return Flight(
         file_name=bag.path.name,
         message_count=bag.message_count(),
         metadata=bag.metadata,
-        robot=_description(robot),
+        robot=description,
         joint_names=names,
         position=position,
         quaternion=quaternion,
@@ -499,6 +516,7 @@ def read_flight(path: Path) -> Flight:
             for _, message in robot.messages("planned_path")
         ],
         events=robot.events(),
+        meshes=meshes_in(description, bag.attachments) if description is not None else {},
     )
 
 

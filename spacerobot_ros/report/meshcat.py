@@ -18,9 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.model.description import Array, Pose, Shape
+from spacerobot_ros.model.description import Array, Pose
+from spacerobot_ros.model.meshes import TriangleMesh
+from spacerobot_ros.model.visuals import Visual
 from spacerobot_ros.report.live import Live, own_file
-from spacerobot_ros.report.solids import EDGE, is_rod, outline
+from spacerobot_ros.report.solids import EDGE
 
 Command = dict[str, Any]
 
@@ -117,10 +119,10 @@ def set_animation(clips: list[Command]) -> Command:
     return {"type": "set_animation", "animations": clips, "options": {"play": True}}
 
 
-def solid(path: str, shape: Shape, color: str, opacity: float = 1.0) -> list[Command]:
-    """A solid and, where it has sharp ones, its edges."""
-    pose, geometry = shape.pose, {"box": _box, "cylinder": _cylinder, "sphere": _sphere}
-    matrix = matrix_of(pose)
+def solid(path: str, visual: Visual, color: str, opacity: float = 1.0) -> list[Command]:
+    """A visual and, where it is a solid with sharp ones, its edges."""
+    shape = visual.shape
+    matrix = matrix_of(shape.pose)
     if shape.kind == "cylinder":
         # Along y in three.js, along z in URDF.
         matrix = matrix @ np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
@@ -130,16 +132,28 @@ def solid(path: str, shape: Shape, color: str, opacity: float = 1.0) -> list[Com
     if opacity < 1.0:
         look |= {"transparent": True, "opacity": opacity, "depthWrite": False}
         look |= {"polygonOffsetFactor": -1, "polygonOffsetUnits": -1}
+    if shape.kind == "mesh":
+        # Of both sides, because files differ in which of them is outside.
+        look |= {"flatShading": True, "side": 2}
+        return [_object(f"{path}/solid", _triangles(visual.mesh), look, "Mesh")]
+    geometry = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}[shape.kind](shape.size)
     commands = [
-        _object(f"{path}/solid", geometry[shape.kind](shape.size), look, "Mesh"),
+        _object(f"{path}/solid", geometry, look, "Mesh"),
         set_transform(f"{path}/solid", matrix),
     ]
-    if shape.kind != "sphere" and not is_rod(shape):
-        ends = [np.stack([line[:-1], line[1:]], axis=1).reshape(-1, 3) for line in outline(shape)]
-        edges = np.concatenate(ends) @ pose.R.T + pose.r
+    edges = visual.edges.lines
+    if len(edges):
         tint = EDGE if opacity == 1.0 else color
-        commands.append(segments(f"{path}/edges", edges, tint, 0.5 if opacity == 1.0 else 1.0))
+        ends = edges.reshape(-1, 3)
+        commands.append(segments(f"{path}/edges", ends, tint, 0.5 if opacity == 1.0 else 1.0))
     return commands
+
+
+def _triangles(mesh: TriangleMesh) -> Command:
+    kind = "Uint16Array" if len(mesh.vertices) < 1 << 16 else "Uint32Array"
+    made = _points(mesh.vertices)
+    made["data"]["index"] = {"type": kind, "array": mesh.faces.ravel().tolist()}
+    return made
 
 
 def _box(size: tuple[float, ...]) -> dict[str, Any]:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from spacerobot_ros.model.description import Array, JointKind, Pose, RobotDescription, Shape
+from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_from_matrix,
     quaternion_multiply,
 )
+from spacerobot_ros.model.visuals import Visual, solid_mesh, visuals_of
 from spacerobot_ros.report.flight import Flight, Target
 from spacerobot_ros.report.meshcat import (
     Command,
@@ -27,7 +30,7 @@ from spacerobot_ros.report.meshcat import (
     solid,
 )
 from spacerobot_ros.report.signals import Cycles, Indices, Signal, simplified
-from spacerobot_ros.report.solids import SolidRobot, link_color
+from spacerobot_ros.report.solids import SolidRobot, body_color
 from spacerobot_ros.report.style import FAINT, GHOST, PALETTE
 
 FULL_CYCLES = 3
@@ -84,6 +87,9 @@ _ANGLE_TOLERANCE = 0.005
 """Likewise, rad."""
 
 _LINE_POINTS = 4000
+_MOST_FACES = 20_000
+"""Of all meshes together: some 0.6 MB."""
+
 _BACKGROUND = [246 / 255, 247 / 255, 249 / 255]
 _FIELD_OF_VIEW = 30.0
 """Degrees."""
@@ -100,7 +106,7 @@ def scene_of(flight: Flight) -> Scene | str:
     center, radius = _extent(flight, drawn)
     frames = key_frames(_visible(flight, radius), flight.cycles)
     commands = _stage(center, radius, flight.flat)
-    commands += _robot(drawn.robot)
+    commands += _robot(drawn.robot, flight.meshes)
     commands += _lines(flight)
     ghosts = _ghosts(flight, drawn.robot, radius)
     commands += ghosts
@@ -189,23 +195,35 @@ def _link_paths(robot: RobotDescription) -> dict[str, str]:
     return paths
 
 
-def _robot(robot: RobotDescription) -> list[Command]:
+def _robot(robot: RobotDescription, meshes: Mapping[str, TriangleMesh]) -> list[Command]:
     commands: list[Command] = []
     paths = _link_paths(robot)
-    has_shapes = any(shape.kind != "mesh" for link in robot.links for shape in link.shapes)
+    visuals = visuals_of(robot, meshes, _faces(meshes))
     for joint in robot.joints:
         commands.append(set_transform(paths[joint.child], matrix_of(joint.origin)))
-        if not has_shapes:
+        if not visuals:
             ends = np.array([np.zeros(3), joint.origin.r])
             path = f"{paths[joint.parent]}/line to {paths[joint.child].rpartition('/')[2]}"
-            commands.append(segments(path, ends, link_color(robot, joint.parent)))
-    for link in robot.links:
-        shapes = link.shapes if has_shapes else (Shape("sphere", (0.03,), Pose()),)
-        for number, shape in enumerate(shapes):
-            if shape.kind != "mesh":
-                path = f"{paths[link.name]}/visual {number}"
-                commands += solid(path, shape, link_color(robot, link.name))
+            commands.append(segments(path, ends, body_color(robot.frames[joint.parent][0])))
+    for number, visual in enumerate(visuals or _balls(robot)):
+        path = f"{paths[visual.link]}/visual {number}"
+        commands += solid(path, visual, body_color(visual.body))
     return commands
+
+
+def _faces(meshes: Mapping[str, TriangleMesh]) -> int:
+    """Return how many faces each mesh may have, so that the page stays small."""
+    return _MOST_FACES // max(len(meshes), 1)
+
+
+def _balls(robot: RobotDescription) -> list[Visual]:
+    """Return a small ball for each link of a robot that has no visuals."""
+    return [_ball(link.name, robot.frames[link.name][0], 0.03) for link in robot.links]
+
+
+def _ball(link: str, body: int, radius: float) -> Visual:
+    shape = Shape("sphere", (radius,), Pose())
+    return Visual(link, body, shape, solid_mesh(shape))
 
 
 def _motion(flight: Flight, robot: RobotDescription, indices: Indices) -> Command:
@@ -247,19 +265,18 @@ def _ghosts(flight: Flight, robot: RobotDescription, radius: float) -> list[Comm
     if flight.goal is not None and flight.controls("base"):
         matrix = matrix_of(Pose(matrix_from_quaternion(flight.goal.quaternion), _aim(flight)))
         commands.append(set_transform(f"{WORLD}/goal", matrix))
-        for link in robot.links:
-            body, pose = robot.frames[link.name]
-            for number, shape in enumerate(link.shapes if body == 0 else ()):
-                if shape.kind != "mesh":
-                    placed = Shape(shape.kind, shape.size, pose @ shape.pose)
-                    path = f"{WORLD}/goal/{link.name.replace('/', '_')} {number}"
-                    commands += solid(path, placed, GHOST, 0.25)
+        visuals = visuals_of(robot, flight.meshes, _faces(flight.meshes) // 4)
+        for number, visual in enumerate(visuals):
+            if visual.body == 0:
+                path = f"{WORLD}/goal/{visual.link.replace('/', '_')} {number}"
+                commands.append(set_transform(path, matrix_of(robot.frames[visual.link][1])))
+                commands += solid(path, visual, GHOST, 0.25)
     targets: list[Target] = flight.tool_targets[-1:]
     for target in targets:
         pose = Pose(matrix_from_quaternion(target.goal.quaternion), target.goal.position)
         path = f"{WORLD}/end-effector goal"
         commands.append(set_transform(path, matrix_of(pose)))
-        commands += solid(f"{path}/mark", Shape("sphere", (0.03 * radius,), Pose()), GHOST, 0.4)
+        commands += solid(f"{path}/mark", _ball("", 0, 0.03 * radius), GHOST, 0.4)
         if set(flight.controls("end_effector")) & {3, 4, 5}:
             for name, unit, tint in zip("xyz", np.eye(3), _AXES, strict=True):
                 ends = np.array([np.zeros(3), 0.12 * radius * unit])
@@ -311,7 +328,4 @@ def _caption(flight: Flight, frames: KeyFrames, radius: float, ghosts: bool) -> 
             f"between, one instant of {which}, always at the same phase, so that fast loops do not "
             "look like slow ones."
         )
-    assert flight.robot is not None
-    if any(shape.kind == "mesh" for link in flight.robot.links for shape in link.shapes):
-        text += " Meshes are not drawn."
-    return text
+    return text + flight.missing_meshes

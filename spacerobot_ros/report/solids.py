@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,8 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.colors import to_rgb
 
-from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
+from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.kinematics import tree_kinematics
+from spacerobot_ros.model.meshes import TriangleMesh
+from spacerobot_ros.model.visuals import Visual, visuals_of
 from spacerobot_ros.report.style import colour
 
 Image = npt.NDArray[np.float32]
@@ -166,11 +168,8 @@ class Canvas:
 
 _BASE = "#c4c9d2"
 EDGE = "#3d4450"
-_AROUND = 24
-"""Facets around a cylinder or sphere."""
-
-_ROD = 0.05
-"""Thinner than this part of its length, a box is a rod: without edges, its outline a line."""
+_FACES = 1500
+"""Of a mesh in a picture: each is filled by itself."""
 
 Colour = tuple[float, float, float]
 
@@ -186,12 +185,32 @@ class Solids:
         """All corners (k, 3)."""
         return np.concatenate([f.corners for f in self.faces] + [e.line for e in self.edges])
 
+    def add(self, visual: Visual, pose: Pose, fill: Colour) -> None:
+        """Add a visual whose link has a pose in the world."""
+        corners = visual.mesh.vertices[visual.mesh.faces] @ pose.R.T + pose.r
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        lengths = np.linalg.norm(normals, axis=1)
+        for triangle, normal, length in zip(corners, normals, lengths, strict=True):
+            if length > 0:
+                self.faces.append(Face(triangle, normal / length, fill))
+        edges = visual.edges
+        self.edges += [
+            Edge(line, normals[np.newaxis], _rgb(EDGE))
+            for line, normals in zip(
+                edges.lines @ pose.R.T + pose.r, edges.normals @ pose.R.T, strict=True
+            )
+        ]
+
 
 class SolidRobot:
-    """A robot that can be asked where its links are and what it looks like."""
+    """A robot that can be asked where its links are and what it looks like.
 
-    def __init__(self, robot: RobotDescription) -> None:
+    ``meshes`` are the triangles of its meshes by their URIs.
+    """
+
+    def __init__(self, robot: RobotDescription, meshes: Mapping[str, TriangleMesh]) -> None:
         self.robot = robot
+        self._visuals = visuals_of(robot, meshes, _FACES)
         kinematics = tree_kinematics(robot)
         frames = [kinematics.frame(link.name) for link in robot.links]
         poses = [x for R, r, _ in frames for x in (R, r)]
@@ -208,34 +227,22 @@ class SolidRobot:
     def at(self, q: Array, base: Pose) -> Solids:
         """Return the robot at joint positions ``q`` (n,), its base at a pose in the world.
 
-        A robot without boxes, cylinders and spheres is drawn as lines between its bodies.
+        A robot without visuals is drawn as lines between its bodies.
         """
         poses = self.link_poses(q, base)
         solids = Solids()
-        for link in self.robot.links:
-            fill = _rgb(link_color(self.robot, link.name))
-            for shape in link.shapes:
-                pose = poses[link.name] @ shape.pose
-                for corners, normal in _facets(shape):
-                    solids.faces.append(Face(pose.r + corners @ pose.R.T, pose.R @ normal, fill))
-                if not is_rod(shape):
-                    solids.edges += [
-                        Edge(pose.r + line @ pose.R.T, normals @ pose.R.T, _rgb(EDGE))
-                        for line, normals in _edges(shape)
-                    ]
+        for visual in self._visuals:
+            solids.add(visual, poses[visual.link], _rgb(body_color(visual.body)))
         return solids if solids.faces else _skeleton(self.robot, poses)
 
-
-def base_outlines(robot: RobotDescription, base: Pose) -> list[Array]:
-    """Return the edges of what is rigidly on the base link, as lines (k, 3) in the world."""
-    lines = []
-    for link in robot.links:
-        body, pose = robot.frames[link.name]
-        if body == 0:
-            for shape in link.shapes:
-                placed = base @ pose @ shape.pose
-                lines += [placed.r + line @ placed.R.T for line in outline(shape)]
-    return lines or _cross(base)
+    def base_outlines(self, base: Pose) -> list[Array]:
+        """Return the edges of what is rigidly on the base link, as lines (k, 3) in the world."""
+        lines = []
+        for visual in self._visuals:
+            if visual.body == 0:
+                placed = base @ self.robot.frames[visual.link][1]
+                lines += list(visual.outline @ placed.R.T + placed.r)
+        return lines or _cross(base)
 
 
 def _rgb(name: str) -> Colour:
@@ -243,84 +250,9 @@ def _rgb(name: str) -> Colour:
     return r, g, b
 
 
-def link_color(robot: RobotDescription, link: str) -> str:
-    """Return the color of a link: that of the joint that moves it, grey on the base."""
-    body = robot.frames[link][0]
+def body_color(body: int) -> str:
+    """Return the color of the links of a moving body: that of its joint, grey on the base."""
     return _BASE if body == 0 else colour(body - 1)
-
-
-def is_rod(shape: Shape) -> bool:
-    """Whether a shape is too thin to draw its edges."""
-    size = sorted(shape.size) if shape.kind == "box" else [0.0, 1.0, 1.0]
-    return size[1] < _ROD * size[2]
-
-
-def outline(shape: Shape) -> list[Array]:
-    """Lines (k, 3) that show a solid without hiding what is behind: its axis if it is a rod."""
-    if shape.kind == "sphere":
-        return [shape.size[0] * np.roll(_ring(), k, axis=1) for k in range(3)]
-    if is_rod(shape):
-        longest = int(np.argmax(shape.size))
-        return [np.outer([-0.5, 0.5], np.eye(3)[longest] * shape.size[longest])]
-    return [line for line, _ in _edges(shape)]
-
-
-def _facets(shape: Shape) -> list[tuple[Array, Array]]:
-    """Corners (k, 3) and outward normals of the surface of a solid, in its own frame."""
-    ring, up = _ring(), np.array([0.0, 0.0, 1.0])
-    if shape.kind == "box":
-        half = np.array(shape.size) / 2
-        found = []
-        for axis, sign in itertools.product(range(3), (-1.0, 1.0)):
-            corners = np.empty((4, 3))
-            corners[:, axis] = sign * half[axis]
-            corners[:, (axis + 1) % 3] = half[(axis + 1) % 3] * np.array([-1, 1, 1, -1])
-            corners[:, (axis + 2) % 3] = half[(axis + 2) % 3] * np.array([-1, -1, 1, 1])
-            found.append((corners, sign * np.eye(3)[axis]))
-        return found
-    if shape.kind == "cylinder":
-        radius, half_length = shape.size[0], shape.size[1] / 2 * up
-        found = [
-            (np.array([a - half_length, b - half_length, b + half_length, a + half_length]), a + b)
-            for a, b in itertools.pairwise(radius * ring)
-        ]
-        found += [(radius * ring[:-1] + s * half_length, s * up) for s in (-1.0, 1.0)]
-    elif shape.kind == "sphere":
-        polar = np.linspace(-np.pi / 2, np.pi / 2, _AROUND // 2 + 1)
-        rows = [shape.size[0] * (np.cos(t) * ring + np.sin(t) * up) for t in polar]
-        quads = [
-            np.array([low[k], low[k + 1], high[k + 1], high[k]])
-            for low, high in itertools.pairwise(rows)
-            for k in range(_AROUND)
-        ]
-        found = [(quad, quad.mean(axis=0)) for quad in quads]
-    else:
-        return []
-    return [(corners, normal / np.linalg.norm(normal)) for corners, normal in found]
-
-
-def _edges(shape: Shape) -> list[tuple[Array, Array]]:
-    """Sharp edges (k, 3) with the normals (k - 1, 2, 3) beside them; none of a sphere or a mesh."""
-    found = []
-    if shape.kind == "cylinder":
-        ring, up = _ring(), np.array([0.0, 0.0, 1.0])
-        for s in (-1.0, 1.0):
-            cap = np.tile(s * up, (len(ring) - 1, 1))
-            rim = shape.size[0] * ring + s * shape.size[1] / 2 * up
-            found.append((rim, np.stack([cap, ring[1:]], axis=1)))
-    elif shape.kind == "box":
-        half = np.array(shape.size) / 2
-        for axis, s, t in itertools.product(range(3), (-1.0, 1.0), (-1.0, 1.0)):
-            out = np.array([[s], [t]]) * np.eye(3)[[(axis + 1) % 3, (axis + 2) % 3]]
-            along = np.outer([-half[axis], half[axis]], np.eye(3)[axis])
-            found.append((along + out.sum(axis=0) * half, out[np.newaxis]))
-    return found
-
-
-def _ring() -> Array:
-    """Points (k, 3) around the unit circle, the first also the last."""
-    angles = np.linspace(0.0, 2 * np.pi, _AROUND + 1)
-    return np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
 
 
 def _cross(pose: Pose) -> list[Array]:

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from spacerobot_ros.bag import BagWriter, Recording, RecordingError
+from spacerobot_ros.bag import BagWriter, Recording, RecordingError, read_bag
+from spacerobot_ros.resources import robot_file
 
 STRING = "std_msgs/msg/String"
 S = 10**9
@@ -207,3 +208,15 @@ def test_a_disk_that_refuses_a_message_is_reported_once(
     assert [str(failure) for failure in bench.failures] == ["no space left"]
     assert recording.messages == 0
     recording.close()
+
+
+def test_meshes_of_a_robot_go_into_the_bag_with_its_description(bench: Bench) -> None:
+    urdf = robot_file("surveyor").read_bytes()
+    bench.recording.attach_robot("robot_description.urdf", urdf)
+    bench.recording.attach_robot("other.urdf", b"<robot name='x'><mesh is='no robot'/></robot>")
+    bench.recording.close()
+    found = read_bag(bench.path).attachments
+    assert found["robot_description.urdf"] == urdf
+    meshes = {name for name in found if name.startswith("mesh/package://spacerobot_ros/")}
+    assert len(meshes) == 6
+    assert found.keys() == meshes | {"robot_description.urdf", "other.urdf"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ from support.chromium import Browser, browser, chromium
 from support.flight_bags import FINAL, GOAL, Story, cyclic_shapes, tell, urdf_of
 from support.html_page import leave_blank
 
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
+from spacerobot_ros.model.visuals import solid_mesh
 from spacerobot_ros.report import meshcat, write_report
 from spacerobot_ros.report.flight import Flight, read_flight
 from spacerobot_ros.report.meshcat import Command, Scene
@@ -147,6 +149,30 @@ def test_a_gait_can_be_looked_at_in_parts(tmp_path: Path) -> None:
     assert names == ["whole flight", "first 5 s", "first 3 cycles", "last 3 cycles"]
     assert [end - start for _, start, end in scene.parts[2:]] == pytest.approx([4.5, 4.5])
     assert "always at the same phase" in scene.caption
+
+
+def test_meshes_that_a_bag_carries_are_drawn(tmp_path: Path) -> None:
+    mesh = solid_mesh(Shape("box", (1.0, 2.0, 3.0), Pose()))
+    told = tell(tmp_path / "flight.mcap", Story(wander(20)))
+    bare = read_flight(told)
+    assert "Meshes are not drawn." in bare.missing_meshes
+    carried = replace(bare, meshes={"package://robot/dish.stl": mesh})
+    assert carried.missing_meshes == ""
+    assert bare.drawn is not None
+    assert carried.drawn is not None
+    faces = [len(f.drawn.at(f.joints[0], f.base_at(0)).faces) for f in (bare, carried)]
+    assert faces[1] == faces[0] + 12
+    geometries = []
+    for each in (bare, carried):
+        scene = scene_of(each)
+        assert isinstance(scene, Scene)
+        objects = [c["object"] for c in scene.commands if c["type"] == "set_object"]
+        geometries.append([o["geometries"][0] for o in objects if o["object"]["type"] == "Mesh"])
+    (drawn,) = [g for g in geometries[1] if g["type"] == "BufferGeometry"]
+    corners = np.reshape(drawn["data"]["attributes"]["position"]["array"], (-1, 3))
+    index = np.reshape(drawn["data"]["index"]["array"], (-1, 3))
+    np.testing.assert_allclose(corners[index], mesh.vertices[mesh.faces], atol=1e-5)
+    assert len(geometries[1]) == len(geometries[0]) + 1
 
 
 def test_without_the_viewer_a_sentence_says_so(
