@@ -85,10 +85,11 @@ def test_an_open_mesh_ends_in_sharp_edges() -> None:
 
 
 def test_a_rod_is_a_line_along_its_longest_side() -> None:
+    inertia = 'ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"'
     text = (
-        '<robot name="r"><link name="base"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" '
-        'ixy="0" ixz="0" iyz="0"/></inertial><visual><origin xyz="1 0 0"/><geometry>'
-        '<box size="0.01 2 0.02"/></geometry></visual></link></robot>'
+        f'<robot name="r"><link name="base"><inertial><mass value="1"/><inertia {inertia}/>'
+        '</inertial><visual><origin xyz="1 0 0"/><geometry><box size="0.01 2 0.02"/></geometry>'
+        "</visual></link></robot>"
     )
     (rod,) = visuals_of(parse_robot(text), {}, 100)
     assert len(rod.edges.lines) == 0
