@@ -158,9 +158,10 @@ def test_meshes_that_a_bag_carries_are_drawn(tmp_path: Path) -> None:
     assert "Meshes are not drawn." in bare.missing_meshes
     carried = replace(bare, meshes={"package://robot/dish.stl": mesh})
     assert carried.missing_meshes == ""
-    assert bare.drawn is not None
-    assert carried.drawn is not None
-    faces = [len(f.drawn.at(f.joints[0], f.base_at(0)).faces) for f in (bare, carried)]
+    faces = []
+    for each in (bare, carried):
+        assert each.drawn is not None
+        faces.append(len(each.drawn.at(each.joints[0], each.base_at(0)).faces))
     assert faces[1] == faces[0] + 12
     geometries = []
     for each in (bare, carried):
