@@ -62,7 +62,7 @@ test-oldest: ## run the quick tests with the versions of Ubuntu 24.04, in .venv-
 	@.venv-oldest/bin/python3 -m pip freeze | grep -iE '^($(subst $() ,|,$(OLDEST)))=='
 	nice .venv-oldest/bin/python3 -m pytest -n 1 -p no:cacheprovider
 
-OLDEST := click lxml lz4 matplotlib numpy pin PyYAML scipy zstandard
+OLDEST := click lxml lz4 matplotlib numpy pin pyarrow pyparsing PyYAML scipy zstandard
 
 .PHONY: fuzz
 fuzz: $(STAMP)/test ## try more than ten thousand inputs that nobody would send, and count them

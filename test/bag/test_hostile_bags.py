@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
+from support.command_line import CliRunner
 from support.hostile.records import CASES, Part, bag, message, string, zstd_zeros
 from support.hostile_bags import QUICK
 

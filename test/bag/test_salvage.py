@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 import yaml
-from click.testing import CliRunner
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
+from support.command_line import CliRunner
 
 from spacerobot_ros.bag import LATCHED, BagWriter, RecordingError, read_bag
 from spacerobot_ros.bag.salvage import salvage_bag

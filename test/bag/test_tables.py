@@ -15,12 +15,12 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from click.testing import CliRunner
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.serialization import serialize_message
 from scipy.io import loadmat
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
+from support.command_line import CliRunner
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import Bag, BagWriter, RecordingError, read_bag
@@ -177,6 +177,7 @@ def from_csv(path: Path, like: pd.DataFrame) -> pd.DataFrame:
         keep_default_na=False,
         na_values={name: ["nan"] for name in numbers},
         dtype=dict.fromkeys(like.columns.difference(numbers), str),
+        float_precision="round_trip",  # The default only since pandas 3.1
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from support.command_line import CliRunner
 
 from spacerobot_ros.benchmarks.soak import QUANTITIES, robust_slope, trend_of
 from spacerobot_ros.cli.main import main

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from support.command_line import CliRunner, Result
 from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.cli.analyze import json_of, lines_of

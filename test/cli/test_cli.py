@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from support.command_line import CliRunner, Result
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError

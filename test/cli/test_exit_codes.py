@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from click.testing import CliRunner
+from support.command_line import CliRunner
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.scenario import load_scenario

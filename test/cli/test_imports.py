@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import pytest
-from click.testing import CliRunner
+from support.command_line import CliRunner
 
 from spacerobot_ros.cli.main import COMMANDS, main
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
+from support.command_line import CliRunner
 from support.oracles import PinocchioOracle
 
 from spacerobot_ros.cli.main import main

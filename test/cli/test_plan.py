@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 from scipy.spatial.transform import Rotation
+from support.command_line import CliRunner, Result
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.cli.plan import problem_of

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from support.command_line import CliRunner, Result
 
 from spacerobot_ros.bag.salvage import Salvaged
 from spacerobot_ros.cli.main import main

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 from sensor_msgs.msg import JointState
 from support.altered_bags import altered
+from support.command_line import CliRunner
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.cli.main import main

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from planning.test_optimal import FOLDER
+from support.command_line import CliRunner
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pypdf
 import pytest
-from click.testing import CliRunner
+from support.command_line import CliRunner
 from support.flight_bags import GOAL, Story, tell
 from support.sentences import assert_one_sentence
 

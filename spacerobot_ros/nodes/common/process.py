@@ -106,7 +106,7 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # The middleware's errors: arguments, parameter files.
-        print(f"ROS 2 does not start: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"ROS 2 does not start: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
         return 2
     stop = rclpy.task.Future()
     node = None
@@ -114,7 +114,7 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
         try:
             node = factory()
         except SpaceRobotError as error:
-            print(f"{error}", file=sys.stderr)
+            print(f"{error}", file=sys.stderr, flush=True)
             return 2
         node.on_end = stop.set_result
         # What is there now stays; going through it again in flight would take tens of ms.
