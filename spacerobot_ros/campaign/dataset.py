@@ -17,9 +17,9 @@ import yaml
 
 from spacerobot_ros import __version__
 from spacerobot_ros.campaign.config import OF_ALL, Campaign, parse_campaign
-from spacerobot_ros.campaign.engines import Row
 from spacerobot_ros.campaign.extras import needed
 from spacerobot_ros.campaign.metrics import joint_names, metric_names
+from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.errors import ParameterError, RecordingError
 from spacerobot_ros.flight.scenario import load_scenario, scenario_text
 from spacerobot_ros.model.urdf import load_robot

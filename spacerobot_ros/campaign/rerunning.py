@@ -10,7 +10,7 @@ from pathlib import Path
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
-from spacerobot_ros.campaign.engines import Row
+from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.recorded import recorded_flight
 

@@ -15,8 +15,9 @@ from typing import Any
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws
-from spacerobot_ros.campaign.engines import Row, chosen_engine, engine_called
+from spacerobot_ros.campaign.engines import chosen_engine, engine_called
 from spacerobot_ros.campaign.extras import needed
+from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.errors import SpaceRobotError
 
 TASK_TIME = 2.0

@@ -7,10 +7,10 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,35 +27,46 @@ GIVEN: dict[str, Any] = {
     "disperse": {"mass.*": {"norm": {"loc": 1.0, "scale": 0.03}}},
     "flights": 120,
     "seed": 8,
+    "engine": "flights",
 }
 _LONGEST = 300.0
 
 
+@dataclass(frozen=True)
+class Started:
+    """A process, and the file that it prints into."""
+
+    process: subprocess.Popen[bytes]
+    log: Path
+
+    def awaited(self, pattern: str) -> str:
+        """Return what it prints of a pattern."""
+        end = time.monotonic() + _LONGEST
+        while not (found := re.search(pattern, self.log.read_text())):
+            assert time.monotonic() < end
+            assert self.process.poll() is None, self.log.read_text()
+            time.sleep(0.05)
+        return found[0]
+
+    def kill(self, number: signal.Signals = signal.SIGKILL) -> int:
+        """Send a signal, wait for the end, and return its code."""
+        os.kill(self.process.pid, number)
+        return self.process.wait(timeout=_LONGEST)
+
+
 @contextmanager
-def started(*command: str) -> Iterator[subprocess.Popen[str]]:
+def started(folder: Path, *command: str) -> Iterator[Started]:
     """Run a process of this Python while the block lasts."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", *command],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-
-
-def awaited(process: subprocess.Popen[str], pattern: str) -> str:
-    """Return what a process prints of a pattern, and read on so that it does not stand still."""
-    assert process.stdout is not None
-    for line in process.stdout:
-        found = re.search(pattern, line)
-        if found:
-            threading.Thread(target=process.stdout.read, daemon=True).start()
-            return found[0]
-    raise AssertionError(f"it ended without {pattern}")
+    log = folder / f"{command[0]}-{len(list(folder.glob('*.log')))}.log"
+    with log.open("wb") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-m", *command], stdout=output, stderr=subprocess.STDOUT
+        )
+        try:
+            yield Started(process, log)
+        finally:
+            process.kill()
+            process.wait()
 
 
 def flown(folder: Path) -> int:
@@ -80,27 +91,22 @@ def test_workers_and_campaigns_that_are_killed(tmp_path: Path) -> None:
     out = tmp_path / "out"
     scheduler = ("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0",
                  "--no-dashboard", "--no-jupyter")  # fmt: skip
-    with started(*scheduler) as process:
-        address = awaited(process, r"tcp://127\.0\.0\.1:\d+")
+    with started(tmp_path, *scheduler) as process:
+        address = process.awaited(r"tcp://127\.0\.0\.1:\d+")
         worker = ("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny",
                   "--no-dashboard", "--host", "127.0.0.1")  # fmt: skip
         command = ("spacerobot_ros", "campaign", str(file), "--out", str(out), "--scheduler")
-        with started(*worker) as first, started(*worker) as second:
+        with started(tmp_path, *worker) as first, started(tmp_path, *worker) as second:
             for each in (first, second):
-                awaited(each, "Registered to")
-            with started(*command, address) as run:
-                assert run.stdout is not None
-                threading.Thread(target=run.stdout.read, daemon=True).start()
+                each.awaited("Registered to")
+            with started(tmp_path, *command, address) as run:
                 until(out, 10)
-                os.kill(first.pid, signal.SIGKILL)
+                first.kill()
                 until(out, flown(out) + 10)
-                os.kill(run.pid, signal.SIGKILL)
-                run.wait()
-            before = flown(out)
-            assert 20 <= before < 120
-            with started(*command, address) as run:
-                said = run.communicate(timeout=_LONGEST)[0]
-            assert run.returncode == 0, said
+                run.kill()
+            assert 20 <= flown(out) < 120
+            with started(tmp_path, *command, address) as run:
+                assert run.process.wait(timeout=_LONGEST) == 0, run.log.read_text()
     run_campaign(campaign(**GIVEN), tmp_path / "undisturbed")
     assert [row["flight"] for row in rows(out)] == list(range(120))
     assert str(rows(out)) == str(rows(tmp_path / "undisturbed"))
@@ -113,7 +119,7 @@ def test_a_flight_that_kills_its_worker_twice_is_reported(tmp_path: Path) -> Non
     (tmp_path / "sitecustomize.py").write_text(
         "import os\n"
         "def poison():\n"
-        "    from spacerobot_ros.campaign import engines\n"
+        "    from spacerobot_ros.campaign import one_by_one as engines\n"
         "    fly = engines.drawn_flight\n"
         "    def flown(campaign, draw, common):\n"
         "        if draw.number == 7: os.kill(os.getpid(), 9)\n"
@@ -140,11 +146,9 @@ def test_what_was_flown_is_kept_after_ctrl_c(tmp_path: Path) -> None:
     file, out = tmp_path / "many.yaml", tmp_path / "out"
     file.write_text(yaml.safe_dump({"campaign": section(**{**GIVEN, "flights": 100000})}))
     command = ("spacerobot_ros", "campaign", str(file), "--out", str(out), "--workers", "2")
-    with started(*command) as run:
+    with started(tmp_path, *command) as run:
         until(out, 8)
-        os.kill(run.pid, signal.SIGINT)
-        said = run.communicate(timeout=60)[0]
-    assert run.returncode == 130, said
+        assert run.kill(signal.SIGINT) == 130, run.log.read_text()
     numbers = [row["flight"] for row in rows(out)]
     assert len(numbers) >= 8
     assert len(numbers) == len(set(numbers))

@@ -11,8 +11,9 @@ from support.campaigns import campaign
 
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.dataset import Dataset
-from spacerobot_ros.campaign.engines import ERROR, FlightsEngine, Row
+from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.rerunning import TOLERANCE, largest_deviation, rerun_flight
+from spacerobot_ros.campaign.rows import ERROR, Row
 from spacerobot_ros.campaign.running import Progress, run_campaign
 from spacerobot_ros.errors import ParameterError
 

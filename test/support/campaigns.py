@@ -6,7 +6,7 @@ from typing import Any
 
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
-from spacerobot_ros.campaign.engines import FlightsEngine
+from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.flight.arrays import FlightArrays
 
 SHORT = {

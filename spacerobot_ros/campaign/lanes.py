@@ -1,0 +1,260 @@
+"""Draws flown in lanes: those that follow one schedule from start to end; others one by one.
+
+The planner's executive makes the plan of each draw, as in every engine. Where it would do anything
+but track that plan to its end and find the goal reached (a correction, a joint that is limited or
+does not follow), the draw is flown again by the engine ``flights``: the rows are the same.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from spacerobot_ros.batch import Flights, FollowedSchedule, SensorErrors, Starts, fly_lanes
+from spacerobot_ros.batch.flights import BatchResult
+from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.draws import Draw, drawn_flight
+from spacerobot_ros.campaign.one_by_one import FlightsEngine, node_robot, robots_of
+from spacerobot_ros.campaign.rows import Row
+from spacerobot_ros.campaign.targets import DrawnFlight
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.arrays import Commands, FlightArrays, Outcome
+from spacerobot_ros.flight.lockstep import fly_scenario
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.inertial_parameters import InertialParameters
+from spacerobot_ros.parameters import values_of
+from spacerobot_ros.planning import GaitSchedule, PoseError
+from spacerobot_ros.planning.execution.status import PlannerStatus, remaining_error
+from spacerobot_ros.simulation.initial_state import InitialState
+
+_INSTANTS = 40
+"""States of a flight that are looked at, beside its last one."""
+
+_MOST_TICKS = 4_000_000
+"""Ticks of one batch: its schedules are in memory."""
+
+_MOST = 512
+"""Flights of one batch."""
+
+_AT_END = 1e-6
+"""A schedule has ended when every joint is this near its last position, m or rad."""
+
+
+@dataclass(frozen=True)
+class _Planned:
+    """A draw with its schedule, and when that was made."""
+
+    draw: Draw
+    flight: DrawnFlight
+    schedule: GaitSchedule
+    gait: PlannerStatus
+    plan_time: float
+
+
+class LanesEngine:
+    """Many flights at once, on vector registers."""
+
+    name = "lanes"
+
+    def __init__(self) -> None:
+        self._flights = FlightsEngine()
+        self._plans: dict[str, tuple[GaitSchedule, PlannerStatus, float]] = {}
+
+    def refusal(self, campaign: Campaign) -> str:
+        """Return why not, as a clause."""
+        why = self._flights.refusal(campaign)
+        if why:
+            return why
+        scenario = campaign.scenario
+        plant = scenario.plant
+        if scenario.commanders != ("planner",) or plant.actuation != "velocity":
+            return "lanes follow the velocities of a planner alone"
+        if plant.faults or any(each.name.startswith("faults") for each in campaign.dispersions):
+            return "it has faults"
+        planner = scenario.planner
+        if planner.averaging > 1 or planner.drift_position or planner.drift_attitude:
+            return "the planner averages states, or watches the path"
+        if planner.replanning or planner.output != "commands":
+            return "the planner plans again on the way"
+        dispersed = [each.name for each in campaign.dispersions]
+        changing = (
+            *("plant.tick_rate", "plant.integration_step", "planner.tick_rate"),
+            *("planner.averaging", "planner.drift", "planner.replan", "planner.shape_"),
+        )
+        if any(name.startswith(changing) for name in dispersed):
+            return "what lanes have in common is dispersed"
+        sensors = plant.sensors
+        joints = sensors.joint_noise or any(sensors.joint_bias)
+        if joints or any(name.startswith("plant.sensors.joint") for name in dispersed):
+            return "the joints are not measured as they are"
+        return ""
+
+    def fly(
+        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
+    ) -> Iterator[Row]:
+        """Fly draws in batches."""
+        common, batch = DrawnFlight.of(campaign.scenario), list[_Planned]()
+        others: list[Draw] = []
+        for draw in draws:
+            if stopped():
+                return
+            try:
+                planned = self._planned(draw, drawn_flight(campaign, draw, common))
+            except SpaceRobotError as error:
+                yield Row.failed(draw, error, self.name)
+                continue
+            if planned is None:
+                others.append(draw)
+                continue
+            batch.append(planned)
+            if len(batch) >= _MOST or sum(each.schedule.ticks for each in batch) > _MOST_TICKS:
+                yield from self._flown(campaign, batch, others)
+                batch = []
+        if batch:
+            yield from self._flown(campaign, batch, others)
+        yield from self._flights.fly(campaign, others, stopped)
+
+    def _planned(self, draw: Draw, flight: DrawnFlight) -> _Planned | None:
+        """Have the executive plan a draw; None where it makes no plan for the first state."""
+        key = _key(flight)
+        if key not in self._plans:
+            began = time.perf_counter()
+            period = flight.scenario.plant.control_period
+            first = fly_scenario(flight.scenario, robots=robots_of(flight), longest=period)
+            if len(first.schedules) != 1 or first.gait is None:
+                return None
+            ((begins_ns, schedule),) = first.schedules
+            if begins_ns or schedule.partial or not schedule.ticks:
+                return None
+            if not _has_noise(flight):
+                self._plans.clear()
+            self._plans[key] = schedule, first.gait, time.perf_counter() - began
+        schedule, gait, taken = self._plans[key]
+        if _has_noise(flight):
+            del self._plans[key]
+        return _Planned(draw, flight, schedule, gait, taken)
+
+    def _flown(
+        self, campaign: Campaign, batch: list[_Planned], others: list[Draw]
+    ) -> Iterator[Row]:
+        """Fly a batch in lanes; what it cannot fly goes to ``others``."""
+        began = time.perf_counter()
+        flights, ends = _flights(batch)
+        result = fly_lanes(flights)
+        taken = (time.perf_counter() - began) / len(batch)
+        for row, planned in enumerate(batch):
+            flight = _flight(result, row, planned, flights, ends[row])
+            if flight is None or flight.duration > campaign.longest:
+                others.append(planned.draw)
+            else:
+                made = Row.of(campaign, planned.draw, flight, self.name)
+                yield replace(made, wall_time=taken + planned.plan_time)
+
+
+def _has_noise(flight: DrawnFlight) -> bool:
+    sensors = values_of(flight.scenario.plant.sensors)
+    return any(np.any(value) for name, value in sensors.items() if name != "seed")
+
+
+def _key(flight: DrawnFlight) -> str:
+    """Return all that the plan of a flight follows from, as a text."""
+    scenario = flight.scenario
+    plant = values_of(scenario.plant)
+    if not _has_noise(flight):
+        plant.pop("sensors.seed")
+    # The robot of the plant is only measured: at rest, whatever its masses are, unless it drifts.
+    moving = any(scenario.plant.linear_momentum) or any(scenario.plant.angular_momentum)
+    if not moving and not scenario.plant.initial_center_of_mass:
+        plant.pop("robot_description")
+    goal = [*scenario.goal.position, *scenario.goal.quaternion]
+    shape = scenario.goal.joint_positions
+    wanted = goal, None if shape is None else shape.tolist()
+    return repr((plant, values_of(scenario.planner), wanted))
+
+
+def _flights(batch: list[_Planned]) -> tuple[Flights, list[int]]:
+    """Return the batch of some draws, and which of its instants is the end of each."""
+    scenario = batch[0].flight.scenario
+    plant = scenario.plant
+    robot = node_robot("plant", batch[0].flight)
+    ticks = [each.schedule.ticks for each in batch]
+    most = max(ticks)
+    instants = np.unique([*np.linspace(0, most, _INSTANTS).astype(int), *ticks]).tolist()
+    configs = [each.flight.scenario.plant for each in batch]
+    nominal = InertialParameters.of(batch[0].flight.nominal)
+    positions: Array = np.array([_padded(each.schedule.positions, most) for each in batch])
+    first = batch[0].schedule
+    if all(each.schedule is first for each in batch):
+        positions = first.positions
+    planner = scenario.planner
+    flights = Flights(
+        robot=robot,
+        actuation="velocity",
+        control_period=plant.control_period,
+        ticks=most,
+        starts=Starts.of(robot, [InitialState.of(config) for config in configs]),
+        program=FollowedSchedule(positions, planner.shape_gain, planner.shape_deadband),
+        inertial=InertialParameters.stacked([each.flight.inertial or nominal for each in batch]),
+        sensors=SensorErrors.of(robot, [config.sensors for config in configs]),
+        integration_step=plant.integration_step,
+        instants=tuple(instants),
+    )
+    return flights, [instants.index(tick) for tick in ticks]
+
+
+def _padded(positions: Array, ticks: int) -> Array:
+    missing = ticks + 1 - len(positions)
+    return np.vstack([positions, np.repeat(positions[-1:], missing, axis=0)])
+
+
+def _flight(
+    result: BatchResult, row: int, planned: _Planned, flights: Flights, end: int
+) -> FlightArrays | None:
+    """Return a flight that has reached its goal at the end of its schedule; None for any other."""
+    if row in result.failures:
+        return None
+    if any(counts[row].any() for counts in result.limited.values()):
+        return None
+    scenario, schedule = planned.flight.scenario, planned.schedule
+    measured, q = result.measured_pose[row, end], result.measured_q[row, end]
+    band = max(_AT_END, scenario.planner.shape_deadband)
+    if np.abs(schedule.positions[-1] - q).max(initial=0.0) > band:
+        return None
+    error = PoseError.between(measured[:3], measured[3:], scenario.goal, q)
+    if not scenario.planner.tolerance.admits(error, schedule.controls):
+        return None
+    kept = slice(0, end + 1)
+    time = result.time[kept]
+    n = schedule.positions.shape[1]
+    # The shape is that of the schedule in every tick: its feedback had nothing to do.
+    status = replace(
+        planned.gait,
+        sentence=f"The goal is reached: {remaining_error(error, schedule.controls)}.",
+    )
+    return FlightArrays(
+        scenario=scenario,
+        robot=planned.flight.nominal,
+        outcome=Outcome.REACHED,
+        sentence=status.sentence,
+        control_period=flights.control_period,
+        time=time,
+        pose=result.pose[row, kept],
+        twist=result.twist[row, kept],
+        q=schedule.positions,
+        qdot=result.peak_rate[row][np.newaxis],
+        effort=np.zeros((1, n)),
+        momentum=result.momentum[row, kept],
+        quantities={},
+        commands={"joint_commands": Commands(np.zeros(0, np.int64), np.zeros((0, n)))},
+        statuses=(),
+        schedules=(),
+        events=(),
+        status=status,
+        gait=planned.gait,
+        plan_time=planned.plan_time,
+        wall_time=math.nan,
+    )

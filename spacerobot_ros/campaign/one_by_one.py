@@ -1,0 +1,151 @@
+"""Draws flown one after the other: without ROS, and through the whole stack."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.draws import Draw, drawn_flight
+from spacerobot_ros.campaign.rows import Row
+from spacerobot_ros.campaign.targets import DrawnFlight
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.arrays import FlightArrays, Outcome
+from spacerobot_ros.flight.lockstep import Robots, fly_scenario, require_flyable
+from spacerobot_ros.flight.recorded import recorded_flight
+from spacerobot_ros.flight.scenario import Scenario, scenario_text
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.robot_source import BelievedRobotConfig, RobotConfig, robot_of
+
+
+class FlightsEngine:
+    """The real plant, planner and controller, without ROS."""
+
+    name = "flights"
+
+    def refusal(self, campaign: Campaign) -> str:
+        """Return why not, as a clause."""
+        try:
+            require_flyable(campaign.scenario)
+        except SpaceRobotError as error:
+            return str(error)
+        return ""
+
+    def fly(
+        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
+    ) -> Iterator[Row]:
+        """Fly one draw after the other."""
+        common = DrawnFlight.of(campaign.scenario)
+        for draw in draws:
+            if stopped():
+                return
+            try:
+                flight = drawn_flight(campaign, draw, common)
+                flown = self.flown(campaign, flight, stopped)
+                if stopped() and flown.outcome is Outcome.INTERRUPTED:
+                    return
+                yield Row.of(campaign, draw, flown, self.name)
+            except Exception as error:  # One flight that cannot be flown does not end the others.
+                yield Row.failed(draw, error, self.name)
+
+    def flown(
+        self,
+        campaign: Campaign,
+        flight: DrawnFlight,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> FlightArrays:
+        """Fly one draw.
+
+        Raises
+        ------
+        SpaceRobotError
+            Something of it is refused.
+        """
+        return fly_scenario(
+            flight.scenario,
+            robots=robots_of(flight),
+            progress=lambda now, end: stopped(),
+            longest=campaign.longest,
+        )
+
+
+def robots_of(flight: DrawnFlight) -> Robots:
+    """Return the models of a flight: built once for all draws that differ in masses alone."""
+    inertial, scenario = flight.inertial, flight.scenario
+    if inertial is None:
+        return Robots.of(scenario, _built)
+    text = scenario.plant.robot_description
+    weighing = node_robot("plant", flight).with_inertial(inertial)
+    # What is saved has the masses that were flown.
+    description = replace(weighing.description, urdf=text)
+    nominal = scenario.with_overrides("plant", {"robot_description": flight.nominal.urdf})
+    return replace(Robots.of(nominal, _built), plant=weighing, description=description)
+
+
+def node_robot(node: str, flight: DrawnFlight) -> SpaceRobot:
+    """Return the robot of a node without dispersions of its masses."""
+    robot = _built_once(node, flight.nominal.urdf, "", 0.0, 0)
+    assert robot is not None
+    return robot
+
+
+def _built(node: str, config: RobotConfig) -> SpaceRobot | None:
+    """Return the robot of a node, the same one as long as the node believes in it."""
+    error, seed = 0.0, 0
+    if isinstance(config, BelievedRobotConfig):
+        error, seed = config.model_error, config.model_error_seed
+    return _built_once(node, config.robot_description, config.robot, error, seed)
+
+
+@lru_cache(maxsize=32)
+def _built_once(node: str, text: str, name: str, error: float, seed: int) -> SpaceRobot | None:
+    # Of each node its own: a robot's functions have buffers.
+    if error:
+        return robot_of(BelievedRobotConfig(text, name, error, seed))
+    return robot_of(RobotConfig(text, name))
+
+
+class RosEngine:
+    """The whole stack, flown by ``spacerobot run`` in a process for each draw."""
+
+    name = "ros"
+
+    def refusal(self, campaign: Campaign) -> str:
+        """Return why not, as a clause."""
+        return "it kills nodes on the way" if campaign.scenario.kills else ""
+
+    def fly(
+        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
+    ) -> Iterator[Row]:
+        """Fly one draw after the other, each in a process and with a bag of its own."""
+        common = DrawnFlight.of(campaign.scenario)
+        for draw in draws:
+            if stopped():
+                return
+            began = time.perf_counter()
+            try:
+                with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
+                    flight = drawn_flight(campaign, draw, common)
+                    bag = Path(folder, "flight.mcap")
+                    self._run(flight.scenario, Path(folder, "draw.yaml"), bag)
+                    flown = recorded_flight(bag)
+                row = Row.of(campaign, draw, flown, self.name)
+                taken = time.perf_counter() - began
+                yield replace(row, wall_time=taken)
+            except Exception as error:
+                yield Row.failed(draw, error, self.name)
+
+    def _run(self, scenario: Scenario, file: Path, bag: Path) -> None:
+        """Fly a scenario in another process: signals and the contexts of ROS are a process's."""
+        file.write_text(scenario_text(scenario), encoding="utf-8")
+        command = [sys.executable, "-m", "spacerobot_ros", "run", str(file), "--bag", str(bag)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if not bag.exists():
+            lines = (done.stderr or done.stdout).strip().splitlines() or ["it left no bag"]
+            raise SpaceRobotError(f"spacerobot run ended with {done.returncode}: {lines[-1]}")

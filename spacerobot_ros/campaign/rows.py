@@ -1,0 +1,84 @@
+"""What comes of a draw, and what flies draws."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from spacerobot_ros.campaign.config import Campaign, passed
+from spacerobot_ros.campaign.draws import Draw
+from spacerobot_ros.campaign.metrics import measured
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.arrays import FlightArrays
+
+ERROR = "error"
+"""The outcome of a flight that could not be flown; the reason says why."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What came of one draw.
+
+    Attributes
+    ----------
+    draw
+        What was drawn.
+    outcome, reason
+        What became of the goal, or ``error``; and the sentence.
+    metrics
+        By name; empty where nothing was flown.
+    passed
+        Whether the goal was reached and every criterion met.
+    engine
+        What flew it.
+    wall_time, plan_time
+        What the flight, and planning in it, took, s.
+    """
+
+    draw: Draw
+    outcome: str
+    reason: str
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    passed: bool = False
+    engine: str = ""
+    wall_time: float = math.nan
+    plan_time: float = math.nan
+
+    @classmethod
+    def of(cls, campaign: Campaign, draw: Draw, flight: FlightArrays, engine: str) -> Row:
+        """Return the row of a flight."""
+        metrics = measured(flight)
+        return cls(
+            draw=draw,
+            outcome=flight.outcome.value,
+            reason=flight.sentence,
+            metrics=metrics,
+            passed=passed(campaign.criteria, flight.outcome.value, metrics),
+            engine=engine,
+            wall_time=flight.wall_time,
+            plan_time=flight.plan_time,
+        )
+
+    @classmethod
+    def failed(cls, draw: Draw, error: BaseException, engine: str) -> Row:
+        """Return the row of a draw that could not be flown."""
+        reason = str(error)
+        if not isinstance(error, SpaceRobotError):
+            reason = f"{type(error).__name__}: {' '.join(reason.split())}"
+        return cls(draw, ERROR, reason, engine=engine)
+
+
+class Engine(Protocol):
+    """Flies draws."""
+
+    name: str
+
+    def refusal(self, campaign: Campaign) -> str:
+        """Return why this engine cannot fly a campaign, as a clause; empty if it can."""
+
+    def fly(
+        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
+    ) -> Iterator[Row]:
+        """Yield a row for each draw; fewer where it is stopped."""

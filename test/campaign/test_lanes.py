@@ -1,0 +1,65 @@
+"""Draws in lanes beside the same draws one by one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from support.campaigns import campaign
+
+from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.draws import Draws
+from spacerobot_ros.campaign.engines import chosen_engine
+from spacerobot_ros.campaign.lanes import LanesEngine
+from spacerobot_ros.campaign.one_by_one import FlightsEngine
+from spacerobot_ros.campaign.rerunning import TOLERANCE, largest_deviation
+from spacerobot_ros.campaign.rows import Row
+from spacerobot_ros.errors import SpaceRobotError
+
+DISPERSED: dict[str, Any] = {
+    "mass.*": {"norm": {"loc": 1.0, "scale": 0.03}},
+    "inertia.*": {"norm": {"loc": 1.0, "scale": 0.03}},
+    "com.*": {"norm": {"scale": 0.002}},
+    "plant.sensors.position_noise": {"uniform": [0.0, 0.001]},
+    "goal.position.z": {"norm": {"scale": 0.002}},
+    "initial.position.x": {"norm": {"scale": 0.002}},
+    "initial.rotvec.y": {"norm": {"scale": 0.002}},
+}
+
+
+def flown(engine: LanesEngine | FlightsEngine, made: Campaign) -> dict[int, Row]:
+    rows = engine.fly(made, list(Draws(made)), lambda: False)
+    return {row.draw.number: row for row in rows}
+
+
+@pytest.mark.parametrize("tolerance", [0.05, 0.0012])
+def test_the_same_draw_is_the_same_flight_in_every_engine(tolerance: float) -> None:
+    """A tight tolerance makes some need a correction, which lanes leave to the planner."""
+    tolerances = {"planner.position_tolerance": 0.05, "planner.attitude_tolerance": tolerance}
+    made = campaign(disperse=DISPERSED, flights=12, seed=1, set=tolerances)
+    lanes, one_by_one = flown(LanesEngine(), made), flown(FlightsEngine(), made)
+    assert lanes.keys() == one_by_one.keys() == set(range(12))
+    for number, row in one_by_one.items():
+        other = lanes[number]
+        deviation, at = largest_deviation(row.metrics, other.metrics)
+        assert deviation < TOLERANCE, (number, at, deviation)
+        assert (row.outcome, row.reason) == (other.outcome, other.reason)
+        assert row.passed is other.passed
+    engines = [row.engine for row in lanes.values()]
+    corrected = sum(row.metrics["corrections"] > 0 for row in one_by_one.values())
+    assert engines.count("flights") == corrected
+    assert 0 < corrected < 12 if tolerance < 0.01 else not corrected
+
+
+def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
+    made = campaign(disperse=DISPERSED)
+    assert chosen_engine(made, "auto").name == "lanes"
+    assert chosen_engine(made, "flights").name == "flights"
+    stuck = campaign(set={"plant.faults": ["joint_stuck slider_1 at 1"]})
+    assert chosen_engine(stuck, "auto").name == "flights"
+    with pytest.raises(SpaceRobotError, match="'lanes' cannot fly this campaign: it has faults"):
+        chosen_engine(stuck, "lanes")
+    background = campaign(set={"planner.plan_in_background": True})
+    assert chosen_engine(background, "auto").name == "ros"
+    for given in ({"plant.sensors.joint_noise": 1e-3}, {"planner.averaging": 3}):
+        assert chosen_engine(campaign(set=given), "auto").name == "flights"
