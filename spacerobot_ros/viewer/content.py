@@ -56,7 +56,7 @@ def rpy_from_quaternion(quaternion: Array) -> Array:
     return np.array([roll, math.asin(sine), yaw])
 
 
-def quaternion_from_rpy(rpy: Sequence[float]) -> Array:
+def quaternion_from_rpy(rpy: Sequence[float] | Array) -> Array:
     """Return the quaternion (x, y, z, w) of such angles, rad."""
     halves = 0.5 * np.asarray(rpy, float)
     (sr, sp, sy), (cr, cp, cy) = np.sin(halves), np.cos(halves)

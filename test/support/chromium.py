@@ -107,16 +107,27 @@ class Browser:
 
     def call(self, method: str, **parameters: Any) -> Any:
         """Send a command and return its result."""
-        self._number += 1
-        message = {"id": self._number, "method": method, "params": parameters}
-        if self._session is not None:
-            message["sessionId"] = self._session
-        os.write(self._out, json.dumps(message).encode() + b"\0")
+        number = self._send(self._session, method, **parameters)
         for answer in self._messages():
-            if answer.get("id") == self._number:
+            if answer.get("id") == number:
                 assert "error" not in answer, (method, answer["error"])
                 return answer["result"]
         raise AssertionError("the browser has ended")
+
+    def _send(self, session: str | None, method: str, **parameters: Any) -> int:
+        """Send a command, and return its number."""
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters}
+        if session is not None:
+            message["sessionId"] = session
+        os.write(self._out, json.dumps(message).encode() + b"\0")
+        return self._number
+
+    def watch_workers(self) -> None:
+        """Take note of what the workers of pages ask for as well, and of what they complain of."""
+        self.call(
+            "Target.setAutoAttach", autoAttach=True, waitForDebuggerOnStart=True, flatten=True
+        )
 
     def open(self, page: Path, width: int = 1000, height: int = 800) -> None:
         """Open a file in a window of a size."""
@@ -178,6 +189,9 @@ class Browser:
 
     def _note(self, message: Any) -> None:
         kind, details = message.get("method"), message.get("params", {})
+        if kind == "Target.attachedToTarget" and self._session is not None:
+            for command in ("Network.enable", "Runtime.enable", "Runtime.runIfWaitingForDebugger"):
+                self._send(details["sessionId"], command)
         if kind == "Runtime.exceptionThrown":
             self.complaints.append(str(details["exceptionDetails"]))
         elif kind == "Runtime.consoleAPICalled" and details["type"] in ("error", "assert"):

@@ -105,6 +105,8 @@ class Page:
 
     def __init__(self, window: Browser, url: str, width: int = 1200, height: int = 800) -> None:
         self._window, self._url, self._size = window, url, (width, height)
+        # The page receives in a worker what the viewer sends.
+        window.watch_workers()
         window.visit(url, width, height)
         self.wait_for_text("Log")
 

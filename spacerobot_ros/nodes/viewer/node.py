@@ -33,6 +33,7 @@ from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.remote_parameters import RemoteParameters
 from spacerobot_ros.nodes.viewer.listener import Listener
 from spacerobot_ros.planning import Goal, RobotState
+from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import Targets
 from spacerobot_ros.viewer.config import ViewerConfig
@@ -81,6 +82,12 @@ _SERVICES: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
 }
 """Whose service a request calls, which one, and what it is told (None: it is a trigger)."""
 
+_LONGEST_MEETING = 4.0
+"""Wall s that a goal waits for commanders that are known and not met yet."""
+
+_LONGEST_ANSWER = 5.0
+"""Wall s after which a commander that has a goal has said so."""
+
 _MICROSECOND_NS = 1000
 _FLAG_NS = 1_000_000
 
@@ -124,6 +131,8 @@ class ViewerNode(FlightNode):
         self._asking: dict[str, RemoteParameters] = {}
         self._planner_state: PlannerState | None = None
         self._sent = 0
+        self._to_send: tuple[Mapping[Part, Goal], float] | None = None
+        self._unanswered: tuple[str, float] | None = None
         # Nobody spins this one: its messages wait until the page is drawn.
         self._streams = rclpy.create_node(
             f"_{self.get_name()}_streams",
@@ -190,6 +199,7 @@ class ViewerNode(FlightNode):
         if state.planner is not None and state.planner.state is not self._planner_state:
             self._planner_state = state.planner.state
             self._page.touch_goal(now)  # The robot is elsewhere.
+        self._send_goals(state, now)
         self._check_goal(state, now)
 
     def _check_goal(self, state: StackState, now: float) -> None:
@@ -326,7 +336,7 @@ class ViewerNode(FlightNode):
     def _carry_out(self, action: Action, state: StackState) -> None:
         match action:
             case Fly(goals):
-                self._send(goals)
+                self._to_send = goals, time.monotonic() + _LONGEST_MEETING
             case Inject(text):
                 self._fault_topic.publish(String(data=text))
                 self._note(f"Sent to the plant: {text}", source="page")
@@ -335,15 +345,38 @@ class ViewerNode(FlightNode):
             case Request():
                 self._request(action)
 
+    def _send_goals(self, state: StackState, now: float) -> None:
+        """Send what is to be sent once its readers are met, and notice where nobody answers."""
+        if self._to_send is not None:
+            goals, until = self._to_send
+            topics = [self._goal_topics[part] for part in goals]
+            # A commander that has just begun is known before it can be reached.
+            met = all(
+                topic.get_subscription_count() >= self.count_subscribers(topic.topic_name)
+                for topic in topics
+            )
+            if met or now >= until:
+                self._to_send = None
+                self._send(goals)
+        if self._unanswered is not None:
+            goal_id, until = self._unanswered
+            statuses = (state.planner, state.controller)
+            if any(status is not None and status.goal_id == goal_id for status in statuses):
+                self._unanswered = None
+            elif now >= until:
+                self._unanswered = None
+                self._note("Nobody has answered the goal: send it again.", 2, "page")
+
     def _send(self, goals: Mapping[Part, Goal]) -> None:
         # No other goal has this stamp, by which statuses name it: other viewers may send one now.
         self._sent += 1
         flag = time.time_ns() // _MICROSECOND_NS * _MICROSECOND_NS % _FLAG_NS
-        stamp = divmod(carried(self._listener.time_ns() + flag + self._sent % 1000), NANOSECONDS)
+        time_ns = self._listener.time_ns() + flag + self._sent % 1000
+        sec, nanosec = divmod(carried(time_ns), NANOSECONDS)
         for part, goal in goals.items():
             message = PoseStamped()
             message.header.frame_id = self.config.world_frame
-            message.header.stamp.sec, message.header.stamp.nanosec = stamp
+            message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
             p, o = message.pose.position, message.pose.orientation
             p.x, p.y, p.z = goal.position.tolist()
             o.x, o.y, o.z, o.w = goal.quaternion.tolist()
@@ -354,6 +387,8 @@ class ViewerNode(FlightNode):
             self._note("Nobody takes the goal: no planner and no controller is there.", 2, "page")
         else:
             self._note("The goal is sent.", source="page")
+            goal_id = GoalIds().of(sec, nanosec)
+            self._unanswered = goal_id, time.monotonic() + _LONGEST_ANSWER
         self._checker.cancel()
 
     def _request(self, request: Request) -> None:

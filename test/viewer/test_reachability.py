@@ -1,0 +1,111 @@
+"""Goals that are checked in the background: against the planner of a stack, cancelled and not."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from threading import Event
+
+import numpy as np
+import pytest
+
+from spacerobot_ros import plan
+from spacerobot_ros.model import load_robot
+from spacerobot_ros.parameters import values_of
+from spacerobot_ros.planning import Goal, RobotState
+from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.viewer.reachability import Check, GoalChecker, Planner, Question, Verdict
+
+URDF = load_robot(robot_file("sliding_masses")).urdf
+ORIGIN = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+SPEED = {"method": "lie_bracket", "lie_bracket.t1": 4.0, "lie_bracket.cycles": 0}
+
+
+def question(*position: float, **parameters: object) -> Question:
+    """Ask for a position, of a planner with such parameters."""
+    values = {**values_of(PlannerConfig()), **SPEED, **parameters, "robot": "elsewhere.urdf"}
+    texts = {name: json.dumps(value) for name, value in values.items()}
+    goal = Goal.checked(position, [0.0, 0.0, 0.0, 1.0])
+    return Question(URDF, texts, ORIGIN, goal)
+
+
+def as_asked(asked: Question) -> dict[str, object]:
+    return dict(json.loads(asked.to_json(1)))
+
+
+def test_an_answer_is_what_the_planner_would_plan() -> None:
+    answer = Planner().answer(as_asked(question(0.1, 0.0, 0.05, tick_rate=10.0)), Cancellation())
+    own = plan(
+        "sliding_masses", position=(0.1, 0.0, 0.05), method="lie_bracket", t1=4.0, cycles=0,
+        control_period=0.1,
+    )  # fmt: skip
+    assert answer["verdict"] == "reachable"
+    assert answer["duration_s"] == pytest.approx(own.duration)
+    np.testing.assert_allclose(answer["shape"], own.positions[-1], atol=1e-9)
+    np.testing.assert_allclose(answer["path"][-1], own.path.position[-1], atol=1e-12)
+
+
+def test_a_refusal_has_the_sentence_of_the_planner_and_the_next_goal_is_planned() -> None:
+    planner = Planner()
+    refused = planner.answer(as_asked(question(9.0, 0.0, 0.0)), Cancellation())
+    assert refused["verdict"] == "refused"
+    assert "slider" in refused["sentence"] or "limits" in refused["sentence"]
+    wrong = planner.answer(as_asked(question(0.1, 0.0, 0.0, method="none")), Cancellation())
+    assert (wrong["verdict"], "method" in wrong["sentence"]) == ("refused", True)
+    assert planner.answer(as_asked(question(0.1, 0.0, 0.0)), Cancellation())["verdict"] == (
+        "reachable"
+    )
+
+
+def test_a_cancelled_check_has_no_answer() -> None:
+    cancellation = Cancellation()
+    cancellation.cancel()
+    with pytest.raises(PlanningCancelled):
+        Planner().answer(as_asked(question(0.1, 0.0, 0.0, method="optimal")), cancellation)
+
+
+@pytest.fixture
+def checker() -> Iterator[GoalChecker]:
+    checker = GoalChecker()
+    yield checker
+    checker.close()
+
+
+def looked(checker: GoalChecker, until: Callable[[Check], bool]) -> list[Check]:
+    """Look until an answer is as wanted; return all that were there."""
+    found: list[Check] = []
+    end = time.monotonic() + 60.0
+    while not (found and until(found[-1])):
+        assert time.monotonic() < end, found[-3:]
+        check = checker.look()
+        if check is not None:
+            found.append(check)
+        Event().wait(0.005)  # The process needs the processor.
+    return found
+
+
+def test_the_last_goal_is_the_one_that_is_answered(checker: GoalChecker) -> None:
+    for x in (0.1, 0.2, 9.0, 0.05):
+        checker.ask(question(x, 0.0, 0.0))
+    seen = looked(checker, lambda check: check.verdict is not Verdict.PLANNING)
+    assert seen[-1].verdict is Verdict.REACHABLE
+    assert seen[-1].path is not None
+    assert seen[-1].path[-1][0] == pytest.approx(0.05, abs=1e-3)
+    assert {check.verdict for check in seen[:-1]} <= {Verdict.PLANNING}
+    assert checker.look() is None
+    # One that is cancelled has no answer, and a process that is killed has a successor.
+    checker.ask(question(0.1, 0.0, 0.0))
+    checker.cancel()
+    assert checker.look() is None
+    assert checker._process is not None
+    checker._process.kill()
+    checker._process.wait()
+    checker.ask(question(9.0, 0.0, 0.0))
+    seen = looked(checker, lambda check: check.verdict is not Verdict.PLANNING)
+    assert seen[-1].verdict is Verdict.REFUSED
+    process = checker._process
+    checker.close()
+    assert process.poll() is not None

@@ -1,0 +1,211 @@
+"""What the page says: texts, colors and numbers, and which of them users may send on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from spacerobot_ros.bag.playback import ReplayStatus
+from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
+from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.model import load_robot
+from spacerobot_ros.model.rotations import matrix_from_quaternion, matrix_from_rpy
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.faults import Targets
+from spacerobot_ros.simulation.status import PlantState, PlantStatus
+from spacerobot_ros.viewer import content
+from spacerobot_ros.viewer.content import History, Trail
+from spacerobot_ros.viewer.goal_editor import carried
+from spacerobot_ros.viewer.port import Measured, Momenta, Notice, StackState
+from spacerobot_ros.viewer.reachability import Check, Verdict
+
+HERE = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0])
+STATE = StackState(Measured(4.0, HERE, np.zeros(3), np.zeros(3), np.zeros(3)), age_s=0.1)
+
+angles = st.floats(-math.pi, math.pi)
+
+
+@given(angles, st.floats(-math.pi / 2, math.pi / 2), angles)
+def test_angles_on_the_page_are_those_of_a_urdf(roll: float, pitch: float, yaw: float) -> None:
+    quaternion = content.quaternion_from_rpy((roll, pitch, yaw))
+    R = matrix_from_rpy([roll, pitch, yaw])
+    np.testing.assert_allclose(matrix_from_quaternion(quaternion), R, atol=1e-12)
+    again = matrix_from_rpy(content.rpy_from_quaternion(quaternion))
+    # At a pitch of 90 deg the angles are badly conditioned, like the arcsine.
+    np.testing.assert_allclose(again, R, atol=2e-7)
+
+
+def test_a_vertical_pitch_has_angles() -> None:
+    for pitch in (math.pi / 2, -math.pi / 2):
+        q = content.quaternion_from_rpy((0.3, pitch, 0.8))
+        again = content.quaternion_from_rpy(content.rpy_from_quaternion(q))
+        np.testing.assert_allclose(
+            matrix_from_quaternion(again), matrix_from_quaternion(q), atol=1e-7
+        )
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, 1e300])
+def test_numbers_that_are_no_goal_are_refused(number: float) -> None:
+    with pytest.raises(GoalError):
+        content.goal_of((0.0, number, 0.0), (0.0, 0.0, 0.0, 1.0))
+    with pytest.raises(GoalError):
+        content.goal_of((0.0, 0.0, 0.0), content.quaternion_from_rpy((0.0, math.nan, 0.0)))
+
+
+def test_silence_is_said() -> None:
+    assert "No state has come yet" in content.silence(StackState())
+    assert content.silence(STATE) == ""
+    assert content.silence(replace(STATE, age_s=5.9)) == "No state for 5 s."
+    paused = PlantStatus(PlantState.PAUSED, "Time stands still.")
+    assert content.silence(replace(STATE, age_s=5.9, plant=paused)) == ""
+    held = ReplayStatus(1.0, 2.0, paused=True, ended=False, rate=1.0)
+    assert content.silence(replace(STATE, age_s=5.9, replay=held)) == ""
+    plays = replace(held, paused=False)
+    assert content.silence(replace(STATE, age_s=5.9, replay=plays)) == "No state for 5 s."
+    head = content.head(replace(STATE, silent={"/planner": 3.2}))
+    assert "Node &#x27;/planner&#x27; is silent for 3 s." in head
+
+
+def test_time_to_go_is_of_the_schedule_that_is_flown() -> None:
+    executing = PlannerStatus(PlannerState.EXECUTING, manoeuvre_time_s=8.0, ends_at_s=10.0)
+    flying = replace(STATE, planner=executing)
+    assert content.time_to_go(flying) == pytest.approx(6.0)
+    assert content.share_flown(flying) == pytest.approx(0.25)
+    assert "6.0 s to go" in content.head(flying)
+    assert content.time_to_go(STATE) is None
+    assert content.share_flown(STATE) == 0.0
+    reached = replace(STATE, planner=replace(executing, state=PlannerState.REACHED))
+    assert content.time_to_go(reached) is None
+    late = replace(STATE, planner=replace(executing, ends_at_s=3.0))
+    assert content.time_to_go(late) == 0.0
+    assert content.share_flown(late) == 1.0
+
+
+def test_what_nodes_say_is_no_html() -> None:
+    evil = "<img src=x onerror=alert(1)>"
+    state = replace(
+        STATE,
+        plant=PlantStatus(PlantState.LATCHED, evil, faults=(evil,)),
+        planner=PlannerStatus(PlannerState.REFUSED, evil),
+        controller=ControllerStatus(ControllerState.STOPPED, evil),
+        silent={evil: 3.0},
+    )
+    texts = [
+        content.head(state),
+        content.faults((evil,)),
+        content.quiet(evil),
+        content.verdict(Check(Verdict.REFUSED, evil)),
+        content.log([Notice(evil, 2, 1.0, evil)]),
+    ]
+    robot = load_robot(robot_file("three_joint_arm"))
+    urdf = robot.urdf.replace(robot.joint_names[0], "a&lt;b&gt;c")
+    assert "&lt;img" in texts[0]
+    assert all("<img" not in text for text in texts)
+    from spacerobot_ros.model.urdf import parse_robot
+
+    zeros = np.zeros(3)
+    table = content.joints(parse_robot(urdf), zeros, zeros, zeros)
+    assert "a&lt;b&gt;c" in table
+    assert "a<b>c" not in table
+
+
+def test_joints_stand_beside_their_limits() -> None:
+    robot = load_robot(robot_file("sliding_masses"))
+    lower, upper = robot.limits("lower"), robot.limits("upper")
+    middle = (lower + upper) / 2
+    rows = content.joints(robot, middle, np.zeros(3), np.zeros(3)).split("<tr>")[2:]
+    assert [name in row for name, row in zip(robot.joint_names, rows, strict=True)] == [True] * 3
+    assert all("left:50%" in row for row in rows)
+    near = upper - 0.01 * (upper - lower)
+    assert content.joints(robot, near, np.zeros(3), np.zeros(3)).count("left:99%") == 3
+    beyond = content.joints(robot, upper + 1.0, np.zeros(3), np.zeros(3))
+    assert beyond.count("left:100%;") == 3
+    assert beyond.count("#d23c3c") == 3
+
+
+def test_errors_are_to_the_goal() -> None:
+    assert content.base_error(STATE) is None
+    turned = content.quaternion_from_rpy((0.0, 0.0, 0.5))
+    goal = Goal(np.array([1.0, 2.0, 5.0]), turned)
+    assert content.base_error(replace(STATE, goals={"base": goal})) == pytest.approx((2.0, 0.5))
+    errors = {"base.x": 9.0, "end_effector.x": 3.0, "end_effector.y": 4.0, "end_effector.rz": 0.2}
+    report = CommandReport("model_based", False, 1.0, 0.0, 0.0, 0.0, 0.0, errors)
+    controlled = ControllerStatus(ControllerState.TRACKING, command=report)
+    assert content.tool_error(replace(STATE, controller=controlled)) == pytest.approx((5.0, 0.2))
+    assert content.tool_error(STATE) is None
+
+
+def test_momenta_are_compared_with_what_they_should_be() -> None:
+    actual, first = np.arange(6.0), np.zeros(6)
+    alone = Momenta(actual, None, 0.0)
+    assert content.momentum_drift(alone, actual) == (0.0, 0.0)
+    assert content.momentum_drift(alone, first) == pytest.approx((math.sqrt(5), math.sqrt(50)))
+    pushed = Momenta(actual, actual - [0, 0, 2, 0, 3, 0], 0.0)
+    assert content.momentum_drift(pushed, first) == pytest.approx((2.0, 3.0))
+
+
+def test_faults_are_written_for_the_plant() -> None:
+    targets = Targets(("elbow",), wrench=False)
+    kinds = content.fault_kinds(targets)
+    assert kinds["joint_stuck"] == ["elbow"]
+    assert "thruster_off" not in kinds
+    assert "nozzle_open" not in kinds
+    line = content.fault_line("joint_slow", "elbow", 0.5, 10.0, 2.5, targets)
+    assert line == "joint_slow elbow 0.5 until 12.5"
+    assert content.fault_line("joint_stuck", "elbow", 9.0, 0.0, 2.5, targets) == "joint_stuck elbow"
+    for kind, target, value, lasts in (
+        ("joint_slow", "elbow", 2.0, 0.0),
+        ("joint_slow", "elbow", math.nan, 0.0),
+        ("joint_slow", "knee", 0.5, 0.0),
+        ("-", "-", 0.5, 0.0),
+        ("joint_stuck", "elbow", 0.0, math.nan),
+        ("joint_stuck", "elbow", 0.0, -1.0),
+    ):
+        with pytest.raises(ParameterError):
+            content.fault_line(kind, target, value, lasts, 2.5, targets)
+
+
+def test_history_keeps_the_last_minutes_and_forgets_a_time_that_comes_again() -> None:
+    history = History(1, span_s=100.0, most=50)
+    assert all(np.isnan(column).all() for column in history.columns())
+    for k in range(1000):
+        history.add(0.5 * k, [float(k)])
+    time, values = history.columns()
+    assert len(time) <= 50
+    assert time[-1] == 499.5
+    assert time[0] >= 399.5
+    np.testing.assert_array_equal(values, 2 * time)
+    assert np.all(np.diff(time) > 0)
+    history.add(450.0, [-1.0])
+    time, values = history.columns()
+    assert (time[-1], values[-1]) == (450.0, -1.0)
+    assert np.all(np.diff(time) > 0)
+
+
+def test_a_trail_is_as_long_as_the_flight_with_as_many_points_as_are_drawn() -> None:
+    trail = Trail(0.01, most=100)
+    for k in range(10_000):
+        trail.add(float(k), np.array([0.005 * k, 0.0, 0.0]))
+    assert 50 <= len(trail.points) <= 100
+    assert trail.points[0][0] == 0.0
+    assert trail.points[-1][0] > 48.0
+    trail.add(100.0, np.array([0.5, 1.0, 0.0]))
+    assert trail.points[-1].tolist() == [0.5, 1.0, 0.0]
+    assert trail.points[-2][0] < 0.5
+
+
+def test_a_goal_that_is_carried_along_stays_where_it_is_beside_the_base() -> None:
+    quarter = content.quaternion_from_rpy((0.0, 0.0, math.pi / 2))
+    before = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    after = np.concatenate([[5.0, 5.0, 5.0], quarter])
+    tool = np.array([3.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
+    moved = carried(tool, before, after)
+    np.testing.assert_allclose(moved[:3], [5.0, 7.0, 5.5], atol=1e-12)
+    np.testing.assert_allclose(moved[3:], quarter, atol=1e-12)

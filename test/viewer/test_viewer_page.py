@@ -1,0 +1,157 @@
+"""The page in a real browser: what its users do, against what the robot then does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Odometry
+from support.chromium import browser, chromium
+from support.ros_harness import Harness, Probe
+from support.viewer_page import ROOT, Page, Processes, processes
+
+from spacerobot_ros.model import load_robot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.viewer.page import CAMERA
+from spacerobot_ros.viewer.scene import reach_of
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(chromium() is None, reason="no Chromium to open the page with"),
+]
+
+FILE = ("--params-file", str(ROOT / "config" / "sliding_masses.yaml"))
+# A browser that draws without a graphics card leaves little of a processor to the planner.
+PLANT = ("time_mode:=realtime", "real_time_factor:=4.0", "command_timeout:=60.0")
+PLANNER = ("plan_in_background:=true",)
+POSITION, ANGLES = "Goal (m)", "Roll, pitch, yaw (deg)"
+
+
+@pytest.fixture
+def harness(ros_context: object) -> Iterator[Harness]:
+    harness = Harness(ros_context)
+    yield harness
+    harness.close()
+
+
+@pytest.fixture
+def nodes(tmp_path: Path, ros_domain: int) -> Iterator[Processes]:
+    with processes(tmp_path, ros_domain) as started:
+        yield started
+
+
+class Watched:
+    """What the stack says, heard by a tool beside the viewer."""
+
+    def __init__(self, harness: Harness) -> None:
+        self._harness = harness
+        topics = {"odom": Odometry, "plant/status": DiagnosticStatus}
+        topics["planner/status"] = DiagnosticStatus
+        latched = ("plant/status", "planner/status")
+        self.probe: Probe = harness.probe(topics, latched=latched)
+
+    def hear(self) -> None:
+        """Take what has come."""
+        self._harness.settle(self.probe)
+
+    @property
+    def position(self) -> Array:
+        p = self.probe.last("odom").pose.pose.position
+        return np.array([p.x, p.y, p.z])
+
+    def value(self, topic: str, key: str) -> str:
+        values = {pair.key: pair.value for pair in self.probe.last(topic).values}
+        return str(values.get(key, ""))
+
+    def wait(self, topic: str, key: str, value: str) -> None:
+        self._harness.spin_until(
+            lambda: self.probe.count(topic) and self.value(topic, key) == value,
+            f"{key} of {topic} is {value}",
+            timeout=60.0,
+        )
+
+
+def test_a_mission_is_flown_from_the_page(
+    harness: Harness, nodes: Processes, tmp_path: Path
+) -> None:
+    # The page is opened before there is anything to see.
+    url = nodes.start_viewer()
+    with browser(tmp_path / "profile") as window:
+        page = Page(window, url)
+        page.wait_for_text("No state has come yet")
+        page.press("Fly")
+        nodes.start("plant", *PLANT, files=FILE)
+        nodes.start("planner", *PLANNER, files=FILE)
+        watched = Watched(harness)
+        page.wait_for_text("Waiting for a goal pose.", "Goal reachable")
+        watched.hear()
+        np.testing.assert_allclose(watched.position, 0.0, atol=1e-9)
+        assert watched.value("planner/status", "state") == "idle", "opening it moves nothing"
+
+        # The gizmo is dragged along the vertical axis, and the goal is checked anew.
+        reach = reach_of(load_robot(ROOT / "urdf" / "sliding_masses.urdf"))
+        tip, to = (np.array([0.0, 0.0, z * reach]) for z in (0.40, 0.46))
+        camera = reach * CAMERA
+        page.drag(page.pixel(tip, camera), page.pixel(to, camera))
+        x, y, z = page.numbers(POSITION)
+        assert (x, y) == (0.0, 0.0)
+        assert z == pytest.approx(0.06 * reach, rel=0.2)
+        page.wait_for_text("Goal reachable", "by 'optimal'", without="in 0 s")
+        page.press("Fly")
+        watched.wait("planner/status", "state", "reached")
+        watched.hear()
+        np.testing.assert_allclose(watched.position, [0, 0, z], atol=0.02)
+        page.wait_for_text("reached")
+
+        # A goal that no robot of these strokes reaches is red, and is refused when it is sent.
+        page.type(POSITION, (9, 0, 0))
+        page.wait_for_text("Goal refused")
+        page.press("Fly")
+        watched.wait("planner/status", "state", "refused")
+
+        # A flight is aborted.
+        page.type(POSITION, (0.3, -0.25, 0.1))
+        page.wait_for_text("Goal reachable")
+        page.press("Fly")
+        watched.wait("planner/status", "state", "executing")
+        page.press("Abort")
+        watched.wait("planner/status", "state", "aborted")
+        page.wait_for_text("aborted")
+        watched.hear()
+        stopped = watched.position
+        assert np.linalg.norm(stopped - [0.3, -0.25, 0.1]) > 0.05
+
+        # A fault is injected, seen and cleared.
+        page.press("Faults")
+        page.wait_for_text("No fault is active.")
+        page.press("Inject")
+        page.wait_for_text("joint_stuck", "for good")
+        harness.spin_until(
+            lambda: "joint_stuck" in watched.value("plant/status", "faults"), "a fault is active"
+        )
+        page.wait_for_text("joint_stuck slider", without="No fault is active.")
+        page.press("Clear faults")
+        page.wait_for_text("No fault is active.")
+        watched.wait("plant/status", "faults", "")
+
+        # The planner dies and comes again; the page goes on.
+        nodes.kill("planner")
+        page.wait_for_text("Node '/planner' is silent")
+        nodes.start("planner", *PLANNER, files=FILE)
+        page.wait_for_text("Waiting for a goal pose.", without="is silent")
+        page.press("Goal")
+        page.type(POSITION, (0, 0, 0))
+        page.wait_for_text("Goal reachable")
+        page.press("Fly")
+        watched.wait("planner/status", "state", "reached")
+        watched.hear()
+        np.testing.assert_allclose(watched.position, 0.0, atol=0.02)
+
+        assert page.frames_per_s(3.0, time.monotonic) > 10.0
+        assert window.complaints == []
+        assert page.requests_outside() == []
+    assert "Traceback" not in nodes.log("viewer")
