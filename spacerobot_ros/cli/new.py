@@ -10,6 +10,7 @@ import click
 
 from spacerobot_ros.cli.errors import fail
 from spacerobot_ros.cli.options import PATH
+from spacerobot_ros.cli.progress import display
 
 
 @click.command("new")
@@ -23,7 +24,7 @@ def command(robot: str, out: Path | None) -> None:
     """
     from spacerobot_ros.bag import free_name
     from spacerobot_ros.cli.analyze import lines_of
-    from spacerobot_ros.cli.plan import progress, table
+    from spacerobot_ros.cli.plan import table
     from spacerobot_ros.model import SpaceRobot
     from spacerobot_ros.planning.analysis import analyze
     from spacerobot_ros.resources import is_path, robot_file
@@ -32,14 +33,16 @@ def command(robot: str, out: Path | None) -> None:
 
     file = robot_file(robot)
     model = SpaceRobot.from_file(file)
-    for line in lines_of(analyze(model)):
+    name = file.name.split(".")[0]
+    with display(name):
+        known = analyze(model)
+    for line in lines_of(known):
         click.echo(line)
     for remark in remarks(model.description):
         click.echo(f"{'to mind':<13}{remark}")
     click.echo()
-    name = file.name.split(".")[0]
     problem = first_problem(name, model, file)
-    with progress():
+    with display(name):
         found = compare(problem)
     for line in table(found):
         click.echo(line)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +23,7 @@ from spacerobot_ros.cli.options import (
     write,
     write_json,
 )
+from spacerobot_ros.cli.progress import display
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 
 if TYPE_CHECKING:
@@ -83,7 +82,7 @@ def command(
         _try_random(problem, [method] if beside is None else [method, beside], count, within)
         return
     found: Mapping[str, Trial | SpaceRobotError]
-    with progress():
+    with display(scenario):
         found = compare(problem) if comparing else {method: try_method(problem, method)}
     if comparing:
         for line in table(found):
@@ -222,20 +221,3 @@ def _row(record: Record) -> str:
     low, middle, high = np.quantile(record.durations, [0.0, 0.5, 1.0])
     planned, longest = np.quantile(record.plan_times, [0.5, 1.0])
     return f"{counts}{low:>10.4g}{middle:>10.4g}{high:>10.4g}{planned:>11.3g}{longest:>9.3g}"
-
-
-@contextmanager
-def progress() -> Iterator[None]:
-    """Show what the methods log of their search, where somebody is looking."""
-    log, handler = logging.getLogger("spacerobot_ros.planning"), logging.StreamHandler(sys.stderr)
-    if not sys.stderr.isatty():
-        yield
-        return
-    level = log.level
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        log.removeHandler(handler)
-        log.setLevel(level)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +23,7 @@ from spacerobot_ros.cli.options import (
     viewing_if,
     write_json,
 )
+from spacerobot_ros.cli.progress import display
 
 if TYPE_CHECKING:
     from spacerobot_ros.flight.scenario import Scenario
@@ -74,8 +72,8 @@ def command(
     if view and realtime is None:
         raise click.UsageError("--view needs --realtime: what is flown in lockstep is over soon.")
     path = bag or free_name(Path("out") / f"{chosen.name}.mcap")
-    with viewing_if(view, chosen.parameters("viewer")), _progress(chosen.name) as progress:
-        result = run_scenario(chosen, path, progress, processes=processes)
+    with viewing_if(view, chosen.parameters("viewer")), display(chosen.name) as shown:
+        result = run_scenario(chosen, path, shown.fly, processes=processes)
     path = Path(result.summary["bag"])
     if json_file is not None:
         write_json(json_file, result.summary)
@@ -107,21 +105,6 @@ def _chosen(
         scenario = scenario.in_real_time(realtime)
     scenario = scenario.with_settings(settings)
     return scenario if method is None else scenario.with_method(method)
-
-
-@contextmanager
-def _progress(label: str) -> Iterator[Callable[[float, float], None]]:
-    """Show simulated time against the end of the schedule, where somebody is looking."""
-    if not sys.stderr.isatty():
-        yield lambda now, end: None
-        return
-    with click.progressbar(length=1000, label=label, file=sys.stderr) as bar:
-
-        def show(now: float, end: float) -> None:
-            share = min(now / end, 1.0) if end > 0 else 0.0
-            bar.update(max(0, int(1000 * share) - bar.pos))
-
-        yield show
 
 
 def _summary_lines(summary: dict[str, Any]) -> list[str]:

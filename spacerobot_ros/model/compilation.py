@@ -15,6 +15,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import json
+import logging
 import math
 import os
 import shutil
@@ -65,6 +66,11 @@ _MOST_AT_HAND = 12
 
 _at_hand: dict[tuple[str, ...], ca.Function] = {}
 """Kept functions that were asked for last, by their name, key and how they are compiled."""
+
+ANNOUNCEMENT = "announcement"
+"""The attribute of log records that say what begins and takes long."""
+
+_LOG = logging.getLogger(__name__)
 
 _hung: set[str] = set()
 """Compilers that have run into the time limit: the next function is not to wait as long again."""
@@ -405,6 +411,7 @@ def _compiled(
     name, cache = function.name(), Cache(cache_directory())
     if compiler in _hung:
         raise _CompilationError(f"{compiler} did not end before, and is not called again")
+    _announce()
     try:
         with tempfile.TemporaryDirectory(prefix="spacerobot_ros_") as folder:
             built = _built(_source(function), compiler, flags, Path(folder), limit)
@@ -418,6 +425,14 @@ def _compiled(
     except OSError as error:
         raise _CompilationError(error.strerror or str(error)) from None
     raise _CompilationError("the compiled object cannot be loaded")
+
+
+@lru_cache(maxsize=1)
+def _announce() -> None:
+    """Log, once in a process, that something is compiled: the first flight of a robot waits."""
+    _LOG.info(
+        "Compiling the equations of this robot: once, some seconds.", extra={ANNOUNCEMENT: True}
+    )
 
 
 @lru_cache(maxsize=1)

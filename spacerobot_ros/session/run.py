@@ -111,7 +111,8 @@ def run_scenario(
                 stack.spin(look)
                 wall_time = time.perf_counter() - began
                 if progress is not None and not stopped():
-                    progress(1.0, 1.0)
+                    flown = stack.time_ns / 1e9
+                    progress(flown, flown)
                 stack.finish()
                 return RunResult(_summary(stack, wall_time))
         finally:

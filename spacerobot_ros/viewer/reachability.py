@@ -29,6 +29,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.core.progress import reported
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
 from spacerobot_ros.termination import Terminated, child_options, guarded
@@ -124,7 +125,7 @@ class GoalChecker:
         self._process: subprocess.Popen[bytes] | None = None
         self._reader: threading.Thread | None = None
         self._number = self._begun = 0
-        self._last = ""
+        self._last = self._progress = ""
         self._asked_at = 0.0
         self._cancelled_at: float | None = None
         self._answered = True
@@ -166,8 +167,8 @@ class GoalChecker:
             # A solver, or a compiler, that does not look for its cancellation.
             self.close()
             self._send(self._running(), self._last)
-        seconds = time.monotonic() - self._asked_at
-        return Check(Verdict.PLANNING, f"Planning for {seconds:.0f} s.")
+        seconds, found = time.monotonic() - self._asked_at, self._progress
+        return Check(Verdict.PLANNING, f"Planning for {seconds:.0f} s{found}.")
 
     def close(self) -> None:
         """End the process."""
@@ -220,10 +221,12 @@ class GoalChecker:
             for line in lines:
                 answer = json.loads(line)
                 with self._lock:
-                    if "verdict" in answer:
+                    if "progress" in answer:
+                        self._progress = f": {answer['progress']}"
+                    elif "verdict" in answer:
                         self._answers[answer["number"]] = _check_of(answer)
                     else:
-                        self._begun = answer["number"]
+                        self._begun, self._progress = answer["number"], ""
 
 
 def _check_of(answer: Mapping[str, Any]) -> Check:
@@ -332,14 +335,15 @@ def main() -> None:
             answers.flush()
 
         threading.Thread(target=read, daemon=True).start()
-        planner = Planner()
-        while True:
-            question, cancellation = desk.take()
-            number = question["number"]
-            say(number=number)
-            if "urdf" in question:
-                with suppress(PlanningCancelled):
-                    say(number=number, **planner.answer(question, cancellation))
+        planner, number = Planner(), 0
+        with reported(lambda progress: say(number=number, progress=progress.sentence)):
+            while True:
+                question, cancellation = desk.take()
+                number = question["number"]
+                say(number=number)
+                if "urdf" in question:
+                    with suppress(PlanningCancelled):
+                        say(number=number, **planner.answer(question, cancellation))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from spacerobot_ros.bag import LATCHED, BagWriter, RecordingError, Timeline, read_bag
-from spacerobot_ros.bag.playback import Playback, ReaderWait, renamed
+from spacerobot_ros.bag.playback import Playback, ReaderWait, ReplayMessage, renamed
 from spacerobot_ros.errors import ParameterError
 
 STRING = "std_msgs/msg/String"
@@ -139,6 +139,53 @@ def test_a_loop_begins_again_at_the_time_of_the_last_message(path: Path) -> None
     times = [time for time, _ in found]
     turn = [0.0, 0.25, 0.5, 0.75]
     assert times[:12] == pytest.approx([0.75 * n + t for n in range(3) for t in turn])
+
+
+def texts_of(messages: Sequence[ReplayMessage]) -> list[str]:
+    return [message.data[8:-1].decode() for message in messages]
+
+
+def test_a_jump_brings_what_a_subscriber_would_have(path: Path) -> None:
+    playback = Playback(read_bag(path))
+    everything = played(Playback(read_bag(path)), 1.0)
+    playback.run(CLOCK)
+    playback.due(CLOCK + S // 2, 1000)
+    # Back and forth, running: the last of each topic, then all that follows in its time.
+    for seconds in (0.05, 0.62, 0.3, 0.0):
+        at = BEGAN + round(seconds * S)
+        shown = playback.seek(at, CLOCK)
+        last = {text.split()[0]: text for time, text in everything if time < seconds}
+        assert sorted(texts_of(shown)) == sorted(last.values())
+        assert all(message.log_time_ns == at for message in shown)
+        assert playback.running
+        assert playback.bag_time(CLOCK) == at
+        rest = texts_of(playback.due(CLOCK + 2 * S, 1000))
+        assert rest == [text for time, text in everything if time >= seconds]
+        assert playback.ended
+    # Beyond the ends: at them. What is there last is still to come.
+    assert texts_of(playback.seek(BEGAN - S, CLOCK)) == []
+    playback.pause(CLOCK)
+    playback.seek(BEGAN + 9 * S, CLOCK)
+    assert not playback.running
+    assert playback.bag_time(CLOCK + S) == BEGAN + S
+    assert (playback.start_ns, playback.duration_s) == (BEGAN, 1.0)
+    assert not playback.ended
+
+
+def test_a_jump_stays_in_the_part_that_is_played(path: Path) -> None:
+    playback = Playback(read_bag(path), start=0.2, duration=0.5)
+    assert (playback.start_ns, playback.duration_s) == (BEGAN + S // 5, 0.5)
+    playback.run(CLOCK)
+    shown = playback.seek(BEGAN, CLOCK)
+    assert texts_of(shown) == ["/latched 2"]
+    last = texts_of(playback.due(CLOCK + 9 * S, 1000))[-1]
+    assert last == [text for time, text in played(Playback(read_bag(path)), 1.0) if time <= 0.7][-1]
+
+
+def test_what_is_long_ago_is_not_shown_again(tmp_path: Path) -> None:
+    path = bag_of(tmp_path / "a.mcap", [("/a", 0.0), ("/b", 3.0), ("/a", 4.0)])
+    playback = Playback(read_bag(path))
+    assert texts_of(playback.seek(BEGAN + round(3.5 * S), CLOCK)) == ["/b 1"]
 
 
 def test_messages_written_out_of_order_are_played_in_order(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import struct
@@ -14,17 +15,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import String
+from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool, Trigger
 from support.ros_harness import Harness, Probe, construction, nanoseconds
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile
+from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import ReplayNode
 from spacerobot_ros.nodes.replay import _profile
@@ -192,6 +195,60 @@ def test_pause_step_and_resume(harness: Harness, bag: Path) -> None:
     played.finish()
     harness.spin_until(lambda: played.probe.count("/stream") == COUNT, "all are heard")
     assert played.texts() == ALL
+
+
+def status_of(probe: Probe) -> ReplayStatus:
+    """Where the replay is, as it says."""
+    message = probe.last("/replay/status")
+    return ReplayStatus.from_values({pair.key: pair.value for pair in message.values})
+
+
+def test_a_replay_that_holds_goes_back_in_time(harness: Harness, bag: Path) -> None:
+    played = Played(harness, bag, hold=True)
+    probe = played.probe
+    probe.watch("/replay/status", DiagnosticStatus, latched=True)
+    seek = harness.matched(probe.create_publisher(Float64, "/replay/seek", 10))
+    pause = probe.create_client(SetBool, "/replay/pause")
+    length = (COUNT - 1) * SPACING / 1e9
+    harness.spin_until(lambda: probe.count("/replay/status") and status_of(probe).ended, "its end")
+    assert played.codes == []
+    harness.spin_until(lambda: probe.count("/stream") == COUNT, "all are heard")
+    end = status_of(probe)
+    assert (end.paused, end.rate) == (True, 1.0)
+    assert end.duration_s == pytest.approx(length)
+    assert end.position_s == pytest.approx(length)
+    # Paused, a jump shows what was there then, and no more.
+    seek.publish(Float64(data=0.3))
+    harness.spin_until(lambda: not status_of(probe).ended, "the jump")
+    assert status_of(probe).position_s == pytest.approx(0.3)
+    harness.settle(probe)
+    assert played.texts()[COUNT:] == ["29"]
+    assert status_of(probe).paused
+    for strange in (math.nan, math.inf, -math.inf):
+        seek.publish(Float64(data=strange))
+    seek.publish(Float64(data=-5.0))
+    harness.spin_until(lambda: status_of(probe).position_s == 0.0, "its beginning")
+    # It plays from there, and again from the beginning when it is at its end.
+    for _ in range(2):
+        wanted = probe.count("/stream") + COUNT
+        harness.call(pause, SetBool.Request(data=False))
+        harness.spin_until(lambda: probe.count("/stream") >= wanted, "all again")  # noqa: B023
+        harness.spin_until(lambda: status_of(probe).ended, "its end")
+        assert played.texts()[-COUNT:] == ALL
+    assert played.codes == []
+
+
+def test_a_recorded_replay_status_is_not_replayed(harness: Harness, tmp_path: Path) -> None:
+    path = tmp_path / "b.mcap"
+    with BagWriter(path) as writer:
+        recorded = writer.add_topic("/replay/status", STRING)
+        stream = writer.add_topic("/stream", STRING)
+        for k in range(3):
+            writer.write(recorded, string("old"), BEGAN + k, BEGAN)
+            writer.write(stream, string(f"{k}"), BEGAN + k, BEGAN)
+    played = Played(harness, path)
+    played.finish()
+    assert played.node.messages_replayed == 3
 
 
 def test_a_clock_of_its_own_is_never_behind_a_message(harness: Harness, bag: Path) -> None:

@@ -20,6 +20,7 @@ from spacerobot_ros.errors import NotFoundError, PlanningError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
+from spacerobot_ros.planning.core.progress import SearchProgress, log_progress
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
 from spacerobot_ros.planning.methods.optimal.held_commands import (
     CommandHolder,
@@ -165,6 +166,8 @@ class _Progress:
         As of :meth:`ManoeuvreSearch.search`.
     starts, rejection
         Guesses that were tried, and why the last candidate was none.
+    shortest
+        Duration of the fastest solution so far, s.
     """
 
     boundary: BoundaryConditions
@@ -175,6 +178,7 @@ class _Progress:
     library: SolutionLibrary | None = None
     starts: int = 0
     rejection: str = ""
+    shortest: float = math.inf
     _began: float = field(default_factory=lambda: time.monotonic())
 
     def stop_rule(self, *, found: bool) -> StopRule:
@@ -192,13 +196,14 @@ class _Progress:
         return self.stop_rule(found=found).expired(found=found)
 
     def report(self, what: str, result: str, iterations: int) -> None:
-        """Log what came of a guess."""
-        _LOG.info(
-            "%s: %s after %.2f s, %d steps of the solver",
-            what,
-            result,
-            time.monotonic() - self._began,
-            iterations,
+        """Log what came of a guess, and how far the search has come."""
+        seconds = time.monotonic() - self._began
+        # Where no guess led to anything on the coarse grid, some are tried on the full one as well.
+        most = max(self.budget.starts, self.starts)
+        log_progress(
+            _LOG,
+            SearchProgress(self.starts, most, self.shortest),
+            f"{what}: {result} after {seconds:.2f} s, {iterations} steps of the solver",
         )
 
     def agreed(self, solutions: list[Trajectory]) -> bool:
@@ -311,6 +316,8 @@ class ManoeuvreSearch:
             progress.cancellation.raise_if_requested()
             progress.starts += 1
             result = _NOTHING if solution is None else f"{solution.duration:.6g} s"
+            if solution is not None:
+                progress.shortest = min(progress.shortest, solution.duration)
             progress.report(f"start {progress.starts}", result, grid.iterations)
             if solution is None:
                 progress.rejection = _NOTHING

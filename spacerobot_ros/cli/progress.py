@@ -1,0 +1,107 @@
+"""What a command shows while it works, where somebody is looking: on standard error, if that is a
+terminal.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from spacerobot_ros.planning.core.progress import SearchProgress
+
+_SHARES = 1000
+"""Steps of the bar of a flight."""
+
+
+class Display:
+    """A bar for the search, with the best so far, then one for the flight.
+
+    Searches report in threads of their own.
+
+    Parameters
+    ----------
+    label
+        What is planned or flown.
+    visible
+        Whether anything is shown.
+    """
+
+    def __init__(self, label: str, *, visible: bool) -> None:
+        self._label, self._visible = label, visible
+        self._bar: Any = None
+        self._flies = False
+        self._lock = threading.Lock()
+
+    def search(self, progress: SearchProgress) -> None:
+        """Show how far a search has come; searches in flight are shown nowhere."""
+        with self._lock:
+            if self._flies or not self._visible:
+                return
+            if self._bar is None or progress.starts <= self._bar.pos:
+                self._begin(f"planning {self._label}", progress.most, "%(info)s")
+            self._bar.length = progress.most
+            self._bar.update(progress.starts - self._bar.pos, progress.sentence)
+
+    def fly(self, now: float, end: float) -> None:
+        """Show simulated time against the end of the schedule, s; 0: there is none yet."""
+        with self._lock:
+            if not self._visible or end <= 0.0:
+                return
+            if not self._flies:
+                self._flies = True
+                self._begin(f"flying {self._label}", _SHARES, "%(info)s")
+            share = max(0, round(_SHARES * min(now / end, 1.0)) - self._bar.pos)
+            self._bar.update(share, f"{now:.1f} of {end:.1f} s")
+
+    def announce(self, sentence: str) -> None:
+        """Show a line."""
+        with self._lock:
+            if self._visible:
+                self._finish()
+                click.echo(sentence, err=True)
+
+    def close(self) -> None:
+        """Leave the terminal as other lines want it."""
+        with self._lock:
+            self._finish()
+
+    def _begin(self, label: str, length: int, info: str) -> None:
+        self._finish()
+        self._bar = click.progressbar(
+            length=length,
+            label=label,
+            file=sys.stderr,
+            show_eta=False,
+            show_percent=False,
+            item_show_func=lambda item: item or "",
+            bar_template=f"%(label)s  [%(bar)s]  {info}",
+            width=24,
+        )
+        self._bar.__enter__()
+
+    def _finish(self) -> None:
+        bar, self._bar = self._bar, None
+        if bar is not None:
+            bar.__exit__(None, None, None)
+
+
+@contextmanager
+def display(label: str) -> Iterator[Display]:
+    """Have a display for the length of a block; nothing is imported where nobody looks."""
+    shown = Display(label, visible=sys.stderr.isatty())
+    try:
+        if not sys.stderr.isatty():
+            yield shown
+            return
+        from spacerobot_ros.planning.core.progress import reported
+
+        with reported(shown.search, shown.announce):
+            yield shown
+    finally:
+        shown.close()

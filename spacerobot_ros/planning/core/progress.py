@@ -1,0 +1,89 @@
+"""How far a search has come, and what else takes long, for whoever wants to know.
+
+Searches log it, as they log everything, in a record that :func:`reported` finds. So it passes
+through methods that know nothing of it, and out of the threads that plans are made in.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from spacerobot_ros.model.compilation import ANNOUNCEMENT
+
+_KEY = "search_progress"
+"""The attribute of a log record that has it."""
+
+_PACKAGE = "spacerobot_ros"
+
+
+@dataclass(frozen=True)
+class SearchProgress:
+    """How far a search has come.
+
+    Attributes
+    ----------
+    starts, most
+        Initial guesses that were tried, and those that are tried at most: a search ends sooner
+        where enough solutions agree.
+    best_s
+        Duration of the best manoeuvre so far, s; infinite before the first.
+    """
+
+    starts: int
+    most: int
+    best_s: float = math.inf
+
+    @property
+    def sentence(self) -> str:
+        """The same for people, without an end."""
+        best = f"best {self.best_s:.4g} s" if math.isfinite(self.best_s) else "none found yet"
+        return f"start {self.starts} of at most {self.most}, {best}"
+
+
+def log_progress(logger: logging.Logger, progress: SearchProgress, line: str) -> None:
+    """Log a line about a search, with how far that has come."""
+    logger.info(line, extra={_KEY: progress})
+
+
+@contextmanager
+def reported(
+    show: Callable[[SearchProgress], None], announce: Callable[[str], None] = lambda sentence: None
+) -> Iterator[None]:
+    """Have functions called in the threads of those that work in here.
+
+    Parameters
+    ----------
+    show
+        Called with the progress of every search.
+    announce
+        Called with the sentence of what begins and takes long.
+    """
+    handler, logger = _Handler(show, announce), logging.getLogger(_PACKAGE)
+    before = logger.level
+    logger.addHandler(handler)
+    # What others than this handler are to be told of stays as it is: they have levels of their own.
+    logger.setLevel(logging.INFO if before == logging.NOTSET else min(before, logging.INFO))
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+        logger.removeHandler(handler)
+
+
+class _Handler(logging.Handler):
+    def __init__(
+        self, show: Callable[[SearchProgress], None], announce: Callable[[str], None]
+    ) -> None:
+        super().__init__(logging.INFO)
+        self._show, self._announce = show, announce
+
+    def emit(self, record: logging.LogRecord) -> None:
+        progress = getattr(record, _KEY, None)
+        if isinstance(progress, SearchProgress):
+            self._show(progress)
+        elif getattr(record, ANNOUNCEMENT, False):
+            self._announce(record.getMessage())
