@@ -1,0 +1,293 @@
+"""The viewer node beside a plant and without one: what it shows, sends, and gives up."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64, Float64MultiArray, String
+from std_srvs.srv import SetBool, Trigger
+from support.ros_harness import LATCHED, Harness, Probe
+
+from spacerobot_ros.bag.playback import ReplayStatus
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.model import load_robot
+from spacerobot_ros.nodes import ViewerNode
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.status import PlantState, PlantStatus
+
+URDF = load_robot(robot_file("sliding_masses")).urdf
+ARM = load_robot(robot_file("three_joint_arm"))
+
+
+@pytest.fixture
+def harness(ros_context: rclpy.Context) -> Iterator[Harness]:
+    harness = Harness(ros_context)
+    yield harness
+    harness.close()
+
+
+class Stack:
+    """A probe that says what a plant and its replay say, and hears what the viewer sends."""
+
+    def __init__(self, harness: Harness) -> None:
+        self.harness = harness
+        topics = {"/goal_pose": PoseStamped, "/fault_injection": String, "/replay/seek": Float64}
+        self.probe: Probe = harness.probe(topics, name="stack")
+        self.called: list[str] = []
+        for kind, name in (
+            (Trigger, "/robot/abort"),
+            (Trigger, "/robot/rearm"),
+            (Trigger, "/robot/reset"),
+            (SetBool, "/robot/pause"),
+        ):
+            self.probe.create_service(kind, name, self._answer(name))
+        create = self.probe.create_publisher
+        self.description = create(String, "/robot_description", LATCHED)
+        self.status = create(DiagnosticStatus, "/plant/status", LATCHED)
+        self.odom = create(Odometry, "/odom", 10)
+        self.joints = create(JointState, "/joint_states", 10)
+        self.momentum = create(Float64MultiArray, "/momentum", 10)
+        overrides = {"port": 0, "update_rate": 60.0}
+        self.viewer = harness.add(
+            ViewerNode(
+                context=harness.context,
+                parameter_overrides=[Parameter(k, value=v) for k, v in overrides.items()],
+            )
+        )
+        harness.connect()
+
+    def _answer(self, name: str) -> Any:
+        def answer(request: Any, response: Any) -> Any:
+            data = getattr(request, "data", None)
+            self.called.append(name if data is None else f"{name} {data}")
+            response.success, response.message = True, f"Done: {name}."
+            return response
+
+        return answer
+
+    def describe(self, urdf: str = URDF) -> None:
+        self.description.publish(String(data=urdf))
+        plant = PlantStatus(PlantState.RUNNING, "A command is in force.")
+        values = [KeyValue(key=k, value=v) for k, v in plant.to_values().items()]
+        self.status.publish(DiagnosticStatus(name="/robot", values=values, message=plant.sentence))
+
+    def move(self, x: float, names: tuple[str, ...]) -> bool:
+        odom = Odometry()
+        odom.pose.pose.position.x = x
+        odom.pose.pose.orientation.w = 1.0
+        self.odom.publish(odom)
+        zeros = [0.0] * len(names)
+        self.joints.publish(
+            JointState(name=list(names), position=zeros, velocity=zeros, effort=zeros)
+        )
+        return False
+
+    @property
+    def page(self) -> Any:
+        return self.viewer._page
+
+    def head(self) -> str:
+        return str(self.page._head.content)
+
+    def log(self) -> str:
+        return " | ".join(notice.sentence for notice in self.page._log._notices)
+
+    def until(self, predicate: Any, what: str) -> None:
+        self.harness.spin_until(predicate, what)
+
+    def press(self, handle: Any, value: str | float | None = None) -> None:
+        """Do what a click in a browser does: call what waits for it, in the page's loop."""
+        if value is not None:
+            handle._impl.value = value
+        event = type("Event", (), {"target": handle, "client": object(), "client_id": 0})()
+        for callback in handle._impl.update_cb:
+            asyncio.run_coroutine_threadsafe(
+                callback(event), self.viewer._server.get_event_loop()
+            ).result(10)
+
+    def drag(self, pose: np.ndarray) -> None:
+        """Move the gizmo of the base as a browser does."""
+        gizmo = self.page._editor._gizmos["/goal"]
+        target = type("Target", (), {"position": pose[:3], "wxyz": pose[[6, 3, 4, 5]]})()
+        event = type("Event", (), {"target": target, "phase": "update", "client": object()})()
+        for callback in gizmo._impl_aux.update_cb:
+            asyncio.run_coroutine_threadsafe(
+                callback(event), self.viewer._server.get_event_loop()
+            ).result(10)
+
+
+def names_of(urdf_robot: Any) -> tuple[str, ...]:
+    return tuple(urdf_robot.joint_names)
+
+
+def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness) -> None:
+    stack = Stack(harness)
+    page = stack.page
+    stack.until(lambda: "No state has come yet" in stack.head(), "the page says so")
+    stack.press(page._buttons._fly)
+    stack.until(lambda: "no goal to fly to" in stack.log(), "nothing is sent")
+    stack.describe()
+    stack.until(lambda: page._drawing is not None, "the robot")
+    names = names_of(load_robot(robot_file("sliding_masses")))
+
+    def moved() -> bool:
+        stack.move(0.25, names)
+        return bool(page._editor.placed and page._drawing.base.visible)
+
+    stack.until(moved, "the robot is where it is")
+    assert page._drawing.base.position[0] == 0.25
+    stack.until(lambda: "running" in stack.head(), "its status")
+    assert stack.probe.count("/goal_pose") == 0, "opening the page sends nothing"
+    # A goal by the gizmo, one by the fields, and none that is no pose.
+    stack.drag(np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]))
+    stack.press(page._buttons._fly)
+    stack.until(lambda: stack.probe.count("/goal_pose") == 1, "a goal")
+    p = stack.probe.last("/goal_pose").pose.position
+    assert (p.x, p.y, p.z) == (1.0, 2.0, 3.0)
+    stack.drag(np.array([np.nan, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]))
+    page._editor._position._impl.value = (float("nan"), 0.0, 0.0)
+    stack.press(page._editor._position)
+    stack.until(lambda: "is not finite" in stack.log(), "a refusal")
+    assert page._editor._position.value == (1.0, 2.0, 3.0)
+    page._editor._position._impl.value = (0.5, 0.0, 0.0)
+    stack.press(page._editor._position)
+    stack.press(page._buttons._fly)
+    stack.until(lambda: stack.probe.count("/goal_pose") == 2, "another goal")
+    assert stack.probe.last("/goal_pose").pose.position.x == 0.5
+    stamps = [m.header.stamp for m in stack.probe.messages["/goal_pose"]]
+    assert len({(each.sec, each.nanosec) for each in stamps}) == 2, "statuses name them by it"
+    # Services and faults.
+    for label, service in (
+        ("Stop", "/robot/abort"),
+        ("Rearm", "/robot/rearm"),
+        ("Reset", "/robot/reset"),
+    ):
+        stack.press(page._buttons._plant, label)
+        stack.until(lambda service=service: service in stack.called, service)
+    for label in ("Pause", "Resume"):
+        stack.press(page._buttons._time, label)
+    stack.until(lambda: len(stack.called) == 5, "both")
+    assert stack.called[3:] == ["/robot/pause True", "/robot/pause False"]
+    stack.until(lambda: "Done: /robot/pause." in stack.log(), "its answer")
+    stack.press(page._buttons._goal, "Abort")
+    stack.until(lambda: "No planner or controller answers 'abort' now." in stack.log(), "nobody")
+    stack.press(page._faults._clear)
+    stack.until(lambda: stack.probe.count("/fault_injection") == 1, "clear")
+    assert stack.probe.last("/fault_injection").data == "clear"
+    stack.press(page._faults._inject)
+    stack.until(lambda: "The fault '- -' is refused" in stack.log(), "no fault is known yet")
+
+
+def test_a_viewer_survives_what_is_wrong(harness: Harness) -> None:
+    stack = Stack(harness)
+    page = stack.page
+    stack.describe("<robot name='broken'><link")
+    stack.until(lambda: "robot_description:" in stack.log(), "a refusal")
+    assert page._drawing is None
+    sliders = names_of(load_robot(robot_file("sliding_masses")))
+    stack.describe()
+    stack.until(lambda: page._drawing is not None, "the robot")
+    stack.until(lambda: stack.move(0.1, sliders) or page._editor.placed, "its state")
+    # Numbers and messages that are none.
+    strange = Odometry()
+    strange.pose.pose.position.x = float("nan")
+    stack.odom.publish(strange)
+    stack.odom.publish(Odometry())  # No attitude.
+    stack.joints.publish(JointState(name=["other"], position=[1.0]))
+    stack.joints.publish(JointState(name=list(sliders), position=[float("inf")] * 3))
+    stack.momentum.publish(Float64MultiArray(data=[1.0]))
+    stack.momentum.publish(Float64MultiArray(data=[float("nan")] * 7))
+    stack.status.publish(DiagnosticStatus(name="/robot"))
+    stack.until(lambda: stack.move(0.2, sliders) or page._last.pose[0] == 0.2, "the next state")
+    # Another robot comes in its place; its joints are others.
+    before = page._drawing
+    stack.describe(ARM.urdf)
+    stack.until(lambda: page._drawing is not before, "another robot")
+    assert not page._editor.placed
+    arm = names_of(ARM)
+    stack.until(lambda: stack.move(0.3, arm) or page._editor.placed, "its state")
+    stack.drag(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
+    # Time goes by.
+    stack.viewer._listener._came_at -= 5.0
+    stack.until(lambda: "No state for 5 s." in stack.head(), "silence is said")
+    stack.until(lambda: stack.move(0.4, arm) or "No state" not in stack.head(), "and its end")
+    assert stack.viewer.is_active
+
+
+def test_a_replay_has_a_time_line(harness: Harness) -> None:
+    stack = Stack(harness)
+    page = stack.page
+    status = stack.probe.create_publisher(DiagnosticStatus, "/replay/status", LATCHED)
+    harness.matched(status)
+
+    def tell(position: float) -> bool:
+        replay = ReplayStatus(position, 20.0, paused=False, ended=False, rate=1.0)
+        values = [KeyValue(key=k, value=v) for k, v in replay.to_values().items()]
+        status.publish(DiagnosticStatus(name="/replay", values=values))
+        return False
+
+    stack.until(lambda: tell(4.0) or page._time_line._slider is not None, "the time line")
+    line = page._time_line
+    stack.until(lambda: line._slider.value == 4.0, "where it is")
+    assert (line._slider.min, line._slider.max) == (0.0, 20.0)
+    assert line._folder.visible
+    assert not page._buttons._fly.visible, "a recording takes no goals"
+    stack.press(line._slider, 7.5)
+    stack.until(lambda: stack.probe.count("/replay/seek") == 1, "the jump")
+    assert stack.probe.last("/replay/seek").data == 7.5
+    tell(4.1)
+    harness.settle(stack.probe)
+    assert line._slider.value == 7.5, "it does not fight the user's hand"
+    stack.press(line._buttons, "Hold")
+    stack.until(lambda: "No replay answers 'pause' now." in stack.log(), "nobody is there")
+
+
+def test_the_parameters_of_a_plant_decide_on_its_faults(harness: Harness) -> None:
+    stack = Stack(harness)
+    stack.describe()
+    stack.until(lambda: stack.page._drawing is not None, "the robot")
+    values = {"actuation": json.dumps("effort"), "thrusters": json.dumps("")}
+    stack.viewer._remote_values["plant"] = values
+    stack.viewer._show_plant()
+    kinds = stack.page._faults._kind.options
+    assert "thruster_off" in kinds
+    assert "nozzle_open" not in kinds
+    stack.viewer._remote_values["plant"] = {**values, "thrusters": json.dumps("none.yaml")}
+    stack.viewer._show_plant()
+    stack.until(lambda: "none.yaml" in stack.log(), "what is wrong with it")
+    stack.page._faults._kind._impl.value = "joint_slow"
+    stack.press(stack.page._faults._kind)
+    stack.until(lambda: stack.page._faults._value.visible, "its factor")
+    stack.page._faults._value._impl.value = float("nan")
+    stack.press(stack.page._faults._inject)
+    stack.until(lambda: "not a finite number" in stack.log(), "a refusal")
+    stack.page._faults._value._impl.value = 0.5
+    stack.press(stack.page._faults._inject)
+    stack.until(lambda: stack.probe.count("/fault_injection") == 1, "a fault")
+    assert stack.probe.last("/fault_injection").data.split()[0] == "joint_slow"
+
+
+def test_an_address_that_others_reach_is_warned_of_and_a_wrong_one_is_refused(
+    harness: Harness, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def node(host: str) -> ViewerNode:
+        overrides = [Parameter("host", value=host), Parameter("port", value=0)]
+        return ViewerNode(context=harness.context, parameter_overrides=overrides)
+
+    with pytest.raises(SpaceRobotError, match=r"no\.such\.host\.invalid"):
+        node("no.such.host.invalid")
+    harness.add(node("0.0.0.0"))
+    said = capfd.readouterr()
+    assert "whoever reaches this machine there can steer the robot" in said.err
+    assert said.out.startswith("viewer      http://127.0.0.1:")
