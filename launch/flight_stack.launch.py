@@ -28,6 +28,7 @@ ARGUMENTS = (
     ("log_level", "info", "debug, info, warn, error or fatal"),
     ("respawn", "false", "whether a node that dies is started again; else everything ends with it"),
     ("rviz", "false", "whether to start RViz"),
+    ("view", "false", "whether to serve the page that shows the robot and steers it"),
 )
 
 VIEWED = 0.1
@@ -61,6 +62,8 @@ def nodes(context: LaunchContext) -> list[Node]:
         )
         for name in wanted
     ]
+    if is_true(chosen["view"]):
+        started.append(viewer(namespace, files, chosen))
     return [*started, rviz(namespace)] if is_true(chosen["rviz"]) else started
 
 
@@ -109,6 +112,19 @@ def at_its_end(name: str, *, respawn: bool) -> dict[str, Any]:
     if respawn:
         return {"respawn": True, "respawn_delay": RESPAWN_DELAY}
     return {"on_exit": Shutdown(reason=f"the node '{name}' has ended")}
+
+
+def viewer(namespace: str, files: list[Path], chosen: dict[str, str]) -> Node:
+    """Return the page of the robot; the flight goes on when it ends."""
+    return Node(
+        package=PACKAGE,
+        executable="viewer",
+        name="viewer",
+        namespace=namespace,
+        output="screen",
+        parameters=list(map(str, files)),
+        ros_arguments=["--log-level", chosen["log_level"]],
+    )
 
 
 def rviz(namespace: str) -> Node:

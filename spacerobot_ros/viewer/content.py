@@ -213,14 +213,14 @@ def _bar(share: float, level: int) -> str:
     place = 100 * min(1.0, max(0.0, share))
     color = _LEVELS[level]
     return (
-        f'<div style="width:90px;height:8px;background:{_QUIET}55;border-radius:4px;'
+        f'<div style="width:56px;height:8px;background:{_QUIET}55;border-radius:4px;'
         f'position:relative"><div style="position:absolute;left:{place:.0f}%;top:-2px;width:4px;'
         f'height:12px;margin-left:-2px;background:{color};border-radius:2px"></div></div>'
     )
 
 
 def _of(value: float, limit: float) -> str:
-    return f"{value:.3g}" if not math.isfinite(limit) else f"{value:.3g} of {limit:.3g}"
+    return f"{value:.2f}" if not math.isfinite(limit) else f"{value:.2f} of {limit:.3g}"
 
 
 def log(notices: Iterable[Notice]) -> str:
@@ -362,9 +362,10 @@ class History:
             self._rows = deque([*kept[:-1:2], kept[-1]])
 
     def columns(self) -> tuple[Array, ...]:
-        """Return time (k,) and each number (k,); at least one row, of not-a-numbers."""
+        """Return time (k,) and each number (k,); at least one row, of zeros."""
         if not self._rows:
-            return tuple(np.full(1, np.nan) for _ in range(self._width + 1))
+            # A figure has no scale for numbers that are none.
+            return tuple(np.zeros(1) for _ in range(self._width + 1))
         table = np.array(self._rows)
         return tuple(np.ascontiguousarray(column) for column in table.T)
 

@@ -242,7 +242,8 @@ class Plots:
             return
         time_s = measured.time_s
         error, tool = content.base_error(state), content.tool_error(state)
-        self._error.history.add(time_s, error or (math.nan, math.nan))
+        if error is not None:
+            self._error.history.add(time_s, error)
         if tool is not None:
             self._tool.handle.visible = True
             self._tool.history.add(time_s, tool)

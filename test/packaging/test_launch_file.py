@@ -68,7 +68,7 @@ def test_arguments_are_those_that_the_docs_name(description: Noted) -> None:
     names = {argument.args[0] for argument in description.args[0][:-1]}
     assert names == {
         "scenario", "robot", "params_file", "bag", "record", "namespace", "autostart",
-        "use_sim_time", "log_level", "respawn", "rviz",
+        "use_sim_time", "log_level", "respawn", "rviz", "view",
     }  # fmt: skip
     text = (FILE.parents[1] / "docs" / "operation.md").read_text(encoding="utf-8")
     for name in names:
@@ -107,7 +107,10 @@ def test_a_file_is_obeyed_in_any_namespace(
 
 
 def test_each_namespace_has_a_clock_of_its_own(description: Noted) -> None:
-    for name, node in launched(description, namespace="a", rviz="true").items():
+    for name, node in launched(description, namespace="a", rviz="true", view="true").items():
+        if name == "viewer":
+            assert node.options["namespace"] == "a"
+            continue  # It reads no clock and no transforms.
         renamed = dict(node.options["remappings"])
         assert renamed["/clock"] == "clock", name
         assert renamed["/tf"] == "tf"
@@ -116,8 +119,8 @@ def test_each_namespace_has_a_clock_of_its_own(description: Noted) -> None:
 
 
 def test_a_launch_ends_or_goes_on_when_a_node_dies(description: Noted) -> None:
-    for name, node in launched(description, rviz="true").items():
-        if name == "rviz":
+    for name, node in launched(description, rviz="true", view="true").items():
+        if name in ("rviz", "viewer"):
             assert "on_exit" not in node.options
             continue
         assert type(node.options["on_exit"]).__name__ == "Shutdown"

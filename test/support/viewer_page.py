@@ -61,8 +61,11 @@ class Processes:
 
     def kill(self, name: str) -> None:
         """End a node as a crash does."""
-        self.running[name].kill()
-        self.running[name].wait()
+        process = self.running.pop(name)
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
 
     def log(self, name: str) -> str:
         """Return what a node has written to standard error."""
