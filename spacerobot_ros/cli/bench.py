@@ -37,6 +37,14 @@ from spacerobot_ros.cli.options import PATH, json_option, write_json
     "and threads of all processes stay flat. With --json also a picture beside it.",
 )
 @click.option(
+    "--viewer",
+    "viewed",
+    type=click.FloatRange(min=5.0),
+    metavar="S",
+    help="Instead: fly the servicer in real time, in separate processes, without and with a viewer "
+    "and a browser in turns of S s; updates received, deadlines missed.",
+)
+@click.option(
     "--planning",
     "goals",
     type=click.IntRange(min=1),
@@ -82,6 +90,7 @@ def command(
     seconds: float | None,
     rates: tuple[float, ...],
     soak: float | None,
+    viewed: float | None,
     goals: int | None,
     starts: int | None,
     library: int | None,
@@ -109,6 +118,10 @@ def command(
         from spacerobot_ros.benchmarks.lanes import lanes_benchmark
 
         figures = lanes_benchmark(click.echo)
+    elif viewed is not None:
+        from spacerobot_ros.benchmarks.viewing import run_viewer_benchmark
+
+        figures = run_viewer_benchmark(viewed, click.echo)
     elif goals is not None:
         from spacerobot_ros.benchmarks.planning import run_planning_benchmark
 
