@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ from std_srvs.srv import Trigger
 from support.control_loop import SHAPE, STATUS, TIP, URDF, Loop, pose
 from support.ros_harness import LATCHED, Harness, Probe, construction, nanoseconds
 from support.sentences import assert_one_sentence
+from support.warm_python import WarmPython
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.nodes import CoordinatedControlNode, FlightNode, PlannerNode, PlantNode
@@ -225,17 +224,15 @@ def test_a_goal_that_is_aborted_before_the_robot_is_known_is_not_flown_to(
     np.testing.assert_allclose(loop.answer()[0], 0.0, atol=1e-12)
 
 
-def test_a_process_with_a_broken_file_ends_with_one_sentence(file: Path, ros_domain: int) -> None:
+def test_a_process_with_a_broken_file_ends_with_one_sentence(
+    warm_python: WarmPython, file: Path, ros_domain: int
+) -> None:
     file.write_text("{")
-    ended = subprocess.run(
-        [
-            *(sys.executable, "-m", "spacerobot_ros.nodes.controller.node", "--ros-args"),
-            *("-p", "robot:=planar_manipulator", "-p", f"resume_file:={file}"),
-        ],
-        env={**os.environ, "ROS_DOMAIN_ID": str(ros_domain)},
-        capture_output=True,
-        text=True,
-        timeout=60,
+    words = (
+        *("-m", "spacerobot_ros.nodes.controller.node", "--ros-args"),
+        *("-p", "robot:=planar_manipulator", "-p", f"resume_file:={file}"),
     )
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain)}
+    ended = warm_python.run(words, file.parent, environment, timeout=60.0)
     assert ended.returncode == 2
     assert_one_sentence(ended.stderr.strip().splitlines()[-1], "resume_file", str(file), "no goal")

@@ -29,6 +29,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from support.ros_harness import Harness, Probe, nanoseconds
 from support.sentences import assert_one_sentence
+from support.warm_python import WarmPython
 
 from spacerobot_ros.nodes import NODE_TYPES
 
@@ -118,27 +119,27 @@ def start(tmp_path: Path, ros_domain: int) -> Iterator[Start]:
             process.kill()
 
 
-def test_a_bad_start_ends_with_a_sentence_and_exit_code_2(start: Start, tmp_path: Path) -> None:
+def test_a_bad_start_ends_with_a_sentence_and_exit_code_2(
+    warm_python: WarmPython, ros_domain: int, tmp_path: Path
+) -> None:
     broken = tmp_path / "broken.urdf"
     broken.write_text("<robot name='half'><link name='base_link'>", "utf-8")
     missing = str(tmp_path / "missing.yaml")
-    robot = {"robot": "sliding_masses"}
-    cases: list[tuple[str, dict[str, str], list[str], list[str]]] = [
-        ("plant", {**robot, "tick_rate": "0.0"}, [], ["'tick_rate'"]),
-        ("plant", {"robot": str(broken)}, [], [str(broken), "not valid URDF"]),
-        ("planner", robot, ["--params-file", missing], [missing]),
-        ("recorder", {"bag": str(tmp_path)}, [], [str(tmp_path)]),
+    robot = ("-p", "robot:=sliding_masses")
+    cases: list[tuple[str, tuple[str, ...], list[str]]] = [
+        ("plant", (*robot, "-p", "tick_rate:=0.0"), ["'tick_rate'"]),
+        ("plant", ("-p", f"robot:={broken}"), [str(broken), "not valid URDF"]),
+        ("planner", (*robot, "--params-file", missing), [missing]),
+        ("recorder", ("-p", f"bag:={tmp_path}"), [str(tmp_path)]),
     ]
-    # All at once: it takes them a while to start.
-    started = [
-        start(node, parameters, namespace=f"/case_{k}", arguments=arguments)
-        for k, (node, parameters, arguments, _) in enumerate(cases)
-    ]
-    for process, (_, _, _, mentions) in zip(started, cases, strict=True):
-        assert process.end() == 2, process.said
-        assert "Traceback" not in process.said
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain)}
+    for node, arguments, mentions in cases:
+        words = ("-m", NODE_TYPES[node].__module__, "--ros-args", *arguments)
+        ended = warm_python.run(words, ROOT, environment, timeout=START)
+        assert ended.returncode == 2, ended.stderr
+        assert "Traceback" not in ended.stderr
         # What ROS itself refuses, it says in its own words.
-        sentence = process.said.strip().splitlines()[-1].removesuffix(".") + "."
+        sentence = ended.stderr.strip().splitlines()[-1].removesuffix(".") + "."
         assert_one_sentence(sentence, *mentions)
 
 
