@@ -127,3 +127,17 @@ def test_there_are_no_columns_in_what_is_no_message() -> None:
     data = serialize_message(JointState(name=["a"]))
     for broken in (b"", data[:3], data[:10], data[:-12], b"\0\0" + data[2:]):
         assert columns([broken], "sensor_msgs/msg/JointState", TYPESTORE.fielddefs) is None
+
+
+def test_there_are_no_columns_where_the_order_of_bytes_changes() -> None:
+    little, big = (bytes([0, order, 0, 0]) + bytes(8) for order in (1, 0))
+    time = "builtin_interfaces/msg/Time"
+    assert columns([little, little], time, TYPESTORE.fielddefs) is not None
+    assert columns([little, big], time, TYPESTORE.fielddefs) is None
+
+
+def test_numbers_beyond_int64_stay_as_they_are() -> None:
+    message = bytes([0, 1, 0, 0]) + (2**63 + 5).to_bytes(8, "little")
+    found = columns([message] * 2, "std_msgs/msg/UInt64", TYPESTORE.fielddefs)
+    assert found is not None
+    assert [int(each) for each in found["data"]] == [2**63 + 5] * 2

@@ -115,3 +115,25 @@ def test_manoeuvre_without_inertial_measurements() -> None:
 def test_durations_that_are_refused(durations: tuple[float, float]) -> None:
     with pytest.raises(ParameterError, match="must be positive"):
         DeadReckoning(load("planar_manipulator"), *durations)
+
+
+def test_measured_joints_far_from_the_predicted_ones_turn_the_base_to_second_order() -> None:
+    """One step of all joints, against a thousand small ones: the error is of third order."""
+    robot = load("planar_manipulator")
+    start = ControlState.at_rest(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.7, -0.9]))
+
+    def turned(step: np.ndarray, count: int) -> float:
+        estimator = DeadReckoning(robot, 1e-6)
+        estimator.reset(start)
+        none = Actuation(np.zeros(6), np.zeros(robot.n))
+        for k in range(1, count + 1):
+            estimate = estimator.step(none, start.q + step * k / count, np.zeros(robot.n))
+        return float(Rotation.from_quat(estimate.quaternion_WB).as_rotvec()[2])
+
+    errors = []
+    for size in (0.4, 0.2):
+        step = size * np.array([1.0, 0.6])
+        errors.append(abs(turned(step, 1) - turned(step, 1000)))
+        assert abs(turned(step, 1000)) > 0.1 * size
+    assert errors[0] < 0.01
+    assert errors[0] > 5 * errors[1]

@@ -22,7 +22,7 @@ from spacerobot_ros.control import Actuation, ControlState, PoseReference, Refer
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import ControlExecutive
-from spacerobot_ros.control.joint_rates import JointRateLimits
+from spacerobot_ros.control.joint_rates import JointRateLimits, _largest_share
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
@@ -454,3 +454,21 @@ def test_what_is_held_does_not_change_with_the_arrays_of_a_state() -> None:
     np.testing.assert_allclose(first, 0.0, atol=1e-9)
     q[1] += 0.1
     assert np.abs(controller.command(0.01, state, q, state.qdot).realised.tau).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("wanted", "pushed", "share"),
+    [
+        ([0.0, 10.0], [400.0, 0.0], 0.5),
+        ([-100.0, 10.0], [300.0, 0.0], 1 / 3),
+        # The first motor cannot do its part, whatever the push; or each would need another push.
+        ([250.0, 0.0], [0.0, 100.0], 0.0),
+        ([300.0, -300.0], [200.0, 200.0], 0.0),
+    ],
+)
+def test_the_largest_share_of_a_push_that_motors_bear(
+    wanted: list[float], pushed: list[float], share: float
+) -> None:
+    """``abs(wanted - share * pushed) <= effort`` for all, of 200 and 50 N m."""
+    found = _largest_share(np.array(wanted), np.array(pushed), np.array([200.0, 50.0]))
+    assert found == pytest.approx(share)

@@ -220,3 +220,10 @@ def test_the_best_three_of_any_curvature_have_the_smallest_condition_number(join
         ]
         assert np.linalg.cond(M) == pytest.approx(min(conditions))
         assert triple in set(itertools.combinations(range(joints), 3))
+
+
+def test_brackets_say_where_they_were_looked_at() -> None:
+    robot = robot_named("three_joint_arm")
+    shape = np.array([0.1, -0.8, 1.5])
+    assert "at the shape [0.1, -0.8, 1.5]" in brackets_at(robot, shape).sentence
+    assert "at the best of 24 shapes" in brackets_anywhere(robot).sentence

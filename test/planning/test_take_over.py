@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,9 @@ from support.planner_loop import (
 
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.planning import BasePath
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile
+from spacerobot_ros.planning.execution.in_motion import InMotion
 from spacerobot_ros.planning.execution.state_machine import Phase
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.execution.take_over import PathDeviation
@@ -395,3 +398,29 @@ def test_goals_are_the_same_where_every_number_is() -> None:
     object.__setattr__(shaped, "joint_positions", np.zeros(3))
     assert not same_goal(goal_at(TURNED), shaped)
     assert same_goal(shaped, shaped)
+
+
+def test_the_remaining_motion_is_planned_again_where_plans_are_made_beside_the_flight() -> None:
+    assert PlannerConfig(plan_in_background=True).replanning > 0
+    assert PlannerConfig(plan_in_background=False).replanning == 0
+    for background in (True, False):
+        config = PlannerConfig(plan_in_background=background, replan_period=2.5)
+        assert config.replanning == 2.5
+
+
+@pytest.mark.parametrize(
+    ("parameters", "averaged"),
+    [
+        ({"averaging": 1, "replan_period": 0.0}, 0),
+        ({"averaging": 7, "replan_period": 0.0}, 7),
+        ({"averaging": 1, "replan_period": 2.0}, 1),
+        ({"averaging": 7, "replan_period": 2.0, "takeover_time": 0.0}, 0),
+    ],
+)
+def test_measured_poses_are_averaged_where_they_are_needed(
+    parameters: dict[str, Any], averaged: int
+) -> None:
+    able: Any = SimpleNamespace(starts_in_motion=lambda schedule: True)
+    nothing: Any = None
+    config = PlannerConfig(**{"takeover_time": AHEAD * TICK, **parameters})
+    assert InMotion(nothing, able).begin_schedule(config, nothing, 0) == averaged

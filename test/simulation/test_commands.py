@@ -324,9 +324,10 @@ def test_an_unset_stamp_means_now() -> None:
     assert rig.offer(0, now) is None
     assert rig.joints.stamp_ns == now
     # At the start it is the stamp of the first state.
-    early = real_time()
-    assert early.offer(0, TICK) is None
-    assert early.joints.stamp_ns == 0
+    for timeout in (0.5, 0.0):
+        early = Rig(time_mode="realtime", command_timeout=timeout)
+        assert early.offer(0, TICK) is None
+        assert early.joints.stamp_ns == 0
 
 
 def test_commands_hold_until_they_are_older_than_the_timeout() -> None:
