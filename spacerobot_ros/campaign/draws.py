@@ -92,7 +92,8 @@ class Draws:
             "halton": qmc.Halton,
         }
         rng = np.random.default_rng(np.random.SeedSequence(campaign.seed))
-        engine = kinds[campaign.sampler](d=size, rng=rng)
+        # The name before scipy 1.15, which later ones take, too.
+        engine = kinds[campaign.sampler](d=size, seed=rng)
         if campaign.sampler == "sobol":
             # Any number of them: balance is asked for by a power of two, and told in the docs.
             power = int(np.ceil(np.log2(max(1, campaign.flights))))

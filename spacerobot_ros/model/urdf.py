@@ -8,7 +8,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 from urllib.parse import unquote, urlparse
 from xml.etree import ElementTree
 
@@ -178,6 +178,9 @@ def parse_robot(text: str) -> RobotDescription:
             )
     joints = _with_leaders(joints)
     bodies, frames = weld(links, joints)
+    for number, body in enumerate(bodies):
+        if flaw_of_inertia(body.inertia.about_com):
+            _refuse_inertia([link for link in links.values() if frames[link.name][0] == number])
     description = RobotDescription(
         name=tree.name or "robot",
         links=tuple(links.values()),
@@ -243,24 +246,38 @@ def _link(link: Any, colours: dict[str, Any]) -> Link:
             about = _finite(link.inertial.inertia.to_matrix(), where)
         if mass < 0:
             raise RobotDescriptionError(f"The mass of {where} is negative ({mass} kg).")
-        _require_possible(about, where)
         inertia = Inertia(mass, np.zeros(3), about).moved(pose)
     return Link(link.name, inertia, tuple(_shapes(link, colours, where)))
 
 
-def _require_possible(about: Array, where: str) -> None:
-    """Refuse moments of inertia (3, 3), kg m^2, that no body has."""
+def flaw_of_inertia(about: Array) -> str:
+    """Return what no body has of these moments of inertia (3, 3), kg m^2; empty if one may.
+
+    It is the end of a sentence that begins with whose inertia it is.
+    """
     low, middle, high = np.linalg.eigvalsh(about)
     if low < -1e-12 * max(1.0, float(np.abs(about).max())):
-        raise RobotDescriptionError(
-            f"The inertia of {where} has a negative principal moment; check its signs."
-        )
+        return "has a negative principal moment; check its signs."
     if high > (1 + TRIANGLE_SLACK) * (low + middle) + 1e-12:
-        raise RobotDescriptionError(
-            f"The inertia of {where} is that of no body: its principal moments are {low:.4g}, "
-            f"{middle:.4g} and {high:.4g} kg m^2, and none can be larger than the sum of the other "
-            "two. Check units and digits of <inertia>."
+        return (
+            f"is that of no body: its principal moments are {low:.4g}, {middle:.4g} and "
+            f"{high:.4g} kg m^2, and none can be larger than the sum of the other two. Check units "
+            "and digits of <inertia>."
         )
+    return ""
+
+
+def _refuse_inertia(welded: list[Link]) -> NoReturn:
+    """Refuse a body whose inertia is impossible: that of its worst link, all welded together."""
+
+    def excess(link: Link) -> float:
+        low, middle, high = np.linalg.eigvalsh(link.inertia.about_com)
+        return float(max(high - middle - low, -low))
+
+    worst = max(welded, key=excess)
+    raise RobotDescriptionError(
+        f"The inertia of link '{worst.name}' {flaw_of_inertia(worst.inertia.about_com)}"
+    )
 
 
 def _shapes(link: Any, colours: dict[str, Any], where: str) -> list[Shape]:

@@ -19,6 +19,7 @@ _USED = {
     "robot": ("link", "joint", "material"),
     "link": ("inertial", "visual"),
     "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
+    "material": ("color",),
 }
 """Elements that are read; others are of other programs, or say what nothing here asks for."""
 
@@ -156,6 +157,8 @@ def _require_type(joint: Element, where: str, types: tuple[str, ...]) -> None:
 
 def _require(element: Element, where: str) -> None:
     """Check an element of a link, joint or material, and those in it."""
+    if element.tag == "material":
+        _leave_out(element, {child.tag for child in element} - set(_USED["material"]))
     for child, mend in _NEEDED.get(element.tag, {}).items():
         if element.find(child) is None:
             owner = where if element.tag == "joint" else f"<{element.tag}> of {where}"

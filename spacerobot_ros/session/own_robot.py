@@ -13,7 +13,7 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotvec_from_quaternion
-from spacerobot_ros.model.urdf import mesh_file
+from spacerobot_ros.model.urdf import flaw_of_inertia, mesh_file
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
@@ -92,6 +92,10 @@ def remarks(robot: RobotDescription) -> Iterator[str]:
                 f"The joint '{joint.name}' has the effort limit 0: driven by velocities it moves, "
                 'driven by efforts it cannot. Give <limit effort="..."/> in N or N m.'
             )
+    for link in robot.links:
+        # Of a body as a whole it is refused.
+        if flaw := flaw_of_inertia(link.inertia.about_com):
+            yield f"The inertia of link '{link.name}' {flaw} What it is welded to makes up for it."
     yield from _about_looks(robot)
 
 

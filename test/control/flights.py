@@ -49,7 +49,7 @@ def random_state(rng: np.random.Generator, joints: int) -> ControlState:
     """Return a state of order one in everything."""
     return ControlState(
         rng.uniform(-2, 2, 3),
-        Rotation.random(rng=rng).as_quat(),
+        Rotation.random(random_state=rng).as_quat(),
         rng.uniform(-1, 1, 3),
         rng.uniform(-1, 1, 3),
         rng.uniform(-1.2, 1.2, joints),
@@ -59,7 +59,9 @@ def random_state(rng: np.random.Generator, joints: int) -> ControlState:
 
 def random_pose_reference(rng: np.random.Generator) -> PoseReference:
     return PoseReference(
-        rng.uniform(-2, 2, 3), Rotation.random(rng=rng).as_quat(), *rng.uniform(-1, 1, (4, 3))
+        rng.uniform(-2, 2, 3),
+        Rotation.random(random_state=rng).as_quat(),
+        *rng.uniform(-1, 1, (4, 3)),
     )
 
 

@@ -202,7 +202,7 @@ def test_attitude_error_takes_the_shorter_way(degrees: float, sign: float) -> No
     outputs = Outputs(OutputVector(robot, OutputSelection(base=("rx", "ry", "rz"))))
     axis = np.array([2.0, -3.0, 6.0]) / 7.0
     rng = np.random.default_rng(11)
-    present = Rotation.random(rng=rng)
+    present = Rotation.random(random_state=rng)
     half = np.radians(degrees) / 2
     turn = np.append(np.sin(half) * axis, np.cos(half))
     target = sign * (Rotation.from_quat(turn) * present).as_quat()

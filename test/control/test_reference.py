@@ -26,7 +26,7 @@ STEP = 1e-4
 
 
 def random_pose(rng: np.random.Generator) -> PoseReference:
-    return PoseReference(rng.uniform(-2, 2, 3), Rotation.random(rng=rng).as_quat())
+    return PoseReference(rng.uniform(-2, 2, 3), Rotation.random(random_state=rng).as_quat())
 
 
 def random_profile(seed: int) -> QuinticReference:

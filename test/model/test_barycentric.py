@@ -57,7 +57,10 @@ def mass_centres(oracle: PinocchioOracle, links: list[str], q: Array) -> tuple[A
     """
     oracle.set_configuration(q)
     model, data = oracle.model, oracle.data
-    joints = [model.frames[model.getFrameId(link)].parentJoint for link in links]
+    frames = [model.frames[model.getFrameId(link)] for link in links]
+    # Its name is another since Pinocchio 3.
+    parent = "parentJoint" if hasattr(frames[0], "parentJoint") else "parent"
+    joints = [getattr(frame, parent) for frame in frames]
     masses = [model.inertias[joint].mass for joint in joints]
     centres = [data.oMi[joint].act(model.inertias[joint].lever) for joint in joints]
     return np.array(masses), np.array(centres)

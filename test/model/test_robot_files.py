@@ -10,6 +10,7 @@ from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.urdf import mesh_file
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.session.own_robot import remarks
 
 INERTIAL = """<inertial><mass value="{mass}"/>
     <inertia ixx="{ixx}" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>"""
@@ -333,6 +334,27 @@ def test_what_other_programs_have_written_is_passed_over(tmp_path: Path) -> None
     found = load_robot(file_with(tmp_path, text))
     assert (found.name, found.joint_names, found.total_mass) == ("probe", ("elbow",), 11.0)
     assert "capsule" in found.urdf
+
+
+def test_what_a_link_is_welded_to_makes_up_for_its_inertia(tmp_path: Path) -> None:
+    """Antennas and mounts of many a public URDF have moments that no body has."""
+    impossible = TOOL.replace(SOME_INERTIA, SOME_INERTIA.replace('ixx="1"', 'ixx="0.4" was="1"'))
+    text = more(impossible.replace('izz="1"', 'izz="1.5"'), joint("mount", "arm", "tool"))
+    with pytest.raises(RobotDescriptionError, match=r"inertia of link 'tool' is that of no body"):
+        load_robot(file_with(tmp_path, text))
+    fixed = text.replace('name="mount" type="revolute"', 'name="mount" type="fixed"')
+    robot = load_robot(file_with(tmp_path, fixed))
+    found = [each for each in remarks(robot) if "of no body" in each]
+    assert found == [next(each for each in found if "'tool'" in each and "welded" in each)]
+
+
+def test_textures_are_passed_over(tmp_path: Path) -> None:
+    visual = (
+        '<visual><geometry><sphere radius="1"/></geometry>'
+        '<material name="skin"><texture/><color rgba="1 0 0 1"/></material></visual>'
+    )
+    robot = load_robot(file_with(tmp_path, urdf(visual=visual)))
+    assert robot.links[0].shapes[0].rgba == (1.0, 0.0, 0.0, 1.0)
 
 
 def test_of_a_fixed_joint_axis_and_limits_do_not_matter(tmp_path: Path) -> None:
