@@ -6,6 +6,7 @@ import numpy as np
 from support.random_actions.expectations import SECOND, Goals, Situation, State
 from support.random_actions.setups import Setup
 
+from spacerobot_ros.control.thrusters.table import find_thrusters
 from spacerobot_ros.simulation.status import PlantState
 
 
@@ -73,26 +74,50 @@ class RestCheck:
         return None
 
 
+def energy_of_pulses(setup: Setup) -> float:
+    """Return the kinetic energy of one shortest pulse of every thruster that pushes one way, J.
+
+    No modulator owes more (:class:`.ThrusterModulator`): of each axis of force and torque, the half
+    of the thrusters that pushes more that way fires on, from rest.
+    """
+    robot = setup.model
+    table = find_thrusters(str(setup.plant["thrusters"]), robot.description)
+    impulses = table.wrenches * table.min_on_time
+    most = np.maximum(np.maximum(impulses, 0.0).sum(axis=1), np.maximum(-impulses, 0.0).sum(axis=1))
+    D = np.array(robot.function("locked_inertia")(setup.home)[0])
+    least = float(np.linalg.eigvalsh(D).min())
+    force, torque = most[:3].max(), most[3:].max()
+    return float(0.5 * force**2 / robot.total_mass + 0.5 * torque**2 / least)
+
+
 class EnergyCheck:
     """From a latch on, and after the rearm until there is a goal, kinetic energy is not made.
 
     For robots that efforts drive. Under the latch nothing thrusts, both momenta stay, and brakes
     take energy away. After the rearm a controller holds the robot where it is: thrusters may brake
     the base, and the arm may swing with it, but a spring that begins where the robot is and a
-    damper never give more than there was. Thrusters that are on or off push a little too much, and
-    so do commands that a busy machine holds longer than their control period, in real time.
+    damper never give more than there was. Thrusters that are on or off push too much, and so do
+    commands that a busy machine holds longer than their control period, in real time.
     """
 
-    FLOOR, FLOOR_OF_LATENESS, FLOOR_OF_NOZZLES = 1e-6, 1e-3, 0.05
-    """Energies that are none, J: rounding; late commands; some of the shortest pulses."""
+    FLOOR = 1e-12
+    """Energy that is none, J. A robot at rest is held by a spring and a damper of nothing: what is
+    left is rounding of its state, of order 1e-16 m and rad, and with gains up to 1e3 N/m and times
+    of 1 s, 1e-13 m/s. Of 1e3 kg that is 1e-23 J; measured in lockstep: 3e-34 J."""
+
+    FLOOR_OF_LATENESS = 1e-3
+    """The same in real time, J. A command that is held for a time t instead of a control period has
+    the dampers push on by their force: a speed v becomes v (1 - kd t / m), so energy grows where t
+    is beyond 2 m / kd, 0.1 s of the lightest load here, by the share that there was of it. What
+    begins with less than a thousandth of a J may become that much on a machine that is so late."""
 
     SHARE = 1.02
 
     def __init__(self, setup: Setup, situation: Situation, *, lockstep: bool) -> None:
         self._setup, self._situation = setup, situation
         self._floor = self.FLOOR if lockstep else self.FLOOR_OF_LATENESS
-        if setup.nozzles:
-            self._floor = self.FLOOR_OF_NOZZLES
+        if setup.plant.get("thrusters"):
+            self._floor += energy_of_pulses(setup)
         self._most: float | None = None
         """Kinetic energy under the latch at first, J."""
         self._latched_at = -1
