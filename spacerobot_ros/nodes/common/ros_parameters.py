@@ -59,10 +59,15 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
         node.undeclare_parameter(name)
         value = parameter.default if given is None else parameter.checked(given)
         stored = _ros_parameter(parameter, value)
-        # By its type, because rclpy cannot tell that of an empty list. One parameter that is left
-        # unset would have get_parameters answer nothing, whatever else it is asked for.
-        node.declare_parameter(name, stored.type_, _descriptor(parameter), ignore_override=True)
-        Node.set_parameters(node, [stored])
+        if value == ():
+            # By its type, because rclpy cannot tell that of an empty list. One parameter that is
+            # left unset would have get_parameters answer nothing, whatever else it is asked for.
+            node.declare_parameter(name, stored.type_, _descriptor(parameter), ignore_override=True)
+            Node.set_parameters(node, [stored])
+        else:
+            node.declare_parameter(
+                name, stored.value, _descriptor(parameter), ignore_override=True
+            )
         values[name] = value
     return values
 
