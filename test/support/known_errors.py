@@ -31,7 +31,10 @@ from support.forked import NotExchangedError
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "test" / "known_errors"
 
-_COPIED = ("spacerobot_ros", "test", "config", "urdf", "bags", "docs", "docs_build", "examples")
+_COPIED = (
+    *("spacerobot_ros", "test", "config", "urdf", "meshes", "bags", "docs", "docs_build"),
+    "examples",
+)
 _AT_ONCE = 2
 _TIME_LIMIT = 240.0
 """Wall time for the tests of one error, s."""
