@@ -11,6 +11,7 @@ import math
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -174,6 +175,13 @@ def declared(config: type[Any] | Any, prefix: str = "") -> tuple[Parameter, ...]
     ``config`` is the class, or an instance whose values are the defaults; ``prefix`` comes before
     every name.
     """
+    if isinstance(config, type):
+        return _declared(config, prefix)
+    return tuple(parameter for parameter, _ in _leaves(config, prefix))
+
+
+@cache
+def _declared(config: type[Any], prefix: str) -> tuple[Parameter, ...]:
     return tuple(parameter for parameter, _ in _leaves(config, prefix))
 
 
@@ -192,7 +200,7 @@ def configured(kind: type[C], values: Mapping[str, Any], prefix: str = "") -> C:
 
 def values_of(config: Any, prefix: str = "") -> dict[str, Value]:
     """Return the value of every parameter of a configuration by full name."""
-    return {parameter.name: value for parameter, value in _leaves(config, prefix)}
+    return {f"{prefix}{name}": value for name, _, value in _fields_of(config)}
 
 
 def require_known(owner: str, config: type[Any], names: Iterable[str]) -> None:
@@ -213,8 +221,10 @@ def _configured(kind: type[C], defaults: Any, values: Mapping[str, Any], prefix:
     for each in fields(kind):  # type: ignore[arg-type]
         name, default = f"{prefix}{each.name}", getattr(defaults, each.name)
         if _PARAMETER in each.metadata:
-            declaration = _named(each.metadata[_PARAMETER], name, default)
-            chosen[each.name] = declaration.checked(values[name]) if name in values else default
+            chosen[each.name] = default
+            if name in values:
+                declaration = _named(each.metadata[_PARAMETER], name, default)
+                chosen[each.name] = declaration.checked(values[name])
         elif _GROUP in each.metadata:
             chosen[each.name] = _configured(type(default), default, values, f"{name}.")
         elif _REGISTERED in each.metadata:
@@ -227,17 +237,25 @@ def _configured(kind: type[C], defaults: Any, values: Mapping[str, Any], prefix:
 
 def _leaves(config: type[Any] | Any, prefix: str) -> Iterator[tuple[Parameter, Value]]:
     """Yield every parameter with its value in a configuration."""
+    for name, declaration, value in _fields_of(config):
+        yield _named(declaration, f"{prefix}{name}", value), value
+
+
+def _fields_of(config: type[Any] | Any) -> Iterator[tuple[str, Parameter, Value]]:
+    """Yield name, declaration and value of every parameter of a configuration."""
     assert is_dataclass(config)
     instance = config() if isinstance(config, type) else config
     for each in fields(instance):
-        name, value = f"{prefix}{each.name}", getattr(instance, each.name)
+        value = getattr(instance, each.name)
         if _PARAMETER in each.metadata:
-            yield _named(each.metadata[_PARAMETER], name, value), value
+            yield each.name, each.metadata[_PARAMETER], value
         elif _GROUP in each.metadata:
-            yield from _leaves(value, f"{name}.")
+            for name, declaration, inner in _fields_of(value):
+                yield f"{each.name}.{name}", declaration, inner
         elif _REGISTERED in each.metadata:
             for entry, options in value.items():
-                yield from _leaves(options, f"{prefix}{entry}.")
+                for name, declaration, inner in _fields_of(options):
+                    yield f"{entry}.{name}", declaration, inner
 
 
 def _named(declaration: Parameter, name: str, default: Value) -> Parameter:

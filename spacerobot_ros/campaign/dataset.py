@@ -94,6 +94,7 @@ class Dataset:
             encoding="utf-8",
         )
         facts = {"name": campaign.name, "fingerprint": fingerprint, "versions": VERSIONS}
+        facts["scenario"] = campaign.scenario.name
         about.write_text(json.dumps(facts, indent=1), encoding="utf-8")
         return self.done()
 
@@ -110,7 +111,7 @@ class Dataset:
             content = yaml.safe_load((self.folder / _CAMPAIGN).read_text(encoding="utf-8"))
         except (OSError, ValueError, yaml.YAMLError) as error:
             raise ParameterError(f"The folder {self.folder} holds no campaign: {error}.") from error
-        scenario = load_scenario(str(self.folder / _SCENARIO))
+        scenario = replace(load_scenario(str(self.folder / _SCENARIO)), name=facts["scenario"])
         return parse_campaign(facts["name"], content["campaign"], self.folder, scenario)
 
     # -- rows ---------------------------------------------------------------------------------

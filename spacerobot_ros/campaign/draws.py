@@ -132,4 +132,7 @@ def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = No
     )
     for dispersion in campaign.dispersions:
         flight = dispersion.target.apply(flight, draw.values[dispersion.name])
-    return flight.finished()
+    inertial = flight.inertial
+    if inertial is not None:
+        inertial.require_physical([body.name for body in flight.nominal.bodies])
+    return flight

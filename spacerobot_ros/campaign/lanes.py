@@ -168,11 +168,13 @@ def _key(flight: DrawnFlight) -> str:
         plant.pop("sensors.seed")
     # The robot of the plant is only measured: at rest, whatever its masses are, unless it drifts.
     moving = any(scenario.plant.linear_momentum) or any(scenario.plant.angular_momentum)
-    if not moving and not scenario.plant.initial_center_of_mass:
-        plant.pop("robot_description")
+    inertial = flight.inertial
+    weight = None
+    if inertial is not None and (moving or scenario.plant.initial_center_of_mass):
+        weight = inertial.vector.tolist()
     goal = [*scenario.goal.position, *scenario.goal.quaternion]
     shape = scenario.goal.joint_positions
-    wanted = goal, None if shape is None else shape.tolist()
+    wanted = goal, None if shape is None else shape.tolist(), weight
     return repr((plant, values_of(scenario.planner), wanted))
 
 

@@ -97,14 +97,14 @@ METRICS: dict[str, Metric] = {
         "m or rad", "least distance of a joint from its ends", _ends, by_joint=True, least=True
     ),
     "rate_margin": Metric(
-        "1",
+        "",
         "what remains of the rate limit of a joint, as a share of it",
         lambda f: 1.0 - _peak(f.qdot) / f.robot.limits("velocity"),
         by_joint=True,
         least=True,
     ),
     "effort_margin": Metric(
-        "1",
+        "",
         "what remains of the effort limit of a joint, as a share of it",
         lambda f: 1.0 - _peak(f.effort) / f.robot.limits("effort"),
         by_joint=True,

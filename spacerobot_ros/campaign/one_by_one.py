@@ -80,12 +80,8 @@ def robots_of(flight: DrawnFlight) -> Robots:
     inertial, scenario = flight.inertial, flight.scenario
     if inertial is None:
         return Robots.of(scenario, _built)
-    text = scenario.plant.robot_description
     weighing = node_robot("plant", flight).with_inertial(inertial)
-    # What is saved has the masses that were flown.
-    description = replace(weighing.description, urdf=text)
-    nominal = scenario.with_overrides("plant", {"robot_description": flight.nominal.urdf})
-    return replace(Robots.of(nominal, _built), plant=weighing, description=description)
+    return replace(Robots.of(scenario, _built), plant=weighing)
 
 
 def node_robot(node: str, flight: DrawnFlight) -> SpaceRobot:
@@ -131,7 +127,7 @@ class RosEngine:
             began = time.perf_counter()
             try:
                 with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
-                    flight = drawn_flight(campaign, draw, common)
+                    flight = drawn_flight(campaign, draw, common).finished()
                     bag = Path(folder, "flight.mcap")
                     self._run(flight.scenario, Path(folder, "draw.yaml"), bag)
                     flown = recorded_flight(bag)

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import ScalarFormatter
 
 from spacerobot_ros import __version__
 from spacerobot_ros.campaign.config import Campaign, Criterion, meets
@@ -478,6 +479,7 @@ def _convergence(results: Results) -> str:
     for panel in axes:
         panel.set_xlabel("flights")
         panel.set_xscale("log")
+        panel.xaxis.set_major_formatter(ScalarFormatter())
     return picture(figure, "convergence", "How the numbers settle with the number of flights.")
 
 

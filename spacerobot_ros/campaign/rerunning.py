@@ -90,7 +90,7 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
             f"flight {number}."
         )
     draw = draws[number]
-    run_scenario(drawn_flight(campaign, draw).scenario, bag)
+    run_scenario(drawn_flight(campaign, draw).finished().scenario, bag)
     row = Row.of(campaign, draw, recorded_flight(bag), "ros")
     known = known_flight(dataset, campaign, number)
     if known is None:

@@ -74,7 +74,7 @@ class DrawnFlight:
     Attributes
     ----------
     scenario
-        What is flown; the plant's robot is in it as a URDF text where its masses differ.
+        What is flown; the plant's masses are not in it before :meth:`finished`.
     nominal
         The robot without dispersions.
     mass, inertia
@@ -109,15 +109,11 @@ class DrawnFlight:
 
         The commanders go on to believe in the robot as it was, unless they have one of their own.
 
-        Raises
-        ------
-        RobotDescriptionError
-            No body weighs that.
+        To build one takes milliseconds: engines without ROS take :attr:`inertial` as it is.
         """
         parameters = self.inertial
         if parameters is None:
             return self
-        parameters.require_physical([body.name for body in self.nominal.bodies])
         text = urdf_with(self.nominal, parameters)
         scenario = self.scenario.with_overrides("plant", {"robot_description": text})
         for node in scenario.commanders:

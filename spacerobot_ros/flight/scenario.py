@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +132,8 @@ class Scenario:
     in_file: Mapping[str, Mapping[str, Any]]
     overrides: Mapping[str, Mapping[str, Any]]
     has_goal: bool = True
+    _configs: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """What :meth:`config` has returned, by node."""
 
     def config(self, node: str) -> Any:
         """Return the configuration of a node: defaults, the file's parameters, the overrides.
@@ -141,6 +143,11 @@ class Scenario:
         ParameterError
             The node has no such parameter, or a value is refused; the sentence names both.
         """
+        if node not in self._configs:
+            self._configs[node] = self._configured(node)
+        return self._configs[node]
+
+    def _configured(self, node: str) -> Any:
         known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
         values = {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
         for name, value in values.items():
