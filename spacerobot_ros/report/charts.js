@@ -59,7 +59,9 @@
     // From the last to the first: a mark's words have the room up to the next.
     const limit = [width, width, width];
     const earlier = marks.map(({ event }, k) => {
-      const before = marks.slice(0, k).filter((each) => each.event.row === event.row);
+      // Those at the same place have no words beside these.
+      const before = marks.slice(0, k).filter((each) =>
+        each.event.row === event.row && at(each.event.time) < at(event.time) - 10);
       return before.length ? at(before[before.length - 1].event.time) + 8 : 0;
     });
     for (let k = marks.length - 1; k >= 0; k--) {

@@ -14,8 +14,8 @@ from spacerobot_ros.report.live import Live, own_file
 from spacerobot_ros.report.plates import Group, Plate
 from spacerobot_ros.report.signals import Signal, simplified
 
-_MOST = 2500
-_MOST_IN_SLICES = 6000
+_MOST = 2000
+_MOST_IN_SLICES = 5000
 """Samples of a chart that are kept, where those between lie on lines and where they do not."""
 
 _UNSEEN = 5e-4

@@ -351,7 +351,10 @@ def _draw_rows(axes: Axes, flight: Flight, group: Group, share: float) -> bool:
         if dense:
             time, _, high = envelope(signal, index, columns)
         foot = count - 1 - index
-        axes.fill_between(time, foot, foot + _ROW * high, step="pre", color=tint, linewidth=0.3)
+        # From the sample before, which the value reaches back to.
+        on = high > 0
+        on[:-1] |= on[1:]
+        axes.fill_between(time, foot, foot + _ROW * high, on, step="pre", color=tint, linewidth=0.3)
     axes.set_ylim(-0.2, count)
     axes.set_yticks([count - 1 - k + _ROW / 2 for k in range(count)], group.names)
     axes.tick_params(axis="y", length=0, labelsize="small")
@@ -380,6 +383,8 @@ def _first_part(axes: Axes, group: Group, cycles: Cycles) -> bool:
 
 
 def _name_traces(axes: Axes, part: Signal, group: Group) -> None:
+    if not len(part):
+        return
     ends = part.values[-1].tolist()
     end_labels(axes, list(zip(ends, group.names, group.colours, strict=True)))
 

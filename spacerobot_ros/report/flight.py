@@ -317,12 +317,9 @@ class Flight:
                 for status in self.statuses
                 if isinstance(status.report, ControllerStatus)
             )
-        counted = (
-            status.report.manoeuvre_time_s
-            for status in reversed(self.statuses)
-            if isinstance(status.report, PlannerStatus) and status.report.manoeuvre_time_s
-        )
-        return next(counted, self.time_to_end)
+        last = [status.report for status in self.statuses if status.state in _FOLLOWED][-1]
+        counted = last.manoeuvre_time_s if isinstance(last, PlannerStatus) else 0.0
+        return counted or self.time_to_end
 
     @property
     def time_to_end(self) -> float | None:

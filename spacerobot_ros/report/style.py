@@ -258,6 +258,9 @@ def draw_traces(
     them than the panel, ``share`` of a figure's width, has room for, a band spans the smallest and
     the largest value in each slice of time.
     """
+    if not len(signal):
+        # Of a close-up in which nothing was measured.
+        return False
     columns = max(int(COLUMNS * share), 20)
     low, high = axes.get_ylim()
     dense = False

@@ -174,9 +174,7 @@ class ScheduleExecution:
         pursuit = self._pursuit
         assert pursuit is not None
         begins = self._stamp_ns if start_ns is None else start_ns
-        # What the schedule before had yet to do is not done.
-        remainder = pursuit.ends_at - begins / 1e9
-        pursuit.manoeuvre_time -= min(max(remainder, 0.0), pursuit.schedule.duration)
+        self._cut_off(pursuit, begins)
         pursuit.schedule = schedule
         average = self._in_motion.begin_schedule(self.config, schedule, begins)
         self._tracker.start(schedule, begins, average)
@@ -198,6 +196,14 @@ class ScheduleExecution:
             schedule,
         )
         self.outputs.append(ScheduleStart(schedule, begins))
+
+    @staticmethod
+    def _cut_off(pursuit: Pursuit, stamp_ns: int) -> None:
+        """Count what the present schedule would have yet to do as not done."""
+        remainder = pursuit.ends_at - stamp_ns / 1e9
+        if remainder > 0:
+            pursuit.manoeuvre_time -= min(remainder, pursuit.schedule.duration)
+            pursuit.ends_at = stamp_ns / 1e9
 
     def _on_end(self, stamp_ns: int) -> None:
         """End what was tracked; its result is evaluated unless its goal was given up."""
@@ -237,6 +243,7 @@ class ScheduleExecution:
         tracker.stuck += stuck
         self._plan_again_for(self._desk.drop())
         tracker.stop()
+        self._cut_off(pursuit, self._stamp_ns)
         pursuit.stuck_at = None
         pursuit.required = pursuit.schedule.controls & POSE
         pursuit.next_plan = PlanReason.STUCK_JOINTS

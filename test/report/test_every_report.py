@@ -1,0 +1,96 @@
+"""The report of every scenario and every fault scenario, opened at desktop and at phone width."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.chromium import Browser, browser, chromium
+
+from spacerobot_ros.events import EventKind
+from spacerobot_ros.flight.scenario import load_scenario, scenario_names
+from spacerobot_ros.report import write_report
+from spacerobot_ros.report.flight import read_flight
+from spacerobot_ros.session.run import run_scenario
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with"),
+]
+
+LARGEST = 5_000_000
+LONGEST = 10.0
+"""Of a page, in bytes, and of making it, in s of CPU."""
+
+FAULTS = {
+    "stuck_elbow": {"fault on: joint_stuck elbow_pitch", "stuck joint: elbow_pitch"},
+    "stuck_slider": {"fault on: joint_stuck", "stuck joint: slider_1", "goal failed"},
+    "broken_thrusters": {"fault on: thruster_stuck force_y", "fault off: thruster_stuck force_y"},
+    "late_poses": {"fault on: sensor_dropout odom", "fault off: sensor_dropout odom"},
+    "weak_motors": {"fault on: joint_slow slider_1", "correction"},
+    "wrong_masses": {"correction"},
+    "killed_nodes": {"node silent", "node back"},
+}
+"""What must stand below the charts of some: the fault, what found it, its end."""
+
+
+@pytest.fixture(autouse=True)
+def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
+
+
+@pytest.fixture(scope="module")
+def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_the_report_shows_what_happened(name: str, tmp_path: Path, window: Browser) -> None:
+    scenario = load_scenario(name)
+    processes = bool(scenario.kills)
+    if processes:
+        scenario = scenario.in_real_time(4.0)
+    bag, page = tmp_path / "flight.mcap", tmp_path / "flight.html"
+    summary = run_scenario(scenario, bag, processes=processes).summary
+    bag = Path(summary["bag"])
+    began = time.process_time()
+    write_report(bag, page)
+    assert time.process_time() - began < LONGEST
+    assert page.stat().st_size < LARGEST
+    flight = read_flight(bag)
+    # Terminal, JSON and report say the same.
+    assert flight.manoeuvre_time == pytest.approx(summary["manoeuvre_time_s"], abs=1e-6)
+    kinds = {each.event.kind for each in flight.events}
+    for width in (1280, 390):
+        window.complaints.clear()
+        window.requests.clear()
+        window.open(page, width, 900)
+        window.wait_for("document.getElementById('animation').className !== 'loading'")
+        assert window.evaluate("document.getElementById('animation').className") == "ready"
+        assert window.complaints == []
+        outside = [url for url in window.requests if not url.startswith("data:")]
+        assert outside == [page.as_uri()]
+        assert window.evaluate("document.documentElement.scrollWidth") <= width
+        charts = window.evaluate("flightCharts.charts.length")
+        assert charts == window.evaluate("document.querySelectorAll('.lane').length") >= 5
+        below = lanes(window)
+        for words in FAULTS.get(Path(name).name, ()):
+            assert any(words in text for text in below), (words, below)
+        assert any("goal" in text for text in below)
+        if EventKind.FAULT_INJECTED in kinds:
+            assert any(text.startswith("fault on: ") for text in below)
+        if EventKind.STUCK_JOINT in kinds:
+            assert any(text.startswith("stuck joint: ") for text in below)
+
+
+def lanes(window: Browser) -> list[Any]:
+    """Return the words below the first chart; marks of faults and of what found them are seen."""
+    words = "flightCharts.charts[0].marks.map(({words}) => words.textContent)"
+    strong = "flightCharts.charts[0].marks.filter(({event}) => event.strong)"
+    assert window.evaluate(f"{strong}.every(({{mark}}) => mark.offsetHeight > 0)")
+    found: list[Any] = window.evaluate(words)
+    return found
