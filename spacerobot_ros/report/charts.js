@@ -241,6 +241,7 @@
     }).observe(box);
     charts.push(made);
     place(made);
+    requestAnimationFrame(() => place(made));
   }
 
   for (const chart of given.charts) {

@@ -661,8 +661,9 @@ def test_what_is_cut_off_a_schedule_is_no_time_of_the_manoeuvre() -> None:
     first, second = loop.starts[-2:]
     flown = (second.stamp_ns - first.stamp_ns) / 1e9
     assert flown < 0.5 * first.schedule.duration
-    expected = flown + second.schedule.duration
-    assert loop.statuses[-1].manoeuvre_time_s == pytest.approx(expected)
+    # From the first command to the stop; then planning takes some ticks.
+    counted = loop.statuses[-1].manoeuvre_time_s - second.schedule.duration
+    assert flown - 3 * 0.05 < counted < flown
 
 
 def test_a_state_that_is_not_finite_ends_no_goal_silently() -> None:

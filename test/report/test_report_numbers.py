@@ -17,8 +17,10 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from matplotlib.figure import Figure
 from sensor_msgs.msg import JointState
+from support.flight_bags import Story, cyclic_shapes, tell
 from support.made_bags import array, joint_states, made_bag, odometry, pose, stamped
 
+from spacerobot_ros.bag import read_bag
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.figures_time import (
@@ -26,7 +28,9 @@ from spacerobot_ros.report.figures_time import (
     joint_unit,
     pose_errors,
     position_group,
+    position_plate,
     shape_groups,
+    thrusters_plate,
 )
 from spacerobot_ros.report.flight import Flight, read_flight
 from spacerobot_ros.report.live import Live
@@ -39,6 +43,7 @@ from spacerobot_ros.report.tables import (
     result_table,
     runs_table,
 )
+from spacerobot_ros.resources import share_directory
 
 NAMES = ["slide", "turn"]
 STILL = (0.0,) * 6
@@ -494,3 +499,40 @@ def test_whatever_a_bag_holds_is_text_on_the_page(tmp_path: Path) -> None:
         assert odd(n) in read, n
     assert "<i>13&.mcap" in content.text
     assert odd(14) in content.values, "the picture's other text"
+
+
+# -- thrusters, and parts without measurements ------------------------------------------------
+
+
+def test_propellant_is_what_the_plant_counted() -> None:
+    bag = read_bag(share_directory() / "bags" / "servicer_thrusters.mcap")
+    found = read_flight(bag.path)
+    counted = {
+        time_ns / 1e9: float(pair.value)
+        for time_ns, message in bag["diagnostics"].messages()
+        for status in message.status
+        for pair in status.values
+        if pair.key == "propellant_kg"
+    }
+    assert max(counted.values()) > 5e-3
+    assert found.propellant is not None
+    for time, value in counted.items():
+        used = np.interp(time, found.propellant.time, found.propellant.values[:, 0])
+        assert used == pytest.approx(value, rel=1e-6, abs=1e-9)
+    # All thrusters of this robot push with 10 N: the impulse is that times how long they were on.
+    on = bag["thrusters"].field("position")
+    assert found.impulse.values[-1, 0] == pytest.approx(10.0 * float((on[-1] - on[0]).sum()))
+    plate = thrusters_plate(found)
+    assert plate is not None
+    assert [len(group.names) for group in plate.groups] == [6, 1, 1]
+    assert "18 of 24 thrusters were never on" in plate.caption
+
+
+def test_a_flight_that_was_not_measured_at_its_end_is_drawn(tmp_path: Path) -> None:
+    whole = read_flight(tell(tmp_path / "a.mcap", Story(cyclic_shapes())))
+    assert whole.cycles is not None
+    early = whole.position.between(0.0, 0.5 * whole.end)
+    cut = replace(whole, position=early, quaternion=whole.quaternion[: len(early)])
+    plate = position_plate(cut)
+    assert isinstance(plate, Plate)
+    assert plate.groups[0].signal.time[-1] < whole.cycles.last(3)[0]
