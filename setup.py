@@ -126,7 +126,6 @@ setup(
             "meshcat",
             *MESHES,
             *VIEWER,
-            *VIEWER,
             'mujoco>=4; python_version >= "3.11"',
             "mypy",
             "pin",
