@@ -64,6 +64,10 @@ test-oldest: ## run the quick tests with the versions of Ubuntu 24.04, in .venv-
 
 OLDEST := click lxml lz4 matplotlib numpy pin pyarrow pyparsing PyYAML scipy zstandard
 
+.PHONY: viewer-test
+viewer-test: $(STAMP)/test ## fly from the viewer's page in Chromium, and look at recordings there
+	$(BIN)/python3 -m pytest -m 'slow or not slow' test/viewer
+
 .PHONY: fuzz
 fuzz: $(STAMP)/test ## try more than ten thousand inputs that nobody would send, and count them
 	SPACEROBOT_FUZZ=long $(BIN)/python3 -m pytest -q test/fuzz

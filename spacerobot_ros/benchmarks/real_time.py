@@ -34,7 +34,7 @@ _LONGEST_IDLE_END = 5.0
 _WARM_UP = 0.25
 """Part of the time after which memory is to grow no more."""
 
-_PRIORITIES = {"plant": 30, "planner": 20, "recorder": 10}
+_PRIORITIES = {"plant": 30, "planner": 20, "coordinated_control": 20, "recorder": 10}
 """Of the kernel's real-time scheduling, where it is allowed; `chrt -f` gives the same."""
 
 _GOAL = Goal.checked([0.2, -0.15, 0.05], quaternion_from_rotvec([0.1, -0.05, 0.02]))
@@ -145,7 +145,7 @@ def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
         bag = Path(folder, "flight.mcap")
         stack = MultiProcessStack(scenario, bag)
         idle = _IdleProcess(1.0 / rate, duration)
-        prioritised = _prioritise(stack)
+        prioritised = prioritise(stack)
         try:
             stopped = closing.enter_context(ended_on_request())
             stack.start(_GOAL)
@@ -222,7 +222,7 @@ def _figures(
     )
 
 
-def _prioritise(stack: MultiProcessStack) -> bool:
+def prioritise(stack: MultiProcessStack) -> bool:
     """Have the kernel let the plant go first, then its commander; return whether it does."""
     try:
         for name, process in stack.processes.items():

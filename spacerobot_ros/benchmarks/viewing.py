@@ -18,6 +18,7 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 
 from spacerobot_ros.bag import Bag, read_bag
+from spacerobot_ros.benchmarks.real_time import prioritise
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model.description import Array
@@ -77,6 +78,8 @@ class ViewerFigures:
         How many there were.
     browser
         Whether a browser had the page open as well.
+    prioritised
+        Whether the kernel let the plant and its controller go first.
     """
 
     updates_per_s: float
@@ -85,14 +88,17 @@ class ViewerFigures:
     deadlines_without: int
     deadlines_with: int
     browser: bool
+    prioritised: bool
 
     def lines(self) -> Iterator[str]:
         """Yield the figures as lines for people."""
         client = "a browser and a client" if self.browser else "a client (no browser is installed)"
+        priorities = f"{'with' if self.prioritised else 'without'} real-time priorities"
         yield f"viewer with {client}: {self.updates_per_s:.1f} updates a second received"
         yield (
             f"deadlines missed: {self.missed_without_percent:.3f} % of {self.deadlines_without} "
-            f"without it, {self.missed_with_percent:.3f} % of {self.deadlines_with} with it"
+            f"without it, {self.missed_with_percent:.3f} % of {self.deadlines_with} with it "
+            f"({priorities})"
         )
 
 
@@ -122,6 +128,7 @@ def run_viewer_benchmark(seconds: float, show: Callable[[str], None]) -> dict[st
         try:
             stopped = closing.enter_context(ended_on_request())
             goals = _Goals(stack)
+            prioritised = prioritise(stack)
             stack.start(None)
             for viewed in (False, True, False, True):
                 with ExitStack() as beside:
@@ -151,6 +158,7 @@ def run_viewer_benchmark(seconds: float, show: Callable[[str], None]) -> dict[st
         deadlines_without=phases[False].deadlines,
         deadlines_with=phases[True].deadlines,
         browser=browser,
+        prioritised=prioritised,
     )
     for line in figures.lines():
         show(line)

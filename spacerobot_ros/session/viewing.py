@@ -29,6 +29,8 @@ _START = 30.0
 _END = 1.5
 """Wall s that the process has to end after a signal before it is killed."""
 
+_NICENESS = 5
+
 _CHILD = "spacerobot_ros.session.child"
 
 
@@ -74,6 +76,9 @@ def viewing(
                 stderr=errors,
                 start_new_session=True,
             )
+        with suppress(OSError):
+            # Everything that flies goes first.
+            os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
         try:
             show(_announcement(process, log))
             for line in log.read_text("utf-8", errors="replace").splitlines():

@@ -16,7 +16,7 @@ from spacerobot_ros.errors import MeshError
 from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
 from spacerobot_ros.model.link_transforms import LinkTransforms
 from spacerobot_ros.model.meshes import shape_mesh
-from spacerobot_ros.model.rotations import quaternion_from_matrix
+from spacerobot_ros.model.visuals import solid_mesh
 
 if TYPE_CHECKING:
     import viser
@@ -117,39 +117,19 @@ class RobotDrawing:
         return [ball, *(bar for bar in bars if bar is not None)]
 
     def _solid(self, path: str, shape: Shape) -> Any | None:
-        look: dict[str, Any] = {
-            "position": shape.pose.r,
-            "wxyz": wxyz(quaternion_from_matrix(shape.pose.R)),
-            "cast_shadow": False,
-            "receive_shadow": False,
-        }
+        """Draw a visual in the frame of its link; None where it cannot be drawn."""
+        try:
+            mesh = shape_mesh(shape, _MOST_TRIANGLES) if shape.kind == "mesh" else solid_mesh(shape)
+        except MeshError as error:
+            self._on_note(str(error))
+            return None
         red, green, blue, alpha = shape.rgba
+        look: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
         look["color"] = self._color or tuple(round(255 * x) for x in (red, green, blue))
         if self._color is not None:
             look["opacity"] = GHOST_OPACITY
         elif alpha < 1.0:
             look["opacity"] = alpha
-        scene = self._scene
-        match shape.kind:
-            case "box":
-                return scene.add_box(path, dimensions=_triple(shape.size), **look)
-            case "cylinder":
-                return scene.add_cylinder(
-                    path, radius=float(shape.size[0]), height=float(shape.size[1]), **look
-                )
-            case "sphere":
-                return scene.add_icosphere(path, radius=float(shape.size[0]), **look)
-            case _:
-                return self._mesh(path, shape, look)
-
-    def _mesh(self, path: str, shape: Shape, look: dict[str, Any]) -> Any | None:
-        try:
-            mesh = shape_mesh(shape, _MOST_TRIANGLES)
-        except MeshError as error:
-            self._on_note(str(error))
-            return None
-        # Its vertices are in the frame of the link already.
-        look |= {"position": np.zeros(3), "wxyz": np.array([1.0, 0.0, 0.0, 0.0])}
         faces = mesh.faces.astype(np.uint32)
         return self._scene.add_mesh_simple(path, mesh.vertices, faces, flat_shading=True, **look)
 
@@ -183,11 +163,6 @@ def _bar(end: Array) -> Shape | None:
     x /= np.linalg.norm(x)
     R = np.column_stack([x, np.cross(z, x), z])
     return Shape("cylinder", (0.4 * _SCALE, length), Pose(R, end / 2))
-
-
-def _triple(size: tuple[float, ...]) -> tuple[float, float, float]:
-    x, y, z = (float(each) for each in size)
-    return x, y, z
 
 
 def reach_of(robot: RobotDescription) -> float:

@@ -156,3 +156,30 @@ def test_a_mission_is_flown_from_the_page(
         assert window.complaints == []
         assert page.requests_outside() == []
     assert "Traceback" not in nodes.log("viewer")
+
+
+def test_a_page_that_is_closed_in_the_middle_of_a_drag_leaves_a_goal_and_no_harm(
+    harness: Harness, nodes: Processes, tmp_path: Path
+) -> None:
+    url = nodes.start_viewer()
+    nodes.start("plant", *PLANT, files=FILE)
+    nodes.start("planner", *PLANNER, files=FILE)
+    watched = Watched(harness)
+    reach = reach_of(load_robot(ROOT / "urdf" / "sliding_masses.urdf"))
+    camera = reach * CAMERA
+    with browser(tmp_path / "first") as window:
+        page = Page(window, url)
+        page.wait_for_text("Goal reachable")
+        tip, to = (np.array([0.0, 0.0, z * reach]) for z in (0.40, 0.46))
+        page.drag(page.pixel(tip, camera), page.pixel(to, camera), release=False)
+        moved = page.numbers(POSITION)
+        assert moved[2] > 0.0
+    with browser(tmp_path / "second") as window:
+        page = Page(window, url)
+        page.wait_for_text("Goal reachable")
+        assert page.numbers(POSITION) == pytest.approx(moved, abs=1e-4)
+        watched.hear()
+        assert watched.value("planner/status", "state") == "idle"
+        page.press("Goal to the robot")
+        page.wait_for_text("Goal reachable", "Reachable in 0 s")
+        assert window.complaints == []

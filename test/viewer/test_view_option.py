@@ -1,0 +1,122 @@
+"""``--view``: the page beside a command, and what is left when the command ends."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+from support.chromium import browser, chromium
+from support.viewer_page import ROOT, Page
+
+from spacerobot_ros.cli.main import main
+
+COMMAND = (sys.executable, "-m", "spacerobot_ros.cli.main")
+
+
+def test_a_lockstep_flight_is_over_before_it_is_seen() -> None:
+    from click.testing import CliRunner
+
+    refused = CliRunner().invoke(main, ["run", "planar_chain", "--view"])
+    assert refused.exit_code == 2
+    assert "--view needs --realtime" in refused.output
+
+
+@contextmanager
+def viewed(domain: int, folder: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A command with a page, and its address."""
+    process = subprocess.Popen(
+        [*COMMAND, *words, "--view"],
+        env={**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONPATH": str(ROOT)},
+        cwd=folder,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    try:
+        found = None
+        while found is None:
+            line = process.stderr.readline()
+            assert line, "it has ended"
+            found = re.match(r"viewer +(http://127\.0\.0\.1:\d+/)$", line.strip())
+        yield process, found[1]
+    finally:
+        process.kill()
+        process.wait()
+        process.stderr.close()
+
+
+def left(domain: int) -> list[str]:
+    """Return the command lines of the processes that are in a ROS domain, this one left out."""
+    found = []
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit() and int(folder.name) != os.getpid():
+            with suppress(OSError):
+                if f"ROS_DOMAIN_ID={domain}\0" in (folder / "environ").read_text():
+                    found.append((folder / "cmdline").read_text().replace("\0", " "))
+    return found
+
+
+def ended(process: subprocess.Popen[str], domain: int) -> float:
+    """Send Ctrl-C and return how long it took until no process was left, s."""
+    began = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    process.wait(20)
+    while left(domain):
+        assert time.monotonic() - began < 20.0, left(domain)
+    return time.monotonic() - began
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(chromium() is None, reason="no Chromium to open the page with")
+def test_a_recording_is_moved_in_time(ros_domain: int, tmp_path: Path) -> None:
+    bag = ROOT / "bags" / "planar_chain.mcap"
+    with viewed(ros_domain, tmp_path, "replay", str(bag)) as (process, url):
+        with browser(tmp_path / "profile") as window:
+            page = Page(window, url)
+            page.wait_for_text("Replay ended", without="No state")
+            assert "Fly" not in page.text(), "a recording takes no goals"
+            end = page.numbers("Time (s)")[-1]
+            page.press("Play")
+            page.wait_for_text("Replay playing")
+            page.press("Hold")
+            page.wait_for_text("Replay paused")
+            page.type("Time (s)", (1.0,))
+            page.wait_for_text("Replay paused: 1.00 s of")
+            page.wait_for_text("t = 1.00 s")
+            assert end > 2.0
+            # A second page, of a phone, shows the same.
+            with browser(tmp_path / "phone") as phone:
+                other = Page(phone, url, 390, 780)
+                other.wait_for_text("Replay paused: 1.00 s of")
+                assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+                assert phone.complaints == []
+            assert window.complaints == []
+            assert page.requests_outside() == []
+        assert ended(process, ros_domain) < 4.0
+
+
+@pytest.mark.slow
+def test_a_stack_and_its_viewer_end_together(ros_domain: int, tmp_path: Path) -> None:
+    words = ("up", "sliding_masses", "--processes", "--rate", "4")
+    with viewed(ros_domain, tmp_path, *words) as (process, _):
+        assert any("viewer" in line for line in left(ros_domain))
+        assert ended(process, ros_domain) < 6.0
+
+
+@pytest.mark.slow
+def test_a_command_that_is_killed_leaves_no_viewer(ros_domain: int, tmp_path: Path) -> None:
+    with viewed(ros_domain, tmp_path, "up", "sliding_masses") as (process, _):
+        process.kill()
+        process.wait()
+        end = time.monotonic() + 20.0
+        while left(ros_domain):
+            assert time.monotonic() < end, left(ros_domain)
