@@ -73,6 +73,11 @@ class GoalEditor:
         self._angles: Any = gui.add_vector3("Roll, pitch, yaw (deg)", (0.0, 0.0, 0.0), step=1.0)
         self._tool_too = gui.add_checkbox("Goal for the end-effector", initial_value=True)
         self._tool_too.visible = False
+
+        @self._tool_too.on_update
+        async def _(event: Any) -> None:
+            self._defer(lambda: self.touch(time.monotonic()))
+
         self._to_robot = gui.add_button("Goal to the robot", color="gray")
         for field in (self._position, self._angles):
             field.on_update(self._on_field)
@@ -156,13 +161,13 @@ class GoalEditor:
             if name in self._poses
         }
 
-    def goal_at_rest(self, now: float) -> Goal | None:
-        """Return the goal of the base once, when it has not been moved for a moment."""
+    def goals_at_rest(self, now: float) -> dict[Part, Goal] | None:
+        """Return the goals once, when they have not been moved for a moment."""
         if self._changed_at is None or now - self._changed_at < AT_REST_S or not self.placed:
             return None
         self._changed_at = None
         try:
-            return self.goals()["base"]
+            return self.goals()
         except GoalError as error:
             self.show_check(Check(Verdict.REFUSED, str(error)))
             return None

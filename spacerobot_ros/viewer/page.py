@@ -15,13 +15,14 @@ import numpy as np
 from spacerobot_ros.control.thrusters.table import ThrusterTable
 from spacerobot_ros.errors import GoalError
 from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.simulation.faults import Targets
 from spacerobot_ros.viewer import content, scene
 from spacerobot_ros.viewer.config import ViewerConfig
 from spacerobot_ros.viewer.content import Trail
 from spacerobot_ros.viewer.goal_editor import GoalEditor
 from spacerobot_ros.viewer.panels import Buttons, Faults, Joints, Log, Plots, TimeLine
-from spacerobot_ros.viewer.port import Action, Fly, Measured, Notice, Request, StackState
+from spacerobot_ros.viewer.port import Action, Fly, Measured, Notice, Part, Request, StackState
 from spacerobot_ros.viewer.reachability import Check
 
 if TYPE_CHECKING:
@@ -133,9 +134,9 @@ class Page:
         if not self._editor.moving:
             self._editor.show_check(check)
 
-    def goal_to_check(self, now: float) -> Any:
-        """Return the goal of the base once, when it has not been moved for a moment, else None."""
-        return self._editor.goal_at_rest(now)
+    def goals_to_check(self, now: float) -> dict[Part, Goal] | None:
+        """Return the goals once, when they have not been moved for a moment, else None."""
+        return self._editor.goals_at_rest(now)
 
     @property
     def goal_moves(self) -> bool:

@@ -24,6 +24,7 @@ import numpy as np
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.robot_source import robot_from_text
+from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured, declared
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
@@ -33,6 +34,7 @@ from spacerobot_ros.planning.core.progress import reported
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
 from spacerobot_ros.termination import Terminated, child_options, guarded
+from spacerobot_ros.viewer.arm_shape import arm_shape, is_near
 
 _NICE = 10
 """What is added to the niceness of the process: everything else goes first."""
@@ -91,16 +93,21 @@ class Question:
         The planner's own, as JSON texts by their names.
     state, goal
         From where, and to where.
+    tool, link
+        Where a link is to be, for a controller, which plans nothing: then it is asked whether there
+        is a shape in which it is there. None: a planner flies.
     """
 
     urdf: str
     parameters: Mapping[str, str]
     state: RobotState
     goal: Goal
+    tool: Goal | None = None
+    link: str = ""
 
     def to_json(self, number: int) -> str:
         """Return the line that asks it."""
-        state, goal = self.state, self.goal
+        state, goal, tool = self.state, self.goal, self.tool
         return json.dumps(
             {
                 "number": number,
@@ -114,6 +121,8 @@ class Question:
                     )
                 ],
                 "goal": [goal.position.tolist(), goal.quaternion.tolist()],
+                "tool": tool and [tool.position.tolist(), tool.quaternion.tolist()],
+                "link": self.link,
             }
         )
 
@@ -258,6 +267,8 @@ class Planner:
             A newer question has come.
         """
         try:
+            if question["tool"] is not None:
+                return _of_arm(question)
             built = question["urdf"], question["parameters"]
             if built != self._built:
                 self._build(*built)
@@ -290,6 +301,23 @@ class Planner:
         # The robot is that of the stack; the planner may have it from there as well.
         self._config = configured(PlannerConfig, {**values, "robot_description": "", "robot": ""})
         self._worker = PlanningWorker(robot_from_text(urdf, self._config), self._config)
+
+
+def _of_arm(question: Mapping[str, Any]) -> dict[str, Any]:
+    """Return whether there is a shape in which the end-effector is at its goal."""
+    robot = parse_robot(question["urdf"])
+    base, tool = (Goal.checked(*question[name]) for name in ("goal", "tool"))
+    q = np.array(question["state"][2], float)
+    shape, distance, angle = arm_shape(robot, question["link"], base, tool, q)
+    found = {"shape": shape.tolist()}
+    if is_near(distance, angle):
+        sentence = "The end-effector can be at its goal there."
+        return {"verdict": Verdict.REACHABLE.value, "sentence": sentence, **found}
+    sentence = (
+        f"No shape was found in which the end-effector is at its goal: it is {distance:.3g} m and "
+        f"{angle:.3g} rad off in the nearest."
+    )
+    return {"verdict": Verdict.REFUSED.value, "sentence": sentence, **found}
 
 
 class _Desk:

@@ -158,6 +158,16 @@ class Page:
             self._window.call("Input.insertText", text=f"{value}")
             self._window.evaluate(f"{_fields(label)}[{i}].blur()")
 
+    def slide(self, share: float) -> None:
+        """Press the page's slider at a share of its length."""
+        box = "document.querySelector('[role=slider]').parentElement.getBoundingClientRect()"
+        x, y = self._window.evaluate(f"(b => [b.x + {share} * b.width, b.y + b.height / 2])({box})")
+        self._window.mouse("mouseMoved", x, y)
+        self._window.mouse("mousePressed", x, y, held=True)
+        self.draw()
+        self._window.mouse("mouseReleased", x, y, held=True)
+        self.draw()
+
     def pixel(self, point: Array, camera: Array) -> tuple[float, float]:
         """Return where a point of the world is seen from a camera that looks at the origin."""
         forward = -camera / np.linalg.norm(camera)

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from threading import Event
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from spacerobot_ros import plan
 from spacerobot_ros.model import load_robot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning import Goal, RobotState
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
@@ -109,3 +112,41 @@ def test_the_last_goal_is_the_one_that_is_answered(checker: GoalChecker) -> None
     process = checker._process
     checker.close()
     assert process.poll() is not None
+
+
+def test_the_arm_of_a_controlled_robot_reaches_its_goal_or_not() -> None:
+    robot = load_robot(robot_file("servicer"))
+    urdf, link = robot.urdf, robot.end_effector()
+    model = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
+    data, frame = model.createData(), model.getFrameId(link)
+    rng = np.random.default_rng(5)
+    lower, upper = robot.limits("lower"), robot.limits("upper")
+    for _ in range(3):
+        # Where Pinocchio has the end-effector in some shape, it can be.
+        q = rng.uniform(0.9 * lower, 0.9 * upper)
+        full = pin.neutral(model)
+        full[:3], full[3:7] = rng.normal(size=3), _unit(rng.normal(size=4))
+        for name, position in zip(robot.joint_names, q, strict=True):
+            full[model.joints[model.getJointId(name)].idx_q] = position
+        pin.framesForwardKinematics(model, data, full)
+        pose = pin.SE3ToXYZQUAT(data.oMf[frame])
+        base, tool = (Goal(each[:3], each[3:7]) for each in (full, pose))
+        start = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6))
+        near = Question(urdf, {}, start, base, tool, link)
+        answer = Planner().answer(as_asked(near), Cancellation())
+        assert answer["verdict"] == "reachable", answer
+        shape = np.array(answer["shape"])
+        assert np.all((lower - 1e-6 <= shape) & (shape <= upper + 1e-6))
+        for name, position in zip(robot.joint_names, shape, strict=True):
+            full[model.joints[model.getJointId(name)].idx_q] = position
+        pin.framesForwardKinematics(model, data, full)
+        np.testing.assert_allclose(data.oMf[frame].translation, tool.position, atol=1e-3)
+    far = Goal(tool.position + np.array([9.0, 0.0, 0.0]), tool.quaternion)
+    answer = Planner().answer(as_asked(replace(near, tool=far)), Cancellation())
+    assert answer["verdict"] == "refused"
+    assert "m and" in answer["sentence"]
+
+
+def _unit(quaternion: Array) -> Array:
+    unit: Array = quaternion / np.linalg.norm(quaternion)
+    return unit

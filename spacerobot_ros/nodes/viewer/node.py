@@ -42,6 +42,7 @@ from spacerobot_ros.viewer.port import (
     Action,
     Fly,
     Inject,
+    Measured,
     Notice,
     Part,
     Request,
@@ -81,6 +82,11 @@ _SERVICES: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
     Request.HOLD: (("replay",), "pause", True),
 }
 """Whose service a request calls, which one, and what it is told (None: it is a trigger)."""
+
+_ASKED = ("plant", "planner", "controller")
+"""Whose parameters are of use."""
+
+_END_EFFECTOR = "end_effector_frame"
 
 _LONGEST_MEETING = 4.0
 """Wall s that a goal waits for commanders that are known and not met yet."""
@@ -205,9 +211,9 @@ class ViewerNode(FlightNode):
     def _check_goal(self, state: StackState, now: float) -> None:
         if self._page.goal_moves:
             self._checker.cancel()
-        goal = self._page.goal_to_check(now)
-        if goal is not None:
-            question, why_not = self._question(state, goal)
+        goals = self._page.goals_to_check(now)
+        if goals is not None:
+            question, why_not = self._question(state, goals)
             if question is None:
                 self._checker.cancel()
                 self._page.show_check(Check(Verdict.UNCHECKED, why_not))
@@ -217,23 +223,42 @@ class ViewerNode(FlightNode):
         if check is not None:
             self._page.show_check(check)
 
-    def _question(self, state: StackState, goal: Goal) -> tuple[Question | None, str]:
+    def _question(
+        self, state: StackState, goals: Mapping[Part, Goal]
+    ) -> tuple[Question | None, str]:
         """Return what is to be planned, or None and why not."""
         if not self.config.check_goals:
             return None, "Parameter 'check_goals' is false."
+        measured, goal = state.measured, goals["base"]
+        if measured is None or self._robot is None:
+            return None, "No state has come yet."
         if state.planner is None:
-            return None, "No planner is there: a controller flies to any pose."
+            return self._question_of_arm(measured, goals)
         if state.planner.state is PlannerState.PLANNING:
             return None, "The planner plans."
         parameters = self._remote_values.get("planner")
-        measured = state.measured
-        if parameters is None or measured is None:
+        if parameters is None:
             return None, "The planner's parameters are not known yet."
         momenta = np.zeros(6) if state.momenta is None else state.momenta.actual
         robot_state = RobotState(
             measured.pose[:3], measured.pose[3:], measured.q, momenta[:3], momenta[3:]
         )
         return Question(self._urdf, parameters, robot_state, goal), ""
+
+    def _question_of_arm(
+        self, measured: Measured, goals: Mapping[Part, Goal]
+    ) -> tuple[Question | None, str]:
+        """Return whether the arm can be as a controller is to bring it, or None and why not."""
+        assert self._robot is not None
+        tool = goals.get("end_effector")
+        if tool is None:
+            return None, "No planner is there: a controller flies the base to any pose."
+        named = json.loads(self._remote_values.get("controller", {}).get(_END_EFFECTOR, '""'))
+        link = self._robot.end_effector(named)
+        if link not in self._robot.frames:
+            return None, "The end-effector is no link of the robot."
+        state = RobotState(measured.pose[:3], measured.pose[3:], measured.q)
+        return Question(self._urdf, {}, state, goals["base"], tool, link), ""
 
     # -- what the stack says --------------------------------------------------------------------
 
@@ -262,7 +287,7 @@ class ViewerNode(FlightNode):
         for keys, service, data in _SERVICES.values():
             if key in keys:
                 self._client(Trigger if data is None else SetBool, f"{name}/{service}")
-        if key in ("plant", "planner"):
+        if key in _ASKED:
             self._ask(key)
 
     def _on_event(self, message: DiagnosticStatus) -> None:
@@ -274,7 +299,7 @@ class ViewerNode(FlightNode):
         self._page.note(Notice(event.sentence, event.level, event.time_s, message.name))
         if event.kind in (EventKind.ACTIVATED, EventKind.NODE_BACK):
             for key, name in self._full_names.items():
-                if name == message.name and key in ("plant", "planner"):
+                if name == message.name and key in _ASKED:
                     self._ask(key)
 
     def _on_log(self, message: RosoutLog) -> None:
@@ -283,7 +308,7 @@ class ViewerNode(FlightNode):
             self._note(message.msg, level, message.name)
 
     def _on_change(self, message: ParameterEvent) -> None:
-        for key in ("plant", "planner"):
+        for key in _ASKED:
             if self._full_names.get(key) == message.node and key in self._remote_values:
                 self._ask(key)
 
