@@ -2,6 +2,7 @@
 
 from spacerobot_ros.batch.flights import (
     BatchResult,
+    Controlled,
     FlightProgram,
     Flights,
     FollowedSchedule,
@@ -14,6 +15,7 @@ from spacerobot_ros.batch.scalar import fly_one_by_one
 
 __all__ = [
     "BatchResult",
+    "Controlled",
     "FlightProgram",
     "Flights",
     "FollowedSchedule",

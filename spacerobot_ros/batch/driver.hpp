@@ -2,18 +2,21 @@
 // together is called a row; a group's memory is a table of rows, the same for all groups.
 //
 // FLIGHT and REPORT are CasADi's functions of a tick: the latter also gives what is reported.
+// CONTROL, where there is one, gives the command for a state.
 
 struct Span {
   long long from, to, count;  // rows
 };
 
-enum Program { HELD = 0, FOLLOWED = 1 };
+enum Program { HELD = 0, FOLLOWED = 1, CONTROLLED = 2 };
+
+enum Pending { NOTHING = 0, COMMIT = 1, TICK = 2 };
 
 struct Job {
   V *memory;               // groups x rows
   long long groups, rows;
   long long *at;           // of each group: the tick that is next
-  unsigned char *pending;  // of each group: a tick was taken, and is to be committed
+  unsigned char *pending;  // of each group: what is next is to commit a tick, or to take it
   // Arguments and results of the two functions: rows, in the order of CasADi.
   const long long *arguments, *flight_results, *report_results;
   long long argument_count, flight_result_count, report_result_count;
@@ -31,8 +34,8 @@ struct Job {
   long long table_ticks, each_table;
   // FOLLOWED: the table has shapes, and one more of them than ticks.
   long long q_row, measured_row, bias_row, noise_row, n, noisy;
-  const double *normals;   // (groups, ticks from normals_from on, n, LANES)
-  long long normals_from, normals_ticks;
+  const double *normals;   // (groups, ticks from normals_from on, normals_width, LANES)
+  long long normals_from, normals_ticks, normals_width;
   double gain, deadband;
   // Reports.
   const long long *instants;  // ticks, ascending
@@ -40,6 +43,11 @@ struct Job {
   V *reports;              // (groups, instants, report rows)
   const Span *reported;
   long long reported_count, report_rows;
+  // CONTROLLED: rows of CONTROL's arguments and results, and those that the loop looks at.
+  const long long *control_arguments, *control_results;
+  long long control_argument_count, control_result_count;
+  long long normals_row, time_row, since_row, begun_row, exact_row, settled_row, reached_row;
+  V *reached;              // (groups, report rows): the state when a goal was reached
 };
 
 static V *work_memory() {
@@ -48,15 +56,25 @@ static V *work_memory() {
   return memory;
 }
 
-static void evaluate(const Job &job, V *group, bool report) {
-  const V *arguments[ARGUMENT_POINTERS];
-  V *results[RESULT_POINTERS];
+typedef int Function(const V **, V **, long long *, V *, int);
+
+static void call(Function *function, V *group, const long long *arguments, long long argument_count,
+                 const long long *results, long long result_count) {
+  const V *in[ARGUMENT_POINTERS];
+  V *out[RESULT_POINTERS];
   static thread_local long long integers[INTEGER_SIZE];
-  const long long count = report ? job.report_result_count : job.flight_result_count;
-  const long long *rows = report ? job.report_results : job.flight_results;
-  for (long long i = 0; i < job.argument_count; ++i) arguments[i] = group + job.arguments[i];
-  for (long long i = 0; i < count; ++i) results[i] = rows[i] < 0 ? nullptr : group + rows[i];
-  (report ? REPORT : FLIGHT)(arguments, results, integers, work_memory(), 0);
+  for (long long i = 0; i < argument_count; ++i) in[i] = group + arguments[i];
+  for (long long i = 0; i < result_count; ++i) out[i] = group + results[i];
+  function(in, out, integers, work_memory(), 0);
+}
+
+static void evaluate(const Job &job, V *group, bool report) {
+  if (report)
+    call(REPORT, group, job.arguments, job.argument_count, job.report_results,
+         job.report_result_count);
+  else
+    call(FLIGHT, group, job.arguments, job.argument_count, job.flight_results,
+         job.flight_result_count);
 }
 
 static long long instant_of(const Job &job, long long tick) {
@@ -65,14 +83,30 @@ static long long instant_of(const Job &job, long long tick) {
   return -1;
 }
 
+// Copy what is reported of the state of a group, in the lanes where a flag is not zero.
+static void copy_report(const Job &job, long long g, V *to, V chosen) {
+  const V *group = job.memory + g * job.rows;
+  const Bits mask = chosen.x != 0.0;
+  for (long long i = 0; i < job.reported_count; ++i)
+    for (long long k = 0; k < job.reported[i].count; ++k) {
+      Numbers &there = to[job.reported[i].to + k].x;
+      there = mask ? group[job.reported[i].from + k].x : there;
+    }
+}
+
 static void record(const Job &job, long long g, long long tick) {
   const long long instant = instant_of(job, tick);
-  if (instant < 0) return;
-  V *to = job.reports + (g * job.instant_count + instant) * job.report_rows;
-  const V *group = job.memory + g * job.rows;
-  for (long long i = 0; i < job.reported_count; ++i)
-    for (long long k = 0; k < job.reported[i].count; ++k)
-      to[job.reported[i].to + k] = group[job.reported[i].from + k];
+  if (instant >= 0)
+    copy_report(job, g, job.reports + (g * job.instant_count + instant) * job.report_rows, V(1.0));
+}
+
+static V normal(const Job &job, long long g, long long tick, long long column) {
+  const double *each =
+      job.normals +
+      ((g * job.normals_ticks + tick - job.normals_from) * job.normals_width + column) * LANES;
+  Numbers numbers;
+  for (int lane = 0; lane < LANES; ++lane) numbers[lane] = each[lane];
+  return V(numbers);
 }
 
 static void measure(const Job &job, long long g, long long tick, V *group) {
@@ -82,13 +116,8 @@ static void measure(const Job &job, long long g, long long tick, V *group) {
     for (long long j = 0; j < job.n; ++j) measured[j] = q[j];
     return;
   }
-  const double *normals =
-      job.normals + (g * job.normals_ticks + tick - job.normals_from) * job.n * LANES;
-  for (long long j = 0; j < job.n; ++j) {
-    Numbers normal;
-    for (int lane = 0; lane < LANES; ++lane) normal[lane] = normals[j * LANES + lane];
-    measured[j] = q[j] + bias[j] + group[job.noise_row] * V(normal);
-  }
+  for (long long j = 0; j < job.n; ++j)
+    measured[j] = q[j] + bias[j] + group[job.noise_row] * normal(job, g, tick, j);
 }
 
 static V entry(const Job &job, long long g, long long tick, long long column) {
@@ -125,6 +154,35 @@ static void command(const Job &job, long long g, long long tick, V *group) {
   }
 }
 
+#ifdef CONTROL
+// Measure the state and evaluate the command for it; return whether lanes need another one.
+static bool control(const Job &job, long long g, long long tick, V *group) {
+  for (long long k = 0; job.noisy && k < job.normals_width; ++k)
+    group[job.normals_row + k] = normal(job, g, tick, k);
+  group[job.time_row] = V(tick * job.period);
+  call(CONTROL, group, job.control_arguments, job.control_argument_count, job.control_results,
+       job.control_result_count);
+  group[job.since_row] = group[job.begun_row];
+  V &reached = group[job.reached_row];
+  const V now = group[job.settled_row] && reached < V(0.0);
+  reached.x = now.x != 0.0 ? group[job.time_row].x : reached.x;
+  copy_report(job, g, job.reached + g * job.report_rows, now);
+  const V exact = group[job.exact_row] && group[job.alive_row];
+  bool any = false;
+  for (int lane = 0; lane < LANES; ++lane) any = any || exact.x[lane] != 0.0;
+  return any;
+}
+
+// Measure the first state of every group: what references begin from.
+extern "C" void measure_starts(const Job *job) {
+  for (long long g = 0; g < job->groups; ++g) {
+    V *group = job->memory + g * job->rows;
+    control(*job, g, 0, group);
+    group[job->since_row] = group[job->reached_row] = V(-1.0);
+  }
+}
+#endif
+
 static void commit(const Job &job, long long g) {
   V *group = job.memory + g * job.rows;
   for (long long i = 0; i < job.sum_count; ++i)
@@ -147,7 +205,7 @@ static void commit(const Job &job, long long g) {
     for (long long k = 0; k < job.copies[i].count; ++k)
       group[job.copies[i].to + k] = group[job.copies[i].from + k];
   job.at[g] += 1;
-  job.pending[g] = 0;
+  job.pending[g] = NOTHING;
   record(job, g, job.at[g]);
 }
 
@@ -159,36 +217,46 @@ extern "C" void start_flights(const Job *job) {
   }
 }
 
-// Fly all groups until a tick, or until a lane needs another tick than this one; the number of
-// groups that stopped for that is returned, their ticks pending.
+// Fly all groups until a tick, or until a lane needs another command or tick than this one; the
+// number of groups that wait for that is returned.
 extern "C" long long fly_until(const Job *job, long long until) {
-  long long stopped = 0;
+  long long waiting = 0;
   for (long long g = 0; g < job->groups; ++g) {
     V *group = job->memory + g * job->rows;
-    if (job->pending[g]) commit(*job, g);
+    if (job->pending[g] == COMMIT) commit(*job, g);
     while (job->at[g] < until) {
       const long long tick = job->at[g];
+#ifdef CONTROL
+      if (job->pending[g] != TICK && control(*job, g, tick, group)) {
+        job->pending[g] = TICK;
+        ++waiting;
+        break;
+      }
+      job->pending[g] = NOTHING;
+      evaluate(*job, group, true);
+#else
       command(*job, g, tick, group);
       evaluate(*job, group, instant_of(*job, tick + 1) >= 0);
+#endif
       if (job->stop_row >= 0) {
         const V stop = (group[job->stop_row] != V(0.0)) * group[job->alive_row];
         bool any = false;
         for (int lane = 0; lane < LANES; ++lane) any = any || stop.x[lane] != 0.0;
         if (any) {
-          job->pending[g] = 1;
-          ++stopped;
+          job->pending[g] = COMMIT;
+          ++waiting;
           break;
         }
       }
       commit(*job, g);
     }
   }
-  return stopped;
+  return waiting;
 }
 
 // CasADi's interface with a number for each V: for the trial of a new object.
-static int trial(int (*function)(const V **, V **, long long *, V *, int), const long long *sizes_in,
-                 long long count_in, const long long *sizes_out, long long count_out,
+static int trial(Function *function, const long long *sizes_in, long long count_in,
+                 const long long *sizes_out, long long count_out,
                  const double **arguments, double **results) {
   const V *in[ARGUMENT_POINTERS];
   V *out[RESULT_POINTERS];

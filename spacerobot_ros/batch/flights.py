@@ -12,6 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -227,7 +229,33 @@ class HeldCommands:
     wrench: Array | None = None
 
 
-FlightProgram = FollowedSchedule | HeldCommands
+@dataclass(frozen=True)
+class Controlled:
+    """Commands of a :class:`.CoordinatedController` to goals that it has from the first state on.
+
+    Attributes
+    ----------
+    config
+        Its parameters, the same for all flights; its gains where ``gains`` gives none.
+    base, end_effector
+        Goals in W, (7,) or (N, 7): position (m) and quaternion; None: it is held where it is.
+    joints
+        Shapes to end in, (n,) or (N, n); None: those at the start.
+    gains
+        Those of each flight; none: of the configuration.
+    robot
+        The robot as the controller believes it; None: the nominal one of the flights.
+    """
+
+    config: ControllerConfig
+    base: Array | None = None
+    end_effector: Array | None = None
+    joints: Array | None = None
+    gains: tuple[Gains, ...] = ()
+    robot: SpaceRobot | None = None
+
+
+FlightProgram = FollowedSchedule | HeldCommands | Controlled
 
 
 @dataclass(frozen=True)
@@ -285,6 +313,7 @@ class Flights:
             raise ParameterError(f"A flight of {self.ticks} ticks is none.")
         if not self.instants:
             object.__setattr__(self, "instants", (self.ticks,))
+        self._require_program()
         last = -1
         for instant in self.instants:
             if not last < instant <= self.ticks:
@@ -303,19 +332,28 @@ class Flights:
             self.inertial.require_physical([body.name for body in bodies])
         if self.sensors is not None and len(self.sensors) != count:
             raise ParameterError(f"Sensors of {len(self.sensors)} flights are not of {count}.")
-        match self.program:
-            case FollowedSchedule(positions=commanded):
-                if self.actuation != "velocity":
-                    raise ParameterError("A schedule is followed under velocity actuation only.")
-                joints = commanded
-            case HeldCommands(joints=commanded, wrench=wrench):
-                joints = commanded
-                if wrench is not None and self.actuation != "effort":
-                    raise ParameterError("A wrench pushes the base under effort actuation only.")
-                _require_rows("wrench", wrench, count, 6)
-        _require_rows("joints", joints, count, robot.n)
         if self.actuation == "velocity" and self.starts.qdot.any():
             raise ParameterError("Joints under velocity commands start at rest.")
+
+    def _require_program(self) -> None:
+        count, n = len(self), self.robot.n
+        match self.program:
+            case FollowedSchedule(positions=positions):
+                if self.actuation != "velocity":
+                    raise ParameterError("A schedule is followed under velocity actuation only.")
+                _require_rows("joints", positions, count, n)
+            case HeldCommands(joints=joints, wrench=wrench):
+                if wrench is not None and self.actuation != "effort":
+                    raise ParameterError("A wrench pushes the base under effort actuation only.")
+                _require_rows("joints", joints, count, n)
+                _require_rows("wrench", wrench, count, 6)
+            case Controlled(config=config, gains=gains):
+                if self.actuation != "effort":
+                    raise ParameterError("A controller flies under effort actuation only.")
+                if round(config.control_period * 1e9) != round(self.control_period * 1e9):
+                    raise ParameterError("The controller commands at another rate than the plant.")
+                if gains and len(gains) != count:
+                    raise ParameterError(f"Gains of {len(gains)} flights are not of {count}.")
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -376,6 +414,11 @@ class BatchResult:
         (N, n) ticks in which each joint was limited, by what limited it, as the plant counts.
     fallback_ticks
         (N,) ticks that the scalar plant flew because lanes cannot.
+    reached_time
+        (N,) when a controller had kept all errors within its tolerances for its settling time, s;
+        NaN where it had not, or there is none. The flight goes on.
+    reached_state
+        (N, 2 n + 20) the state then: q, qdot, pose, twist and momentum; NaN likewise.
     failures
         Sentences of the flights that did not end, by their row; their later numbers are NaN.
     """
@@ -395,6 +438,8 @@ class BatchResult:
     impulse: Array
     limited: Mapping[str, Counts]
     fallback_ticks: Counts
+    reached_time: Array
+    reached_state: Array
     failures: Mapping[int, str]
 
     @classmethod
@@ -422,6 +467,8 @@ class BatchResult:
             impulse=np.zeros((N, 2)),
             limited={name: np.zeros((N, n), np.int64) for name in (first, "stroke")},
             fallback_ticks=np.zeros(N, np.int64),
+            reached_time=np.full(N, np.nan),
+            reached_state=np.full((N, 2 * n + 20), np.nan),
             failures={},
         )
 

@@ -16,8 +16,15 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from spacerobot_ros.batch.controlling import (
+    CONTROL_INPUTS,
+    CONTROL_OUTPUTS,
+    BatchController,
+    control_state,
+)
 from spacerobot_ros.batch.flights import (
     BatchResult,
+    Controlled,
     Counts,
     Flights,
     FollowedSchedule,
@@ -26,6 +33,8 @@ from spacerobot_ros.batch.flights import (
 )
 from spacerobot_ros.batch.native import Driver, Job, Span
 from spacerobot_ros.batch.scalar import fly_one_by_one, plant_of
+from spacerobot_ros.control.reference import ReferenceProfile
+from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions
@@ -42,7 +51,12 @@ _MOST_GROUPS = 64
 _CHUNK_TICKS = 2000
 """So many ticks are flown between two looks at signals, and noise is drawn for them."""
 
-_HELD, _FOLLOWED = 0, 1
+_HELD, _FOLLOWED, _CONTROLLED = 0, 1, 2
+
+_COMMIT, _TICK = 1, 2
+"""What a group waits for: to commit a tick, or to take one."""
+
+_PROGRAMS = {HeldCommands: _HELD, FollowedSchedule: _FOLLOWED, Controlled: _CONTROLLED}
 
 Flags = npt.NDArray[np.bool_]
 
@@ -100,11 +114,14 @@ class Engine:
         The layout of the tick.
     sizes
         Rows of each name.
+    controller
+        What commands; None: tables.
     """
 
     driver: Driver
     kind: _Kind
     sizes: Mapping[str, int]
+    controller: BatchController | None = None
 
     @classmethod
     def of(cls, flights: Flights, model: ModelFunctions) -> Engine:
@@ -114,6 +131,8 @@ class Engine:
         ------
         NoLibraryError
             It cannot be compiled here.
+        ParameterError
+            The law cannot drive what is to be controlled, or is none for lanes.
         """
         kind, robot = _KINDS[flights.actuation], flights.robot
         make = {"velocity": velocity_plant, "effort": effort_plant}[flights.actuation].tick_function
@@ -128,7 +147,16 @@ class Engine:
             **{n: whole.nnz_in(i) for i, n in enumerate((*kind.inputs, "p"))},
             **{n: whole.nnz_out(i) for i, n in enumerate(kind.outputs)},
         }
-        return cls(Driver(flight, report), kind, sizes)
+        if not isinstance(flights.program, Controlled):
+            return cls(Driver(flight, report), kind, sizes)
+        controller = BatchController(flights)
+        rest = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3)
+        present = ControlState(*rest, flights.starts.q[0], flights.starts.q[0] * 0.0)
+        numbers = controller.numbers(controller.begin(0, present))
+        control = controller.function(len(numbers))
+        sizes |= {name: control.nnz_in(i) for i, name in enumerate(CONTROL_INPUTS)}
+        sizes |= {name: control.nnz_out(i) for i, name in enumerate(CONTROL_OUTPUTS)}
+        return cls(Driver(flight, report, control), kind, sizes, controller)
 
 
 def fly_in_lanes(flights: Flights) -> BatchResult:
@@ -173,8 +201,13 @@ def _block_size(flights: Flights, engine: Engine) -> int:
     each = 8 * (2 * sum(engine.sizes.values()) + 60 * len(flights.instants))
     if flights.sensors is not None:
         each += 8 * chunk * (12 + 2 * n) * 2
-    program = flights.program
-    tables = [program.positions] if isinstance(program, FollowedSchedule) else [program.joints]
+    match flights.program:
+        case FollowedSchedule(positions=positions):
+            tables = [positions]
+        case HeldCommands(joints=joints, wrench=wrench):
+            tables = [joints] if wrench is None else [joints, wrench]
+        case Controlled():
+            tables = []
     each += sum(2 * table[0].nbytes for table in tables if table.ndim == 3)
     lanes = engine.driver.unit.lanes
     groups = max(1, min(_MOST_GROUPS, _BLOCK_BYTES // (each * lanes)))
@@ -221,8 +254,10 @@ class _Block:
         effort = flights.actuation == "effort"
         self._rows = rows_ = _Rows(
             {
+                **{"measured": n, "normals": 0, "time": 0, "since": 0, "begun": 0},
+                **{"exact": 0, "settled": 0},
                 **engine.sizes,
-                **{"alive": 1, "measured": n, "joint_bias": n, "joint_noise": 1},
+                **{"alive": 1, "joint_bias": n, "joint_noise": 1, "reached": 1},
                 **{"limits": n if effort else 2 * n, "peak_rate": n, "peak_effort": n},
                 **{"peak_wrench": 2, "impulse": 2},
             }
@@ -235,6 +270,8 @@ class _Block:
         """The scalar plants of flights that have touched a stop, by their lane in the block."""
         self._ended: dict[int, int] = {}
         """The ticks that flights could not take, by their lane in the block."""
+        self._profiles: list[ReferenceProfile] = []
+        """Those of the flights in lanes, with a controller."""
         self._place(model, p)
         self._job, self._kept = self._prepared()
 
@@ -269,6 +306,12 @@ class _Block:
         if self._flights.sensors is not None:
             self._set("joint_bias", self._flights.sensors.joint_bias[at])
             self._set("joint_noise", self._flights.sensors.noise[at, 4:5])
+        if self._engine.controller is not None:
+            self._set("gains", self._engine.controller.gains(at.tolist()))
+            if self._flights.sensors is not None:
+                errors = self._flights.sensors
+                self._set("bias", np.hstack([errors.pose_bias[at], errors.joint_bias[at]]))
+                self._set("sigma", errors.noise[at])
 
     def _prepared(self) -> tuple[Job, list[Any]]:
         """Return what the driver takes, and the memory that it points to."""
@@ -302,9 +345,13 @@ class _Block:
         arguments = _numbers([rows.first(name) for name in (*kind.inputs, "p")])
         flight = _numbers([rows.first(name) for name in kind.flight])
         report = _numbers([rows.first(name) for name in kind.reported])
-        table, program = self._table()
+        table, program = self._table(), flights.program
         each_table = table.ndim == 4
-        follows = isinstance(program, FollowedSchedule)
+        self._reached = _aligned((self._groups, width, self._lanes), np.nan)
+        control_in, control_out = _numbers([]), _numbers([])
+        if isinstance(program, Controlled):
+            control_in = _numbers([rows.first(name) for name in CONTROL_INPUTS])
+            control_out = _numbers([rows.first(name) for name in CONTROL_OUTPUTS])
         job = Job(
             memory=pointer(self._memory),
             groups=self._groups,
@@ -329,7 +376,7 @@ class _Block:
             wrench_peak_row=rows.first("peak_wrench"),
             impulse_row=rows.first("impulse"),
             period=flights.control_period,
-            program=_FOLLOWED if follows else _HELD,
+            program=_PROGRAMS[type(program)],
             command_row=rows.first("command"),
             command_count=table.shape[2] if each_table else table.shape[1],
             table=pointer(table),
@@ -349,16 +396,23 @@ class _Block:
             reported=pointer(spans(reported)),
             reported_count=len(reported),
             report_rows=width,
+            control_arguments=pointer(control_in),
+            control_results=pointer(control_out),
+            control_argument_count=len(control_in),
+            control_result_count=len(control_out),
+            **{
+                f"{name}_row": rows.first(name)
+                for name in ("normals", "time", "since", "begun", "exact", "settled", "reached")
+            },
+            reached=pointer(self._reached),
         )
         if isinstance(program, FollowedSchedule):
             job.gain = min(program.shape_gain, 1.0 / flights.control_period)
             job.deadband = program.deadband
         return job, kept
 
-    def _table(self) -> tuple[Array, FollowedSchedule | HeldCommands]:
-        """Return the commands, (ticks, width), or (groups, ticks, width, lanes) where they differ,
-        and the program that they are of.
-        """
+    def _table(self) -> Array:
+        """Return commands (ticks, width), or (groups, ticks, width, lanes) where they differ."""
         program = self._flights.program
         match program:
             case FollowedSchedule():
@@ -374,10 +428,12 @@ class _Block:
                     [_lengthened(part, ticks, each, len(self._rows_of_lanes)) for part in parts],
                     axis=-1,
                 )
+            case Controlled():
+                table = np.zeros((1, self._engine.sizes["command"]))
         if table.ndim == 3:
             grouped = table.reshape(self._groups, self._lanes, *table.shape[1:])
             table = np.moveaxis(grouped, 1, 3)
-        return np.ascontiguousarray(table), program
+        return np.ascontiguousarray(table)
 
     def _of_lanes(self, table: Array) -> Array:
         return table if table.ndim == 2 else np.asarray(table[self._rows_of_lanes])
@@ -390,30 +446,61 @@ class _Block:
         # A tick of no duration under no command reports the start.
         driver.start(job)
         self._set("h", np.full(len(self._rows_of_lanes), flights.control_period))
+        whole = self._engine.controller is not None
         for begin in range(0, flights.ticks, _CHUNK_TICKS):
             end = min(begin + _CHUNK_TICKS, flights.ticks)
             # The state at the end is measured too.
-            normals = self._noise.drawn(begin, end + (end == flights.ticks), self._lanes)
-            job.normals = 0 if normals is None else normals.ctypes.data
-            job.normals_from, job.normals_ticks = begin, 0 if normals is None else normals.shape[1]
+            normals = self._noise.drawn(begin, end + (end == flights.ticks), self._lanes, whole)
+            if normals is not None:
+                job.normals = normals.ctypes.data
+                job.normals_from, job.normals_ticks, job.normals_width = begin, *normals.shape[1:3]
+            if not begin:
+                self._begin_control()
             while driver.fly_until(job, end):
-                self._take_stopped(result, failures)
+                self._help(result, failures)
         self._write(result)
 
-    def _take_stopped(self, result: BatchResult, failures: dict[int, str]) -> None:
-        """Have the scalar plant take the ticks of lanes that wait, and put them back."""
-        stop, alive = self._rows.first("limited", 1 + self._flights.robot.n), self._rows["alive"]
+    def _begin_control(self) -> None:
+        """Begin the references of all flights at what is measured first."""
+        controller = self._engine.controller
+        if controller is None:
+            return
+        self._engine.driver.measure_starts(self._job)
+        states = self._get("measured")
+        self._profiles = [
+            controller.begin(int(row), control_state(state))
+            for row, state in zip(self._rows_of_lanes, states, strict=True)
+        ]
+        self._set("profile", np.array([controller.numbers(each) for each in self._profiles]))
+
+    def _help(self, result: BatchResult, failures: dict[int, str]) -> None:
+        """Do what lanes that wait cannot: give a command, or take a tick of the scalar plant."""
+        rows, alive = self._rows, self._rows["alive"]
         for group in np.flatnonzero(self._pending):
-            lanes = self._memory[group, stop] * self._memory[group, alive][0]
+            stop = rows.first("limited", 1 + self._flights.robot.n)
+            waits = stop if self._pending[group] == _COMMIT else rows.first("exact")
+            help_lane = self._take if self._pending[group] == _COMMIT else self._command
+            lanes = (self._memory[group, waits] != 0.0) & (self._memory[group, alive][0] != 0.0)
             for lane in np.flatnonzero(lanes):
                 index = int(group * self._lanes + lane)
                 try:
-                    self._take(int(group), int(lane), index, result)
+                    help_lane(int(group), int(lane), index, result)
                 except SpaceRobotError as error:
                     self._memory[group, alive, lane] = 0.0
                     if index < len(self._flown):
                         failures[int(self._flown[index])] = str(error)
                         self._ended[index] = int(self._at[group])
+
+    def _command(self, group: int, lane: int, index: int, result: BatchResult) -> None:
+        controller, row = self._engine.controller, int(self._rows_of_lanes[index])
+        assert controller is not None
+        state = control_state(self._memory[group, self._rows["measured"], lane])
+        tick = int(self._at[group])
+        realised = controller.exact(row, self._profiles[index], tick, state).realised
+        command = np.concatenate([realised.tau, realised.wrench_B])
+        self._memory[group, self._rows["command"], lane] = command
+        if index < len(self._flown):
+            result.fallback_ticks[row] += 1
 
     def _take(self, group: int, lane: int, index: int, result: BatchResult) -> None:
         row, n = int(self._rows_of_lanes[index]), self._flights.robot.n
@@ -450,6 +537,12 @@ class _Block:
         result.limited[first][rows] = limits[:, :n]
         if first == "rate":
             result.limited["stroke"][rows] = limits[:, n:]
+        if self._engine.controller is not None:
+            time = self._get("reached")[:count, 0]
+            result.reached_time[rows] = np.where(time >= 0.0, time, np.nan)
+            result.reached_state[rows] = np.swapaxes(self._reached, 1, 2).reshape(
+                -1, self._reached.shape[1]
+            )[:count]
         pose, q = self._noise.measured(result.pose[rows], result.q[rows])
         result.measured_pose[rows], result.measured_q[rows] = pose, q
 
@@ -471,23 +564,25 @@ class _Noise:
         ]
         self._at_instants = np.zeros((len(rows), len(self._instants), 12 + 2 * self._n))
 
-    def drawn(self, begin: int, end: int, lanes: int) -> Array | None:
+    def drawn(self, begin: int, end: int, lanes: int, whole: bool) -> Array | None:
         """Draw for the states at the ticks from ``begin`` to before ``end``; return what falls to
-        joint positions, (groups, ticks, n, lanes). None where nothing errs.
+        joint positions, (groups, ticks, n, lanes), or where ``whole`` to everything. None where
+        nothing errs.
         """
         if self._errors is None:
             return None
         ticks, width = end - begin, 12 + 2 * self._n
-        joints = np.zeros((len(self._rows), ticks, self._n))
+        columns = slice(0, width) if whole else slice(12, 12 + self._n)
+        kept = np.zeros((len(self._rows), ticks, columns.stop - columns.start))
         chosen = [(i, tick - begin) for i, tick in enumerate(self._instants) if begin <= tick < end]
         for index, generator in enumerate(self._generators):
             if generator is None:
                 continue
             drawn = generator.standard_normal((ticks, width))
-            joints[index] = drawn[:, 12 : 12 + self._n]
+            kept[index] = drawn[:, columns]
             for instant, tick in chosen:
                 self._at_instants[index, instant] = drawn[tick]
-        grouped = joints.reshape(-1, lanes, ticks, self._n)
+        grouped = kept.reshape(-1, lanes, *kept.shape[1:])
         return np.ascontiguousarray(np.moveaxis(grouped, 1, 3))
 
     def measured(self, pose: Array, q: Array) -> tuple[Array, Array]:
@@ -520,10 +615,10 @@ def _lengthened(table: Array, ticks: int, dimensions: int, count: int) -> Array:
     return np.broadcast_to(whole, (count, *whole.shape)) if dimensions > whole.ndim else whole
 
 
-def _aligned(shape: tuple[int, ...]) -> Array:
-    """Return zeros that begin where a vector register can be loaded from."""
+def _aligned(shape: tuple[int, ...], value: float = 0.0) -> Array:
+    """Return equal numbers that begin where a vector register can be loaded from."""
     count = int(np.prod(shape))
-    memory = np.zeros(count + 8)
+    memory = np.full(count + 8, value)
     offset = (-memory.ctypes.data % 64) // 8
     return memory[offset : offset + count].reshape(shape)
 

@@ -93,13 +93,20 @@ class Job(ctypes.Structure):
         *((name, _WHOLE) for name in ("q_row", "measured_row", "bias_row", "noise_row")),
         *((name, _WHOLE) for name in ("n", "noisy")),
         ("normals", _POINTER),
-        *((name, _WHOLE) for name in ("normals_from", "normals_ticks")),
+        *((f"normals_{name}", _WHOLE) for name in ("from", "ticks", "width")),
         *((name, _REAL) for name in ("gain", "deadband")),
         ("instants", _POINTER),
         ("instant_count", _WHOLE),
         ("reports", _POINTER),
         ("reported", _POINTER),
         *((name, _WHOLE) for name in ("reported_count", "report_rows")),
+        *((name, _POINTER) for name in ("control_arguments", "control_results")),
+        *((f"control_{name}_count", _WHOLE) for name in ("argument", "result")),
+        *(
+            (f"{name}_row", _WHOLE)
+            for name in ("normals", "time", "since", "begun", "exact", "settled", "reached")
+        ),
+        ("reached", _POINTER),
     ]
 
 
@@ -110,6 +117,8 @@ class Driver:
     ----------
     flight, report
         The tick with the results that every tick needs, and with those of reports as well.
+    control
+        The command for a state; None: it follows from tables.
 
     Raises
     ------
@@ -117,9 +126,12 @@ class Driver:
         It cannot be compiled here.
     """
 
-    def __init__(self, flight: ca.Function, report: ca.Function) -> None:
+    def __init__(
+        self, flight: ca.Function, report: ca.Function, control: ca.Function | None = None
+    ) -> None:
         self.unit = vector_unit()
-        self._library = _library(flight, report, self.unit)
+        functions = [flight, report] if control is None else [flight, report, control]
+        self._library = _library(functions, self.unit)
         self._start = self._library.start_flights
         self._fly = self._library.fly_until
         for function in (self._start, self._fly):
@@ -132,52 +144,57 @@ class Driver:
         """Fill what is reported at the start."""
         self._start(ctypes.byref(job))
 
+    def measure_starts(self, job: Job) -> None:
+        """Fill what is measured at the start, with a control function."""
+        measure = self._library.measure_starts
+        measure.argtypes, measure.restype = [ctypes.POINTER(Job)], None
+        measure(ctypes.byref(job))
+
     def fly_until(self, job: Job, tick: int) -> int:
         """Fly to a tick; return how many groups wait for one of their lanes before it."""
         return int(self._fly(ctypes.byref(job), tick))
 
 
-def _library(flight: ca.Function, report: ca.Function, unit: VectorUnit) -> ctypes.CDLL:
+def _library(functions: Sequence[ca.Function], unit: VectorUnit) -> ctypes.CDLL:
     """Return the library, with the vector functions of the C library if it has them."""
     try:
-        return _compiled(flight, report, unit, unit.libmvec)
+        return _compiled(functions, unit, unit.libmvec)
     except NoLibraryError:
         if not unit.libmvec:
             raise
-        return _compiled(flight, report, unit, "")
+        return _compiled(functions, unit, "")
 
 
-def _compiled(
-    flight: ca.Function, report: ca.Function, unit: VectorUnit, libmvec: str
-) -> ctypes.CDLL:
-    renamed = [_renamed(function, f"vector_{function.name()}") for function in (flight, report)]
+def _compiled(functions: Sequence[ca.Function], unit: VectorUnit, libmvec: str) -> ctypes.CDLL:
+    renamed = [_renamed(function, f"vector_{function.name()}") for function in functions]
     body = _SELECTION.sub(r"where(\1,\2)", vector_source(renamed, "V"))
-    parts = [_definitions(flight, report, unit, libmvec), _file("lanes.hpp"), body]
-    parts.append(f"#define FLIGHT {renamed[0].name()}\n#define REPORT {renamed[1].name()}\n")
-    parts += [_file("driver.hpp"), *(_trial(function) for function in (flight, report))]
+    parts = [_definitions(functions, unit, libmvec), _file("lanes.hpp"), body]
+    parts += [
+        f"#define {name} {function.name()}"
+        for name, function in zip(("FLIGHT", "REPORT", "CONTROL"), renamed, strict=False)
+    ]
+    parts += [_file("driver.hpp"), *(_trial(function) for function in functions)]
     # Vectors as arguments between functions of this file: no other is called with them.
     flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *unit.flags)
     libraries = ("-lmvec",) if libmvec else ()
-    return native_library(
-        f"lanes_{flight.name()}", "\n".join(parts), flags, libraries, [flight, report]
-    )
+    name = f"lanes_{functions[0].name()}"
+    return native_library(name, "\n".join(parts), flags, libraries, functions)
 
 
 def _renamed(function: ca.Function, name: str) -> ca.Function:
-    inputs = function.mx_in()
+    inputs = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
     outputs = function.call(inputs, True, False)
     return ca.Function(name, inputs, outputs, function.name_in(), function.name_out())
 
 
-def _definitions(flight: ca.Function, report: ca.Function, unit: VectorUnit, libmvec: str) -> str:
-    both = flight, report
+def _definitions(functions: Sequence[ca.Function], unit: VectorUnit, libmvec: str) -> str:
     numbers = {
         "LANES": unit.lanes,
-        "WORK_SIZE": max(function.sz_w() for function in both) + 1,
-        "ARGUMENT_POINTERS": max(function.sz_arg() for function in both) + 1,
-        "RESULT_POINTERS": max(function.sz_res() for function in both) + 1,
-        "INTEGER_SIZE": max(function.sz_iw() for function in both) + 1,
-        "TRIAL_SIZE": max(function.nnz_in() + function.nnz_out() for function in both) + 1,
+        "WORK_SIZE": max(function.sz_w() for function in functions) + 1,
+        "ARGUMENT_POINTERS": max(function.sz_arg() for function in functions) + 1,
+        "RESULT_POINTERS": max(function.sz_res() for function in functions) + 1,
+        "INTEGER_SIZE": max(function.sz_iw() for function in functions) + 1,
+        "TRIAL_SIZE": max(function.nnz_in() + function.nnz_out() for function in functions) + 1,
     }
     lines = [f"#define {name} {value}" for name, value in numbers.items()]
     if libmvec:

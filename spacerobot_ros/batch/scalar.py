@@ -8,7 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.batch.flights import BatchResult, Flights, FollowedSchedule, HeldCommands
+from spacerobot_ros.batch.controlling import BatchController
+from spacerobot_ros.batch.flights import (
+    BatchResult,
+    Controlled,
+    Flights,
+    FollowedSchedule,
+    HeldCommands,
+)
+from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import Goal
@@ -29,20 +37,29 @@ def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> Batch
     """
     result = BatchResult.empty(flights)
     failures: dict[int, str] = {}
+    controller: BatchController | None = None
     for row in range(len(flights)) if rows is None else rows:
         try:
-            _fly(flights, row, result)
+            if controller is None and isinstance(flights.program, Controlled):
+                controller = BatchController(flights)
+            _fly(flights, row, result, controller)
         except SpaceRobotError as error:
             failures[row] = str(error)
     return replace(result, engine="scalar", failures=failures)
 
 
-def _fly(flights: Flights, row: int, result: BatchResult) -> None:
+def _fly(
+    flights: Flights, row: int, result: BatchResult, controller: BatchController | None
+) -> None:
     plant = plant_of(flights, row)
     config = SensorConfig() if flights.sensors is None else flights.sensors.config(row)
     faulty = FaultyPlant(plant, (), flights.control_period, wrench=isinstance(plant, EffortPlant))
     sensors = Sensors(faulty, config, flights.control_period)
-    commands = _Commands(flights, row)
+    commands: _Commands | _Control
+    if controller is None:
+        commands = _Commands(flights, row)
+    else:
+        commands = _Control(controller, row, result, plant)
     wanted = iter(flights.instants)
     next_instant, column = next(wanted), 0
     try:
@@ -53,7 +70,7 @@ def _fly(flights: Flights, row: int, result: BatchResult) -> None:
                 column += 1
                 next_instant = next(wanted, -1)
             if tick < flights.ticks:
-                plant.step(*commands.at(tick, sensors.q if sensors.used else plant.q))
+                plant.step(*commands.at(tick, sensors if sensors.used else plant))
                 _account(plant, flights.control_period, result, row)
     finally:
         for name, counts in plant.limit_counts.items():
@@ -92,16 +109,47 @@ class _Commands:
                     self._held.append(_of_row(program.wrench, row))
                     self._nothing.append(np.zeros(6))
 
-    def at(self, tick: int, q: Array) -> list[Array]:
-        """Return the commands of a tick at the measured shape ``q`` (n,)."""
+    def at(self, tick: int, measured: Plant | Sensors) -> list[Array]:
+        """Return the commands of a tick for what is measured."""
         if self._follower is not None:
             stamp = tick * self._period_ns
-            self._follower.command(stamp, q, self._position, self._velocity)
+            self._follower.command(stamp, measured.q, self._position, self._velocity)
             return [self._velocity]
         return [
             held[tick] if tick < len(held) else nothing
             for held, nothing in zip(self._held, self._nothing, strict=True)
         ]
+
+
+class _Control:
+    """What a controller commands in one flight, tick by tick, and when it has reached its goal."""
+
+    def __init__(
+        self, controller: BatchController, row: int, result: BatchResult, plant: Plant
+    ) -> None:
+        self._controller, self._row, self._result, self._plant = controller, row, result, plant
+        self._since: int | None = None
+
+    def at(self, tick: int, measured: Plant | Sensors) -> list[Array]:
+        """Return efforts and wrench of a tick for what is measured."""
+        pose, twist = measured.pose, measured.twist
+        parts = pose[:3], pose[3:], twist[:3], twist[3:], measured.q, measured.qdot
+        state = ControlState(*(part.copy() for part in parts))
+        controller, result, row = self._controller, self._result, self._row
+        if tick == 0:
+            controller.begin(row, state)
+        commands = controller.command(tick, state)
+        if not controller.reached(tick):
+            self._since = None
+        elif self._since is None:
+            self._since = tick
+        settled = self._since is not None and controller.settled(self._since, tick)
+        if settled and np.isnan(result.reached_time[row]):
+            plant = self._plant
+            truth = plant.q, plant.qdot, plant.pose, plant.twist, plant.momentum
+            result.reached_time[row] = tick * controller.period
+            result.reached_state[row] = np.concatenate(truth)
+        return commands
 
 
 def _schedule(flights: Flights, positions: Array) -> GaitSchedule:

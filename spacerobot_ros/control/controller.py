@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from enum import Enum
 
+import casadi as ca
 import numpy as np
 
 from spacerobot_ros.control.config import ControllerConfig
@@ -181,14 +182,32 @@ class CoordinatedController:
             commanded = self.law.command(state, self._reference(time))
             if self.coming_to_rest:
                 commanded = self._rates.to_rest(state)
-        result = self._limits.apply(commanded)
         if state is not None:
-            held = self._periods_held(time)
-            kept = self._rates.apply(state, result.realised, self._limits.effort, held)
-            if kept is not result.realised:
-                result = Saturated.of(commanded, kept)
+            result = self.limited(state, commanded, self._periods_held(time))
+        else:
+            result = self._limits.apply(commanded)
         self._sent = result.realised
         return result
+
+    def limited(self, state: ControlState, commanded: Actuation, periods: int = 1) -> Saturated:
+        """Return what is realised of a command at a state that is held for so many periods."""
+        result = self._limits.apply(commanded)
+        kept = self._rates.apply(state, result.realised, self._limits.effort, periods)
+        return result if kept is result.realised else Saturated.of(commanded, kept)
+
+    def limited_expression(
+        self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX
+    ) -> tuple[ca.SX, ca.SX]:
+        """Return what the actuators realise of ``[f; n; tau]`` (6 + n,), and whether the limits of
+        joint rates change that: then it is for :meth:`limited` to say how.
+        """
+        realised = self._limits.expression(actuation)
+        return realised, self._rates.lowered(omega, q, qdot, realised)
+
+    @property
+    def profile(self) -> ReferenceProfile | None:
+        """The profile of the present goals; None before the first state."""
+        return self._profile
 
     @property
     def goal(self) -> Reference:

@@ -87,6 +87,25 @@ class JointRateLimits:
         tau = np.clip(wanted - share * pushed, -effort, effort)
         return Actuation(share * given.wrench_B, tau)
 
+    def lowered(self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX) -> ca.SX:
+        """Return whether :meth:`apply` gives another command than ``[f; n; tau]`` (6 + n,)."""
+        if not np.isfinite(self.rates).any():
+            return ca.SX(0)
+        n, tau = self._robot.n, actuation[6:]
+        gained = ca.fabs(tau) * self._per_effort
+        fast = ca.fabs(qdot) * self._per_rate + gained
+        near = ca.sum1(fast > 1.0)
+        flat, Fs, columns = self._dynamics.function(q, omega, qdot)
+        Js, G = ca.reshape(flat, n, n).T, ca.reshape(columns, 6, n).T
+        qddot = solve_positive_definite(Js, tau + G @ actuation[:6] - Fs)
+        soonest = _PERIODS * self._control_period
+        beyond = []
+        for i, rate in enumerate(self.rates.tolist()):
+            if np.isfinite(rate):
+                lowest, highest = (-rate - qdot[i]) / soonest, (rate - qdot[i]) / soonest
+                beyond.append(ca.logic_or(qddot[i] < lowest, qddot[i] > highest))
+        return ca.logic_and(near > 0, ca.sum1(ca.vertcat(*beyond)) > 0)
+
     def largest_share(self, qdot: Array) -> float:
         """Return the largest of rates (n,) in parts of their limits."""
         # Numbers of Python: arrays of a few joints take longer, and this is asked at every state.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 
+import casadi as ca
 import numpy as np
 
 from spacerobot_ros.control.state import Actuation
@@ -132,6 +133,15 @@ class ActuatorLimits:
         )
         tau = np.clip(commanded.tau, -self.effort, self.effort)
         return Saturated.of(commanded, Actuation(wrench, tau))
+
+    def expression(self, actuation: ca.SX) -> ca.SX:
+        """Return what :meth:`apply` realises of a command ``[f; n; tau]`` (6 + n,)."""
+        parts = []
+        for vector, limit in ((actuation[:3], self.force), (actuation[3:6], self.torque)):
+            size = ca.sqrt(ca.dot(vector, vector))
+            within = not math.isfinite(limit)
+            parts.append(vector if within else vector * ca.if_else(size <= limit, 1, limit / size))
+        return ca.vertcat(*parts, ca.fmin(ca.fmax(actuation[6:], -self.effort), self.effort))
 
 
 def _scaled(vector: Array, limit: float) -> Array:

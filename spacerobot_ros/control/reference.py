@@ -11,7 +11,9 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
+import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.state import JointReference, PoseReference, Reference, TargetNotSetError
@@ -153,6 +155,56 @@ class QuinticReference(ReferenceProfile):
         )
 
 
+def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n: int) -> Array:
+    """Return the numbers of a profile that :func:`profile_expression` takes.
+
+    Parameters
+    ----------
+    profile
+        A profile whose goal has the groups that are asked for.
+    base, end_effector
+        Whether these poses are among them.
+    n
+        Joints whose references are among them; 0: none.
+    """
+    start, goal = profile.start, profile.goal
+    poses = (base, start.base, goal.base), (end_effector, start.end_effector, goal.end_effector)
+    parts: list[npt.ArrayLike] = [[profile.duration]]
+    for wanted, begin, end in poses:
+        if wanted and begin is not None and end is not None:
+            parts += _PoseLine(begin, end).numbers
+    if n and start.joints is not None and goal.joints is not None:
+        parts += [start.joints.q, goal.joints.q - start.joints.q, goal.joints.q]
+    return np.concatenate(parts)
+
+
+def profile_expression(
+    numbers: ca.SX, time: ca.SX, base: bool, end_effector: bool, n: int
+) -> ca.SX:
+    """Return what a profile's :meth:`ReferenceProfile.at` gives, as a law's function takes it.
+
+    ``numbers`` are those of :func:`profile_numbers`, ``time`` is since the start, s.
+    """
+    sizes = [1, *([3, 3, 4, 4, 3, 1, 3, 4] * (base + end_effector)), *([n, n, n] if n else [])]
+    duration, *rest = ca.vertsplit(numbers, np.cumsum([0, *sizes]).tolist())
+    u = ca.fmax(time, 0) / duration
+    s = u**3 * (10 + u * (6 * u - 15))
+    rate = 30 * u**2 * (1 - u) ** 2 / duration
+    acceleration = 60 * u * (1 - u) * (1 - 2 * u) / duration**2
+    moving, resting = [], []
+    for k in range(base + end_effector):
+        r, d, quaternion, half_turn, turn_W, angle, goal, attitude = rest[8 * k : 8 * k + 8]
+        half = s * angle / 2
+        moving += [r + s * d, ca.sin(half) * half_turn + ca.cos(half) * quaternion]
+        moving += [rate * d, rate * turn_W, acceleration * d, acceleration * turn_W]
+        resting += [goal, attitude, ca.SX.zeros(12)]
+    if n:
+        r, d, goal = rest[-3:]
+        moving += [r + s * d, rate * d, acceleration * d]
+        resting += [goal, ca.SX.zeros(2 * n)]
+    return ca.if_else(time < duration, ca.vertcat(*moving), ca.vertcat(*resting))
+
+
 class HeldVelocityReference:
     """Joint references from commands whose velocities are held over a control period.
 
@@ -190,7 +242,7 @@ class _PoseLine:
     """A straight line and a geodesic; ``d`` (3,) in m and ``rotvec`` (3,) in rad, both in W."""
 
     def __init__(self, start: PoseReference, goal: PoseReference) -> None:
-        self._start = start
+        self._start, self._goal = start, goal
         self._d = goal.position - start.position
         turn_B = attitude_error(start.quaternion, goal.quaternion)
         # The axis of the turn is fixed in the body and in W alike.
@@ -200,6 +252,12 @@ class _PoseLine:
         # The quaternion of a turn by phi is linear in sin(phi/2) and cos(phi/2).
         axis = self._turn_W / self.angle if self.angle > 0 else np.zeros(3)
         self._half_turn = quaternion_multiply(np.append(axis, 0.0), start.quaternion)
+
+    @property
+    def numbers(self) -> list[npt.ArrayLike]:
+        """All that it is, and the pose of its end."""
+        line = [self._start.position, self._d, self._start.quaternion, self._half_turn]
+        return [*line, self._turn_W, [self.angle], self._goal.position, self._goal.quaternion]
 
     @classmethod
     def between(cls, start: PoseReference | None, goal: PoseReference | None) -> _PoseLine | None:

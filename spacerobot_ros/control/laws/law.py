@@ -181,9 +181,9 @@ class ControlLaw(ABC):
             "J_z": self.outputs.J_z,
             **self._results(symbols),
         }
-        self._function = BufferedFunction(
-            compiled(dense_function(f"law_{self.name}", symbols, results))
-        )
+        self.function = dense_function(f"law_{self.name}", symbols, results)
+        """The law as expressions: of state, reference, kp, kd and its own inputs, by name."""
+        self._function = BufferedFunction(compiled(self.function))
         self._in = dict(zip(symbols, self._function.inputs, strict=True))
         self._out = dict(zip(results, self._function.outputs, strict=True))
         for name, value in inputs.items():
@@ -267,6 +267,17 @@ class ControlLaw(ABC):
         The values are those at first; :meth:`_actuation` may change them, in ``self._in``.
         """
         return {}
+
+    @property
+    def fixed_inputs(self) -> Mapping[str, npt.ArrayLike] | None:
+        """What its function takes beside state, reference and gains in every flight; None: it
+        depends on the flight.
+        """
+        return self._inputs()
+
+    def defined(self, results: Mapping[str, ca.SX]) -> ca.SX:
+        """Return whether results of :attr:`function` are the command, without further thought."""
+        return ca.SX(1)
 
     @abstractmethod
     def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:

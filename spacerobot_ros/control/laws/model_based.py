@@ -82,6 +82,15 @@ class ModelBasedLaw(ControlLaw):
             "singular_damping": np.zeros(self.outputs.N),
         }
 
+    @property
+    def fixed_inputs(self) -> Mapping[str, npt.ArrayLike] | None:
+        """None where a posture pulls: it is the reference's, or the present one."""
+        return None if self.options.posture_stiffness else self._inputs()
+
+    def defined(self, results: Mapping[str, ca.SX]) -> ca.SX:
+        """Return whether the outputs are far enough from a singularity."""
+        return results["margin"] >= self.singular_value_threshold
+
     def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         z1 = self.outputs
         H = self.robot.function("inertia_matrix", compile=False)(z1.q)
