@@ -65,9 +65,7 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
             node.declare_parameter(name, stored.type_, _descriptor(parameter), ignore_override=True)
             Node.set_parameters(node, [stored])
         else:
-            node.declare_parameter(
-                name, stored.value, _descriptor(parameter), ignore_override=True
-            )
+            node.declare_parameter(name, stored.value, _descriptor(parameter), ignore_override=True)
         values[name] = value
     return values
 
