@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from catkin_pkg.package import parse_package
 
 import spacerobot_ros
 
@@ -61,6 +62,28 @@ def test_workflow_and_hooks_are_yaml_that_names_what_setup_allows() -> None:
     assert f'python_requires=">={versions[0]}"' in (ROOT / "setup.py").read_text()
     hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
     assert [hook["id"] for hook in hooks] == ["ruff-check", "ruff-format", "mypy"]
+
+
+def test_what_is_published_once_waits_for_its_reader() -> None:
+    """Without -w 1 `ros2 topic pub --once` publishes before readers are met: often nobody hears."""
+    pages = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
+    words = [line for page in pages for line in page.read_text("utf-8").splitlines()]
+    once = [line for line in words if line.startswith("ros2 topic pub")]
+    assert len(once) >= 3
+    assert [line for line in once if " -w 1 " not in line] == []
+
+
+def test_the_manifest_declares_what_is_imported_of_ros() -> None:
+    manifest = parse_package(ROOT / "package.xml", warnings=[])
+    declared = {depend.name for depend in manifest.exec_depends}
+    sources = [*ROOT.glob("spacerobot_ros/**/*.py"), *ROOT.glob("launch/*.py")]
+    text = "\n".join(source.read_text("utf-8") for source in sources)
+    imported = set(re.findall(r"^\s*(?:from|import) (\w+)", text, re.MULTILINE))
+    kinds = re.compile(r"_msgs$|_interfaces$|^rcl|^launch|^rosidl")
+    assert {name for name in imported if kinds.search(name)} <= declared
+    # tf2_msgs was declared and never imported.
+    messages = {name for name in declared if name.endswith("_msgs")}
+    assert {name for name in messages if name not in text} == set()
 
 
 def test_the_readme_is_short() -> None:
