@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import pytest
@@ -16,13 +17,16 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
+from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from sensor_msgs.msg import JointState
-from support.ros_harness import Harness
+from support.ros_harness import Harness, construction
 
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.common.node import FlightNode
+from spacerobot_ros.nodes.common.ros_parameters import declare
 from spacerobot_ros.nodes.replay import ReplayNode
+from spacerobot_ros.parameters import Parameter as Declaration
 
 KINDS: dict[str, Any] = {**NODE_TYPES, "replay": ReplayNode}
 
@@ -160,3 +164,20 @@ def test_a_watchdog_heeds_a_timeout_that_was_set_since(harness: Harness) -> None
     assert plant.set_parameters([Parameter("watchdog_timeout", value=2.0)])[0].successful
     plant.start()
     assert "/heartbeat" in {each.topic_name for each in plant.subscriptions}
+
+
+@pytest.mark.parametrize("keeps", [dict, MappingProxyType])
+def test_what_was_given_is_found_however_rclpy_keeps_it(
+    harness: Harness, keeps: Callable[[Any], Any]
+) -> None:
+    given = {"rate": 20, "names": ["a", "b"]}
+    node = harness.add(Node("any", **construction(harness.context, given)))
+    node._parameter_overrides = keeps(node._parameter_overrides)
+    declared = (
+        Declaration("rate", 1.0, description="given as a whole number"),
+        Declaration("left", 2.5, description="not given"),
+        Declaration("names", (), description="given", texts=True),
+    )
+    values = declare(node, declared)
+    assert values == {"rate": 20.0, "left": 2.5, "names": ("a", "b")}
+    assert [node.get_parameter(name).value for name in values] == [20.0, 2.5, ["a", "b"]]

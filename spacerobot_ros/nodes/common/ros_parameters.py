@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -53,10 +54,7 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
     values = {}
     for parameter in parameters:
         name = parameter.name
-        # First without a type, to see what was given whatever its type; then as it should be.
-        node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True))
-        given = node.get_parameter(name).value
-        node.undeclare_parameter(name)
+        given = _given(node, name)
         value = parameter.default if given is None else parameter.checked(given)
         stored = _ros_parameter(parameter, value)
         if value == ():
@@ -68,6 +66,18 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
             node.declare_parameter(name, stored.value, _descriptor(parameter), ignore_override=True)
         values[name] = value
     return values
+
+
+def _given(node: Node, name: str) -> Any:
+    """Return what was given for a parameter, whatever its type; None without."""
+    overrides = getattr(node, "_parameter_overrides", None)
+    if isinstance(overrides, dict):
+        return overrides[name].value if name in overrides else None
+    # Another rclpy: declared without a type, at three times the cost.
+    node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True))
+    value = node.get_parameter(name).value
+    node.undeclare_parameter(name)
+    return value
 
 
 def fix(node: Node, parameters: Iterable[Parameter], *, fixed: bool) -> None:
