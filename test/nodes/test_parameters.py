@@ -107,6 +107,9 @@ def test_a_plant_is_another_after_its_cleanup(harness: Harness) -> None:
     assert not remote.is_read_only("robot")
     results = remote.set(robot="servicer", tick_rate=50, initial_position=[1.0, 2.0, 3.0])
     assert all(result.successful for result in results), results
+    harness.settle(probe)
+    for kept in probe.messages.values():  # States of the plant as it was.
+        kept.clear()
     plant.start()
     harness.spin_until(lambda: probe.messages["joint_states"] and probe.messages["odom"])
     assert len(probe.last("joint_states").name) == 6
