@@ -31,11 +31,12 @@ from spacerobot_ros.batch.flights import (
     HeldCommands,
     SensorErrors,
 )
-from spacerobot_ros.batch.native import Driver, Job, Span
+from spacerobot_ros.batch.native import Driver, Job, Span, vector_unit
 from spacerobot_ros.batch.scalar import fly_one_by_one, plant_of
 from spacerobot_ros.control.reference import ReferenceProfile
 from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.model.compilation import compilation_settings
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
@@ -134,6 +135,19 @@ class Engine:
         ParameterError
             The law cannot drive what is to be controlled, or is none for lanes.
         """
+        # A controller has goals of its flights: with one, nothing is kept.
+        key = cls, flights.actuation, flights.substeps, vector_unit(), compilation_settings()
+        kept = not isinstance(flights.program, Controlled)
+        if not (kept and key in model.derived):
+            engine = cls._new(flights, model)
+            if not kept:
+                return engine
+            model.derived[key] = engine
+        found: Engine = model.derived[key]
+        return found
+
+    @classmethod
+    def _new(cls, flights: Flights, model: ModelFunctions) -> Engine:
         kind, robot = _KINDS[flights.actuation], flights.robot
         make = {"velocity": velocity_plant, "effort": effort_plant}[flights.actuation].tick_function
         whole = make(robot, Composition(model, ca.MX), flights.substeps)

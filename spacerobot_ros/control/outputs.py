@@ -182,6 +182,8 @@ class OutputVector:
     ``m`` outputs, ``N = 6 + n`` degrees of freedom. The symbols ``state`` and ``reference`` are
     what :meth:`pack` writes; the expressions, all functions of the two:
 
+    ``model``
+        Calls the robot's functions by name.
     ``q``, ``omega``, ``v_cm``, ``qdot``
         The state in the velocities z0dot, base components.
     ``J_z``
@@ -210,7 +212,7 @@ class OutputVector:
 
     def __init__(self, robot: SpaceRobot, selection: OutputSelection) -> None:
         selection.require_valid(robot.description)
-        self.robot = robot
+        self.robot, self.model = robot, robot.expressions()
         self.selection = selection
         self.labels = selection.labels
         self.m, self.N = len(self.labels), 6 + robot.n
@@ -289,7 +291,7 @@ class OutputVector:
     # -- groups -------------------------------------------------------------------------------
 
     def _link_jacobian(self, link: str) -> ca.SX:
-        return self.robot.function(f"jacobian:{link}", compile=False)(self.q)
+        return self.model(f"jacobian:{link}", self.q)
 
     def _pose_group(self, J_B: ca.SX, position: ca.SX, quaternion: ca.SX, target: ca.SX) -> _Group:
         """Build the six outputs of a frame from its Jacobian in base components."""
@@ -318,7 +320,7 @@ class OutputVector:
 
     def _end_effector_group(self, r_WB: ca.SX, target: ca.SX) -> _Group:
         link = self.selection.end_effector_link
-        _, r_BL = self.robot.function("link_poses", compile=False)(self.q)
+        _, r_BL = self.model("link_poses", self.q)
         position = r_WB + self._R_WB @ r_BL[:, self.robot.link_names.index(link)]
         attitude = link_quaternion(self.robot.description, link, self.q)
         quaternion = quaternion_multiply(self._quaternion, attitude)

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -65,6 +66,8 @@ class ModelFunctions:
         self._inertia = composites(self._kin)
         self._symbolic: dict[str, ca.Function] = {}
         self._compiled: dict[tuple[str, ...], ca.Function] = {}
+        self.derived: dict[Hashable, Any] = {}
+        """What others have built from the model and want to find again, by keys of theirs."""
 
     @classmethod
     def of(cls, robot: RobotDescription) -> ModelFunctions:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import RobotDescriptionError
-from spacerobot_ros.model.compilation import BufferedFunction
+from spacerobot_ros.model.compilation import BufferedFunction, compiled
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions, SymbolicModels
@@ -240,6 +240,22 @@ class SpaceRobot:
         model = self._model
         function = model.composed(name, lambda: build(Composition(model, ca.MX)))
         return BufferedFunction(function, self._p)
+
+    def expressions(self) -> Composition:
+        """Return the model's functions to build larger ones from, in SX; see :meth:`view`."""
+        return Composition(self._model, ca.SX)
+
+    def view(self, function: ca.Function) -> BufferedFunction:
+        """Return a new view of a function of :meth:`expressions`, compiled.
+
+        What the bodies weigh, where that is its last argument, is this robot's.
+        """
+        return BufferedFunction(compiled(function), self._p)
+
+    @property
+    def weights(self) -> dict[str, Array]:
+        """What functions of :meth:`expressions` take as their last argument, by its name."""
+        return {} if self._p is None else {"p": self._p}
 
     @property
     def equations_key(self) -> str:

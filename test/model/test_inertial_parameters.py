@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import casadi as ca
 import numpy as np
 import pytest
 from support.oracles import PinocchioOracle, assert_agrees
 from support.random_robots import random_robot_urdf
 
+from spacerobot_ros.control import LAWS, ControlState, Gains, Reference
 from spacerobot_ros.model import (
     InertialParameters,
     SpaceRobot,
@@ -126,6 +129,33 @@ def test_one_compilation_serves_every_draw(monkeypatch: pytest.MonkeyPatch) -> N
     ticks = [name for name in built if "tick" in name]
     assert sorted(ticks) == ["effort_tick_100", "velocity_tick_10"]
     assert len({tuple(pose) for pose in poses}) == 3
+
+
+@pytest.mark.parametrize("law", ["model_based", "computed_torque"])
+def test_a_controller_commands_by_what_it_believes_the_bodies_weigh(law: str) -> None:
+    rng = np.random.default_rng(8)
+    description = load_robot(share_directory() / "urdf" / "planar_manipulator.urdf")
+    robot = SpaceRobot(description)
+    believed = robot.with_inertial(robot.inertial.scaled([1.3, 0.8, 1.4]))
+    compiled_in = SpaceRobot(believed.inertial.described(description))
+    state = ControlState(
+        r_WB=rng.normal(size=3),
+        quaternion_WB=np.array([0.0, 0.0, 0.6, 0.8]),
+        v_WB_B=rng.normal(size=3),
+        omega_WB_B=rng.normal(size=3),
+        q=np.array([0.4, -0.9]),
+        qdot=rng.normal(size=2),
+    )
+    commands = []
+    for each in (believed, compiled_in, robot):
+        outputs = LAWS[law].default_outputs(each, "end_effector")
+        controller = LAWS[law](each, outputs, Gains.uniform(2.0, 3.0))
+        other = dataclasses.replace(state, q=state.q + 0.1)
+        reference = Reference.present(each, other, "end_effector")
+        actuation = controller.command(state, reference)
+        commands.append(np.concatenate([actuation.wrench_B, actuation.tau]))
+    np.testing.assert_allclose(commands[0], commands[1], rtol=1e-12, atol=1e-12)
+    assert np.abs(commands[0] - commands[2]).max() > 0.01
 
 
 def test_a_robot_with_its_own_numbers_is_itself() -> None:

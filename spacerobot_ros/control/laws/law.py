@@ -15,7 +15,7 @@ import numpy.typing as npt
 from spacerobot_ros.control.outputs import OutputSelection, OutputVector, default_selection
 from spacerobot_ros.control.state import Actuation, ControlState, Reference
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model.compilation import BufferedFunction, compiled, dense_function
+from spacerobot_ros.model.compilation import dense_function
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import configured, group, parameter, values_of
@@ -175,15 +175,16 @@ class ControlLaw(ABC):
             "kd": ca.SX.sym("kd", self.outputs.m),
             **{name: ca.SX.sym(name, np.size(value)) for name, value in inputs.items()},
         }
+        weights = self.outputs.model.inputs
         results = {
             "error": self.outputs.error,
             "error_rate": self.outputs.error_rate,
             "J_z": self.outputs.J_z,
             **self._results(symbols),
         }
-        self.function = dense_function(f"law_{self.name}", symbols, results)
+        self.function = dense_function(f"law_{self.name}", symbols | weights, results)
         """The law as expressions: of state, reference, kp, kd and its own inputs, by name."""
-        self._function = BufferedFunction(compiled(self.function))
+        self._function = robot.view(self.function)
         self._in = dict(zip(symbols, self._function.inputs, strict=True))
         self._out = dict(zip(results, self._function.outputs, strict=True))
         for name, value in inputs.items():
@@ -273,7 +274,7 @@ class ControlLaw(ABC):
         """What its function takes beside state, reference and gains in every flight; None: it
         depends on the flight.
         """
-        return self._inputs()
+        return {**self._inputs(), **self.robot.weights}
 
     def defined(self, results: Mapping[str, ca.SX]) -> ca.SX:
         """Return whether results of :attr:`function` are the command, without further thought."""

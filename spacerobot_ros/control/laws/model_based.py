@@ -85,7 +85,7 @@ class ModelBasedLaw(ControlLaw):
     @property
     def fixed_inputs(self) -> Mapping[str, npt.ArrayLike] | None:
         """None where a posture pulls: it is the reference's, or the present one."""
-        return None if self.options.posture_stiffness else self._inputs()
+        return None if self.options.posture_stiffness else super().fixed_inputs
 
     def defined(self, results: Mapping[str, ca.SX]) -> ca.SX:
         """Return whether the outputs are far enough from a singularity."""
@@ -93,11 +93,11 @@ class ModelBasedLaw(ControlLaw):
 
     def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         z1 = self.outputs
-        H = self.robot.function("inertia_matrix", compile=False)(z1.q)
-        C = self.robot.function("bias", compile=False)(z1.q, z1.v_cm, z1.omega, z1.qdot)
+        H = z1.model("inertia_matrix", z1.q)
+        C = z1.model("bias", z1.q, z1.v_cm, z1.omega, z1.qdot)
         # The translation of the centre of mass decouples (eq. 15).
         mobility = ca.vertcat(
-            z1.J_z[:, :3].T / self.robot.total_mass,
+            z1.J_z[:, :3].T / z1.model.total_mass,
             solve_positive_definite(H[3:, 3:], z1.J_z[:, 3:].T),
         )
         stiffness, damping = ca.vertsplit(symbols["null_space"])
