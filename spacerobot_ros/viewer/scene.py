@@ -31,6 +31,9 @@ _PLUME: Color = (255, 110, 40)
 _LINE = 3.0
 """Pixels."""
 
+_ROOM = 32
+"""Segments that a line has room for at least."""
+
 _GRID: tuple[Color, Color] = (150, 150, 155), (120, 120, 128)
 """Cells and sections: seen on white and on black."""
 
@@ -188,6 +191,9 @@ def reach_of(robot: RobotDescription) -> float:
 class Lines:
     """Connected points in the scene, such as a path.
 
+    A node has room for a number of segments, and another takes its place when there are more: pages
+    do not draw anew what changes its size.
+
     Parameters
     ----------
     scene, path
@@ -197,27 +203,33 @@ class Lines:
     """
 
     def __init__(self, scene: viser.SceneApi, path: str, color: Color) -> None:
-        self._handle = scene.add_line_segments(
-            path, np.zeros((1, 2, 3), np.float32), color, thickness=_LINE, thickness_units="screen"
-        )
-        self._handle.visible = False
-        self._color = np.array(color, np.uint8)
+        self._scene, self._path, self._color = scene, path, color
+        self._room = 0
+        self._handle: Any = None
 
     def draw(self, points: Array) -> None:
         """Connect points (k, 3), m; fewer than two draw nothing."""
-        self.draw_segments(np.stack([points[:-1], points[1:]], axis=1) if len(points) > 1 else None)
+        self.draw_segments(np.stack([points[:-1], points[1:]], axis=1))
 
-    def draw_segments(self, segments: Array | None) -> None:
-        """Draw segments (k, 2, 3), m; None: nothing."""
-        if segments is None or not len(segments):
-            self._handle.visible = False
+    def draw_segments(self, segments: Array) -> None:
+        """Draw segments (k, 2, 3), m; none: nothing."""
+        if not len(segments):
+            if self._handle is not None:
+                self._handle.visible = False
             return
-        points = segments.astype(np.float32)
-        # Points and colors of one length must come together.
-        if len(self._handle.colors) != len(segments):
-            self._handle.colors = np.broadcast_to(self._color, segments.shape).copy()
-        self._handle.points = points
-        self._handle.visible = True
+        larger = len(segments) > self._room
+        if larger:
+            self._room = max(_ROOM, 2 ** (len(segments) - 1).bit_length())
+        # What is left of the room is at the end, without a length.
+        filled = np.broadcast_to(segments[-1, 1], (self._room, 2, 3)).astype(np.float32)
+        filled[: len(segments)] = segments
+        if larger:
+            self._handle = self._scene.add_line_segments(
+                self._path, filled, self._color, thickness=_LINE, thickness_units="screen"
+            )
+        else:
+            self._handle.points = filled
+            self._handle.visible = True
 
 
 def plumes(table: ThrusterTable, names: tuple[str, ...], duty: Array, length: float) -> Array:

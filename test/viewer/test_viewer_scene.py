@@ -1,0 +1,128 @@
+"""What is drawn: links where Pinocchio has them, lines that grow, plumes against the thrust."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from spacerobot_ros.control.thrusters.table import find_thrusters
+from spacerobot_ros.model import load_robot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.model.urdf import parse_robot
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.viewer import scene
+from spacerobot_ros.viewer.server import start_server, stop_server
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Any]:
+    server = start_server("127.0.0.1", 0)
+    yield server
+    stop_server(server)
+
+
+def pose_of(server: Any, name: str) -> Array:
+    """Return the pose (4, 4) in the world of a node, from those of all above it."""
+    pose, parts = np.eye(4), name.strip("/").split("/")
+    for depth in range(1, len(parts) + 1):
+        handle = server.scene.get_handle_by_name("/" + "/".join(parts[:depth]))
+        local = np.eye(4)
+        local[:3, :3] = matrix_from_quaternion(scene.xyzw(handle.wxyz))
+        local[:3, 3] = handle.position
+        pose = pose @ local
+    return pose
+
+
+@pytest.mark.parametrize("name", ["servicer", "sliding_masses", "surveyor"])
+def test_links_are_drawn_where_pinocchio_has_them(server: Any, name: str) -> None:
+    server.scene.reset()
+    robot = load_robot(robot_file(name))
+    said: list[str] = []
+    drawing = scene.RobotDrawing(server.scene, "/robot", robot, on_note=said.append)
+    rng = np.random.default_rng(3)
+    model = pin.buildModelFromXML(robot.urdf, pin.JointModelFreeFlyer())
+    data, full = model.createData(), pin.neutral(model)
+    full[:3] = rng.normal(size=3)
+    full[3:7] = rng.normal(size=4)
+    full[3:7] /= np.linalg.norm(full[3:7])
+    q = rng.uniform(-0.5, 0.5, len(robot.joint_names))
+    for joint, position in zip(robot.joint_names, q, strict=True):
+        full[model.joints[model.getJointId(joint)].idx_q] = position
+    pin.framesForwardKinematics(model, data, full)
+    drawing.place(full[:7])
+    drawing.bend(q)
+    paths = drawing._paths(robot)
+    for link in robot.links:
+        expected = data.oMf[model.getFrameId(link.name)].homogeneous
+        np.testing.assert_allclose(pose_of(server, paths[link.name]), expected, atol=1e-6)
+    assert len(drawing._solids) == sum(len(link.shapes) for link in robot.links)
+    assert said == []
+    drawing.paint((1, 2, 3))
+    assert {solid.color for solid in drawing._solids} == {(1, 2, 3)}
+
+
+def test_a_mesh_that_is_not_there_is_said_and_the_rest_is_drawn(server: Any) -> None:
+    server.scene.reset()
+    robot = load_robot(robot_file("servicer"))
+    lost = '<visual><geometry><mesh filename="package://none/lost.stl"/></geometry></visual>'
+    text = robot.urdf.replace("<visual>", f"{lost}<visual>", 1)
+    said: list[str] = []
+    drawing = scene.RobotDrawing(server.scene, "/robot", parse_robot(text), on_note=said.append)
+    assert len(said) == 1
+    assert "lost.stl" in said[0]
+    assert len(drawing._solids) == sum(len(link.shapes) for link in robot.links)
+
+
+def test_a_robot_without_shapes_is_seen(server: Any) -> None:
+    server.scene.reset()
+    text = (
+        '<robot name="bare"><link name="a"/><link name="b"/><joint name="j" type="fixed">'
+        '<parent link="a"/><child link="b"/><origin xyz="1 2 2"/></joint></robot>'
+    )
+    text = text.replace(
+        '<link name="a"/>',
+        '<link name="a"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" '
+        'ixz="0" iyz="0"/></inertial></link>',
+    )
+    robot = parse_robot(text)
+    drawing = scene.RobotDrawing(server.scene, "/robot", robot)
+    assert len(drawing._solids) == 3, "two balls and the bar between them"
+    assert scene.reach_of(robot) == pytest.approx(3.0)
+
+
+def test_a_line_has_room_for_what_comes(server: Any) -> None:
+    server.scene.reset()
+    line = scene.Lines(server.scene, "/path", (1, 2, 3))
+    points = np.cumsum(np.random.default_rng(1).normal(size=(100, 3)), axis=0)
+    rooms: list[int] = []
+    for count in (0, 1, 2, 3, 33, 34, 70, 100, 5, 1, 2):
+        line.draw(points[:count])
+        handle = server.scene.get_handle_by_name("/path")
+        if count < 2:
+            assert handle is None or not handle.visible
+            continue
+        assert handle.visible
+        drawn = handle.points
+        assert handle.colors.tolist() == [1, 2, 3], "one for all segments"
+        rooms.append(len(drawn))
+        np.testing.assert_allclose(drawn[: count - 1, 0], points[: count - 1], atol=1e-5)
+        np.testing.assert_allclose(drawn[count - 2 :, 1], points[count - 1], atol=1e-5)
+        np.testing.assert_array_equal(drawn[count - 1 :, 0], drawn[count - 1 :, 1])
+    assert rooms == [32, 32, 32, 64, 128, 128, 128, 128]
+
+
+def test_plumes_point_against_the_thrust() -> None:
+    table = find_thrusters("urdf", load_robot(robot_file("servicer")))
+    duty = np.zeros(len(table.names))
+    assert scene.plumes(table, table.names, duty, 1.0).shape == (0, 2, 3)
+    duty[[2, 5]] = 1.0, 0.5
+    first, second = scene.plumes(table, table.names, duty, 1.0)
+    np.testing.assert_allclose(first[0], table.r_B[2])
+    np.testing.assert_allclose(first[1] - first[0], -table.direction_B[2])
+    assert np.linalg.norm(second[1] - second[0]) < 1.0
+    assert scene.plumes(table, ("unknown",), np.ones(1), 1.0).shape == (0, 2, 3)
