@@ -1,0 +1,39 @@
+"""What is counted of a flight with and without a viewer, and the flight itself."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.command_line import CliRunner
+
+from spacerobot_ros.benchmarks.viewing import Phase, _between
+from spacerobot_ros.cli.main import main
+
+
+def test_deadlines_are_counted_between_two_times() -> None:
+    table = np.array([[0.0, 0, 0], [1.0, 200, 1], [2.0, 400, 1], [3.0, 600, 5], [4.0, 800, 6]])
+    assert _between(table, 1.0, 3.0) == Phase(400, 4)
+    assert _between(table, 0.5, 2.5) == Phase(400, 4), "by whole reports"
+    assert _between(table, 3.5, 99.0) == Phase(0, 0)
+    both = Phase(400, 4) + Phase(600, 1)
+    assert (both.deadlines, both.missed) == (1000, 5)
+    assert both.percent == pytest.approx(0.5)
+    assert Phase().percent == 0.0
+
+
+@pytest.mark.slow
+def test_the_servicer_flies_beside_a_viewer(
+    own_domain: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ran = CliRunner().invoke(main, ["bench", "--viewer", "5", "--json", "figures.json"])
+    assert ran.exit_code == 0, ran.output
+    assert "updates a second received" in ran.output
+    figures = json.loads(Path("figures.json").read_text("utf-8"))
+    assert figures["viewer_updates_per_s"] > 1.0
+    for which in ("with", "without"):
+        assert figures[f"viewer_deadlines_{which}"] > 500
+        assert 0.0 <= figures[f"viewer_missed_{which}_percent"] <= 100.0
