@@ -90,6 +90,10 @@ mutants: $(STAMP)/mutants ## put random errors into the package; see out/mutants
 hostile-bags: $(STAMP)/test ## read bags that were made to harm their reader, each in a process of its own
 	$(BIN)/python3 -m pytest -m 'slow or not slow' -rP test/bag/test_hostile_bags.py
 
+.PHONY: reports
+reports: $(STAMP)/test ## fly every scenario, make its report, open it in Chromium at desktop and phone width
+	$(BIN)/python3 -m pytest -m slow -rP test/report/test_every_report.py
+
 COUNT ?= 2000
 SEED ?= 1
 ONLY ?= many

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.control.status import ControllerStatus
+from spacerobot_ros.control.status import ControllerStatus, tracking_time
 from spacerobot_ros.events import Event
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
@@ -135,9 +135,16 @@ class FlightArrays:
 
     @property
     def manoeuvre_time(self) -> float:
-        """Duration of all schedules for the goal, s; without any, that of the flight."""
+        """Duration of the schedules for the goal that were flown, s; without any, from the first
+        state that a controller tracked to the end that it named.
+        """
         planned = self.status.manoeuvre_time_s if isinstance(self.status, PlannerStatus) else 0.0
-        return planned or self.duration
+        tracked = tracking_time(
+            (stamp_ns / 1e9, status.state)
+            for stamp_ns, status in self.statuses
+            if isinstance(status, ControllerStatus)
+        )
+        return planned or tracked or self.duration
 
     @property
     def corrections(self) -> int:
