@@ -27,7 +27,8 @@ _USE = (
     "click twice for the whole flight. Click once to see the robot at that instant above; the "
     "upright line is the instant that is shown there. Click a name to hide its trace.</p>"
 )
-_MOST_ROWS = 60
+_MOST_ROWS, _MOST_OPEN = 200, 20
+"""Rows of what happened that are on the page, and that need not be unfolded."""
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
@@ -202,7 +203,10 @@ def _events(events: Sequence[FlightEvent]) -> list[str]:
     more = len(rows) - _MOST_ROWS
     table = Table(("Time (s)", "What", "In words", "Node"), rows[:_MOST_ROWS], (0,))
     note = f'<p class="facts">{more} more are in the bag.</p>' if more > 0 else ""
-    return ["<h2>What happened</h2>", _table("events", table), note]
+    shown = _table("events", table) + note
+    if len(rows) > _MOST_OPEN:
+        shown = f"<details><summary>{len(rows)} events</summary>{shown}</details>"
+    return ["<h2>What happened</h2>", shown]
 
 
 def _parameters(flight: Flight) -> list[str]:
