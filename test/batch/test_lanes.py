@@ -18,6 +18,7 @@ from spacerobot_ros.batch import (
     Starts,
     fly_lanes,
     fly_one_by_one,
+    lanes,
     native,
 )
 from spacerobot_ros.model import InertialParameters, SpaceRobot, load_robot
@@ -194,7 +195,8 @@ def test_narrower_registers_give_the_same_flights(
     chosen = native._PLAIN if unit == "plain" else native.UNITS[unit]
     if chosen.lanes > widest.lanes:
         pytest.skip(f"this processor has no {chosen.name}")
-    monkeypatch.setattr(native, "vector_unit", lambda: chosen)
+    for module in (native, lanes):
+        monkeypatch.setattr(module, "vector_unit", lambda: chosen)
     for flights in (
         velocity_flights(robots["servicer"], 19, each=True, deadband=0.0),
         effort_flights(robots["servicer"], 19),
