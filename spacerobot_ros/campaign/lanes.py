@@ -1,8 +1,8 @@
 """Draws flown in lanes: those that follow one schedule from start to end; others one by one.
 
 The planner's executive makes the plan of each draw, as in every engine. Where it would do anything
-but track that plan to its end and find the goal reached (a correction, a joint that is limited or
-does not follow), the draw is flown again by the engine ``flights``: the rows are the same.
+but track that plan to its end and evaluate the goal (a correction, a joint that is limited or does
+not follow), the draw is flown again by the engine ``flights``: the rows are the same.
 """
 
 from __future__ import annotations
@@ -84,6 +84,7 @@ class LanesEngine:
         changing = (
             *("plant.tick_rate", "plant.integration_step", "planner.tick_rate"),
             *("planner.averaging", "planner.drift", "planner.replan", "planner.shape_"),
+            "planner.max_corrections",
         )
         if any(name.startswith(changing) for name in dispersed):
             return "what lanes have in common is dispersed"
@@ -216,7 +217,7 @@ def _padded(positions: Array, ticks: int) -> Array:
 def _flight(
     result: BatchResult, row: int, planned: _Planned, flights: Flights, end: int
 ) -> FlightArrays | None:
-    """Return a flight that has reached its goal at the end of its schedule; None for any other."""
+    """Return a flight whose goal is decided at the end of its schedule; None for any other."""
     if row in result.failures:
         return None
     if any(counts[row].any() for counts in result.limited.values()):
@@ -227,21 +228,23 @@ def _flight(
     if np.abs(schedule.positions[-1] - q).max(initial=0.0) > band:
         return None
     error = PoseError.between(measured[:3], measured[3:], scenario.goal, q)
+    left = remaining_error(error, schedule.controls)
+    outcome, sentence = Outcome.REACHED, f"The goal is reached: {left}."
     if not scenario.planner.tolerance.admits(error, schedule.controls):
-        return None
+        if scenario.planner.max_corrections:
+            return None
+        outcome = Outcome.FAILED
+        sentence = f"The goal is not reached: {left} after 0 correction(s)."
     kept = slice(0, end + 1)
     time = result.time[kept]
     n = schedule.positions.shape[1]
     # The shape is that of the schedule in every tick: its feedback had nothing to do.
-    status = replace(
-        planned.gait,
-        sentence=f"The goal is reached: {remaining_error(error, schedule.controls)}.",
-    )
+    status = replace(planned.gait, sentence=sentence)
     return FlightArrays(
         scenario=scenario,
         robot=planned.flight.nominal,
-        outcome=Outcome.REACHED,
-        sentence=status.sentence,
+        outcome=outcome,
+        sentence=sentence,
         control_period=flights.control_period,
         time=time,
         pose=result.pose[row, kept],
