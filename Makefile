@@ -112,6 +112,10 @@ GOALS ?= 100
 foreign-robots: $(STAMP)/test ## plan GOALS random goals each for robots that are in no paper; goes on where it was ended; ONLY=WORD: some
 	PYTHONPATH=.:test nice $(BIN)/python3 test/foreign_robots/run.py --goals $(GOALS) --only "$(filter-out many,$(ONLY))"
 
+.PHONY: campaigns
+campaigns: $(STAMP)/test ## kill workers and campaigns, fly rows again through ROS: the slow tests of campaigns and flights
+	$(BIN)/python3 -m pytest -m slow test/campaign test/flight
+
 .PHONY: real-time
 real-time: $(STAMP)/demo ## fly ten minutes in real time in separate processes, at 100, then 200 and 500 Hz
 	$(BIN)/spacerobot bench --real-time 600 --rate 100

@@ -176,7 +176,28 @@ def command_line() -> str:
             table(("option", "meaning"), rows),
         ]
         sections.append("\n\n".join(part for part in parts if part))
+        if isinstance(command, click.Group):
+            sections += _subcommands(command, inner)
     return "\n\n".join(sections)
+
+
+def _subcommands(group: click.Group, context: click.Context) -> list[str]:
+    """Return a section for every command of a group."""
+    sections = []
+    for name, command in group.commands.items():
+        inner = click.Context(command, info_name=name, parent=context)
+        rows = [
+            (f"`{record[0]}`", record[1])
+            for parameter in command.get_params(inner)
+            if (record := parameter.get_help_record(inner)) is not None
+        ]
+        usage = " ".join(command.collect_usage_pieces(inner))
+        whole = f"{context.info_name} {name}"
+        sections.append(
+            f"### {whole}\n\n{inspect.cleandoc(command.help or '')}\n\n"
+            f"```text\nspacerobot {whole} {usage}\n```\n\n{table(('option', 'meaning'), rows)}"
+        )
+    return sections
 
 
 def python_api(package: str) -> str:

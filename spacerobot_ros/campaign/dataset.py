@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
@@ -54,6 +55,8 @@ class Dataset:
         self._written = time.monotonic()
         self._schema: Any = None
         self._part = 0
+        self._descriptor = -1
+        """Of the folder, locked while this process flies into it."""
 
     # -- what it is of ------------------------------------------------------------------------
 
@@ -82,6 +85,7 @@ class Dataset:
                 f"The folder {self.folder} is not empty and holds no campaign: name another one."
             )
         (self.folder / _FLIGHTS).mkdir(parents=True, exist_ok=True)
+        self._lock()
         for left in (self.folder / _FLIGHTS).glob(".*"):
             left.unlink()  # What was being written when an earlier process ended.
         section = {**campaign.section, "scenario": _SCENARIO, "flights": campaign.flights}
@@ -97,6 +101,33 @@ class Dataset:
         facts["scenario"] = campaign.scenario.name
         about.write_text(json.dumps(facts, indent=1), encoding="utf-8")
         return self.done()
+
+    def _lock(self) -> None:
+        """Keep other processes from flying into this folder; the lock goes with this one.
+
+        Raises
+        ------
+        ParameterError
+            Another process flies into it.
+        """
+        descriptor = os.open(self.folder / _FLIGHTS, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(descriptor)
+            raise ParameterError(
+                f"Another process flies the campaign in {self.folder} now."
+            ) from None
+        self._descriptor = descriptor
+
+    def close(self) -> None:
+        """Write what is left, and let others fly into the folder."""
+        try:
+            self.flush()
+        finally:
+            if self._descriptor >= 0:
+                os.close(self._descriptor)
+                self._descriptor = -1
 
     def campaign(self) -> Campaign:
         """Return the campaign that the folder is of.

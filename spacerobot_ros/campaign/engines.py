@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.lanes import LanesEngine
@@ -42,6 +43,7 @@ def chosen_engine(campaign: Campaign, wanted: str) -> Engine:
     raise SpaceRobotError(f"No engine can fly this campaign. {' '.join(reasons)}")
 
 
+@cache
 def engine_called(name: str) -> Engine:
-    """Return an engine by its name."""
+    """Return an engine by its name, the same one in each process: it keeps what it has built."""
     return ALL[name]()

@@ -59,6 +59,7 @@ class LanesEngine:
     """Many flights at once, on vector registers."""
 
     name = "lanes"
+    least = 64
 
     def __init__(self) -> None:
         self._flights = FlightsEngine()
@@ -137,6 +138,8 @@ class LanesEngine:
         schedule, gait, taken = self._plans[key]
         if _has_noise(flight):
             del self._plans[key]
+        else:
+            self._plans[key] = schedule, gait, 0.0  # It was made once.
         return _Planned(draw, flight, schedule, gait, taken)
 
     def _flown(

@@ -28,6 +28,7 @@ class FlightsEngine:
     """The real plant, planner and controller, without ROS."""
 
     name = "flights"
+    least = 1
 
     def refusal(self, campaign: Campaign) -> str:
         """Return why not, as a clause."""
@@ -111,6 +112,7 @@ class RosEngine:
     """The whole stack, flown by ``spacerobot run`` in a process for each draw."""
 
     name = "ros"
+    least = 1
 
     def refusal(self, campaign: Campaign) -> str:
         """Return why not, as a clause."""

@@ -71,9 +71,13 @@ class Row:
 
 
 class Engine(Protocol):
-    """Flies draws."""
+    """Flies draws.
+
+    ``least`` flights at once are flown best: fewer take as long.
+    """
 
     name: str
+    least: int
 
     def refusal(self, campaign: Campaign) -> str:
         """Return why this engine cannot fly a campaign, as a clause; empty if it can."""

@@ -136,7 +136,7 @@ def run_campaign(
             flown += len(batch)
             show(progress(flown))
     finally:
-        dataset.flush()
+        dataset.close()
     return progress(flown)
 
 
@@ -249,8 +249,9 @@ def _client(cluster: Cluster, flights: int) -> Iterator[Any]:
                 threads_per_worker=1,
                 processes=True,
                 host="127.0.0.1",
-                dashboard_address=None,
-                worker_dashboard_address=None,
+                # Without an address they would listen to the whole network, on port 8787.
+                dashboard_address="127.0.0.1:0",
+                worker_dashboard_address="127.0.0.1:0",
                 memory_limit=_memory(cluster.workers),
                 env=threads,
                 silence_logs=50,
@@ -284,7 +285,8 @@ class _Distribution:
     ) -> None:
         self._client, self._specification, self._draws = client, specification, draws
         self._engine, self._stopped = engine, stopped
-        self._size = float(_FIRST)
+        self._least = engine_called(engine).least
+        self._size = float(max(_FIRST, self._least))
         self._running: dict[Any, tuple[list[int], float]] = {}
         self._suspects: deque[int] = deque()
         self._deaths: Counter[int] = Counter()
@@ -308,7 +310,7 @@ class _Distribution:
         workers = max(1, sum(self._client.nthreads().values()))
         while waiting and len(self._running) < _AHEAD * workers:
             # The last tasks are smaller, so that no worker is alone at the end.
-            size = min(self._size, max(1.0, len(waiting) / workers))
+            size = min(self._size, max(self._least, len(waiting) / workers))
             count = min(len(waiting), max(1, round(size)))
             self._task([waiting.popleft() for _ in range(count)])
 
@@ -346,7 +348,8 @@ class _Distribution:
         if not alone and rows:
             took = sum(row.wall_time for row in rows if row.wall_time == row.wall_time)
             if took > 0:
-                self._size = min(_MOST, 0.5 * self._size + 0.5 * len(rows) * TASK_TIME / took)
+                size = 0.5 * self._size + 0.5 * len(rows) * TASK_TIME / took
+                self._size = max(self._least, min(_MOST, size))
         return rows
 
     def _mourned(self, numbers: list[int], alone: bool) -> list[Row]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -192,7 +193,28 @@ def animation(flight: FlightArrays, seconds: float, frames: int) -> Animation:
 
     interval = 1000.0 * seconds / len(rows)
     moving = FuncAnimation(made, draw, frames=len(rows), interval=interval)
-    return Animation(str(moving.to_jshtml(default_mode="loop")))
+    return Animation(_offline(str(moving.to_jshtml(default_mode="loop"))))
+
+
+_ICONS = {
+    "minus": "−",
+    "fast-backward": "⏮",
+    "step-backward": "⏴",
+    "play fa-flip-horizontal": "◀",
+    "pause": "⏸",
+    "play": "▶",
+    "step-forward": "⏵",
+    "fast-forward": "⏭",
+    "plus": "+",
+}
+
+
+def _offline(html: str) -> str:
+    """Return matplotlib's page with characters for icons, which it would take from a server."""
+    html = re.sub(r"<link\b[^>]*>", "", html)
+    return re.sub(
+        r'<i class="fa fa-([^"]*)"></i>', lambda found: _ICONS.get(found[1], found[1]), html
+    )
 
 
 class _Skeleton:

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 import yaml
 from support.campaigns import campaign, section
 
 from spacerobot_ros.campaign.dataset import Dataset
-from spacerobot_ros.campaign.running import run_campaign
+from spacerobot_ros.campaign.running import Cluster, _client, run_campaign
 
 pytestmark = pytest.mark.slow
 
@@ -140,6 +141,19 @@ def test_a_flight_that_kills_its_worker_twice_is_reported(tmp_path: Path) -> Non
         7: "killed"
     }
     assert found[7]["reason"] == "The process that flew it died 2 times."
+
+
+def test_only_this_machine_can_reach_the_workers() -> None:
+    with _client(Cluster(workers=1), 1):
+        here = psutil.Process()
+        listening = [
+            connection.laddr.ip
+            for process in [here, *here.children(recursive=True)]
+            for connection in process.net_connections()
+            if connection.status == psutil.CONN_LISTEN
+        ]
+    assert len(listening) >= 3
+    assert set(listening) == {"127.0.0.1"}
 
 
 def test_what_was_flown_is_kept_after_ctrl_c(tmp_path: Path) -> None:

@@ -98,6 +98,15 @@ def test_a_flight_that_cannot_be_flown_ends_no_other(tmp_path: Path) -> None:
     assert not any(row["passed"] for row in errors)
 
 
+def test_two_processes_do_not_fly_into_one_folder(tmp_path: Path) -> None:
+    first = Dataset(tmp_path)
+    first.begin(small())
+    with pytest.raises(ParameterError, match="Another process flies the campaign"):
+        run_campaign(small(), tmp_path)
+    first.close()
+    assert run_campaign(small(flights=1), tmp_path).done == 1
+
+
 def test_what_is_half_written_is_not_there(tmp_path: Path) -> None:
     run_campaign(small(flights=1), tmp_path)
     (tmp_path / "flights" / ".part-000009.parquet").write_bytes(b"half")

@@ -94,6 +94,9 @@ def test_an_animation_shows_every_frame() -> None:
     shown = flight.animate(seconds=1.0, frames=3)
     assert shown._repr_html_().count("data:image/png") == 3
     assert "show it in a notebook" in repr(shown)
+    # Nothing is asked of a server, and every button has a sign.
+    assert "http" not in shown._repr_html_().replace("http://www.w3.org", "")
+    assert "fa-" not in shown._repr_html_()
 
 
 def test_the_package_names_what_it_offers() -> None:
