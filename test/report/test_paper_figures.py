@@ -15,7 +15,7 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.report import write_figures
+from spacerobot_ros.report import write_figures, write_picture
 from spacerobot_ros.report.figures_time import window_of
 from spacerobot_ros.report.signals import Signal
 from spacerobot_ros.report.style import PictureFormat
@@ -124,7 +124,12 @@ def test_a_picture_of_another_kind_is_refused_before_anything_is_done(
 
 
 @pytest.mark.parametrize(
-    ("command", "kind"), [("plan", "pdf"), ("analyze", "svg"), ("report", "pdf")]
+    ("command", "kind"),
+    [
+        pytest.param("plan", "pdf", marks=pytest.mark.slow),
+        ("analyze", "svg"),
+        pytest.param("report", "pdf", marks=pytest.mark.slow),
+    ],
 )
 def test_a_picture_is_what_its_name_says(
     command: str, kind: str, bag: Path, tmp_path: Path
@@ -138,6 +143,13 @@ def test_a_picture_is_what_its_name_says(
     assert data.startswith(MAGIC[kind])
     if command == "plan":
         assert "time (s)" in pypdf.PdfReader(picture).pages[0].extract_text()
+
+
+def test_an_overview_is_what_its_name_says(bag: Path, tmp_path: Path) -> None:
+    write_picture(bag, tmp_path / "a.pdf")
+    assert "base position (m)" in pypdf.PdfReader(tmp_path / "a.pdf").pages[0].extract_text()
+    with pytest.raises(SpaceRobotError, match=r"\.png, \.svg or \.pdf"):
+        write_picture(bag, tmp_path / "a.gif")
 
 
 def test_an_axis_is_for_what_can_be_read_beside_a_peak() -> None:
