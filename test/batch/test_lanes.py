@@ -102,8 +102,10 @@ def effort_flights(robot: SpaceRobot, count: int) -> Flights:
     starts.q[::3, 0], starts.qdot[::3, 0] = robot.upper[0] - 0.005, 0.1
     effort = np.minimum(robot.effort_limit, 5.0)
     joints = 0.03 * effort * rng.normal(size=(count, 30, robot.n))
-    joints[:, 5] *= 1000.0
-    joints[:, 6] = -joints[:, 5]
+    # Of the first joint alone: such efforts would spin a light wrist beyond all rates, and rounding
+    # would decide where it ends.
+    joints[:, 5, 0] *= 3000.0
+    joints[:, 6, 0] = -joints[:, 5, 0]
     program = HeldCommands(joints, rng.normal(size=(40, 6)))
     return Flights(
         *(robot, "effort", 0.01, 45, starts, program),
