@@ -176,12 +176,25 @@ def declared(config: type[Any] | Any, prefix: str = "") -> tuple[Parameter, ...]
     every name.
     """
     if isinstance(config, type):
-        return _declared(config, prefix)
+        return _declared(config, prefix, _registered(config()))
     return tuple(parameter for parameter, _ in _leaves(config, prefix))
 
 
+def _registered(config: Any) -> tuple[tuple[str, type[Any]], ...]:
+    """Return the names and the options of what is registered now: users add their own."""
+    return tuple(
+        (entry, type(options))
+        for each in fields(config)
+        if _REGISTERED in each.metadata
+        for entry, options in getattr(config, each.name).items()
+    )
+
+
 @cache
-def _declared(config: type[Any], prefix: str) -> tuple[Parameter, ...]:
+def _declared(
+    config: type[Any], prefix: str, registered: tuple[tuple[str, type[Any]], ...]
+) -> tuple[Parameter, ...]:
+    """Return the parameters of a class, while what is registered stays the same."""
     return tuple(parameter for parameter, _ in _leaves(config, prefix))
 
 

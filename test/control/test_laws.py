@@ -178,6 +178,7 @@ class _Damping(ControlLaw):
 def test_a_new_law_is_one_class_and_one_line_in_the_registry(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    assert "damping.strength" not in {each.name for each in declared(ControllerConfig)}
     monkeypatch.setitem(LAWS, "damping", _Damping)
     assert "damping.strength" in {each.name for each in declared(ControllerConfig)}
     options = configured(ControllerConfig, {"damping.strength": 3.0}).options
