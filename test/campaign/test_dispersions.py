@@ -123,7 +123,10 @@ def uniform(low: float, high: float) -> dict[str, Any]:
     return {"uniform": {"loc": low, "scale": high - low}}
 
 
-FAULT = {"plant.faults": ["joint_stuck slider_1 at 1 until 100"], "planner.max_corrections": 0}
+FAULT = {
+    "plant.faults": ["joint_stuck slider_1 at 1 until 100"],
+    **{"planner.max_corrections": 0, "planner.optimal.starts": 1, "planner.optimal.answers": 1},
+}
 
 KINDS: list[Any] = [
     pytest.param({"mass.*": uniform(0.5, 0.9)}, COAST, mass_from_momentum, id="mass"),

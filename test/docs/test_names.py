@@ -46,6 +46,13 @@ def test_files_that_a_page_names_exist(page: Path) -> None:
     assert missing == []
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_of_a_page_lead_somewhere(page: Path) -> None:
+    text = _FENCED.sub("", page.read_text(encoding="utf-8"))
+    targets = re.findall(r"\]\((?!https?:|#|mailto:)([^)#\s]+)", text)
+    assert [target for target in targets if not (page.parent / target).exists()] == []
+
+
 def test_classes_that_the_page_of_the_architecture_names_exist() -> None:
     package = "\n".join(
         path.read_text(encoding="utf-8") for path in (ROOT / "spacerobot_ros").rglob("*.py")

@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 from support.chromium import Browser, browser, chromium
 
+pytestmark = pytest.mark.slow
+"""Links between the pages are looked at by the quick tests, too."""
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
