@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 GIVEN: dict[str, Any] = {
     "disperse": {"mass.*": {"norm": {"loc": 1.0, "scale": 0.03}}},
-    "flights": 120,
+    "flights": 3000,  # So many that a quick machine is not done with them before the kills
     "seed": 8,
     "engine": "flights",
 }
@@ -105,11 +105,11 @@ def test_workers_and_campaigns_that_are_killed(tmp_path: Path) -> None:
                 first.kill()
                 until(out, flown(out) + 10)
                 run.kill()
-            assert 20 <= flown(out) < 120
+            assert 20 <= flown(out) < GIVEN["flights"]
             with started(tmp_path, *command, address) as run:
                 assert run.process.wait(timeout=_LONGEST) == 0, run.log.read_text()
     run_campaign(campaign(**GIVEN), tmp_path / "undisturbed")
-    assert [row["flight"] for row in rows(out)] == list(range(120))
+    assert [row["flight"] for row in rows(out)] == list(range(GIVEN["flights"]))
     assert str(rows(out)) == str(rows(tmp_path / "undisturbed"))
 
 
