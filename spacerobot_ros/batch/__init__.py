@@ -10,7 +10,7 @@ from spacerobot_ros.batch.flights import (
     SensorErrors,
     Starts,
 )
-from spacerobot_ros.batch.flying import fly_lanes
+from spacerobot_ros.batch.lanes import fly_lanes
 from spacerobot_ros.batch.scalar import fly_one_by_one
 
 __all__ = [

@@ -9,17 +9,16 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from spacerobot_ros.batch.compiled_tick import CompiledTick
 from spacerobot_ros.batch.controlling import (
     CONTROL_INPUTS,
     CONTROL_OUTPUTS,
-    BatchController,
     control_state,
 )
 from spacerobot_ros.batch.flights import (
@@ -31,16 +30,15 @@ from spacerobot_ros.batch.flights import (
     HeldCommands,
     SensorErrors,
 )
-from spacerobot_ros.batch.native import Driver, Job, Span, vector_unit
+from spacerobot_ros.batch.native import Job, Span
 from spacerobot_ros.batch.scalar import fly_one_by_one, plant_of
 from spacerobot_ros.control.reference import ReferenceProfile
-from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.model.compilation import compilation_settings
+from spacerobot_ros.model.compilation import NoLibraryError
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.model_functions import Composition, ModelFunctions
+from spacerobot_ros.model.model_functions import ModelFunctions
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
-from spacerobot_ros.simulation import effort_plant, velocity_plant
+from spacerobot_ros.private_files import warn_once
 from spacerobot_ros.simulation.effort_plant import EffortPlant
 
 _BLOCK_BYTES = 32 * 2**20
@@ -62,118 +60,21 @@ _PROGRAMS = {HeldCommands: _HELD, FollowedSchedule: _FOLLOWED, Controlled: _CONT
 Flags = npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class _Kind:
-    """How the tick of a plant is laid out.
+def fly_lanes(flights: Flights) -> BatchResult:
+    """Fly many flights at once.
 
-    ``inputs`` and ``outputs`` are the names of the arguments and results of its function,
-    ``flight`` those results that every tick needs, ``copies`` what a tick hands to the next.
+    Every flight is the one that the plant flies on its own with the same numbers, to rounding
+    (1e-12 over the flights of the benchmark). Without a C++ compiler the plant flies them one by
+    one; :attr:`BatchResult.engine` says so.
     """
-
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    flight: tuple[str, ...]
-    copies: Mapping[str, str]
-
-    @property
-    def reported(self) -> tuple[str, ...]:
-        """Results that reports need too: all but the poses of links."""
-        return tuple(name for name in self.outputs if not name.startswith("link"))
+    try:
+        return _fly_in_lanes(flights)
+    except NoLibraryError as reason:
+        warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
+        return fly_one_by_one(flights)
 
 
-_KINDS = {
-    "velocity": _Kind(
-        ("state", "command", "momenta", "r_cm", "h"),
-        (
-            *("next_state", "pose", "twist", "qdot", "momentum"),
-            *("link_R", "link_r", "limited", "next_r_cm"),
-        ),
-        ("next_state", "qdot", "limited", "next_r_cm"),
-        {"next_state": "state", "next_r_cm": "r_cm"},
-    ),
-    "effort": _Kind(
-        ("state", "command", "h"),
-        (
-            *("next_state", "pose", "twist", "realised"),
-            *("momentum", "link_R", "link_r", "limited"),
-        ),
-        ("next_state", "realised", "limited"),
-        {"next_state": "state"},
-    ),
-}
-
-
-@dataclass(frozen=True)
-class Engine:
-    """The compiled tick of flights that are alike, and where its numbers stand in rows.
-
-    Attributes
-    ----------
-    driver
-        The loop.
-    kind
-        The layout of the tick.
-    sizes
-        Rows of each name.
-    controller
-        What commands; None: tables.
-    """
-
-    driver: Driver
-    kind: _Kind
-    sizes: Mapping[str, int]
-    controller: BatchController | None = None
-
-    @classmethod
-    def of(cls, flights: Flights, model: ModelFunctions) -> Engine:
-        """Compile the tick of flights, or find it compiled.
-
-        Raises
-        ------
-        NoLibraryError
-            It cannot be compiled here.
-        ParameterError
-            The law cannot drive what is to be controlled, or is none for lanes.
-        """
-        # A controller has goals of its flights: with one, nothing is kept.
-        key = cls, flights.actuation, flights.substeps, vector_unit(), compilation_settings()
-        kept = not isinstance(flights.program, Controlled)
-        if not (kept and key in model.derived):
-            engine = cls._new(flights, model)
-            if not kept:
-                return engine
-            model.derived[key] = engine
-        found: Engine = model.derived[key]
-        return found
-
-    @classmethod
-    def _new(cls, flights: Flights, model: ModelFunctions) -> Engine:
-        kind, robot = _KINDS[flights.actuation], flights.robot
-        make = {"velocity": velocity_plant, "effort": effort_plant}[flights.actuation].tick_function
-        whole = make(robot, Composition(model, ca.MX), flights.substeps)
-        inputs = whole.mx_in()
-        outputs = dict(zip(kind.outputs, whole.call(inputs, True, False), strict=True))
-        flight, report = (
-            ca.Function(f"{flights.actuation}_{name}", inputs, [outputs[each] for each in chosen])
-            for name, chosen in (("flight", kind.flight), ("report", kind.reported))
-        )
-        sizes = {
-            **{n: whole.nnz_in(i) for i, n in enumerate((*kind.inputs, "p"))},
-            **{n: whole.nnz_out(i) for i, n in enumerate(kind.outputs)},
-        }
-        if not isinstance(flights.program, Controlled):
-            return cls(Driver(flight, report), kind, sizes)
-        controller = BatchController(flights)
-        rest = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3)
-        present = ControlState(*rest, flights.starts.q[0], flights.starts.q[0] * 0.0)
-        numbers = controller.numbers(controller.begin(0, present))
-        control = controller.function(len(numbers))
-        sizes |= {name: control.nnz_in(i) for i, name in enumerate(CONTROL_INPUTS)}
-        sizes |= {name: control.nnz_out(i) for i, name in enumerate(CONTROL_OUTPUTS)}
-        return cls(Driver(flight, report, control), kind, sizes, controller)
-
-
-def fly_in_lanes(flights: Flights) -> BatchResult:
+def _fly_in_lanes(flights: Flights) -> BatchResult:
     """Fly on vector registers.
 
     Raises
@@ -185,16 +86,16 @@ def fly_in_lanes(flights: Flights) -> BatchResult:
     if inertial is None:
         inertial = flights.robot.inertial.scaled(np.ones((len(flights), 1)))
     model, p = flights.robot.symbolic_model(inertial)
-    engine = Engine.of(flights, model)
+    tick = CompiledTick.of(flights, model)
     fit = _regular_starts(flights)
     result = fly_one_by_one(flights, np.flatnonzero(~fit).tolist())
     failures = dict(result.failures)
     rows = np.flatnonzero(fit)
-    size = _block_size(flights, engine)
+    size = _block_size(flights, tick)
     for first in range(0, len(rows), size):
-        block = _Block(flights, engine, model, p, rows[first : first + size])
+        block = _Block(flights, tick, model, p, rows[first : first + size])
         block.fly(result, failures)
-    lanes, unit = engine.driver.unit.lanes, engine.driver.unit.name
+    lanes, unit = tick.driver.unit.lanes, tick.driver.unit.name
     return replace(result, engine=f"{lanes} lanes ({unit})", failures=failures)
 
 
@@ -209,10 +110,10 @@ def _regular_starts(flights: Flights) -> Flags:
         return np.asarray(fit & np.isfinite(size) & (size > 1e-3) & (size < 1e3))
 
 
-def _block_size(flights: Flights, engine: Engine) -> int:
+def _block_size(flights: Flights, tick: CompiledTick) -> int:
     """Return how many flights fit into a block."""
     n, chunk = flights.robot.n, min(flights.ticks, _CHUNK_TICKS)
-    each = 8 * (2 * sum(engine.sizes.values()) + 60 * len(flights.instants))
+    each = 8 * (2 * sum(tick.sizes.values()) + 60 * len(flights.instants))
     if flights.sensors is not None:
         each += 8 * chunk * (12 + 2 * n) * 2
     match flights.program:
@@ -223,7 +124,7 @@ def _block_size(flights: Flights, engine: Engine) -> int:
         case Controlled():
             tables = []
     each += sum(2 * table[0].nbytes for table in tables if table.ndim == 3)
-    lanes = engine.driver.unit.lanes
+    lanes = tick.driver.unit.lanes
     groups = max(1, min(_MOST_GROUPS, _BLOCK_BYTES // (each * lanes)))
     return int(groups * lanes)
 
@@ -257,10 +158,10 @@ class _Block:
     """
 
     def __init__(
-        self, flights: Flights, engine: Engine, model: ModelFunctions, p: Array, rows: Counts
+        self, flights: Flights, tick: CompiledTick, model: ModelFunctions, p: Array, rows: Counts
     ) -> None:
-        self._flights, self._engine, self._flown = flights, engine, rows
-        self._lanes = engine.driver.unit.lanes
+        self._flights, self._tick, self._flown = flights, tick, rows
+        self._lanes = tick.driver.unit.lanes
         self._groups = -(-len(rows) // self._lanes)
         wanted = self._groups * self._lanes
         self._rows_of_lanes = np.concatenate([rows, np.repeat(rows[-1:], wanted - len(rows))])
@@ -270,7 +171,7 @@ class _Block:
             {
                 **{"measured": n, "normals": 0, "time": 0, "since": 0, "begun": 0},
                 **{"exact": 0, "settled": 0},
-                **engine.sizes,
+                **tick.sizes,
                 **{"alive": 1, "joint_bias": n, "joint_noise": 1, "reached": 1},
                 **{"limits": n if effort else 2 * n, "peak_rate": n, "peak_effort": n},
                 **{"peak_wrench": 2, "impulse": 2},
@@ -320,8 +221,8 @@ class _Block:
         if self._flights.sensors is not None:
             self._set("joint_bias", self._flights.sensors.joint_bias[at])
             self._set("joint_noise", self._flights.sensors.noise[at, 4:5])
-        if self._engine.controller is not None:
-            self._set("gains", self._engine.controller.gains(at.tolist()))
+        if self._tick.controller is not None:
+            self._set("gains", self._tick.controller.gains(at.tolist()))
             if self._flights.sensors is not None:
                 errors = self._flights.sensors
                 self._set("bias", np.hstack([errors.pose_bias[at], errors.joint_bias[at]]))
@@ -329,7 +230,7 @@ class _Block:
 
     def _prepared(self) -> tuple[Job, list[Any]]:
         """Return what the driver takes, and the memory that it points to."""
-        flights, kind, rows = self._flights, self._engine.kind, self._rows
+        flights, kind, rows = self._flights, self._tick.layout, self._rows
         n, effort = flights.robot.n, flights.actuation == "effort"
         kept: list[Any] = []
 
@@ -443,7 +344,7 @@ class _Block:
                     axis=-1,
                 )
             case Controlled():
-                table = np.zeros((1, self._engine.sizes["command"]))
+                table = np.zeros((1, self._tick.sizes["command"]))
         if table.ndim == 3:
             grouped = table.reshape(self._groups, self._lanes, *table.shape[1:])
             table = np.moveaxis(grouped, 1, 3)
@@ -456,11 +357,11 @@ class _Block:
 
     def fly(self, result: BatchResult, failures: dict[int, str]) -> None:
         """Fly the flights and write what comes of them."""
-        flights, job, driver = self._flights, self._job, self._engine.driver
+        flights, job, driver = self._flights, self._job, self._tick.driver
         # A tick of no duration under no command reports the start.
         driver.start(job)
         self._set("h", np.full(len(self._rows_of_lanes), flights.control_period))
-        whole = self._engine.controller is not None
+        whole = self._tick.controller is not None
         for begin in range(0, flights.ticks, _CHUNK_TICKS):
             end = min(begin + _CHUNK_TICKS, flights.ticks)
             # The state at the end is measured too.
@@ -476,10 +377,10 @@ class _Block:
 
     def _begin_control(self) -> None:
         """Begin the references of all flights at what is measured first."""
-        controller = self._engine.controller
+        controller = self._tick.controller
         if controller is None:
             return
-        self._engine.driver.measure_starts(self._job)
+        self._tick.driver.measure_starts(self._job)
         states = self._get("measured")
         self._profiles = [
             controller.begin(int(row), control_state(state))
@@ -506,7 +407,7 @@ class _Block:
                         self._ended[index] = int(self._at[group])
 
     def _command(self, group: int, lane: int, index: int, result: BatchResult) -> None:
-        controller, row = self._engine.controller, int(self._rows_of_lanes[index])
+        controller, row = self._tick.controller, int(self._rows_of_lanes[index])
         assert controller is not None
         state = control_state(self._memory[group, self._rows["measured"], lane])
         tick = int(self._at[group])
@@ -551,7 +452,7 @@ class _Block:
         result.limited[first][rows] = limits[:, :n]
         if first == "rate":
             result.limited["stroke"][rows] = limits[:, n:]
-        if self._engine.controller is not None:
+        if self._tick.controller is not None:
             time = self._get("reached")[:count, 0]
             result.reached_time[rows] = np.where(time >= 0.0, time, np.nan)
             result.reached_state[rows] = np.swapaxes(self._reached, 1, 2).reshape(

@@ -1,0 +1,128 @@
+"""The tick of a plant, and of what commands it, compiled for vector registers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.batch.controlling import CONTROL_INPUTS, CONTROL_OUTPUTS, BatchController
+from spacerobot_ros.batch.flights import Controlled, Flights
+from spacerobot_ros.batch.native import Driver, vector_unit
+from spacerobot_ros.control.state import ControlState
+from spacerobot_ros.model.compilation import compilation_settings
+from spacerobot_ros.model.model_functions import Composition, ModelFunctions
+from spacerobot_ros.simulation import effort_plant, velocity_plant
+
+
+@dataclass(frozen=True)
+class TickLayout:
+    """How the tick of a plant is laid out.
+
+    ``inputs`` and ``outputs`` are the names of the arguments and results of its function,
+    ``flight`` those results that every tick needs, ``copies`` what a tick hands to the next.
+    """
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    flight: tuple[str, ...]
+    copies: Mapping[str, str]
+
+    @property
+    def reported(self) -> tuple[str, ...]:
+        """Results that reports need too: all but the poses of links."""
+        return tuple(name for name in self.outputs if not name.startswith("link"))
+
+
+_LAYOUTS = {
+    "velocity": TickLayout(
+        ("state", "command", "momenta", "r_cm", "h"),
+        (
+            *("next_state", "pose", "twist", "qdot", "momentum"),
+            *("link_R", "link_r", "limited", "next_r_cm"),
+        ),
+        ("next_state", "qdot", "limited", "next_r_cm"),
+        {"next_state": "state", "next_r_cm": "r_cm"},
+    ),
+    "effort": TickLayout(
+        ("state", "command", "h"),
+        (
+            *("next_state", "pose", "twist", "realised"),
+            *("momentum", "link_R", "link_r", "limited"),
+        ),
+        ("next_state", "realised", "limited"),
+        {"next_state": "state"},
+    ),
+}
+
+
+@dataclass(frozen=True)
+class CompiledTick:
+    """The compiled tick of flights that are alike, and where its numbers stand in rows.
+
+    Attributes
+    ----------
+    driver
+        The loop.
+    layout
+        Of its arguments and results.
+    sizes
+        Rows of each name.
+    controller
+        What commands; None: tables.
+    """
+
+    driver: Driver
+    layout: TickLayout
+    sizes: Mapping[str, int]
+    controller: BatchController | None = None
+
+    @classmethod
+    def of(cls, flights: Flights, model: ModelFunctions) -> CompiledTick:
+        """Compile the tick of flights, or find it compiled.
+
+        Raises
+        ------
+        NoLibraryError
+            It cannot be compiled here.
+        ParameterError
+            The law cannot drive what is to be controlled, or is none for lanes.
+        """
+        # A controller has goals of its flights: with one, nothing is kept.
+        key = cls, flights.actuation, flights.substeps, vector_unit(), compilation_settings()
+        kept = not isinstance(flights.program, Controlled)
+        if not (kept and key in model.derived):
+            tick = cls._new(flights, model)
+            if not kept:
+                return tick
+            model.derived[key] = tick
+        found: CompiledTick = model.derived[key]
+        return found
+
+    @classmethod
+    def _new(cls, flights: Flights, model: ModelFunctions) -> CompiledTick:
+        layout, robot = _LAYOUTS[flights.actuation], flights.robot
+        make = {"velocity": velocity_plant, "effort": effort_plant}[flights.actuation].tick_function
+        whole = make(robot, Composition(model, ca.MX), flights.substeps)
+        inputs = whole.mx_in()
+        outputs = dict(zip(layout.outputs, whole.call(inputs, True, False), strict=True))
+        flight, report = (
+            ca.Function(f"{flights.actuation}_{name}", inputs, [outputs[each] for each in chosen])
+            for name, chosen in (("flight", layout.flight), ("report", layout.reported))
+        )
+        sizes = {
+            **{n: whole.nnz_in(i) for i, n in enumerate((*layout.inputs, "p"))},
+            **{n: whole.nnz_out(i) for i, n in enumerate(layout.outputs)},
+        }
+        if not isinstance(flights.program, Controlled):
+            return cls(Driver(flight, report), layout, sizes)
+        controller = BatchController(flights)
+        rest = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3)
+        present = ControlState(*rest, flights.starts.q[0], flights.starts.q[0] * 0.0)
+        numbers = controller.numbers(controller.begin(0, present))
+        control = controller.function(len(numbers))
+        sizes |= {name: control.nnz_in(i) for i, name in enumerate(CONTROL_INPUTS)}
+        sizes |= {name: control.nnz_out(i) for i, name in enumerate(CONTROL_OUTPUTS)}
+        return cls(Driver(flight, report, control), layout, sizes, controller)
