@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import Any
 import psutil
 import pytest
 import yaml
+from support.awaited import await_files
 from support.campaigns import campaign, section
 
 from spacerobot_ros.campaign.dataset import Dataset
@@ -42,11 +42,13 @@ class Started:
 
     def awaited(self, pattern: str) -> str:
         """Return what it prints of a pattern."""
-        end = time.monotonic() + _LONGEST
-        while not (found := re.search(pattern, self.log.read_text())):
-            assert time.monotonic() < end
-            assert self.process.poll() is None, self.log.read_text()
-            time.sleep(0.05)
+
+        def printed() -> re.Match[str] | None:
+            return re.search(pattern, self.log.read_text())
+
+        await_files([self.log.parent], lambda: bool(printed()), self.process, _LONGEST)
+        found = printed()
+        assert found is not None
         return found[0]
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> int:
@@ -74,11 +76,10 @@ def flown(folder: Path) -> int:
     return len(Dataset(folder).done()) if (folder / "flights").is_dir() else 0
 
 
-def until(folder: Path, count: int) -> None:
-    end = time.monotonic() + _LONGEST
-    while flown(folder) < count:
-        assert time.monotonic() < end
-        time.sleep(0.1)
+def until(folder: Path, count: int, run: Started) -> None:
+    """Wait until so many flights of a campaign are in its dataset."""
+    folders = [folder.parent, folder, folder / "flights"]
+    await_files(folders, lambda: flown(folder) >= count, run.process, _LONGEST)
 
 
 def rows(folder: Path) -> list[dict[str, Any]]:
@@ -101,9 +102,9 @@ def test_workers_and_campaigns_that_are_killed(tmp_path: Path) -> None:
             for each in (first, second):
                 each.awaited("Registered to")
             with started(tmp_path, *command, address) as run:
-                until(out, 10)
+                until(out, 10, run)
                 first.kill()
-                until(out, flown(out) + 10)
+                until(out, flown(out) + 10, run)
                 run.kill()
             assert 20 <= flown(out) < GIVEN["flights"]
             with started(tmp_path, *command, address) as run:
@@ -161,7 +162,7 @@ def test_what_was_flown_is_kept_after_ctrl_c(tmp_path: Path) -> None:
     file.write_text(yaml.safe_dump({"campaign": section(**{**GIVEN, "flights": 100000})}))
     command = ("spacerobot_ros", "campaign", str(file), "--out", str(out), "--workers", "2")
     with started(tmp_path, *command) as run:
-        until(out, 8)
+        until(out, 8, run)
         assert run.kill(signal.SIGINT) == 130, run.log.read_text()
     numbers = [row["flight"] for row in rows(out)]
     assert len(numbers) >= 8

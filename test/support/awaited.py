@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-_IN_MODIFY, _IN_CREATE = 0x2, 0x100
+_IN_MODIFY, _IN_MOVED_TO, _IN_CREATE = 0x2, 0x80, 0x100
+_CHANGES = _IN_MODIFY | _IN_MOVED_TO | _IN_CREATE
 _IN_NONBLOCK, _IN_CLOEXEC = os.O_NONBLOCK, os.O_CLOEXEC
 
 
@@ -42,21 +43,45 @@ def await_end(still: Callable[[], Iterable[int]], patience: float) -> list[int]:
 def await_size(file: Path, size: int, writer: subprocess.Popen[bytes], patience: float) -> None:
     """Wait until a file has a size in bytes, or fail as soon as the process that writes it ends.
 
-    The file need not be there yet, its folder must. The kernel tells of every change (inotify).
+    The file need not be there yet, its folder must.
+    """
+
+    def grown() -> bool:
+        return file.exists() and file.stat().st_size >= size
+
+    await_files([file.parent], grown, writer, patience)
+
+
+def await_files(
+    folders: Iterable[Path],
+    met: Callable[[], bool],
+    writer: subprocess.Popen[bytes],
+    patience: float,
+) -> None:
+    """Wait until what is in some folders is as ``met`` says, or fail when its writer ends before.
+
+    The kernel tells of every change (inotify) in those of the folders that are there; one at least
+    must be, and the others must appear in it or in each other.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     changes = libc.inotify_init1(_IN_NONBLOCK | _IN_CLOEXEC)
     assert changes >= 0, os.strerror(ctypes.get_errno())
     ended = os.pidfd_open(writer.pid)
     deadline = time.monotonic() + patience
+    watched = list(folders)
     try:
-        added = libc.inotify_add_watch(changes, bytes(file.parent), _IN_MODIFY | _IN_CREATE)
-        assert added >= 0, os.strerror(ctypes.get_errno())
-        while not file.exists() or file.stat().st_size < size:
+        while True:
+            for folder in watched:
+                # Once more is no harm: a folder has one watch.
+                added = libc.inotify_add_watch(changes, bytes(folder), _CHANGES)
+                assert added >= 0 or not folder.exists(), os.strerror(ctypes.get_errno())
+            if met():
+                return
             left = deadline - time.monotonic()
-            assert left > 0, f"{file.name} has not grown to {size} bytes within {patience:g} s"
+            assert left > 0, f"not met in {watched[0]} within {patience:g} s"
             ready, _, _ = select.select([changes, ended], [], [], left)
-            assert ended not in ready, f"its writer has ended before {file.name} had {size} bytes"
+            # What it wrote last may have come with its end.
+            assert ended not in ready or met(), f"its writer has ended before, in {watched[0]}"
             if changes in ready:
                 os.read(changes, 65536)
     finally:
