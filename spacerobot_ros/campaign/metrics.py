@@ -68,6 +68,16 @@ def _ends(flight: FlightArrays) -> Array:
     return np.minimum(flight.q - lower, upper - flight.q).min(axis=0)
 
 
+def _margin(what: str, limit: str, rows: Callable[[FlightArrays], Array]) -> Metric:
+    return Metric(
+        "",
+        f"what remains of the {what} limit of a joint, as a share of it",
+        lambda f: 1.0 - _peak(rows(f)) / f.robot.limits(limit),
+        by_joint=True,
+        least=True,
+    )
+
+
 METRICS: dict[str, Metric] = {
     "position_error_m": Metric(
         "m", "from the true position of the base at the end to the goal", lambda f: f.error.distance
@@ -96,20 +106,8 @@ METRICS: dict[str, Metric] = {
     "joint_margin": Metric(
         "m or rad", "least distance of a joint from its ends", _ends, by_joint=True, least=True
     ),
-    "rate_margin": Metric(
-        "",
-        "what remains of the rate limit of a joint, as a share of it",
-        lambda f: 1.0 - _peak(f.qdot) / f.robot.limits("velocity"),
-        by_joint=True,
-        least=True,
-    ),
-    "effort_margin": Metric(
-        "",
-        "what remains of the effort limit of a joint, as a share of it",
-        lambda f: 1.0 - _peak(f.effort) / f.robot.limits("effort"),
-        by_joint=True,
-        least=True,
-    ),
+    "rate_margin": _margin("rate", "velocity", lambda f: f.qdot),
+    "effort_margin": _margin("effort", "effort", lambda f: f.effort),
     "momentum_drift": Metric(
         "kg m/s, kg m^2/s",
         "largest change of a momentum that thrust does not explain",

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -24,11 +25,45 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import BelievedRobotConfig, RobotConfig, robot_of
 
 
-class FlightsEngine:
+class _OneByOneEngine(ABC):
+    """Flies one draw after the other; one that cannot be flown does not end the others."""
+
+    name: str
+    least = 1
+
+    def fly(
+        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
+    ) -> Iterator[Row]:
+        """Yield a row for each draw; fewer where it is stopped."""
+        common = DrawnFlight.of(campaign.scenario)
+        for draw in draws:
+            if stopped():
+                return
+            try:
+                flown = self.flown(campaign, drawn_flight(campaign, draw, common), stopped)
+                if stopped() and flown.outcome is Outcome.INTERRUPTED:
+                    return
+                yield Row.of(campaign, draw, flown, self.name)
+            except Exception as error:  # It is a row, with its reason.
+                yield Row.failed(draw, error, self.name)
+
+    @abstractmethod
+    def flown(
+        self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]
+    ) -> FlightArrays:
+        """Fly one draw.
+
+        Raises
+        ------
+        SpaceRobotError
+            Something of it is refused.
+        """
+
+
+class FlightsEngine(_OneByOneEngine):
     """The real plant, planner and controller, without ROS."""
 
     name = "flights"
-    least = 1
 
     def refusal(self, campaign: Campaign) -> str:
         """Return why not, as a clause."""
@@ -37,23 +72,6 @@ class FlightsEngine:
         except SpaceRobotError as error:
             return str(error)
         return ""
-
-    def fly(
-        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row]:
-        """Fly one draw after the other."""
-        common = DrawnFlight.of(campaign.scenario)
-        for draw in draws:
-            if stopped():
-                return
-            try:
-                flight = drawn_flight(campaign, draw, common)
-                flown = self.flown(campaign, flight, stopped)
-                if stopped() and flown.outcome is Outcome.INTERRUPTED:
-                    return
-                yield Row.of(campaign, draw, flown, self.name)
-            except Exception as error:  # One flight that cannot be flown does not end the others.
-                yield Row.failed(draw, error, self.name)
 
     def flown(
         self,
@@ -108,36 +126,25 @@ def _built_once(node: str, text: str, name: str, error: float, seed: int) -> Spa
     return robot_of(RobotConfig(text, name))
 
 
-class RosEngine:
-    """The whole stack, flown by ``spacerobot run`` in a process for each draw."""
+class RosEngine(_OneByOneEngine):
+    """The whole stack, flown by ``spacerobot run`` in a process and with a bag for each draw."""
 
     name = "ros"
-    least = 1
 
     def refusal(self, campaign: Campaign) -> str:
         """Return why not, as a clause."""
         return "it kills nodes on the way" if campaign.scenario.kills else ""
 
-    def fly(
-        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row]:
-        """Fly one draw after the other, each in a process and with a bag of its own."""
-        common = DrawnFlight.of(campaign.scenario)
-        for draw in draws:
-            if stopped():
-                return
-            began = time.perf_counter()
-            try:
-                with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
-                    flight = drawn_flight(campaign, draw, common).finished()
-                    bag = Path(folder, "flight.mcap")
-                    self._run(flight.scenario, Path(folder, "draw.yaml"), bag)
-                    flown = recorded_flight(bag)
-                row = Row.of(campaign, draw, flown, self.name)
-                taken = time.perf_counter() - began
-                yield replace(row, wall_time=taken)
-            except Exception as error:
-                yield Row.failed(draw, error, self.name)
+    def flown(
+        self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]
+    ) -> FlightArrays:
+        """Fly one draw; see :meth:`FlightsEngine.flown`. It is not stopped on the way."""
+        began = time.perf_counter()
+        with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
+            bag = Path(folder, "flight.mcap")
+            self._run(flight.finished().scenario, Path(folder, "draw.yaml"), bag)
+            flown = recorded_flight(bag)
+        return replace(flown, wall_time=time.perf_counter() - began)
 
     def _run(self, scenario: Scenario, file: Path, bag: Path) -> None:
         """Fly a scenario in another process: signals and the contexts of ROS are a process's."""

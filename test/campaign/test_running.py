@@ -11,7 +11,7 @@ from support.campaigns import campaign
 
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.dataset import Dataset
-from spacerobot_ros.campaign.one_by_one import FlightsEngine
+from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
 from spacerobot_ros.campaign.rerunning import TOLERANCE, largest_deviation, rerun_flight
 from spacerobot_ros.campaign.rows import ERROR, Row
 from spacerobot_ros.campaign.running import Progress, run_campaign
@@ -133,6 +133,19 @@ def test_rows_flown_again_through_ros_are_the_same(tmp_path: Path, count: int) -
         assert again.deviation is not None
         assert again.deviation < TOLERANCE
         assert again.row.draw.values["mass.mass_1"] != 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("own_domain")
+def test_a_draw_flown_by_the_whole_stack_is_the_same_flight() -> None:
+    made = small(flights=1)
+    (here,) = FlightsEngine().fly(made, [_draw(made, 0)], lambda: False)
+    (there,) = RosEngine().fly(made, [_draw(made, 0)], lambda: False)
+    assert there.engine == "ros"
+    assert there.outcome == here.outcome
+    assert there.metrics.keys() == here.metrics.keys()
+    assert largest_deviation(here.metrics, there.metrics)[0] < TOLERANCE
+    assert there.wall_time > 0
 
 
 def test_a_row_that_is_another_flight_is_noticed(tmp_path: Path) -> None:
