@@ -13,7 +13,8 @@ import yaml
 from spacerobot_ros.campaign.metrics import METRICS, is_metric
 from spacerobot_ros.campaign.targets import Target, targets_of
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.scenario import CONFIGS, Scenario, scenario_or_robot
+from spacerobot_ros.flight.parameter_files import CONFIGS
+from spacerobot_ros.flight.scenario import Scenario, scenario_or_robot
 from spacerobot_ros.resources import suggestion
 
 SAMPLERS = ("random", "latin_hypercube", "sobol", "halton", "saltelli")

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.scenario import CONFIGS, Scenario
+from spacerobot_ros.flight.parameter_files import CONFIGS
+from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply

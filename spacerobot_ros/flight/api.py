@@ -14,8 +14,8 @@ from spacerobot_ros import planning
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
+from spacerobot_ros.flight.parameter_files import CONFIGS
 from spacerobot_ros.flight.scenario import (
-    CONFIGS,
     Scenario,
     load_scenario,
     scenario_names,

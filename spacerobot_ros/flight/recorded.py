@@ -17,7 +17,8 @@ from spacerobot_ros.errors import RecordingError, SpaceRobotError
 from spacerobot_ros.events import Event
 from spacerobot_ros.flight.arrays import Commands, Outcome, Status
 from spacerobot_ros.flight.flight import Flight
-from spacerobot_ros.flight.scenario import COMMANDERS, CONFIGS, Scenario
+from spacerobot_ros.flight.parameter_files import CONFIGS
+from spacerobot_ros.flight.scenario import COMMANDERS, Scenario
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal

@@ -12,10 +12,16 @@ from typing import Any
 import numpy as np
 import yaml
 
-from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.flight.parameter_files import (
+    CONFIGS,
+    number_in,
+    parse_setting,
+    read_content,
+    sections_of,
+)
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.rotations import (
     matrix_from_rpy,
@@ -35,18 +41,6 @@ from spacerobot_ros.resources import (
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.trials import Problem
-from spacerobot_ros.viewer.config import ViewerConfig
-
-CONFIGS: Mapping[str, type[Any]] = {
-    "plant": PlantConfig,
-    "planner": PlannerConfig,
-    "coordinated_control": ControllerConfig,
-    "recorder": RecorderConfig,
-    "viewer": ViewerConfig,
-}
-"""The nodes that a scenario may set parameters of, and what declares these parameters."""
-
-NODES = tuple(CONFIGS)
 
 COMMANDERS = ("planner", "coordinated_control")
 """Those of them that take goals; a scenario runs the ones its file has a section for."""
@@ -155,7 +149,7 @@ class Scenario:
                 raise ParameterError(f"Node '{node}' has no parameter '{name}'.")
             if isinstance(value, str) and name in known:
                 is_number = isinstance(known[name].default, (int, float))
-                values[name] = _number(value) if is_number else value
+                values[name] = number_in(value) if is_number else value
         try:
             return configured(CONFIGS[node], values)
         except ParameterError as error:
@@ -394,14 +388,14 @@ def load_scenario(name: str) -> Scenario:
             f"There is no scenario '{name}'; there are: {', '.join(known)}, or any YAML file."
             f"{suggestion(name, [*known, *robots])}"
         )
-    content = _content(path)
+    content = read_content(path)
     section = content.get("scenario")
     values = section.get("ros__parameters") if isinstance(section, dict) else None
     if not isinstance(values, dict):
         raise ParameterError(
             f"The scenario file {path} has no 'scenario: ros__parameters:' section with a goal."
         )
-    in_file = _sections(content, path)
+    in_file = sections_of(content, path)
     unknown = sorted(set(map(str, values)) - set(_KEYS))
     if unknown:
         raise ParameterError(
@@ -425,21 +419,6 @@ def load_scenario(name: str) -> Scenario:
         in_file={node: _with_robot_beside(path, values) for node, values in in_file.items()},
         overrides=_LOCKSTEP,
     )
-
-
-def read_sections(path: Path) -> dict[str, dict[str, Any]]:
-    """Return the parameters by node and full name that a parameter file has.
-
-    A section is for a node in any namespace (``/**/plant``), in one (``/robot_1/plant``), in none
-    (``plant``), or for all nodes (``/**``); of two that set a parameter the later one counts, and
-    the one for all nodes counts least.
-
-    Raises
-    ------
-    ParameterError
-        The file cannot be read, or a section has no ``ros__parameters`` with parameters under it.
-    """
-    return _sections(_content(path), path)
 
 
 def _with_robot_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
@@ -527,27 +506,6 @@ def goal_from_rpy(position: Sequence[float], rpy_deg: Sequence[float]) -> Goal:
     return Goal.checked(position, quaternion_from_matrix(matrix_from_rpy(np.radians(angles))))
 
 
-def parse_setting(text: str) -> tuple[str, str, Any]:
-    """Split ``node.parameter=value``; the value is read as YAML.
-
-    Raises
-    ------
-    ParameterError
-        The text has another form, or names no node.
-    """
-    key, equals, value = text.partition("=")
-    node, dot, name = key.strip().partition(".")
-    if not equals or not dot or node not in NODES or not name:
-        raise ParameterError(
-            f"'{text}' is not node.parameter=value with one of the nodes {', '.join(NODES)}."
-        )
-    try:
-        parsed = yaml.safe_load(value)
-    except yaml.YAMLError:
-        raise ParameterError(f"The value in '{text}' cannot be read.") from None
-    return node, name, _number(parsed) if isinstance(parsed, str) else parsed
-
-
 def parse_kills(lines: object, where: str) -> tuple[Kill, ...]:
     """Read ``NODE at SECONDS [until SECONDS]``, a list of such lines, by time.
 
@@ -599,39 +557,6 @@ def _published(rows: Any, path: Path) -> tuple[Published, ...]:
         ) from error
 
 
-def _content(path: Path) -> dict[Any, Any]:
-    """Return what is in a parameter file; a file that is no mapping has nothing."""
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise ParameterError(f"The scenario file {path} cannot be read: {reason}.") from error
-    return content if isinstance(content, dict) else {}
-
-
-def _sections(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
-    """Return what :func:`read_sections` does, of a content that was read."""
-    found: dict[str, dict[str, Any]] = {}
-    of_all: dict[str, Any] = {}
-    for key, given in content.items():
-        node = str(key).rpartition("/")[2]
-        if node not in (*NODES, "**"):
-            continue
-        given = {} if given is None else given
-        values = given.get("ros__parameters", {}) if isinstance(given, dict) else None
-        if not isinstance(values, dict):
-            raise ParameterError(
-                f"The section '{key}' of the scenario file {path} is not 'ros__parameters:' with "
-                "the parameters under it."
-            )
-        (of_all if node == "**" else found.setdefault(node, {})).update(_flat(values))
-    for node, values in found.items():
-        known = {parameter.name for parameter in declared(CONFIGS[node])}
-        shared = {name: value for name, value in of_all.items() if name in known}
-        found[node] = {**shared, **values}
-    return found
-
-
 def _goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
     try:
         position = values.get(f"{name}_position", [0.0, 0.0, 0.0])
@@ -641,22 +566,3 @@ def _goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
         return Goal.checked(position, orientation, values.get(f"{name}_joint_positions"))
     except (GoalError, ValueError, TypeError) as error:
         raise ParameterError(f"The goal of the scenario file {path} is refused: {error}") from error
-
-
-def _flat(section: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return parameters by full name: a map within a section is a group of them."""
-    flat: dict[str, Any] = {}
-    for key, value in section.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat
-
-
-def _number(text: str) -> float | str:
-    """Return the number in a text, if it is one: YAML wants a dot in 1e-3, people do not."""
-    try:
-        return float(text)
-    except ValueError:
-        return text

@@ -10,24 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.bag import Bag, RecordedRobot, TopicSeries, read_bag
-from spacerobot_ros.bag.recorded_robot import columns
 from spacerobot_ros.control.status import CommandReport, ControllerStatus, tracking_time
 from spacerobot_ros.control.thrusters.table import IN_URDF, find_thrusters
-from spacerobot_ros.errors import PlanningError, RobotDescriptionError, SpaceRobotError
+from spacerobot_ros.errors import PlanningError, SpaceRobotError
 from spacerobot_ros.flight.scenario import Published
-from spacerobot_ros.model import RobotDescription, parse_robot
+from spacerobot_ros.model import RobotDescription
 from spacerobot_ros.model.description import Array, Joint, Pose
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
-from spacerobot_ros.model.visuals import meshes_in
 from spacerobot_ros.planning import METHODS, Goal, PoseError
-from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
-from spacerobot_ros.report.events import FlightEvent, read_events
-from spacerobot_ros.report.signals import Cycles, Signal, find_cycles, nearest_rotvec, rotvecs
+from spacerobot_ros.report.events import FlightEvent
+from spacerobot_ros.report.signals import Cycles, Signal, find_cycles, nearest_rotvec
 from spacerobot_ros.report.solids import SolidRobot
-from spacerobot_ros.topics import TOPICS
 
 _FOLLOWED = frozenset(("executing", "reached", "failed", "aborted"))
 """States in which the goal of a status is, or was, the one to fly to."""
@@ -459,169 +454,3 @@ class Flight:
             if same and np.allclose(goal.quaternion, named.quaternion, rtol=0.0, atol=1e-7):
                 return goal
         return named
-
-
-_SAME_CLOCK = 1.0
-"""Stamps this near to the log times, in s, come from the same clock."""
-
-
-def read_flight(path: Path) -> Flight:
-    """Read a bag.
-
-    Raises
-    ------
-    RecordingError
-        There is no such bag, or it is damaged.
-    """
-    bag = read_bag(path)
-    prefixes = [
-        topic.rpartition("/")[0]
-        for topic, kind in bag.topics.items()
-        if topic.endswith("/odom") and kind == TOPICS["odom"].type
-    ]
-    robot = _Recorded(bag, min(prefixes, default=""))
-    names, nozzles = robot.joint_names, robot.names("thrusters")
-    base = robot.signal("odom", "pose.pose")
-    position, quaternion = Signal(base.time, base.values[:, :3]), base.values[:, 3:]
-    description = _description(robot)
-    return Flight(
-        file_name=bag.path.name,
-        message_count=bag.message_count(),
-        metadata=bag.metadata,
-        robot=description,
-        joint_names=names,
-        position=position,
-        quaternion=quaternion,
-        attitude=Signal(base.time, rotvecs(quaternion)),
-        shape=robot.signal("joint_states", "position", len(names)),
-        twist=robot.signal("odom", "twist.twist"),
-        rates=robot.signal("joint_states", "velocity", len(names)),
-        momentum=_momentum_balance(robot),
-        tool=robot.signal("end_effector_pose", "pose"),
-        wrench=robot.signal("base_wrench", "wrench"),
-        efforts=_efforts(robot, names),
-        duty=robot.signal("thrusters", "velocity", len(nozzles)),
-        thrust=robot.signal("thrusters", "effort", len(nozzles)),
-        thruster_names=nozzles,
-        statuses=_statuses(robot),
-        sent=_goals(robot, "goal_pose"),
-        tool_goals=_goals(robot, "end_effector/goal_pose"),
-        planned=[
-            np.array([[getattr(p.pose.position, x) for x in "xyz"] for p in message.poses]).reshape(
-                -1, 3
-            )
-            for _, message in robot.messages("planned_path")
-        ],
-        events=robot.events(),
-        meshes=meshes_in(description, bag.attachments) if description is not None else {},
-    )
-
-
-class _Recorded(RecordedRobot):
-    """The topics of a robot with the time since its first state."""
-
-    def __init__(self, bag: Bag, namespace: str) -> None:
-        super().__init__(bag, namespace)
-        states = [s for name in ("odom", "joint_states", "momentum") if (s := self.get(name))]
-        self._stamped = all(abs(s.stamp[0] - s.time[0]) < _SAME_CLOCK for s in states)
-        self._began = min((self._times(s)[0] for s in states), default=bag.start_time)
-
-    def messages(self, name: str) -> list[tuple[float, Any]]:
-        """Return all messages of a topic, with their log times."""
-        series = self.get(name)
-        if series is None:
-            return []
-        return [(ns / 1e9 - self._began, message) for ns, message in series.messages()]
-
-    def signal(self, name: str, path: str, width: int | None = None) -> Signal:
-        """Return numbers of a topic, without the messages in which one is missing.
-
-        They are those of an array with ``width`` numbers, or of the message at ``path``.
-        """
-        fields = [path] if width is not None else columns(_SAME_MESSAGE.get(name, name), path)
-        series = self.get(name)
-        if series is None:
-            return Signal(np.empty(0), np.empty((0, len(fields) if width is None else width)))
-        values = series.table(fields, width)
-        whole = np.isfinite(values).all(axis=1)
-        time = (self._times(series) - self._began)[whole]
-        order = np.argsort(time, kind="stable")
-        return Signal(time[order], values[whole][order])
-
-    def events(self) -> list[FlightEvent]:
-        """Return the events that figures show."""
-        return read_events(self, self._began, stamped=self._stamped)
-
-    def _times(self, series: TopicSeries) -> Array:
-        return series.stamp if self._stamped else series.time
-
-
-_SAME_MESSAGE = {"base_wrench": "base_wrench_realised"}
-"""State topics whose messages have the fields of another topic's."""
-
-
-def _momentum_balance(robot: _Recorded) -> Signal:
-    """Return momenta and energy (N, 7), without the momenta that thrusters have put in."""
-    balance = robot.signal("momentum", "data", 7)
-    expected = robot.signal("momentum_expected", "data", 6)
-    if len(expected) != len(balance) or not len(balance):
-        return balance
-    values = balance.values.copy()
-    values[:, :6] -= expected.values - expected.values[0]
-    return Signal(balance.time, values)
-
-
-def _description(robot: _Recorded) -> RobotDescription | None:
-    texts = [data for name, data in robot.bag.attachments.items() if name.endswith(".urdf")]
-    texts += [message.data.encode() for _, message in robot.messages("robot_description")[-1:]]
-    for text in texts:
-        try:
-            return parse_robot(text.decode())
-        except (RobotDescriptionError, UnicodeDecodeError):
-            continue
-    return None
-
-
-def _efforts(robot: _Recorded, names: list[str]) -> Signal:
-    """Return the commanded joint efforts (N, n), by the names of the states."""
-    # Commands of velocities hold no efforts, and reading them takes a while.
-    actuation = robot.bag.metadata.get("parameters/plant", {}).get("actuation", "").strip('"')
-    commands = robot.get("joint_commands") if actuation != "velocity" else None
-    given = list(map(str, next(commands.messages())[1].name)) if commands is not None else []
-    if commands is None or sorted(given) != sorted(names):
-        return Signal(np.empty(0), np.empty((0, len(names))))
-    efforts = robot.signal("joint_commands", "effort", len(names))
-    return Signal(efforts.time, efforts.values[:, [given.index(name) for name in names]])
-
-
-def _statuses(robot: _Recorded) -> list[Status]:
-    """Return the statuses of the planner, or else of the controller."""
-    planned = robot.messages("planner/status")
-    kind: type[PlannerStatus | ControllerStatus] = PlannerStatus if planned else ControllerStatus
-    statuses = []
-    for time, message in planned or robot.messages("controller/status"):
-        values = {pair.key: pair.value for pair in message.values}
-        try:
-            report = kind.from_values(values, message.message)
-        except SpaceRobotError:
-            report = None
-        statuses.append(Status(time, message.message, report))
-    return statuses
-
-
-def _goals(robot: _Recorded, topic: str) -> list[SentGoal]:
-    """Return the goal poses that are poses in the frame of the odometry."""
-    odom = robot.get("odom")
-    world = next(odom.messages())[1].header.frame_id if odom is not None else ""
-    goals, ids = [], GoalIds()
-    for time, message in robot.messages(topic):
-        stamp = message.header.stamp
-        goal_id = ids.of(stamp.sec, stamp.nanosec)
-        p, o = message.pose.position, message.pose.orientation
-        try:
-            goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w])
-        except PlanningError:
-            continue
-        if not world or message.header.frame_id in ("", world):
-            goals.append(SentGoal(time, goal, goal_id))
-    return goals

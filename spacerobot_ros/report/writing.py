@@ -34,10 +34,11 @@ from spacerobot_ros.report.figures_time import (
     thrusters_plate,
     twist_plate,
 )
-from spacerobot_ros.report.flight import Flight, read_flight
+from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.report.meshcat import player_of
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.plates import Plate
+from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.report.scene import scene_of
 from spacerobot_ros.report.style import (
     WIDTH,

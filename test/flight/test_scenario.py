@@ -11,9 +11,8 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.flight.parameter_files import CONFIGS, NODES
 from spacerobot_ros.flight.scenario import (
-    CONFIGS,
-    NODES,
     Kill,
     load_scenario,
     parse_kills,

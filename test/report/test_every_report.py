@@ -13,7 +13,7 @@ from support.chromium import Browser, browser, chromium
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.scenario import load_scenario, scenario_names
 from spacerobot_ros.report import write_report
-from spacerobot_ros.report.flight import read_flight
+from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.session.run import run_scenario
 
 pytestmark = [

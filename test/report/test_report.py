@@ -35,8 +35,8 @@ from spacerobot_ros.bag import RecordingError
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.report import figures_space, write_picture, write_report
 from spacerobot_ros.report.figures_time import shape_plate
-from spacerobot_ros.report.flight import read_flight
 from spacerobot_ros.report.plates import Plate
+from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.report.style import drawing
 
 FIGURES = [

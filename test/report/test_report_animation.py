@@ -18,8 +18,9 @@ from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
 from spacerobot_ros.model.visuals import solid_mesh
 from spacerobot_ros.report import meshcat, write_report
-from spacerobot_ros.report.flight import Flight, read_flight
+from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.report.meshcat import Command, Scene
+from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.report.scene import key_frames, scene_of
 from spacerobot_ros.report.signals import Cycles, Signal
 

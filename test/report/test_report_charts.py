@@ -14,7 +14,8 @@ from support.html_page import leave_blank
 
 from spacerobot_ros.report import write_report
 from spacerobot_ros.report.charts import thinned
-from spacerobot_ros.report.flight import Flight, read_flight
+from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.report.signals import Signal
 
 with_browser = pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with")

@@ -13,7 +13,8 @@ from support.flight_bags import GOAL, TICK, Story, goal_value, still, tell
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.report import figures_time
 from spacerobot_ros.report.events import _MARKS
-from spacerobot_ros.report.flight import Flight, read_flight
+from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.reading import read_flight
 
 EVENTS = [
     (0.05, {"event": "goal_accepted", "time": "0.05"}),

@@ -32,10 +32,11 @@ from spacerobot_ros.report.figures_time import (
     shape_groups,
     thrusters_plate,
 )
-from spacerobot_ros.report.flight import Flight, read_flight
+from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.report.live import Live
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.plates import Plate
+from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.report.tables import (
     headline,
     joint_table,
