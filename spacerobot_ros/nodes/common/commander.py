@@ -16,15 +16,18 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.flight.plant_listener import Change, PlantListener, Stopped
 from spacerobot_ros.flight.state_synchroniser import StateSynchroniser
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.robot_source import robot_from_text, robot_of
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS, JointReader, first_time_ns
 from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
-from spacerobot_ros.nodes.common.node import BEST_EFFORT, STREAM, RobotNode
+from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.state_times import StateTimes
 from spacerobot_ros.nodes.common.transforms import KnownFrames, StateFrames, robot_frames
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
@@ -49,8 +52,10 @@ _STATUSES = QoSProfile(
 """Every status counts, not only the last: deeper than what latecomers get."""
 
 
-class CommanderNode(RobotNode):
+class CommanderNode(FlightNode):
     """A node that answers the states of a plant with commands.
+
+    It can do nothing without a robot, and may be given it after its start.
 
     It answers only states of the plant's present time (:class:`StateTimes`), and gives up its goals
     when the plant reports that it does not obey (:class:`PlantListener`).
@@ -61,6 +66,23 @@ class CommanderNode(RobotNode):
 
     config: PlannerConfig | ControllerConfig
     _states: StateSynchroniser
+    _robot: SpaceRobot | None = None
+
+    def find_robot(self) -> None:
+        """Use the robot that the parameters name; without one wait for robot_description.
+
+        Raises
+        ------
+        SpaceRobotError
+            The robot is refused.
+        """
+        # What was built for the robot before belongs to topics that are gone.
+        self._robot = None
+        robot = robot_of(self.config)
+        if robot is None:
+            self.create_subscription(String, "robot_description", self._on_description, LATCHED)
+        else:
+            self._use(robot)
 
     def listen(self, control_period: float) -> None:
         """Subscribe to what the plant publishes; to be called while the node is configured."""
@@ -89,6 +111,14 @@ class CommanderNode(RobotNode):
         self.create_timer(_LOOK_PERIOD, self._look_at_times, clock=steady)
 
     # -- hooks --------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _use(self, robot: SpaceRobot) -> None:
+        """Build what depends on the robot."""
+
+    @abstractmethod
+    def _on_part(self) -> None:
+        """Answer a state that may have waited for the robot."""
 
     @abstractmethod
     def _take_odom(self, raw: bytes) -> None:
@@ -137,6 +167,16 @@ class CommanderNode(RobotNode):
         return self._known_frames.pose(frame, self.config.world_frame, own)
 
     # -- what the plant publishes -------------------------------------------------------------
+
+    def _on_description(self, message: String) -> None:
+        if self._robot is None:
+            try:
+                with self.long_work():
+                    self._use(robot_from_text(message.data, self.config))
+            except SpaceRobotError as error:
+                self.get_logger().error(f"robot_description: {error}")
+                return
+            self._on_part()
 
     def _on_odom(self, raw: bytes) -> None:
         if self._times.admits_odom(raw):

@@ -1,10 +1,9 @@
-"""What all nodes of the stack share: managed life, parameters, raw streams, their robot."""
+"""What all nodes of the stack share: managed life, parameters, raw streams."""
 
 from __future__ import annotations
 
 import time
 import traceback
-from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -14,9 +13,7 @@ from typing import Any, ClassVar
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.msg import (
-    SetParametersResult,
-)
+from rcl_interfaces.msg import SetParametersResult
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.exceptions import InvalidHandle
 from rclpy.experimental import EventsExecutor
@@ -29,13 +26,11 @@ from rclpy.serialization import serialize_message
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.robot_source import robot_from_text, robot_of
 from spacerobot_ros.nodes.common.connections import Connections
 from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
@@ -577,46 +572,6 @@ class FlightNode(LifecycleNode):
             self.config = before
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
-
-
-class RobotNode(FlightNode):
-    """A node that can do nothing without a robot, and may be given it after its start."""
-
-    _robot: SpaceRobot | None = None
-
-    def find_robot(self) -> None:
-        """Use the robot that the parameters name; without one wait for robot_description.
-
-        Raises
-        ------
-        SpaceRobotError
-            The robot is refused.
-        """
-        # What was built for the robot before belongs to topics that are gone.
-        self._robot = None
-        robot = robot_of(self.config)
-        if robot is None:
-            self.create_subscription(String, "robot_description", self._on_description, LATCHED)
-        else:
-            self._use(robot)
-
-    @abstractmethod
-    def _use(self, robot: SpaceRobot) -> None:
-        """Build what depends on the robot."""
-
-    @abstractmethod
-    def _on_part(self) -> None:
-        """Answer a state that may have waited for the robot."""
-
-    def _on_description(self, message: String) -> None:
-        if self._robot is None:
-            try:
-                with self.long_work():
-                    self._use(robot_from_text(message.data, self.config))
-            except SpaceRobotError as error:
-                self.get_logger().error(f"robot_description: {error}")
-                return
-            self._on_part()
 
 
 def described_robot(robot: SpaceRobot | None) -> str:
