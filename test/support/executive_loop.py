@@ -25,7 +25,9 @@ from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
 Array = npt.NDArray[np.float64]
 
 URDF = Path(__file__).parents[2] / "urdf" / "planar_manipulator.urdf"
+AIM = np.array([0.5, 0.25, 0.0])
 SHAPE = np.array([-1.0, 1.0])
+SHAPE_IS_CONTROLLED: dict[str, Any] = {"base_outputs": "x y rz", "joint_outputs": "shoulder elbow"}
 # The links are a metre long and the shoulder is half a metre from the centre of the base.
 TIP = np.array([0.5 + math.cos(-1.0) + 1.0, math.sin(-1.0), 0.0])
 KP, KD = 30.0, 60.0

@@ -1,0 +1,430 @@
+"""What a planner's executive decides and reports: plans it requests, statuses, events."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.planner_loop import HERE, NEAR, TICK_NS, Loop, goal_at
+from support.planner_phases import (
+    FAR,
+    OTHER,
+    braking,
+    evaluating,
+    executing,
+    jump,
+    long_flight,
+    measuring,
+    planning,
+    quick_without_joints,
+    reset_plant,
+    resting,
+    stub_of,
+    stuck,
+    until,
+)
+
+from spacerobot_ros.events import Event as FlightEvent
+from spacerobot_ros.events import EventKind
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.state_machine import (
+    Phase,
+    PlanReason,
+)
+from spacerobot_ros.planning.execution.status import PlannerState
+
+# -- why plans are requested ------------------------------------------------------------------
+
+
+def reasons(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> list[PlanReason]:
+    """Record why the executive of a loop requests plans from now on."""
+    requested: list[PlanReason] = []
+    request = loop.executive._request
+
+    def recorded(ticket: Any, state: Any) -> None:
+        requested.append(ticket.reason)
+        request(ticket, state)
+
+    monkeypatch.setattr(loop.executive, "_request", recorded)
+    return requested
+
+
+def test_a_goal_is_planned_from_rest_or_blended_into(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = resting(ticks=40)
+    requested = reasons(loop, monkeypatch)
+    loop.propose(NEAR)
+    loop.tick(10)
+    loop.propose(OTHER)
+    loop.tick()
+    assert requested == [PlanReason.NEW_GOAL, PlanReason.BLEND]
+    first, second = stub_of(loop).requests
+    assert first.previous is None
+    assert second.previous is None
+    assert not second.correction
+    # The second plan begins where the joints will be at rest, not where they are.
+    assert np.abs(second.state.q - loop.shapes[-2]).max() > 1e-3
+    assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
+
+
+def test_what_is_missed_is_corrected_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = resting()
+    requested = reasons(loop, monkeypatch)
+    stub_of(loop).overshoot = 0.1
+    status = loop.decide(NEAR)
+    # 0.062 m, a tenth of it is missed by every plan: 6.2 mm, 0.62 mm.
+    assert status.state is PlannerState.REACHED
+    assert status.corrections == 1
+    assert requested == [PlanReason.NEW_GOAL, PlanReason.CORRECTION]
+    first, second = stub_of(loop).requests
+    assert (first.correction, second.correction) == (False, True)
+    assert second.previous is loop.starts[0].schedule
+
+
+def test_partial_schedules_are_continued_and_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = resting(max_corrections=0)
+    requested = reasons(loop, monkeypatch)
+    stub_of(loop).partial = True
+    status = loop.decide(NEAR)
+    assert status.state is PlannerState.REACHED
+    assert status.corrections == 0
+    # Half of 0.062 m at a time until 1 mm is left.
+    assert requested == [PlanReason.NEW_GOAL, *[PlanReason.CONTINUATION] * 5]
+    assert all(request.correction for request in stub_of(loop).requests[1:])
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_a_tracking_error_is_planned_for_at_once_or_from_rest(
+    monkeypatch: pytest.MonkeyPatch, held: bool
+) -> None:
+    loop = executing(held=held, ticks=60, wrong_path=0.1, drift_position=0.02)
+    requested = reasons(loop, monkeypatch)
+    stub_of(loop).wrong_path = 0.0
+    for _ in range(400):
+        loop.tick()
+        loop.held.release()
+        if loop.statuses[-1].state.decided:
+            break
+    assert requested == [PlanReason.REPLAN if held else PlanReason.TRACKING_ERROR]
+    status = loop.statuses[-1]
+    assert (status.state, status.corrections) == (PlannerState.REACHED, 1)
+    assert any("Off the path by" in notice for notice in loop.notices)
+    assert not stub_of(loop).requests[-1].correction
+    # Either way the joints come to rest along the path: no step in velocity.
+    assert np.abs(np.diff(loop.speeds)).max() < 0.5 * max(loop.speeds)
+
+
+def test_a_tracking_error_that_cannot_be_planned_for_is_left_to_the_end() -> None:
+    loop = executing(ticks=60, wrong_path=0.1, drift_position=0.02)
+    stub_of(loop).refusing = True
+    loop.until(PlannerState.REACHED)
+    assert any("cannot be planned again: It is too far." in notice for notice in loop.notices)
+    assert loop.states == ["executing", "reached"]
+
+
+def test_tracking_errors_are_corrected_as_often_as_allowed() -> None:
+    loop = executing(ticks=200, wrong_path=0.5, drift_position=1e-3, max_corrections=2)
+    loop.tick(150)
+    assert len(stub_of(loop).requests) == 3
+    assert loop.statuses[-1].corrections == 2
+
+
+def test_a_goal_is_planned_for_without_the_joints_that_are_stuck(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    loop = executing(held=True, ticks=400, stuck_ticks=5)
+    quick_without_joints(loop)
+    requested = reasons(loop, monkeypatch)
+    stuck(loop)
+    q = loop.plant.q.copy()
+    until(loop, Phase.PLANNING)
+    assert requested == [PlanReason.STUCK_JOINTS]
+    task = loop.held.tasks[-1]
+    assert dict(task.stuck) == {"slider_1": q[0]}
+    assert task.required == {"position"}
+    assert not task.request.correction
+    assert any("Stuck: slider_1." in notice for notice in loop.notices)
+    # All joints are planned with for the next goal, and again without for this one if that is
+    # refused.
+    loop.propose(FAR)
+    loop.held.release()
+    loop.tick(2)
+    until(loop, Phase.PLANNING)
+    assert not loop.held.tasks[-1].stuck
+    loop.held.release()
+    until(loop, Phase.EVALUATING)
+    until(loop, Phase.PLANNING)
+    assert dict(loop.held.tasks[-1].stuck) == {"slider_1": q[0]}
+
+
+def test_the_next_goal_takes_the_result_of_a_refused_one_along() -> None:
+    """In the background: braked for a goal that is refused, the earlier one is planned again."""
+    loop = executing(held=True, ticks=40)
+    loop.tick(5)
+    loop.propose(FAR)
+    until(loop, Phase.PLANNING)
+    loop.held.release()
+    loop.tick()
+    refused = loop.statuses[-1]
+    assert (refused.state, refused.goal_id) == (PlannerState.REFUSED, "goal-2")
+    assert refused.sentence == "It is too far. The earlier goal is still pursued."
+    until(loop, Phase.PLANNING)
+    loop.held.release()
+    reached = loop.until(PlannerState.REACHED)
+    assert (reached.goal_id, reached.corrections) == ("goal-1", 0)
+
+
+# -- a plant that does not obey, and times that are not its own -------------------------------
+
+
+@pytest.mark.parametrize("start", [measuring, planning, executing, evaluating])
+def test_a_plant_that_stops_ends_the_goal_with_its_reason(
+    start: Callable[[], Loop], tmp_path: Path
+) -> None:
+    loop = start()
+    loop.executive._file = GoalFile(str(tmp_path / "goal.json"))
+    loop.executive._file.save({BASE: IdentifiedGoal(goal_at(NEAR), "goal-1")})
+    assert loop.executive.plant_stopped("The plant is latched: a fuse is blown.")
+    loop.tick()
+    status = loop.statuses[-1]
+    assert (status.state, status.goal_id) == (PlannerState.ABORTED, "goal-1")
+    assert status.sentence == "Aborted by the plant: The plant is latched: a fuse is blown."
+    assert not (tmp_path / "goal.json").exists()
+    # Nothing moves, whatever was being planned, until there is another goal.
+    loop.held.release()
+    loop.tick(60)
+    assert not any(loop.speeds[-60:])
+    assert loop.statuses[-1] is status
+    assert not loop.executive.plant_stopped("The plant is latched still.")
+    loop.propose(OTHER)
+    for _ in range(250):
+        loop.held.release()
+        loop.tick()
+    assert (loop.states[-1], loop.statuses[-1].goal_id) == ("reached", "goal-2")
+
+
+def test_braking_for_an_aborted_goal_ends_where_the_plant_stops() -> None:
+    loop = braking()
+    before = len(loop.statuses)
+    assert not loop.executive.plant_stopped("The plant is latched.")
+    loop.tick(20)
+    assert not any(loop.speeds[-20:])
+    assert len(loop.statuses) == before
+
+
+def test_a_plant_that_rested_before_the_goal_was_commanded_ends_nothing() -> None:
+    """While a plan is made at once no command comes, and a plant in real time rests."""
+    loop = resting(ticks=40)
+    loop.tick(10)
+    loop.propose(NEAR)
+    loop.tick()
+    (start,) = loop.starts
+    assert not loop.executive.plant_stopped("Too late.", start.stamp_ns - TICK_NS, 10**12)
+    assert not loop.executive.plant_stopped("Too late.", start.stamp_ns - TICK_NS, 0)
+    assert loop.executive.plant_stopped("Too late.", start.stamp_ns, 10**12)
+    # A goal that nothing was commanded for is not touched.
+    loop.propose(OTHER)
+    assert not loop.executive.plant_stopped("Too late.", loop.measured.stamp_ns, 10**12)
+    assert loop.executive.phase is Phase.MEASURING
+
+
+@pytest.mark.parametrize(("rests_after", "aborted"), [(0, True), (500_000_000, False)])
+def test_a_plant_that_rested_before_joints_were_taken_for_stuck_tells_why(
+    rests_after: int, aborted: bool
+) -> None:
+    """What it did while the plan without these joints was made is that plan's fault."""
+    loop = stuck(executing(held=True, ticks=400, stuck_ticks=5))
+    quick_without_joints(loop)
+    until(loop, Phase.PLANNING)
+    planned_from = loop.measured.stamp_ns - TICK_NS
+    last, rests = planned_from - TICK_NS, planned_from + rests_after
+    assert loop.executive.plant_stopped("It is too old.", last, rests) == aborted
+
+
+@pytest.mark.parametrize("seconds", [1e6, 12.0, -3.0])
+def test_a_time_without_a_plan_is_no_end_of_a_schedule(seconds: float) -> None:
+    loop = resting(ticks=40, max_corrections=0)
+    loop.tick(60)
+    loop.propose(NEAR)
+    loop.tick(20)
+    jump(seconds)(loop)
+    assert not any(loop.speeds[-1:])
+    assert any("has jumped" in notice for notice in loop.notices)
+    # The rest is planned again, which is no correction.
+    status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
+    assert (status.state, status.corrections) == (PlannerState.REACHED, 0)
+    assert len(loop.starts) == 2
+
+
+def test_a_gap_within_the_schedule_is_flown_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = executing(ticks=80)
+    requested = reasons(loop, monkeypatch)
+    loop.tick(20)
+    jump(2.0)(loop)
+    assert loop.executive.phase is Phase.EXECUTING
+    loop.until(PlannerState.REACHED)
+    assert requested == []
+
+
+def test_a_reset_is_planned_for_from_where_the_robot_is_then(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    loop = executing(ticks=40, max_corrections=0)
+    requested = reasons(loop, monkeypatch)
+    loop.tick(20)
+    reset_plant(loop)
+    status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
+    assert (status.state, status.corrections) == (PlannerState.REACHED, 0)
+    assert requested == [PlanReason.REPLAN]
+    np.testing.assert_array_equal(stub_of(loop).requests[-1].state.q, np.zeros(3))
+
+
+# -- what the statuses say --------------------------------------------------------------------
+
+
+def test_statuses_speak_of_a_goal_by_its_id() -> None:
+    loop = resting(ticks=40)
+    loop.propose(NEAR)
+    loop.tick(5)
+    loop.propose(FAR)
+    loop.tick()
+    loop.until(PlannerState.REACHED)
+    loop.propose(OTHER)
+    loop.tick(3)
+    loop.abort()
+    assert [(s.state.value, s.goal_id) for s in loop.statuses] == [
+        ("executing", "goal-1"),
+        ("refused", "goal-2"),
+        ("reached", "goal-1"),
+        ("executing", "goal-3"),
+        ("aborted", "goal-3"),
+    ]
+
+
+def test_times_and_corrections_are_those_of_the_goal() -> None:
+    loop = resting()
+    stub_of(loop).overshoot = 0.1
+    status = loop.decide(NEAR)
+    assert status.manoeuvre_time_s == pytest.approx(2 * 8 * 0.05)
+    assert status.ends_at_s == pytest.approx(loop.starts[1].stamp_ns / 1e9 + 8 * 0.05)
+    assert loop.executive.statistics.plans == 2
+    assert loop.executive.statistics.plan_time_s > 0
+    assert loop.executive.statistics.commands_published == len(loop.commands)
+    # A goal that is refused in flight takes nothing from the one that is pursued.
+    stub_of(loop).overshoot = 0.0
+    loop.propose(OTHER)
+    loop.tick(2)
+    loop.propose(FAR)
+    status = loop.until(PlannerState.REACHED)
+    assert status.manoeuvre_time_s == pytest.approx(8 * 0.05)
+
+
+def test_what_is_cut_off_a_schedule_is_no_time_of_the_manoeuvre() -> None:
+    loop = executing(held=True, ticks=400, stuck_ticks=5)
+    quick_without_joints(loop)
+    stuck(loop)
+    until(loop, Phase.PLANNING)
+    loop.held.release()
+    until(loop, Phase.EXECUTING)
+    first, second = loop.starts[-2:]
+    flown = (second.stamp_ns - first.stamp_ns) / 1e9
+    assert flown < 0.5 * first.schedule.duration
+    # From the first command to the stop; then planning takes some ticks.
+    counted = loop.statuses[-1].manoeuvre_time_s - second.schedule.duration
+    assert flown - 3 * 0.05 < counted < flown
+
+
+def test_a_state_that_is_not_finite_ends_no_goal_silently() -> None:
+    loop = measuring()
+    loop.measured.broken = True
+    loop.tick()
+    assert loop.statuses[-1].state is PlannerState.REFUSED
+    assert "not finite" in loop.statuses[-1].sentence
+    loop.measured.broken = False
+    assert loop.decide(NEAR).state is PlannerState.REACHED
+    # Measured in flight, the joints are commanded to rest as long as nothing is known of them.
+    loop.propose(HERE)
+    loop.tick(3)
+    loop.measured.broken = True
+    loop.tick()
+    assert not loop.commands[-1].any()
+    loop.measured.broken = False
+    assert loop.until(PlannerState.REACHED).goal_id == "goal-3"
+
+
+# -- measurements that are none ---------------------------------------------------------------
+
+
+def test_a_goal_whose_result_cannot_be_measured_has_failed_with_the_reason() -> None:
+    loop = evaluating()
+    loop.measured.broken = True
+    loop.tick()
+    status = loop.statuses[-1]
+    assert (status.state, status.goal_id) == (PlannerState.FAILED, "goal-1")
+    assert status.sentence == "The measured state is not finite; see odom and joint_states."
+    assert loop.executive.phase is Phase.IDLE
+    loop.measured.broken = False
+    assert loop.decide(OTHER).state is PlannerState.REACHED
+
+
+def test_a_tracking_error_that_cannot_be_measured_is_none() -> None:
+    loop = executing(ticks=40, wrong_path=0.0, drift_position=1e-3)
+    loop.measured.broken = True
+    loop.tick(3)
+    assert any("The path is not known: The measured state" in n for n in loop.notices)
+    assert loop.executive.phase is Phase.EXECUTING
+    assert not any(loop.speeds[-3:]), "nor is anything commanded"
+    loop.measured.broken = False
+    loop.until(PlannerState.REACHED)
+
+
+# -- events -----------------------------------------------------------------------------------
+
+
+def events_of(loop: Loop) -> list[tuple[str, str]]:
+    """Return kind and goal of every event of an executive, in order."""
+    events = [output for output in loop.outputs if isinstance(output, FlightEvent)]
+    return [(event.kind.value, event.goal_id) for event in events]
+
+
+def test_each_change_of_a_goal_is_one_event() -> None:
+    loop = resting()
+    stub_of(loop).overshoot = 0.1
+    assert loop.decide(NEAR).corrections == 1
+    planned = [("plan_started", "goal-1"), ("plan_ready", "goal-1")]
+    assert events_of(loop) == [
+        *planned,
+        ("goal_accepted", "goal-1"),
+        ("correction", "goal-1"),
+        *planned,
+    ]
+    first = next(output for output in loop.outputs if isinstance(output, FlightEvent))
+    assert first.time_s == 0.0
+    assert dict(first.about) == {"reason": "new goal"}
+    loop.outputs.clear()
+    loop.decide(FAR)
+    assert events_of(loop) == [("plan_started", "goal-2")]
+
+
+def test_no_joint_is_stuck_at_a_plant_where_no_command_is_in_force() -> None:
+    loop = executing(ticks=400, stuck_ticks=5)
+    loop.executive.plant_rests = True
+    loop.plant.hold(np.array([True, False, False]))
+    loop.tick(100)
+    assert loop.executive.phase is Phase.EXECUTING
+    loop.executive.plant_rests = False
+    stuck(loop)
+
+
+def test_stuck_joints_are_an_event_that_names_them() -> None:
+    loop = long_flight()
+    quick_without_joints(loop)
+    stuck(loop)
+    (event,) = [
+        output
+        for output in loop.outputs
+        if isinstance(output, FlightEvent) and output.kind is EventKind.STUCK_JOINT
+    ]
+    assert (event.level, event.goal_id, dict(event.about)) == (1, "goal-1", {"joints": "slider_1"})
