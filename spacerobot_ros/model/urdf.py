@@ -6,11 +6,13 @@ import contextlib
 import io
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
-from urllib.parse import unquote, urlparse
+from urllib.parse import quote, unquote, urlparse
 from xml.etree import ElementTree
+from xml.sax.saxutils import unescape
 
 import numpy as np
 from urdf_parser_py.urdf import URDF
@@ -68,7 +70,8 @@ def load_robot(path: str | Path) -> RobotDescription:
     if path.suffix == ".xacro" or _XACRO.search(text):
         text = _expanded(path)
     try:
-        return parse_robot(with_mesh_files(text, path.resolve().parent))
+        folder = path.resolve().parent
+        return parse_robot(with_mesh_files(text, lambda mesh: _mesh_beside(mesh, folder)))
     except RobotDescriptionError as error:
         raise RobotDescriptionError(f"{path}: {error}") from error
 
@@ -93,12 +96,22 @@ def _expanded(path: Path) -> str:
             ) from error
 
 
-def with_mesh_files(text: str, folder: Path) -> str:
-    """Return a URDF text whose meshes are found from anywhere: see :func:`load_robot`."""
+def with_mesh_files(text: str, find: Callable[[str], Path | None]) -> str:
+    """Return a URDF text in which meshes are named by their files.
+
+    Parameters
+    ----------
+    text
+        Of the URDF.
+    find
+        Returns the file of a mesh by what the text calls it; None: it keeps its name.
+    """
 
     def absolute(match: re.Match[str]) -> str:
-        found = _mesh_beside(match["file"], folder)
-        return match[0] if found is None else f"{match['before']}file://{found}{match['after']}"
+        found = find(unescape(match["file"]))
+        if found is None:
+            return match[0]
+        return f"{match['before']}file://{quote(str(found))}{match['after']}"
 
     return _MESH.sub(absolute, text)
 

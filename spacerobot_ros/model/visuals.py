@@ -2,8 +2,8 @@
 
 Pictures, pages and viewers choose colours, cameras and backgrounds; which solid or mesh is where is
 here. Meshes travel in bags as :func:`carried_meshes` makes them, and come from there again by
-:func:`meshes_in`; on the machine of the robot, :func:`~spacerobot_ros.model.meshes.shape_mesh`
-reads their files.
+:func:`meshes_in`, or as files by :class:`MeshFolder`; on the machine of the robot,
+:func:`~spacerobot_ros.model.meshes.shape_mesh` reads their files.
 """
 
 from __future__ import annotations
@@ -13,12 +13,15 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from spacerobot_ros.errors import MeshError
 from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
 from spacerobot_ros.model.meshes import TriangleMesh, joined, mesh_of_stl, shape_mesh, stl_of
+from spacerobot_ros.model.urdf import mesh_file, with_mesh_files
 
 _AROUND = 24
 """Facets around a cylinder or sphere."""
@@ -205,6 +208,60 @@ def meshes_in(robot: RobotDescription, attachments: Mapping[str, bytes]) -> dict
         except (KeyError, MeshError):
             continue
     return found
+
+
+class MeshFolder:
+    """A folder with meshes of bags that are not on this machine, for programs that read files.
+
+    Parameters
+    ----------
+    attachments
+        Of the bag, as :func:`carried_meshes` makes them.
+
+    Raises
+    ------
+    OSError
+        There is no room for a folder.
+    """
+
+    def __init__(self, attachments: Mapping[str, bytes]) -> None:
+        self._attachments = attachments
+        self._folder = TemporaryDirectory(prefix="spacerobot_")
+        self._files: dict[str, Path | None] = {}
+
+    def described(self, urdf: str) -> str:
+        """Return the text of a URDF with the files of the meshes that only the bag has.
+
+        Those that are found on this machine, or that the bag does not carry, keep their names.
+        """
+        return with_mesh_files(urdf, self._file)
+
+    def _file(self, resource: str) -> Path | None:
+        if resource not in self._files:
+            self._files[resource] = self._written(resource)
+        return self._files[resource]
+
+    def _written(self, resource: str) -> Path | None:
+        data = self._attachments.get(f"{_PREFIX}{resource}")
+        if data is None or mesh_file(resource) is not None:
+            return None
+        try:
+            mesh = mesh_of_stl(data, resource).coarsened(_CARRIED)
+        except MeshError:
+            return None
+        # Its name is none of the bag's, and what is written is what was understood.
+        path = Path(self._folder.name, f"{len(self._files)}.stl")
+        path.write_bytes(stl_of(mesh))
+        return path
+
+    def close(self) -> None:
+        """Remove the folder."""
+        self._folder.cleanup()
+
+
+def carries_meshes(attachments: Mapping[str, bytes]) -> bool:
+    """Whether a mesh is among the attachments of a bag."""
+    return any(name.startswith(_PREFIX) for name in attachments)
 
 
 def _resources(robot: RobotDescription) -> list[str]:

@@ -13,15 +13,17 @@ from rclpy.duration import Duration
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.bag import Playback, QosProfile, ReplayMessage, read_bag
 from spacerobot_ros.bag.config import ReplayConfig
 from spacerobot_ros.bag.playback import ReaderWait, ReplayStatus, renamed
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.model.visuals import MeshFolder, carries_meshes
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS, raw_publish
 from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
@@ -53,6 +55,8 @@ _STATUS, _SEEK = "replay/status", "replay/seek"
 _STATUS_PERIOD = 0.2
 """Wall s between two statuses."""
 
+_TEXT, _DESCRIPTION = "std_msgs/msg/String", "/robot_description"
+
 _BAD_BAG = 2
 
 
@@ -60,9 +64,11 @@ class ReplayNode(FlightNode):
     """Publishes what a bag holds, as bytes, with the quality of service that was recorded.
 
     It waits for readers to be matched, keeps the spacing of the log times divided by ``rate``, and
-    has its process end with the bag. Services: ``~/pause`` (SetBool), ``~/resume`` and, while
-    paused, ``~/step`` (Trigger): the next message. A time on ``replay/seek`` is where it goes on,
-    and ``replay/status`` says where it is.
+    has its process end with the bag. Meshes of ``robot_description`` that are not on this machine
+    are files with what the bag carries, as long as it lasts.
+
+    Services: ``~/pause`` (SetBool), ``~/resume`` and, while paused, ``~/step`` (Trigger): the next
+    message. A time on ``replay/seek`` is where it goes on, and ``replay/status`` says where it is.
     """
 
     Config: ClassVar = ReplayConfig
@@ -73,6 +79,7 @@ class ReplayNode(FlightNode):
         self._sends: dict[str, Callable[[bytes], None]] = {}
         self._timers: list[Timer] = []
         self._close_bag: Callable[[], None] = lambda: None
+        self._meshes: MeshFolder | None = None
         super().__init__(name, **kwargs)
 
     # -- life ---------------------------------------------------------------------------------
@@ -83,8 +90,9 @@ class ReplayNode(FlightNode):
         if not config.bag:
             raise ParameterError("Parameter 'bag' is empty; name the MCAP file to replay.")
         self.messages_replayed = 0
+        bag = read_bag(config.bag)
         self._playback = Playback(
-            read_bag(config.bag),
+            bag,
             topics=config.topics.split(),
             rate=config.rate,
             start=config.start,
@@ -94,6 +102,8 @@ class ReplayNode(FlightNode):
         self._close_bag = self._playback.close
         self._outputs: list[Publisher] = []
         self._sends = {}
+        if carries_meshes(bag.attachments):
+            self._meshes = MeshFolder(bag.attachments)
         replayed = {topic.name for topic in self._playback.topics}
         self._create_publishers(renamed(config.remap, replayed))
         self._paused = config.paused
@@ -135,8 +145,16 @@ class ReplayNode(FlightNode):
         self._timers = []
 
     def cleanup(self) -> None:
-        """Close the bag."""
+        """Close the bag, and remove the files of its meshes."""
         self._close_bag()
+        meshes, self._meshes = self._meshes, None
+        if meshes is not None:
+            meshes.close()
+
+    def destroy_node(self) -> None:
+        """Close the bag and remove the files of its meshes, whatever state the node is in."""
+        self.cleanup()
+        super().destroy_node()
 
     # -- publishers ---------------------------------------------------------------------------
 
@@ -169,7 +187,11 @@ class ReplayNode(FlightNode):
                     self.get_logger().warning(sentence)
                 continue
             self._outputs.append(publisher)
-            self._sends[topic.name] = raw_publish(publisher)
+            send = raw_publish(publisher)
+            described = topic.type_name == _TEXT and topic.name.endswith(_DESCRIPTION)
+            if described and self._meshes is not None:
+                send = _described(send, self._meshes)
+            self._sends[topic.name] = send
         if not self._outputs and not own_clock:
             raise SpaceRobotError("None of the bag's message types is installed here.")
 
@@ -337,6 +359,17 @@ class ReplayNode(FlightNode):
         response.message = f"{message.topic} at {message.log_time_ns / NANOSECONDS:.9f} s"
         self._end_if_done()
         return response
+
+
+def _described(send: Callable[[bytes], None], meshes: MeshFolder) -> Callable[[bytes], None]:
+    """Return what sends robot descriptions with the files of the meshes that only the bag has."""
+
+    def send_with_files(data: bytes) -> None:
+        text = deserialize_message(data, String).data
+        located = meshes.described(text)
+        send(data if located == text else serialize_message(String(data=located)))
+
+    return send_with_files
 
 
 def _profile(qos: QosProfile) -> QoSProfile:

@@ -29,6 +29,8 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.model.meshes import TriangleMesh, read_mesh, stl_of
+from spacerobot_ros.model.urdf import mesh_file
 from spacerobot_ros.nodes import ReplayNode
 from spacerobot_ros.nodes.replay import _profile
 
@@ -261,6 +263,51 @@ def test_a_clock_of_its_own_is_never_behind_a_message(harness: Harness, bag: Pat
     harness.spin_until(lambda: played.probe.count("/stream") == COUNT, "all are heard")
     assert at == [BEGAN + k * SPACING for k in range(COUNT)]
     assert now == sorted(now)
+
+
+def test_meshes_that_only_the_bag_has_are_files_while_it_is_replayed(
+    harness: Harness, tmp_path: Path
+) -> None:
+    here = tmp_path / "here.stl"
+    here.write_bytes(b"a mesh of this machine")
+    corners = np.array([[0, 0, 0], [3, 0, 0], [0, 2, 0], [0, 0, 1]], float)
+    tetrahedron = TriangleMesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+    elsewhere, lost, damaged = "package://gone/a&b.stl", "package://gone/c.stl", "/gone/d.stl"
+    lines = [
+        f"<mesh scale='2 2 2' filename='{name.replace('&', '&amp;')}'/>"
+        for name in (elsewhere, f"file://{here}", lost, damaged)
+    ]
+    path = tmp_path / "carried.mcap"
+    with BagWriter(path) as writer:
+        for name in ("/robot_description", "/robot_1/robot_description", "/stream"):
+            topic = writer.add_topic(name, STRING, LATCHED)
+            writer.write(topic, string("".join(lines)), BEGAN, BEGAN)
+        for name, data in (
+            (elsewhere, stl_of(tetrahedron)),
+            (f"file://{here}", stl_of(tetrahedron)),
+            (damaged, b"no mesh"),
+        ):
+            writer.add_attachment(f"mesh/{name}", data, "model/stl", BEGAN)
+    topics = ("/robot_description", "/robot_1/robot_description", "/stream")
+    probe = harness.probe(dict.fromkeys(topics, String), latched=topics)
+    replay: ReplayNode = harness.make(ReplayNode, {"bag": str(path), "hold": True})
+    harness.spin_until(lambda: all(map(probe.count, topics)), "all are heard")
+    assert probe.last("/stream").data == "".join(lines), "another text stays"
+    texts = {probe.last(topic).data for topic in topics[:2]}
+    assert len(texts) == 1
+    first, *others = texts.pop().replace("/>", "/>\n").splitlines()
+    assert others == lines[1:], "what is here, is not in the bag, or is none keeps its name"
+    assert first.startswith("<mesh scale='2 2 2' filename='file:///")
+    file = mesh_file(first.split("'")[3])
+    assert file is not None
+    assert file.parent.stat().st_mode & 0o077 == 0, "a folder of this user's alone"
+    found = read_mesh(file)
+    np.testing.assert_array_equal(
+        np.unique(found.vertices, axis=0), np.unique(corners, axis=0), "the mesh of the bag"
+    )
+    assert len(found.faces) == 4
+    replay.destroy_node()
+    assert not file.parent.exists()
 
 
 def test_a_loop_goes_on_until_it_is_told_to_stop(harness: Harness, bag: Path) -> None:
