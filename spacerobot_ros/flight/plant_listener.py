@@ -60,8 +60,9 @@ class PlantListener:
 
     @property
     def rests(self) -> bool:
-        """Whether no command is in force."""
-        return self._status is not None and self._status.state is PlantState.RESTING
+        """Whether no command is in force: none has come, or none is obeyed."""
+        status = self._status
+        return status is not None and (status.state is PlantState.RESTING or bool(self.blocked))
 
     @property
     def paused(self) -> bool:

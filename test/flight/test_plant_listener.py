@@ -28,7 +28,7 @@ def listener(*statuses: PlantStatus) -> PlantListener:
 
 def test_a_latched_plant_stops_commanders_once_and_goals_are_refused() -> None:
     one = listener(RUNNING)
-    assert one.blocked == ""
+    assert (one.blocked, one.rests) == ("", False)
     assert one.take(LATCHED, "/robot/plant") == [Stopped("Nothing moves: a fuse.")]
     assert one.take(replace(LATCHED, faults=("joint_stuck a",)), "/robot/plant") == []
     assert_one_sentence(one.blocked, "a fuse is blown", "/robot/plant/rearm")
@@ -36,8 +36,9 @@ def test_a_latched_plant_stops_commanders_once_and_goals_are_refused() -> None:
     for state in (PlantState.PAUSED, PlantState.INACTIVE):
         assert one.take(replace(LATCHED, state=state), "/robot/plant") == []
         assert one.blocked
+        assert one.rests, "no command is in force"
     assert one.take(AGAIN) == [Change.OBEYS]
-    assert one.blocked == ""
+    assert (one.blocked, one.rests) == ("", False)
 
 
 def test_a_commander_that_comes_later_learns_that_the_plant_is_latched() -> None:

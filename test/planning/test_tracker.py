@@ -220,6 +220,18 @@ def test_a_tracker_holds_the_last_shape_of_a_schedule_or_the_measured_one() -> N
     np.testing.assert_array_equal(tracker.setpoint.position, measured)
 
 
+def test_joints_that_move_while_no_command_is_in_force_are_not_pulled_back() -> None:
+    config = replace(PlannerConfig(tick_rate=1 / PERIOD), output="reference")
+    tracker = TrajectoryTracker(robot_of(), config)
+    tracker.start(schedule_of(), START_NS)
+    tracker.stop(at_last_shape=True)
+    for step in (0.004, 0.006):
+        tracker.hold(RAMP[20] + step, obeyed=False)
+        np.testing.assert_array_equal(tracker.setpoint.position, RAMP[20] + step)
+    tracker.hold(RAMP[20] + 0.1)
+    np.testing.assert_array_equal(tracker.setpoint.position, RAMP[20] + 0.006)
+
+
 def test_a_stuck_joint_is_commanded_to_rest_and_a_broken_measurement_stops_all() -> None:
     tracker = TrajectoryTracker(robot_of(), PlannerConfig(tick_rate=1 / PERIOD))
     tracker.start(schedule_of(), START_NS)

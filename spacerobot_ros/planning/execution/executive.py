@@ -201,7 +201,7 @@ class Executive(ScheduleExecution):
             if stuck and self._pursuit is not None:
                 self._on_stuck(stuck)
         if not tracker.active:
-            tracker.hold(q)
+            tracker.hold(q, obeyed=not self.plant_rests)
         self._commands += 1
         return tracker.setpoint
 

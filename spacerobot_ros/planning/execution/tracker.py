@@ -370,10 +370,11 @@ class TrajectoryTracker:
             return []
         return self._watch.look(q, position, velocity)
 
-    def hold(self, q: Array) -> None:
+    def hold(self, q: Array, *, obeyed: bool = True) -> None:
         """Write the setpoint that keeps the shape, where nothing is tracked."""
-        # A reference must stay where it is; a plant makes rest of the shape that it has.
-        if self._commands_plant or not self._holding:
+        # A reference must stay where it is; a plant makes rest of the shape that it has. While no
+        # command is in force, what the joints do is not to be undone when commands pass again.
+        if self._commands_plant or not self._holding or not obeyed:
             if math.isfinite(q.dot(q)):
                 self.setpoint.position[:] = q
             self.setpoint.velocity[:] = 0.0
