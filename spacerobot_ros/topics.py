@@ -280,7 +280,12 @@ _TABLE = (
         "thruster force and torque wanted at the origin of the base link, in its frame",
     ),
     Topic("goal_pose", _POSE_STAMPED, _USER, "where the base is to be, in the world"),
-    Topic("goal_joint_states", _JOINTS, _USER, "the shape that later goals are to end in"),
+    Topic(
+        "goal_joint_states",
+        _JOINTS,
+        _USER,
+        "the shape that later goals are to end in; without joints: any",
+    ),
     Topic(
         "end_effector/goal_pose",
         _POSE_STAMPED,

@@ -71,7 +71,8 @@ def recorded_scenario(bag: Bag) -> Scenario:
         assert goal is not None
         if shapes is not None:
             first = next(shapes.messages())[1]
-            goal = Goal(goal.position, goal.quaternion, np.array(first.position))
+            if len(first.position):  # Without any, the shape was free.
+                goal = Goal(goal.position, goal.quaternion, np.array(first.position))
         end_effector_goal = _goal(about, "end_effector_goal")
     except (ValueError, KeyError, RecursionError) as error:
         raise RecordingError(

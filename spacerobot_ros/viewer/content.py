@@ -65,15 +65,19 @@ def quaternion_from_rpy(rpy: Sequence[float] | Array) -> Array:
     return product
 
 
-def goal_of(position: Sequence[float] | Array, quaternion: Sequence[float] | Array) -> Goal:
-    """Return the goal of the numbers on the page.
+def goal_of(
+    position: Sequence[float] | Array,
+    quaternion: Sequence[float] | Array,
+    shape: Array | None = None,
+) -> Goal:
+    """Return the goal of the numbers on the page; ``shape`` (n,) to end in, m or rad, if any.
 
     Raises
     ------
     GoalError
         They are no pose.
     """
-    return Goal.checked(list(position), list(quaternion))
+    return Goal.checked(list(position), list(quaternion), shape)
 
 
 # -- the head of the page -----------------------------------------------------------------------

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spacerobot_ros.errors import GoalError
-from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.description import Array, Joint, RobotDescription
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_inverse,
@@ -73,6 +73,7 @@ class GoalEditor:
         self._angles: Any = gui.add_vector3("Roll, pitch, yaw (deg)", (0.0, 0.0, 0.0), step=1.0)
         self._tool_too = gui.add_checkbox("Goal for the end-effector", initial_value=True)
         self._tool_too.visible = False
+        self._final = _FinalShape(gui, defer, self._change)
 
         @self._tool_too.on_update
         async def _(event: Any) -> None:
@@ -97,6 +98,7 @@ class GoalEditor:
         if pose is not None and self.placed:
             self._add_gizmo(_TOOL, 0.2 * self._reach)
             self._move(_TOOL, pose)
+            self.touch(time.monotonic())
 
     def on_to_robot(self, act: Callable[[], None]) -> None:
         """Have the goal put where the robot is when its button is pressed."""
@@ -111,6 +113,7 @@ class GoalEditor:
         self._poses.clear()
         self._ghost, self._shape, self._changed_at = None, None, None
         self._reach, self._robot = reach, robot
+        self._final.show_robot(robot)
 
     def place(self, base: Array, tool: Array | None, q: Array, now: float) -> None:
         """Put the goal to poses (7,), the ghost in a shape (n,)."""
@@ -120,6 +123,8 @@ class GoalEditor:
             self._ghost = RobotDrawing(
                 self._server.scene, f"{_BASE}/ghost", self._robot, color=COLORS[Verdict.UNCHECKED]
             )
+        self._final.robot_is_at(q)
+        self._final.fill()
         self._move(_BASE, base)
         if tool is not None and self.has_tool:
             self._move(_TOOL, tool)
@@ -128,15 +133,21 @@ class GoalEditor:
         self._changed_at = now
 
     def bend(self, q: Array) -> None:
-        """Give the ghost a shape (n,) as long as no plan has one."""
+        """Give the ghost the shape (n,) of the robot as long as no plan or user has another one."""
+        self._final.robot_is_at(q)
         if self._ghost is not None and self._check.shape is None:
-            self._ghost.bend(q)
+            wanted = self._final.wanted
+            self._ghost.bend(q if wanted is None else wanted)
 
     def show_tool(self, *, there: bool) -> None:
         """Show or hide what is for the end-effector."""
         self._tool_too.visible = there
         if _TOOL in self._gizmos:
             self._gizmos[_TOOL].visible = there and self._tool_too.value
+
+    def show_shape(self, *, there: bool) -> None:
+        """Show or hide what is for the joint positions to end in, which planners take."""
+        self._final.show(visible=there)
 
     def show(self, *, visible: bool) -> None:
         """Show or hide everything: a replay takes no goals."""
@@ -155,8 +166,9 @@ class GoalEditor:
         wanted = [_BASE]
         if self._tool_too.visible and self._tool_too.value and _TOOL in self._poses:
             wanted.append(_TOOL)
+        shapes = {_BASE: self._final.wanted}
         return {
-            _PART_OF[name]: goal_of(self._poses[name][:3], self._poses[name][3:])
+            _PART_OF[name]: goal_of(self._poses[name][:3], self._poses[name][3:], shapes.get(name))
             for name in wanted
             if name in self._poses
         }
@@ -237,6 +249,12 @@ class GoalEditor:
         self._poses[name] = pose
         if name == _BASE and _TOOL in self._poses:
             self._move(_TOOL, carried(self._poses[_TOOL], before, pose))
+        self._change()
+
+    def _change(self) -> None:
+        """Take note of a goal that is another one now."""
+        if not self.placed:
+            return
         self._changed_at = time.monotonic()
         if self._check.verdict is not Verdict.UNCHECKED:
             self.show_check(Check(Verdict.PLANNING, "The goal moves."))
@@ -254,6 +272,95 @@ class GoalEditor:
             turns = np.degrees(rpy_from_quaternion(pose[3:]))
             roll, pitch, yaw = (round(float(each), 2) for each in turns)
             self._angles.value = (roll, pitch, yaw)
+
+
+class _FinalShape:
+    """The joint positions to end in, if any are asked for.
+
+    Parameters
+    ----------
+    gui, defer
+        As of :class:`GoalEditor`.
+    on_change
+        Called when users have changed them.
+    """
+
+    def __init__(self, gui: viser.GuiApi, defer: Defer, on_change: Callable[[], None]) -> None:
+        self._gui, self._defer, self._on_change = gui, defer, on_change
+        self._asked: Any = gui.add_checkbox(
+            "Final joint positions",
+            initial_value=False,
+            hint="Have the planner end in these joint positions, not in any.",
+        )
+        self._asked.visible = False
+        self._folder = gui.add_folder("At the end", visible=False)
+        self._fields: list[Any] = []
+        self._q: Array = np.zeros(0)
+
+        @self._asked.on_update
+        async def _(event: Any) -> None:
+            defer(self._switch)
+
+    @property
+    def wanted(self) -> Array | None:
+        """Positions (n,), m or rad; None: any."""
+        if not (self._asked.visible and self._asked.value):
+            return None
+        return np.array([field.value for field in self._fields], float)
+
+    def show_robot(self, robot: RobotDescription | None) -> None:
+        """Have a field for each joint of another robot."""
+        for field in self._fields:
+            field.remove()
+        self._fields, self._q, self._asked.value = [], np.zeros(0), False
+        joints = () if robot is None else robot.movable_joints
+        with self._folder:
+            for joint in joints:
+                field = self._field(joint)
+                field.on_update(self._on_field)
+                self._fields.append(field)
+        self._switch()
+
+    def _field(self, joint: Joint) -> Any:
+        """Return a slider between the limits of a joint, or a number where it has none."""
+        label, low, high = f"{joint.name} ({joint.unit})", joint.limits.lower, joint.limits.upper
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            return self._gui.add_number(label, 0.0, step=0.01)
+        step = 10.0 ** math.floor(math.log10((high - low) / 100))
+        low, high = (
+            round(whole(end / step) * step, 9)
+            for whole, end in ((math.ceil, low), (math.floor, high))
+        )
+        return self._gui.add_slider(label, low, high, step, min(max(0.0, low), high))
+
+    def robot_is_at(self, q: Array) -> None:
+        """Take note of the positions (n,) of the robot."""
+        self._q = q
+
+    def fill(self) -> None:
+        """Put the fields to where the robot is."""
+        for field, position in zip(self._fields, self._q, strict=False):
+            low, high = getattr(field, "min", None), getattr(field, "max", None)
+            value = round(float(position), 4)
+            field.value = value if low is None or high is None else min(max(value, low), high)
+
+    def show(self, *, visible: bool) -> None:
+        """Show or hide everything."""
+        shown = visible and bool(self._fields)
+        if shown != self._asked.visible:
+            self._asked.visible = shown
+            self._switch()
+
+    def _switch(self) -> None:
+        shown = self._asked.visible and self._asked.value
+        if shown and not self._folder.visible:
+            self.fill()
+        self._folder.visible = shown
+        self._on_change()
+
+    async def _on_field(self, event: Any) -> None:
+        if event.client is not None:  # What the page itself has written is no wish of a user.
+            self._defer(self._on_change)
 
 
 def carried(pose: Array, before: Array, after: Array) -> Array:

@@ -208,6 +208,7 @@ class Page:
         if has_tool and state.measured is not None and not self._editor.has_tool:
             self._editor.add_tool(state.tool)
         self._editor.show_tool(there=has_tool and state.replay is None)
+        self._editor.show_shape(there=state.planner is not None and state.replay is None)
 
     def _is_due(self, what: str, period: float) -> bool:
         if self._now < self._due.get(what, 0.0):

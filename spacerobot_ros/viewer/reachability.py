@@ -120,11 +120,16 @@ class Question:
                         *(state.linear_momentum, state.angular_momentum),
                     )
                 ],
-                "goal": [goal.position.tolist(), goal.quaternion.tolist()],
+                "goal": [goal.position.tolist(), goal.quaternion.tolist(), _listed(goal)],
                 "tool": tool and [tool.position.tolist(), tool.quaternion.tolist()],
                 "link": self.link,
             }
         )
+
+
+def _listed(goal: Goal) -> list[float] | None:
+    """Return the joint positions of a goal."""
+    return None if goal.joint_positions is None else goal.joint_positions.tolist()
 
 
 class GoalChecker:
@@ -285,9 +290,12 @@ class Planner:
         path = schedule.path.position
         step = max(1, len(path) // _MOST_POINTS)
         duration = schedule.expected_duration
+        sentence = f"Reachable in {duration:.4g} s by '{schedule.method}'."
+        if goal.joint_positions is not None and "shape" not in schedule.controls:
+            sentence += f" '{schedule.method}' does not heed the final joint positions."
         return {
             "verdict": Verdict.REACHABLE.value,
-            "sentence": f"Reachable in {duration:.4g} s by '{schedule.method}'.",
+            "sentence": sentence,
             "duration_s": duration,
             "shape": schedule.positions[-1].tolist(),
             "path": np.vstack([path[:-1:step], path[-1:]]).tolist(),

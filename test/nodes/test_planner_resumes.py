@@ -75,3 +75,6 @@ def test_a_goal_has_the_shape_that_was_wanted_before_it(harness: Harness, tmp_pa
     goal = GoalFile(str(path)).load()[BASE].goal
     assert goal.joint_positions is not None
     assert goal.joint_positions.tolist() == [0.1, 0.2, 0.3]
+    # A message without joints lets later goals end in any.
+    shapes.publish(JointState())
+    harness.spin_until(lambda: flight.planner._goal_shape is None, "the shape is free")

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from threading import Event
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -35,7 +36,7 @@ def question(*position: float, **parameters: object) -> Question:
     return Question(URDF, texts, ORIGIN, goal)
 
 
-def as_asked(asked: Question) -> dict[str, object]:
+def as_asked(asked: Question) -> dict[str, Any]:
     return dict(json.loads(asked.to_json(1)))
 
 
@@ -49,6 +50,15 @@ def test_an_answer_is_what_the_planner_would_plan() -> None:
     assert answer["duration_s"] == pytest.approx(own.duration)
     np.testing.assert_allclose(answer["shape"], own.positions[-1], atol=1e-9)
     np.testing.assert_allclose(answer["path"][-1], own.path.position[-1], atol=1e-12)
+
+
+def test_joint_positions_of_a_goal_are_asked_for_and_a_method_without_them_says_so() -> None:
+    asked = question(0.1, 0.0, 0.05)
+    wanted = replace(asked, goal=replace(asked.goal, joint_positions=np.array([0.1, -0.05, 0.2])))
+    assert as_asked(wanted)["goal"][2] == [0.1, -0.05, 0.2]
+    answer = Planner().answer(as_asked(wanted), Cancellation())
+    assert answer["verdict"] == "reachable"
+    assert "'lie_bracket' does not heed the final joint positions" in answer["sentence"]
 
 
 def test_a_refusal_has_the_sentence_of_the_planner_and_the_next_goal_is_planned() -> None:

@@ -23,6 +23,7 @@ from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.nodes import ViewerNode
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
@@ -187,6 +188,50 @@ def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness
     assert stack.probe.last("/fault_injection").data == "clear"
     stack.press(page._faults._inject)
     stack.until(lambda: "The fault '- -' is refused" in stack.log(), "no fault is known yet")
+
+
+def test_a_goal_has_the_joint_positions_that_the_page_shows(harness: Harness) -> None:
+    stack = Stack(harness)
+    names = names_of(load_robot(robot_file("sliding_masses")))
+    shapes: list[JointState] = []
+    stack.probe.create_subscription(JointState, "/goal_joint_states", shapes.append, 10)
+    planner = stack.probe.create_publisher(DiagnosticStatus, "/planner/status", LATCHED)
+    status = PlannerStatus(PlannerState.IDLE, "Waiting for a goal pose.")
+    values = [KeyValue(key=k, value=v) for k, v in status.to_values().items()]
+    planner.publish(DiagnosticStatus(name="/planner", values=values, message=status.sentence))
+    harness.connect()
+    stack.describe()
+    final = stack.page._editor._final
+
+    def fly(count: int) -> None:
+        stack.press(stack.page._buttons._fly)
+        stack.until(lambda: stack.probe.count("/goal_pose") == count, "a goal")
+
+    stack.until(lambda: stack.move(0.0, names) or final._asked.visible, "a planner is there")
+    stack.until(lambda: stack.move(0.0, names) or stack.page._editor.placed, "a goal is shown")
+    fly(1)
+    assert shapes == [], "any"
+    stack.press(final._asked, True)
+    stack.until(lambda: final._folder.visible, "the fields")
+    stack.press(final._fields[1], -0.25)
+    fly(2)
+    stack.until(lambda: len(shapes) == 1, "its shape")
+    assert list(shapes[0].name) == list(names)
+    assert list(shapes[0].position) == [0.0, -0.25, 0.0]
+    stack.press(final._asked, False)
+    stack.until(lambda: not final._folder.visible, "no fields")
+    fly(3)
+    stack.until(lambda: len(shapes) == 2, "any again")
+    assert list(shapes[1].name) == []
+    fly(4)
+    # Somebody else has a planner end in a shape, which the page does not show.
+    beside = stack.probe.create_publisher(JointState, "/goal_joint_states", 10)
+    harness.connect()
+    beside.publish(JointState(name=list(names), position=[0.1, 0.1, 0.1]))
+    stack.until(lambda: stack.viewer._shape_wanted, "the viewer has noticed")
+    fly(5)
+    stack.until(lambda: len(shapes) == 4, "any again")
+    assert list(shapes[3].name) == []
 
 
 def test_a_viewer_survives_what_is_wrong(harness: Harness) -> None:

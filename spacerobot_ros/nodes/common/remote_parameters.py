@@ -14,6 +14,9 @@ from rclpy.parameter import parameter_value_to_python
 _MOST_LOOKS = 200
 """Looks after which a node that does not answer has no such services."""
 
+_LOST_AFTER = 50
+"""Looks after which an answer is lost: the middleware drops it where it has not met the client."""
+
 
 class RemoteParameters:
     """All parameters of one node, once it has answered; look again and again.
@@ -56,12 +59,13 @@ class RemoteParameters:
         """Return the answer of a service; None if it is late."""
         client: Client = self._node.create_client(kind, f"{self._name}/{service}")
         try:
-            future = None
-            for _ in range(_MOST_LOOKS):
-                if future is None and client.service_is_ready():
-                    future = client.call_async(request)
-                elif future is not None and future.done():
+            future, asked_at = None, 0
+            for look in range(_MOST_LOOKS):
+                if future is not None and future.done():
                     return future.result()
+                lost = future is None or look - asked_at >= _LOST_AFTER
+                if lost and client.service_is_ready():
+                    future, asked_at = client.call_async(request), look
                 yield False
             return None
         finally:

@@ -193,11 +193,15 @@ class PlannerNode(CommanderNode):
             self._executive.propose(identified)
 
     def _on_goal_shape(self, message: JointState) -> None:
-        """Keep the shape that goals from now on are to end in, for methods that take one."""
+        """Keep the shape that goals from now on are to end in, for methods that take one.
+
+        A message without joints lets them end in any.
+        """
         if self._robot is None:
             return
         try:
-            self._goal_shape = shape_of(message, self._robot.joint_names)
+            names = self._robot.joint_names
+            self._goal_shape = shape_of(message, names) if message.name else None
         except PlanningError as error:
             self._publish_status(PlannerStatus(PlannerState.REFUSED, str(error)))
 

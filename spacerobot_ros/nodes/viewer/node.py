@@ -19,6 +19,7 @@ from rclpy.client import Client
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool, Trigger
 
@@ -137,6 +138,8 @@ class ViewerNode(FlightNode):
         self._asking: dict[str, RemoteParameters] = {}
         self._planner_state: PlannerState | None = None
         self._sent = 0
+        self._shape_wanted = False
+        """Whether a planner has been given joint positions to end in, by anybody."""
         self._to_send: tuple[Mapping[Part, Goal], float] | None = None
         self._unanswered: tuple[str, float] | None = None
         # Nobody spins this one: its messages wait until the page is drawn.
@@ -157,7 +160,9 @@ class ViewerNode(FlightNode):
             part: self.create_publisher(PoseStamped, topic, STREAM)
             for part, topic in _TOPICS.items()
         }
+        self._shape_topic = self.create_publisher(JointState, "goal_joint_states", STREAM)
         self._fault_topic = self.create_publisher(String, "fault_injection", STREAM)
+        self.create_subscription(JointState, "goal_joint_states", self._on_shape, STREAM)
         self._seek_topic = self.create_publisher(Float64, "replay/seek", STREAM)
 
     def activate(self) -> None:
@@ -323,8 +328,11 @@ class ViewerNode(FlightNode):
         for key, asking in tuple(self._asking.items()):
             if not asking.look():
                 continue
+            if asking.values is None:
+                self._ask(key)  # It reports a status: it is there, and busy.
+                continue
             del self._asking[key]
-            if asking.values is None or asking.values == self._remote_values.get(key):
+            if asking.values == self._remote_values.get(key):
                 continue
             self._remote_values[key] = asking.values
             if key == "plant":
@@ -374,7 +382,7 @@ class ViewerNode(FlightNode):
         """Send what is to be sent once its readers are met, and notice where nobody answers."""
         if self._to_send is not None:
             goals, until = self._to_send
-            topics = [self._goal_topics[part] for part in goals]
+            topics = [self._shape_topic, *(self._goal_topics[part] for part in goals)]
             # A commander that has just begun is known before it can be reached.
             met = all(
                 topic.get_subscription_count() >= self.count_subscribers(topic.topic_name)
@@ -398,6 +406,7 @@ class ViewerNode(FlightNode):
         flag = time.time_ns() // _MICROSECOND_NS * _MICROSECOND_NS % _FLAG_NS
         time_ns = self._listener.time_ns() + flag + self._sent % 1000
         sec, nanosec = divmod(carried(time_ns), NANOSECONDS)
+        self._send_shape(goals["base"])
         for part, goal in goals.items():
             message = PoseStamped()
             message.header.frame_id = self.config.world_frame
@@ -415,6 +424,18 @@ class ViewerNode(FlightNode):
             goal_id = GoalIds().of(sec, nanosec)
             self._unanswered = goal_id, time.monotonic() + _LONGEST_ANSWER
         self._checker.cancel()
+
+    def _send_shape(self, goal: Goal) -> None:
+        """Have the goal that follows end in its joint positions, or in any if it has none."""
+        shape, names = goal.joint_positions, () if self._robot is None else self._robot.joint_names
+        if shape is None and not self._shape_wanted:
+            return
+        self._shape_wanted = shape is not None
+        wanted = JointState() if shape is None else JointState(name=names, position=shape.tolist())
+        self._shape_topic.publish(wanted)
+
+    def _on_shape(self, message: JointState) -> None:
+        self._shape_wanted = bool(message.name)
 
     def _request(self, request: Request) -> None:
         """Call the service of everybody that has it."""
