@@ -132,6 +132,7 @@ def head(state: StackState) -> str:
     if state.plant is not None:
         lines.append(_status("Plant", state.plant.state.value, state.plant.sentence,
                              state.plant.level))  # fmt: skip
+        lines.extend(_line(f"Fault: {each}", 1) for each in state.plant.faults)
     if state.planner is not None:
         status = state.planner
         lines.append(_status("Planner", status.state.value, status.sentence, status.state.level))
@@ -191,12 +192,9 @@ def joints(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -> str
         if share is not None and not _NEAR_LIMIT <= share <= 1 - _NEAR_LIMIT:
             level = 2 if not 0.0 <= share <= 1.0 else 1
         bar = "no limits" if share is None else _bar(share, level)
-        numbers = [_of(qdot[i], fastest[i]), _of(effort[i], strongest[i])]
-        rows.append(
-            f"<tr><td>{escape(joint.name)}</td><td>{q[i]:.3f} {joint.unit}</td><td>{bar}</td>"
-            + "".join(f"<td>{number}</td>" for number in numbers)
-            + "</tr>"
-        )
+        cells = [escape(joint.name), f"{_fixed(q[i], 3)} {joint.unit}", bar]
+        cells += [_of(qdot[i], fastest[i]), _of(effort[i], strongest[i])]
+        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
     titles = ("joint", "at", "in its range", "rate", "effort")
     heads = "".join(f"<th>{title}</th>" for title in titles)
     if not rows:
@@ -224,7 +222,13 @@ def _bar(share: float, level: int) -> str:
 
 
 def _of(value: float, limit: float) -> str:
-    return f"{value:.2f}" if not math.isfinite(limit) else f"{value:.2f} of {limit:.3g}"
+    number = _fixed(value, 2)
+    return number if not math.isfinite(limit) else f"{number} of {limit:.3g}"
+
+
+def _fixed(value: float, digits: int) -> str:
+    """Return a number with so many digits behind the point; what rounds to zero has no sign."""
+    return f"{round(float(value), digits) + 0.0:.{digits}f}"
 
 
 def log(notices: Iterable[Notice]) -> str:

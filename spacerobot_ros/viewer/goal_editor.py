@@ -37,6 +37,9 @@ Defer = Callable[[Callable[[], None]], None]
 AT_REST_S = 0.3
 """Wall s without a change after which a goal is checked."""
 
+_APART = 0.01
+"""Where the ghost is nearer to the robot it is not drawn, in lengths of the robot and rad."""
+
 _BASE, _TOOL = "/goal", "/end_effector_goal"
 _PART_OF: dict[str, Part] = {_BASE: "base", _TOOL: "end_effector"}
 
@@ -128,16 +131,33 @@ class GoalEditor:
         self._move(_BASE, base)
         if tool is not None and self.has_tool:
             self._move(_TOOL, tool)
-        self.bend(q)
+        self.robot_is_at(base, q)
         self._show_fields()
         self._changed_at = now
 
-    def bend(self, q: Array) -> None:
-        """Give the ghost the shape (n,) of the robot as long as no plan or user has another one."""
+    def robot_is_at(self, pose: Array, q: Array) -> None:
+        """Take note of where the robot is: its base at a pose (7,), its joints at (n,).
+
+        The ghost has its shape as long as no plan or user has another one, and is not drawn where
+        it would only colour the robot.
+        """
         self._final.robot_is_at(q)
-        if self._ghost is not None and self._check.shape is None:
+        if self._ghost is None:
+            return
+        shape = self._check.shape
+        if shape is None:
             wanted = self._final.wanted
-            self._ghost.bend(q if wanted is None else wanted)
+            shape = q if wanted is None else wanted
+            self._ghost.bend(shape)
+        self._ghost.base.visible = not self._is_there(pose, q, shape)
+
+    def _is_there(self, pose: Array, q: Array, shape: Array) -> bool:
+        """Whether a robot at a pose, with joints at ``q``, is where the ghost is with ``shape``."""
+        goal = self._poses[_BASE]
+        distance = float(np.linalg.norm(goal[:3] - pose[:3]))
+        turned = 2.0 * math.acos(min(1.0, abs(float(goal[3:] @ pose[3:]))))
+        bent = float(np.abs(shape - q).max(initial=0.0))
+        return distance < _APART * self._reach and max(turned, bent) < _APART
 
     def show_tool(self, *, there: bool) -> None:
         """Show or hide what is for the end-effector."""

@@ -94,7 +94,12 @@ class Page:
 
     @staticmethod
     def _theme(*, dark: bool) -> dict[str, Any]:
-        return {"dark_mode": dark, "show_logo": False, "show_share_button": False}
+        return {
+            "dark_mode": dark,
+            "control_width": "large",
+            "show_logo": False,
+            "show_share_button": False,
+        }
 
     # -- what the stack is ----------------------------------------------------------------------
 
@@ -182,7 +187,7 @@ class Page:
         drawing.bend(measured.q)
         if not self._editor.placed and state.replay is None:
             self._editor.place(measured.pose, None, measured.q, self._now)
-        self._editor.bend(measured.q)
+        self._editor.robot_is_at(measured.pose, measured.q)
         self._plots.add(state)
         self._trail.add(measured.time_s, measured.pose[:3])
         if self._is_due("paths", _PATHS_S):

@@ -156,13 +156,15 @@ class GoalChecker:
         self._last = question.to_json(self._number)
         self._send(process, self._last)
 
-    def cancel(self) -> None:
-        """Drop what is being planned."""
-        if self._process is not None and not self._answered:
-            self._number += 1
-            self._cancelled_at = self._cancelled_at or time.monotonic()
-            self._answered = True
-            self._send(self._process, json.dumps({"number": self._number}))
+    def cancel(self) -> bool:
+        """Drop what is being planned; return whether anything was."""
+        if self._process is None or self._answered:
+            return False
+        self._number += 1
+        self._cancelled_at = self._cancelled_at or time.monotonic()
+        self._answered = True
+        self._send(self._process, json.dumps({"number": self._number}))
+        return True
 
     def look(self) -> Check | None:
         """Return the answer to the last question, once; before, how long it has been planned."""

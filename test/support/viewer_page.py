@@ -145,6 +145,10 @@ class Page:
         self._window.mouse("mousePressed", x, y, held=True)
         self._window.mouse("mouseReleased", x, y, held=True)
 
+    def tick(self, label: str) -> None:
+        """Press the checkbox with a label."""
+        self._window.evaluate(f"{_fields(label)}[0].click()")
+
     def numbers(self, label: str) -> list[float]:
         """Return the numbers in the fields with a label."""
         found = self._window.evaluate(f"{_fields(label)}.map(each => each.value)")

@@ -77,7 +77,7 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> N
     assert goal.joint_positions is None, "any"
     page.editor.goals_at_rest(LATER)
     # The fields begin where the robot is now.
-    page.editor.bend(q + 0.02)
+    page.editor.robot_is_at(POSE, q + 0.02)
     page.set(page.final._asked, True)
     assert page.final._folder.visible
     shape = page.editor.goals()["base"].joint_positions
@@ -95,13 +95,34 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> N
     assert checked is not None
     assert checked["base"].joint_positions is not None
     # The ghost has that shape before it is planned for, whatever the robot does.
-    page.editor.bend(np.zeros(3))
+    page.editor.robot_is_at(POSE, np.zeros(3))
     moved = [float(np.linalg.norm(a - b)) for a, b in zip(page.ghost(), at_rest, strict=True)]
     np.testing.assert_allclose(moved, [0.02, 0.02, 0.35], atol=1e-9)
     # Without a planner nobody takes it.
     page.editor.show_shape(there=False)
     assert not page.final._folder.visible
     assert page.editor.goals()["base"].joint_positions is None
+
+
+def test_the_ghost_is_not_drawn_where_the_robot_is(server: Any) -> None:
+    page = Editor(server, "sliding_masses")
+    q = np.zeros(3)
+    page.editor.place(POSE, None, q, 0.0)
+    ghost = page.editor._ghost
+    assert ghost is not None
+
+    def is_drawn(pose: Array = POSE, q: Array = q) -> bool:
+        page.editor.robot_is_at(pose, q)
+        return bool(ghost.base.visible)
+
+    assert not is_drawn()
+    assert not is_drawn(POSE * [1, 1, 1, -1, -1, -1, -1]), "the same attitude"
+    assert is_drawn(POSE + np.eye(7)[0] * 0.1)
+    half = np.array([0.0, 0.0, 0.05])
+    assert is_drawn(np.concatenate([POSE[:3], np.sin(half), [np.cos(0.05)]])), "0.1 rad"
+    page.editor.show_check(Check(Verdict.REACHABLE, shape=np.array([0.0, 0.0, 0.1])))
+    assert is_drawn()
+    assert not is_drawn(q=np.array([0.0, 0.0, 0.1]))
 
 
 def test_fields_of_joints_stay_within_their_limits(server: Any) -> None:

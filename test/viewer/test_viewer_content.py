@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from html import escape
 
 import numpy as np
 import pytest
@@ -107,6 +108,7 @@ def test_what_nodes_say_is_no_html() -> None:
     robot = load_robot(robot_file("three_joint_arm"))
     urdf = robot.urdf.replace(robot.joint_names[0], "a&lt;b&gt;c")
     assert "&lt;img" in texts[0]
+    assert f"Fault: {escape(evil)}" in texts[0]
     assert all("<img" not in text for text in texts)
     from spacerobot_ros.model.urdf import parse_robot
 
@@ -128,6 +130,8 @@ def test_joints_stand_beside_their_limits() -> None:
     beyond = content.joints(robot, upper + 1.0, np.zeros(3), np.zeros(3))
     assert beyond.count("left:100%;") == 3
     assert beyond.count("#d23c3c") == 3
+    tiny = np.full(3, -1e-9)
+    assert "-0.0" not in content.joints(robot, tiny, tiny, tiny), "zero has no sign"
 
 
 def test_errors_are_to_the_goal() -> None:

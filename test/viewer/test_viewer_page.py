@@ -152,7 +152,7 @@ def test_a_mission_is_flown_from_the_page(
         np.testing.assert_allclose(watched.position, 0.0, atol=0.02)
 
         # The next goal is reached in the joint positions that are asked for.
-        page.press("Final joint positions")
+        page.tick("Final joint positions")
         page.wait_for_text("At the end")
         page.type("slider_1 (m)", (0.1,))
         page.wait_for_text("Goal reachable", without="The goal moves.")

@@ -209,7 +209,8 @@ class ViewerNode(FlightNode):
             self._carry_out(action, state)
         if state.planner is not None and state.planner.state is not self._planner_state:
             self._planner_state = state.planner.state
-            self._page.touch_goal(now)  # The robot is elsewhere.
+            if self._planner_state not in (PlannerState.PLANNING, PlannerState.EXECUTING):
+                self._page.touch_goal(now)  # The robot is elsewhere.
         self._send_goals(state, now)
         self._check_goal(state, now)
 
@@ -423,7 +424,8 @@ class ViewerNode(FlightNode):
             self._note("The goal is sent.", source="page")
             goal_id = GoalIds().of(sec, nanosec)
             self._unanswered = goal_id, time.monotonic() + _LONGEST_ANSWER
-        self._checker.cancel()
+        if self._checker.cancel():
+            self._page.show_check(Check(Verdict.UNCHECKED, "It was sent before it was checked."))
 
     def _send_shape(self, goal: Goal) -> None:
         """Have the goal that follows end in its joint positions, or in any if it has none."""

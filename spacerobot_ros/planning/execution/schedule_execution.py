@@ -186,10 +186,11 @@ class ScheduleExecution:
             self._go(Event.PLANNED, Phase.EXECUTING)
         else:
             self._go(Event.TAKEN_OVER, Phase.EXECUTING)
+        article = "an" if schedule.method[:1] in tuple("aeiou") else "a"
         from_where = "" if start_ns is None else ", which begins in motion"
         self._out.report(
             PlannerState.EXECUTING,
-            f"Executing a {schedule.method} gait of {schedule.duration:.6g} s{from_where}.",
+            f"Executing {article} {schedule.method} gait of {schedule.duration:.6g} s{from_where}.",
             pursuit.identified,
             pursuit,
             remaining,
