@@ -11,6 +11,7 @@ from support.oracles import PinocchioOracle
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.planning.execution.state_average import StateAverage
 from spacerobot_ros.resources import share_directory
+from spacerobot_ros.simulation import EffortPlant, InitialState
 
 URDF = (share_directory() / "urdf" / "three_joint_arm.urdf").read_text("utf-8")
 Q = np.array([0.2, -0.4, 0.9])
@@ -64,6 +65,26 @@ def test_momenta_are_those_measured_last_at_rest() -> None:
     average.add(pose(), 2 * twist, Q, np.array([0.1, 0.0, 0.0]))
     moving = average.state()
     np.testing.assert_array_equal(moving.linear_momentum, state.linear_momentum)
+
+
+def test_before_a_robot_was_at_rest_its_momenta_are_those_in_motion() -> None:
+    robot = robot_of(URDF)
+    average = StateAverage(robot)
+    average.add(pose(), np.array([0.01, 0.0, -0.02, 0.03, 0.0, 0.01]), Q, REST)
+    assert np.abs(average.state().angular_momentum).max() > 0.01
+    # It is put elsewhere, where its momenta are others, and its joints move.
+    average.forget()
+    assert average.count == 0
+    p, L = np.array([0.2, -0.1, 0.3]), np.array([0.03, 0.02, -0.01])
+    initial = InitialState(
+        joint_positions=Q, joint_velocities=-Q, linear_momentum=p, angular_momentum=L
+    )
+    plant = EffortPlant(robot, 0.01, initial)
+    assert plant.qdot.any()
+    average.add(plant.pose, plant.twist, plant.q, plant.qdot)
+    state = average.state()
+    np.testing.assert_allclose(state.linear_momentum, p, atol=1e-12)
+    np.testing.assert_allclose(state.angular_momentum, L, atol=1e-12)
 
 
 def test_rates_within_the_tolerance_are_rest_and_larger_ones_are_not() -> None:

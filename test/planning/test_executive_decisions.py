@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.planner_loop import HERE, NEAR, TICK_NS, Loop, goal_at
+from support.planner_loop import HERE, NEAR, TICK, TICK_NS, Loop, PlantState, goal_at
 from support.planner_phases import (
     FAR,
     OTHER,
@@ -35,6 +35,7 @@ from spacerobot_ros.planning.execution.state_machine import (
     PlanReason,
 )
 from spacerobot_ros.planning.execution.status import PlannerState
+from spacerobot_ros.simulation import InitialState, VelocityPlant
 
 # -- why plans are requested ------------------------------------------------------------------
 
@@ -279,6 +280,35 @@ def test_a_reset_is_planned_for_from_where_the_robot_is_then(
     assert (status.state, status.corrections) == (PlannerState.REACHED, 0)
     assert requested == [PlanReason.REPLAN]
     np.testing.assert_array_equal(stub_of(loop).requests[-1].state.q, np.zeros(3))
+
+
+def test_momenta_of_before_a_reset_are_not_planned_for() -> None:
+    loop = resting()
+    spin = InitialState(angular_momentum=np.array([0.0, 0.0, 0.25]))
+    loop.measured = PlantState(VelocityPlant(loop.plant.robot, TICK, spin))
+    loop.propose(NEAR)
+    loop.tick()
+    (request,) = stub_of(loop).requests
+    np.testing.assert_allclose(request.state.angular_momentum, [0.0, 0.0, 0.25], atol=1e-12)
+    # The plant is reset while the joints move already, at no momentum.
+    loop.executive.abort()
+    loop.plant.step(np.array([0.1, 0.0, 0.0]))
+    loop.measured = PlantState(loop.plant)
+    loop.executive.plant_reset()
+    loop.propose(NEAR)
+    assert loop.plant.qdot.any()
+    loop.tick()
+    np.testing.assert_allclose(stub_of(loop).requests[1].state.angular_momentum, 0.0, atol=1e-12)
+
+
+def test_after_a_reset_the_shape_of_before_is_not_held() -> None:
+    loop = evaluating(output="reference")
+    loop.until(PlannerState.REACHED)
+    loop.tick(3)
+    assert np.abs(loop.plant.q).max() > 0.01
+    reset_plant(loop)
+    loop.tick()
+    np.testing.assert_array_equal(loop.executive.update(loop.measured).position, np.zeros(3))
 
 
 # -- what the statuses say --------------------------------------------------------------------

@@ -153,10 +153,11 @@ class Executive(ScheduleExecution):
 
     def plant_reset(self) -> None:
         """Plan again for the present goal, if any: the robot is in another state than before."""
-        self._average.restart()
+        self._average.forget()
+        # The shape that is held is one of before, like the schedule.
+        self._tracker.stop()
         if self.phase in (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING):
             return
-        self._tracker.stop()
         # What is planned begins at a state that is gone.
         self._plan_again_for(self._desk.drop())
         if self._pursuit is not None:

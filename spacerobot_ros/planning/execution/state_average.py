@@ -48,7 +48,7 @@ class StateAverage:
 
     While joints move, the momentum of a robot whose masses are not quite known is uncertain; at
     rest the base alone shows it, and without thrust it stays. So the momenta of a state are those
-    that were measured last at rest.
+    that were measured last at rest, where any were.
 
     Parameters
     ----------
@@ -66,7 +66,8 @@ class StateAverage:
         self._poses: list[Array] = []
         self._rates: list[Array] = []
         self._shapes: list[Array] = []
-        self._momenta = np.zeros(3), np.zeros(3)
+        self._momenta: tuple[Array, Array] | None = None
+        """Those measured last at rest, (3,) each; None: none were."""
 
     @property
     def count(self) -> int:
@@ -81,6 +82,11 @@ class StateAverage:
     def restart(self) -> None:
         """Forget the states, not the momenta."""
         self._poses, self._rates, self._shapes = [], [], []
+
+    def forget(self) -> None:
+        """Forget the states and the momenta: the robot is in another state than before."""
+        self.restart()
+        self._momenta = None
 
     def add(self, pose: Array, twist: Array, q: Array, qdot: Array) -> None:
         """Add a state: pose (7,), twist (6,), shape and its rates (n,), as plants report them."""
@@ -107,10 +113,13 @@ class StateAverage:
             turn = np.mean([attitude_error(first, pose[3:]) for pose in poses], axis=0)
             quaternion = quaternion_multiply(first, quaternion_from_rotvec(turn))
         twist, qdot = rates[:6], rates[6:]
-        if np.abs(qdot).max(initial=0.0) <= max(_AT_REST, self._tolerance):
-            if self._tolerance and np.abs(twist).max() <= self._tolerance:
-                self._momenta = np.zeros(3), np.zeros(3)
+        momenta = self._momenta
+        at_rest = np.abs(qdot).max(initial=0.0) <= max(_AT_REST, self._tolerance)
+        if at_rest or momenta is None:
+            if at_rest and self._tolerance and np.abs(twist).max() <= self._tolerance:
+                momenta = np.zeros(3), np.zeros(3)
             else:
-                p, L, _ = self._robot.momentum(quaternion, q, twist[:3], twist[3:], qdot)
-                self._momenta = p, L
-        return RobotState(poses[:, :3].mean(axis=0), quaternion, q, *self._momenta)
+                momenta = self._robot.momentum(quaternion, q, twist[:3], twist[3:], qdot)[:2]
+        if at_rest:
+            self._momenta = momenta
+        return RobotState(poses[:, :3].mean(axis=0), quaternion, q, *momenta)
