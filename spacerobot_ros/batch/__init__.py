@@ -3,6 +3,7 @@
 from spacerobot_ros.batch.flights import (
     BatchResult,
     Controlled,
+    Decision,
     FlightProgram,
     Flights,
     FollowedSchedule,
@@ -16,6 +17,7 @@ from spacerobot_ros.batch.scalar import fly_one_by_one
 __all__ = [
     "BatchResult",
     "Controlled",
+    "Decision",
     "FlightProgram",
     "Flights",
     "FollowedSchedule",

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
-import numpy as np
 
 from spacerobot_ros.batch.controlling import CONTROL_INPUTS, CONTROL_OUTPUTS, BatchController
 from spacerobot_ros.batch.flights import Controlled, Flights
 from spacerobot_ros.batch.native import Driver, vector_unit
-from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.model.compilation import compilation_settings
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions
+from spacerobot_ros.parameters import values_of
 from spacerobot_ros.simulation import effort_plant, velocity_plant
 
 
@@ -90,15 +90,21 @@ class CompiledTick:
         ParameterError
             The law cannot drive what is to be controlled, or is none for lanes.
         """
-        # A controller has goals of its flights: with one, nothing is kept.
-        key = cls, flights.actuation, flights.substeps, vector_unit(), compilation_settings()
-        kept = not isinstance(flights.program, Controlled)
-        if not (kept and key in model.derived):
-            tick = cls._new(flights, model)
-            if not kept:
-                return tick
-            model.derived[key] = tick
+        key: tuple[Any, ...] = (
+            *(cls, flights.actuation, flights.substeps, vector_unit(), compilation_settings()),
+        )
+        program = flights.program
+        if isinstance(program, Controlled):
+            # All but the gains, which flights have of their own, is part of the function.
+            given = values_of(program.config).items()
+            parameters = [each for each in given if not each[0].startswith("gains.")]
+            believed = program.robot or flights.robot
+            key = (*key, believed, repr(parameters), repr(program.config.motion))
+        if key not in model.derived:
+            model.derived[key] = cls._new(flights, model)
         found: CompiledTick = model.derived[key]
+        if found.controller is not None and isinstance(program, Controlled):
+            return replace(found, controller=found.controller.serving(program))
         return found
 
     @classmethod
@@ -118,11 +124,8 @@ class CompiledTick:
         }
         if not isinstance(flights.program, Controlled):
             return cls(Driver(flight, report), layout, sizes)
-        controller = BatchController(flights)
-        rest = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3)
-        present = ControlState(*rest, flights.starts.q[0], flights.starts.q[0] * 0.0)
-        numbers = controller.numbers(controller.begin(0, present))
-        control = controller.function(len(numbers))
+        controller = BatchController.of(flights)
+        control = controller.function()
         sizes |= {name: control.nnz_in(i) for i, name in enumerate(CONTROL_INPUTS)}
         sizes |= {name: control.nnz_out(i) for i, name in enumerate(CONTROL_OUTPUTS)}
         return cls(Driver(flight, report, control), layout, sizes, controller)

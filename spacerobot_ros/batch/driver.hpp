@@ -10,6 +10,8 @@ struct Span {
 
 enum Program { HELD = 0, FOLLOWED = 1, CONTROLLED = 2 };
 
+enum Decision { NONE = 0, REACHED = 1, FAILED = 2, LOST = 3 };  // about the goal of a controller
+
 enum Pending { NOTHING = 0, COMMIT = 1, TICK = 2 };
 
 struct Job {
@@ -28,6 +30,7 @@ struct Job {
   // Force and torque on the base: rows of the wrench, of two peaks and two impulses; -1: none.
   long long wrench_row, wrench_peak_row, impulse_row;
   double period;
+  long long period_ns;
   // Commands.
   long long program, command_row, command_count;
   const double *table;     // (ticks, command_count), or with each_table (groups, ticks, count, LANES)
@@ -48,7 +51,22 @@ struct Job {
   long long control_argument_count, control_result_count;
   long long normals_row, time_row, since_row, begun_row, exact_row, settled_row, reached_row;
   V *reached;              // (groups, report rows): the state when a goal was reached
+  long long lowest_row, highest_row;  // of the joint positions
+  // CONTROLLED: what is decided about goals, when, and with which errors; whether flights then end.
+  long long wild_row, wild_count_row, errors_row, decision_row, decided_row, decided_errors_row;
+  long long lost_states, last_tick, ends, ended_row;
+  V *ended;                // (groups, report rows): the state at the end
+  // CONTROLLED: momenta as they are and as thrust explains them; the largest change of either.
+  long long momentum_row, expected_row, first_momenta_row, drift_row;
 };
+
+static bool any(V flags) {
+  for (int lane = 0; lane < LANES; ++lane)
+    if (flags.x[lane] != 0.0) return true;
+  return false;
+}
+
+INLINE void assign_where(V flag, V &to, V value) { to.x = flag.x != 0.0 ? value.x : to.x; }
 
 static V *work_memory() {
   static thread_local V *memory = nullptr;
@@ -155,22 +173,40 @@ static void command(const Job &job, long long g, long long tick, V *group) {
 }
 
 #ifdef CONTROL
+// Decide about the goals of a group, by the errors of the command at a tick.
+static void decide(const Job &job, long long tick, V *group) {
+  V lost(0.0);
+  for (int kind = 0; kind < 2; ++kind) {
+    V &count = group[job.wild_count_row + kind];
+    count = group[job.wild_row + kind] * (count + V(1.0));
+    lost = lost || count >= V(double(job.lost_states));
+  }
+  V &decision = group[job.decision_row];
+  V made(job.last_tick >= 0 && tick >= job.last_tick ? double(FAILED) : double(NONE));
+  assign_where(group[job.settled_row], made, V(double(REACHED)));
+  assign_where(lost, made, V(double(LOST)));
+  const V now = decision == V(double(NONE)) && made && group[job.alive_row];
+  if (!any(now)) return;
+  assign_where(now, decision, made);
+  assign_where(now, group[job.decided_row], V(double(tick)));
+  for (int k = 0; k < 3; ++k)
+    assign_where(now, group[job.decided_errors_row + k], group[job.errors_row + k]);
+}
+
 // Measure the state and evaluate the command for it; return whether lanes need another one.
 static bool control(const Job &job, long long g, long long tick, V *group) {
   for (long long k = 0; job.noisy && k < job.normals_width; ++k)
     group[job.normals_row + k] = normal(job, g, tick, k);
-  group[job.time_row] = V(tick * job.period);
+  group[job.time_row] = V(double(tick * job.period_ns) / 1e9);
   call(CONTROL, group, job.control_arguments, job.control_argument_count, job.control_results,
        job.control_result_count);
   group[job.since_row] = group[job.begun_row];
   V &reached = group[job.reached_row];
   const V now = group[job.settled_row] && reached < V(0.0);
-  reached.x = now.x != 0.0 ? group[job.time_row].x : reached.x;
+  assign_where(now, reached, group[job.time_row]);
   copy_report(job, g, job.reached + g * job.report_rows, now);
-  const V exact = group[job.exact_row] && group[job.alive_row];
-  bool any = false;
-  for (int lane = 0; lane < LANES; ++lane) any = any || exact.x[lane] != 0.0;
-  return any;
+  decide(job, tick, group);
+  return any(group[job.exact_row] && group[job.alive_row]);
 }
 
 // Measure the first state of every group: what references begin from.
@@ -178,42 +214,90 @@ extern "C" void measure_starts(const Job *job) {
   for (long long g = 0; g < job->groups; ++g) {
     V *group = job->memory + g * job->rows;
     control(*job, g, 0, group);
-    group[job->since_row] = group[job->reached_row] = V(-1.0);
+    group[job->since_row] = group[job->reached_row] = group[job->decided_row] = V(-1.0);
+    group[job->decision_row] = V(double(NONE));
+    group[job->wild_count_row] = group[job->wild_count_row + 1] = V(0.0);
+  }
+}
+
+// End the flights of a group whose goals are decided, after the tick that is committed.
+static void end_decided(const Job &job, long long g, V *group) {
+  V &alive = group[job.alive_row];
+  const V ending = group[job.decision_row] && alive;
+  if (!any(ending)) return;
+  copy_report(job, g, job.ended + g * job.report_rows, ending);
+  assign_where(ending, group[job.ended_row], V(double(job.at[g])));
+  alive = alive && !ending;
+}
+
+// Return by how much thrust does not explain the momenta (6) of a group.
+static void unexplained(const Job &job, const V *group, V *to) {
+  for (int k = 0; k < 6; ++k) to[k] = group[job.momentum_row + k] - group[job.expected_row + k];
+}
+
+static void watch_momenta(const Job &job, V *group, V alive) {
+  V now[6];
+  unexplained(job, group, now);
+  for (int part = 0; part < 2; ++part) {
+    V square(0.0);
+    for (int k = 3 * part; k < 3 * part + 3; ++k) {
+      const V change = now[k] - group[job.first_momenta_row + k];
+      square += change * change;
+    }
+    V &drift = group[job.drift_row + part];
+    assign_where(alive, drift, fmax(drift, sqrt(square)));
   }
 }
 #endif
 
 static void commit(const Job &job, long long g) {
   V *group = job.memory + g * job.rows;
+  const V alive = group[job.alive_row];
   for (long long i = 0; i < job.sum_count; ++i)
     for (long long k = 0; k < job.sums[i].count; ++k)
-      group[job.sums[i].to + k] += group[job.sums[i].from + k];
+      group[job.sums[i].to + k] += group[job.sums[i].from + k] * alive;
   for (long long i = 0; i < job.peak_count; ++i)
     for (long long k = 0; k < job.peaks[i].count; ++k) {
       V &peak = group[job.peaks[i].to + k];
-      peak = fmax(peak, fabs(group[job.peaks[i].from + k]));
+      assign_where(alive, peak, fmax(peak, fabs(group[job.peaks[i].from + k])));
     }
   if (job.wrench_row >= 0)
     for (int part = 0; part < 2; ++part) {
       const V *w = group + job.wrench_row + 3 * part;
       const V size = sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
       V &peak = group[job.wrench_peak_row + part];
-      peak = fmax(peak, size);
-      group[job.impulse_row + part] += V(job.period) * size;
+      assign_where(alive, peak, fmax(peak, size));
+      V &impulse = group[job.impulse_row + part];
+      assign_where(alive, impulse, impulse + V(job.period) * size);
     }
   for (long long i = 0; i < job.copy_count; ++i)
     for (long long k = 0; k < job.copies[i].count; ++k)
       group[job.copies[i].to + k] = group[job.copies[i].from + k];
+  for (long long k = 0; k < job.n; ++k) {
+    V &lowest = group[job.lowest_row + k], &highest = group[job.highest_row + k];
+    assign_where(alive, lowest, fmin(lowest, group[job.q_row + k]));
+    assign_where(alive, highest, fmax(highest, group[job.q_row + k]));
+  }
   job.at[g] += 1;
   job.pending[g] = NOTHING;
   record(job, g, job.at[g]);
+#ifdef CONTROL
+  watch_momenta(job, group, alive);
+  if (job.ends) end_decided(job, g, group);
+#endif
 }
 
 // Evaluate the report of every group at its state, and record it if the start is an instant.
 extern "C" void start_flights(const Job *job) {
   for (long long g = 0; g < job->groups; ++g) {
-    evaluate(*job, job->memory + g * job->rows, true);
+    V *group = job->memory + g * job->rows;
+    evaluate(*job, group, true);
     record(*job, g, 0);
+    for (long long k = 0; k < job->n; ++k)
+      group[job->lowest_row + k] = group[job->highest_row + k] = group[job->q_row + k];
+#ifdef CONTROL
+    unexplained(*job, group, group + job->first_momenta_row);
+#endif
   }
 }
 
@@ -224,7 +308,7 @@ extern "C" long long fly_until(const Job *job, long long until) {
   for (long long g = 0; g < job->groups; ++g) {
     V *group = job->memory + g * job->rows;
     if (job->pending[g] == COMMIT) commit(*job, g);
-    while (job->at[g] < until) {
+    while (job->at[g] < until && any(group[job->alive_row])) {
       const long long tick = job->at[g];
 #ifdef CONTROL
       if (job->pending[g] != TICK && control(*job, g, tick, group)) {
@@ -239,10 +323,7 @@ extern "C" long long fly_until(const Job *job, long long until) {
       evaluate(*job, group, instant_of(*job, tick + 1) >= 0);
 #endif
       if (job->stop_row >= 0) {
-        const V stop = (group[job->stop_row] != V(0.0)) * group[job->alive_row];
-        bool any = false;
-        for (int lane = 0; lane < LANES; ++lane) any = any || stop.x[lane] != 0.0;
-        if (any) {
+        if (any((group[job->stop_row] != V(0.0)) && group[job->alive_row])) {
           job->pending[g] = COMMIT;
           ++waiting;
           break;

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
@@ -245,6 +246,9 @@ class Controlled:
         Those of each flight; none: of the configuration.
     robot
         The robot as the controller believes it; None: the nominal one of the flights.
+    until_decided
+        Whether a flight ends with the decision about its goal: a tick later, as its command is
+        still obeyed. Otherwise it goes on, and holds the goal.
     """
 
     config: ControllerConfig
@@ -253,6 +257,19 @@ class Controlled:
     joints: Array | None = None
     gains: tuple[Gains, ...] = ()
     robot: SpaceRobot | None = None
+    until_decided: bool = False
+
+
+class Decision(IntEnum):
+    """What became of the goal of a controller; the values are those of ``driver.hpp``."""
+
+    NONE = 0
+    REACHED = 1
+    FAILED = 2
+    """It was not reached within the time limit."""
+    LOST = 3
+    """Control was lost: joints too fast, or errors that grow. What the controller would do from
+    then on is not flown."""
 
 
 FlightProgram = FollowedSchedule | HeldCommands | Controlled
@@ -419,6 +436,21 @@ class BatchResult:
         NaN where it had not, or there is none. The flight goes on.
     reached_state
         (N, 2 n + 20) the state then: q, qdot, pose, twist and momentum; NaN likewise.
+    lowest, highest
+        (N, n) ends of the ranges of the joint positions, over the states at all ticks.
+    decision
+        (N,) :class:`Decision` of a controller about its goal, the first one.
+    decided_tick
+        (N,) the tick whose state it was made at; -1: there was none.
+    decided_errors
+        (N, 3) the largest errors of positions (m), attitudes (rad) and joints then; NaN likewise.
+    end_tick
+        (N,) how many ticks were flown.
+    end_state
+        (N, 2 n + 20) the state then; NaN without a controller.
+    momentum_drift
+        (N, 2) largest change of linear and angular momentum that thrust does not explain; NaN
+        without a controller.
     failures
         Sentences of the flights that did not end, by their row; their later numbers are NaN.
     """
@@ -440,6 +472,14 @@ class BatchResult:
     fallback_ticks: Counts
     reached_time: Array
     reached_state: Array
+    lowest: Array
+    highest: Array
+    decision: Counts
+    decided_tick: Counts
+    decided_errors: Array
+    end_tick: Counts
+    end_state: Array
+    momentum_drift: Array
     failures: Mapping[int, str]
 
     @classmethod
@@ -469,6 +509,14 @@ class BatchResult:
             fallback_ticks=np.zeros(N, np.int64),
             reached_time=np.full(N, np.nan),
             reached_state=np.full((N, 2 * n + 20), np.nan),
+            lowest=flights.starts.q.copy(),
+            highest=flights.starts.q.copy(),
+            decision=np.full(N, Decision.NONE, np.int64),
+            decided_tick=np.full(N, -1, np.int64),
+            decided_errors=np.full((N, 3), np.nan),
+            end_tick=np.full(N, flights.ticks, np.int64),
+            end_state=np.full((N, 2 * n + 20), np.nan),
+            momentum_drift=np.full((N, 2), np.nan),
             failures={},
         )
 

@@ -25,6 +25,7 @@ from spacerobot_ros.batch.flights import (
     BatchResult,
     Controlled,
     Counts,
+    Decision,
     Flights,
     FollowedSchedule,
     HeldCommands,
@@ -32,6 +33,7 @@ from spacerobot_ros.batch.flights import (
 )
 from spacerobot_ros.batch.native import Job, Span
 from spacerobot_ros.batch.scalar import fly_one_by_one, plant_of
+from spacerobot_ros.control.executive import LOST_STATES
 from spacerobot_ros.control.reference import ReferenceProfile
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.compilation import NoLibraryError
@@ -170,11 +172,13 @@ class _Block:
         self._rows = rows_ = _Rows(
             {
                 **{"measured": n, "normals": 0, "time": 0, "since": 0, "begun": 0},
-                **{"exact": 0, "settled": 0},
+                **{"exact": 0, "settled": 0, "wild": 0, "errors": 0},
                 **tick.sizes,
                 **{"alive": 1, "joint_bias": n, "joint_noise": 1, "reached": 1},
                 **{"limits": n if effort else 2 * n, "peak_rate": n, "peak_effort": n},
-                **{"peak_wrench": 2, "impulse": 2},
+                **{"peak_wrench": 2, "impulse": 2, "lowest": n, "highest": n},
+                **{"wild_count": 2, "decision": 1, "decided": 1, "decided_errors": 3, "ended": 1},
+                **{"first_momenta": 6, "drift": 2},
             }
         )
         self._memory = _aligned((self._groups, rows_.count, self._lanes))
@@ -263,6 +267,7 @@ class _Block:
         table, program = self._table(), flights.program
         each_table = table.ndim == 4
         self._reached = _aligned((self._groups, width, self._lanes), np.nan)
+        self._ends = _aligned((self._groups, width, self._lanes), np.nan)
         control_in, control_out = _numbers([]), _numbers([])
         if isinstance(program, Controlled):
             control_in = _numbers([rows.first(name) for name in CONTROL_INPUTS])
@@ -291,6 +296,7 @@ class _Block:
             wrench_peak_row=rows.first("peak_wrench"),
             impulse_row=rows.first("impulse"),
             period=flights.control_period,
+            period_ns=round(flights.control_period * 1e9),
             program=_PROGRAMS[type(program)],
             command_row=rows.first("command"),
             command_count=table.shape[2] if each_table else table.shape[1],
@@ -317,9 +323,18 @@ class _Block:
             control_result_count=len(control_out),
             **{
                 f"{name}_row": rows.first(name)
-                for name in ("normals", "time", "since", "begun", "exact", "settled", "reached")
+                for name in (
+                    *("normals", "time", "since", "begun", "exact", "settled", "reached"),
+                    *("lowest", "highest", "wild", "wild_count", "errors", "decision", "decided"),
+                    *("decided_errors", "ended", "momentum", "first_momenta", "drift"),
+                )
             },
             reached=pointer(self._reached),
+            ended=pointer(self._ends),
+            lost_states=LOST_STATES,
+            last_tick=-1 if self._tick.controller is None else self._tick.controller.last_tick,
+            ends=isinstance(program, Controlled) and program.until_decided,
+            expected_row=rows.first("next_state", 2 * n + 4),
         )
         if isinstance(program, FollowedSchedule):
             job.gain = min(program.shape_gain, 1.0 / flights.control_period)
@@ -362,10 +377,14 @@ class _Block:
         driver.start(job)
         self._set("h", np.full(len(self._rows_of_lanes), flights.control_period))
         whole = self._tick.controller is not None
+        alive = self._memory[:, self._rows.first("alive")]
         for begin in range(0, flights.ticks, _CHUNK_TICKS):
+            if not alive.any():
+                break
             end = min(begin + _CHUNK_TICKS, flights.ticks)
             # The state at the end is measured too.
-            normals = self._noise.drawn(begin, end + (end == flights.ticks), self._lanes, whole)
+            last = end + (end == flights.ticks)
+            normals = self._noise.drawn(begin, last, alive, whole)
             if normals is not None:
                 job.normals = normals.ctypes.data
                 job.normals_from, job.normals_ticks, job.normals_width = begin, *normals.shape[1:3]
@@ -382,11 +401,13 @@ class _Block:
             return
         self._tick.driver.measure_starts(self._job)
         states = self._get("measured")
-        self._profiles = [
+        begun = [
             controller.begin(int(row), control_state(state))
             for row, state in zip(self._rows_of_lanes, states, strict=True)
         ]
+        self._profiles = [profile for profile, _ in begun]
         self._set("profile", np.array([controller.numbers(each) for each in self._profiles]))
+        self._set("bounds", np.array([bounds for _, bounds in begun]))
 
     def _help(self, result: BatchResult, failures: dict[int, str]) -> None:
         """Do what lanes that wait cannot: give a command, or take a tick of the scalar plant."""
@@ -452,14 +473,40 @@ class _Block:
         result.limited[first][rows] = limits[:, :n]
         if first == "rate":
             result.limited["stroke"][rows] = limits[:, n:]
+        for name in ("lowest", "highest"):
+            getattr(result, name)[rows] = self._get(name)[:count]
         if self._tick.controller is not None:
-            time = self._get("reached")[:count, 0]
-            result.reached_time[rows] = np.where(time >= 0.0, time, np.nan)
-            result.reached_state[rows] = np.swapaxes(self._reached, 1, 2).reshape(
-                -1, self._reached.shape[1]
-            )[:count]
+            self._write_decisions(result, rows)
         pose, q = self._noise.measured(result.pose[rows], result.q[rows])
         result.measured_pose[rows], result.measured_q[rows] = pose, q
+
+    def _write_decisions(self, result: BatchResult, rows: Counts) -> None:
+        """Write what became of the goals of a controller."""
+        count, n = len(rows), self._flights.robot.n
+
+        def of_flights(name: str) -> Array:
+            return self._get(name)[:count]
+
+        time = of_flights("reached")[:, 0]
+        result.reached_time[rows] = np.where(time >= 0.0, time, np.nan)
+        result.reached_state[rows] = _by_flight(self._reached)[:count]
+        decision = of_flights("decision")[:, 0].astype(np.int64)
+        made = decision != Decision.NONE
+        result.decision[rows] = decision
+        result.decided_tick[rows] = of_flights("decided")[:, 0].astype(np.int64)
+        errors = of_flights("decided_errors")
+        result.decided_errors[rows] = np.where(made[:, np.newaxis], errors, np.nan)
+        result.momentum_drift[rows] = of_flights("drift")
+        # Flights that are not decided are where they are now.
+        state = of_flights("next_state")
+        parts = state[:, :n], state[:, n + 4 : 2 * n + 4], of_flights("pose")
+        now = np.hstack([*parts, of_flights("twist"), of_flights("momentum")])
+        ended = made & bool(self._job.ends)
+        states = np.where(ended[:, np.newaxis], _by_flight(self._ends)[:count], now)
+        result.end_state[rows] = states
+        at = np.repeat(self._at, self._lanes)[:count]
+        ticks = of_flights("ended")[:, 0].astype(np.int64)
+        result.end_tick[rows] = np.where(ended, ticks, at)
 
 
 class _Noise:
@@ -479,10 +526,10 @@ class _Noise:
         ]
         self._at_instants = np.zeros((len(rows), len(self._instants), 12 + 2 * self._n))
 
-    def drawn(self, begin: int, end: int, lanes: int, whole: bool) -> Array | None:
+    def drawn(self, begin: int, end: int, alive: Array, whole: bool) -> Array | None:
         """Draw for the states at the ticks from ``begin`` to before ``end``; return what falls to
         joint positions, (groups, ticks, n, lanes), or where ``whole`` to everything. None where
-        nothing errs.
+        nothing errs. ``alive`` (groups, lanes): others need none any more.
         """
         if self._errors is None:
             return None
@@ -491,13 +538,13 @@ class _Noise:
         kept = np.zeros((len(self._rows), ticks, columns.stop - columns.start))
         chosen = [(i, tick - begin) for i, tick in enumerate(self._instants) if begin <= tick < end]
         for index, generator in enumerate(self._generators):
-            if generator is None:
+            if generator is None or not alive.flat[index]:
                 continue
             drawn = generator.standard_normal((ticks, width))
             kept[index] = drawn[:, columns]
             for instant, tick in chosen:
                 self._at_instants[index, instant] = drawn[tick]
-        grouped = kept.reshape(-1, lanes, *kept.shape[1:])
+        grouped = kept.reshape(-1, alive.shape[1], *kept.shape[1:])
         return np.ascontiguousarray(np.moveaxis(grouped, 1, 3))
 
     def measured(self, pose: Array, q: Array) -> tuple[Array, Array]:
@@ -521,6 +568,11 @@ def _rotated(quaternion: Array, vectors: Array) -> Array:
     """Return ``R v`` of quaternions (N, 4) and vectors (N, 3)."""
     x, w = quaternion[:, :3], quaternion[:, 3:]
     return np.asarray(vectors + 2 * np.cross(x, np.cross(x, vectors) + w * vectors))
+
+
+def _by_flight(rows: Array) -> Array:
+    """Return rows (groups, size, lanes) flight by flight."""
+    return np.swapaxes(rows, 1, 2).reshape(-1, rows.shape[1])
 
 
 def _lengthened(table: Array, ticks: int, dimensions: int, count: int) -> Array:

@@ -87,6 +87,7 @@ class Job(ctypes.Structure):
         *((name, _WHOLE) for name in ("stop_row", "alive_row")),
         *((name, _WHOLE) for name in ("wrench_row", "wrench_peak_row", "impulse_row")),
         ("period", _REAL),
+        ("period_ns", _WHOLE),
         *((name, _WHOLE) for name in ("program", "command_row", "command_count")),
         ("table", _POINTER),
         *((name, _WHOLE) for name in ("table_ticks", "each_table")),
@@ -107,6 +108,12 @@ class Job(ctypes.Structure):
             for name in ("normals", "time", "since", "begun", "exact", "settled", "reached")
         ),
         ("reached", _POINTER),
+        *((f"{name}_row", _WHOLE) for name in ("lowest", "highest")),
+        *((f"{name}_row", _WHOLE) for name in ("wild", "wild_count", "errors")),
+        *((f"{name}_row", _WHOLE) for name in ("decision", "decided", "decided_errors")),
+        *((name, _WHOLE) for name in ("lost_states", "last_tick", "ends", "ended_row")),
+        ("ended", _POINTER),
+        *((f"{name}_row", _WHOLE) for name in ("momentum", "expected", "first_momenta", "drift")),
     ]
 
 

@@ -12,10 +12,12 @@ from spacerobot_ros.batch.controlling import BatchController
 from spacerobot_ros.batch.flights import (
     BatchResult,
     Controlled,
+    Decision,
     Flights,
     FollowedSchedule,
     HeldCommands,
 )
+from spacerobot_ros.control.executive import LOST_STATES
 from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.description import Array
@@ -41,7 +43,7 @@ def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> Batch
     for row in range(len(flights)) if rows is None else rows:
         try:
             if controller is None and isinstance(flights.program, Controlled):
-                controller = BatchController(flights)
+                controller = BatchController.of(flights)
             _fly(flights, row, result, controller)
         except SpaceRobotError as error:
             failures[row] = str(error)
@@ -52,14 +54,13 @@ def _fly(
     flights: Flights, row: int, result: BatchResult, controller: BatchController | None
 ) -> None:
     plant = plant_of(flights, row)
+    assert controller is None or isinstance(plant, EffortPlant)
     config = SensorConfig() if flights.sensors is None else flights.sensors.config(row)
     faulty = FaultyPlant(plant, (), flights.control_period, wrench=isinstance(plant, EffortPlant))
     sensors = Sensors(faulty, config, flights.control_period)
-    commands: _Commands | _Control
-    if controller is None:
-        commands = _Commands(flights, row)
-    else:
-        commands = _Control(controller, row, result, plant)
+    control = None if controller is None else _Control(controller, row, result, plant)  # type: ignore[arg-type]
+    commands: _Commands | _Control = control or _Commands(flights, row)
+    last = flights.ticks
     wanted = iter(flights.instants)
     next_instant, column = next(wanted), 0
     try:
@@ -69,9 +70,17 @@ def _fly(
                 _report(plant, sensors, result, row, column)
                 column += 1
                 next_instant = next(wanted, -1)
-            if tick < flights.ticks:
-                plant.step(*commands.at(tick, sensors if sensors.used else plant))
-                _account(plant, flights.control_period, result, row)
+            if tick == last:
+                result.end_tick[row] = tick
+                break
+            plant.step(*commands.at(tick, sensors if sensors.used else plant))
+            _account(plant, flights.control_period, result, row)
+            if control is not None:
+                control.watch_momenta()
+                if control.ends:
+                    last = tick + 1
+        if control is not None:
+            result.end_state[row] = control.truth
     finally:
         for name, counts in plant.limit_counts.items():
             result.limited[name][row] = counts
@@ -122,13 +131,29 @@ class _Commands:
 
 
 class _Control:
-    """What a controller commands in one flight, tick by tick, and when it has reached its goal."""
+    """What a controller commands in one flight, tick by tick, and what becomes of its goal."""
 
     def __init__(
-        self, controller: BatchController, row: int, result: BatchResult, plant: Plant
+        self, controller: BatchController, row: int, result: BatchResult, plant: EffortPlant
     ) -> None:
         self._controller, self._row, self._result, self._plant = controller, row, result, plant
         self._since: int | None = None
+        self._bounds: Array = np.zeros(0)
+        self._wild = [0, 0]
+        self._first = self._unexplained()
+        result.momentum_drift[row] = 0.0
+
+    @property
+    def truth(self) -> Array:
+        """The state of the plant as results have it."""
+        plant = self._plant
+        return np.concatenate([plant.q, plant.qdot, plant.pose, plant.twist, plant.momentum])
+
+    @property
+    def ends(self) -> bool:
+        """Whether the flight ends after the last command."""
+        decided = self._result.decision[self._row] != Decision.NONE
+        return self._controller.until_decided and bool(decided)
 
     def at(self, tick: int, measured: Plant | Sensors) -> list[Array]:
         """Return efforts and wrench of a tick for what is measured."""
@@ -137,7 +162,7 @@ class _Control:
         state = ControlState(*(part.copy() for part in parts))
         controller, result, row = self._controller, self._result, self._row
         if tick == 0:
-            controller.begin(row, state)
+            _, self._bounds = controller.begin(row, state)
         commands = controller.command(tick, state)
         if not controller.reached(tick):
             self._since = None
@@ -145,11 +170,34 @@ class _Control:
             self._since = tick
         settled = self._since is not None and controller.settled(self._since, tick)
         if settled and np.isnan(result.reached_time[row]):
-            plant = self._plant
-            truth = plant.q, plant.qdot, plant.pose, plant.twist, plant.momentum
-            result.reached_time[row] = tick * controller.period
-            result.reached_state[row] = np.concatenate(truth)
+            result.reached_time[row] = controller.time(tick)
+            result.reached_state[row] = self.truth
+        self._decide(tick, settled, state.qdot)
         return commands
+
+    def _decide(self, tick: int, settled: bool, qdot: Array) -> None:
+        controller, result, row = self._controller, self._result, self._row
+        wild = controller.wild(qdot, self._bounds)
+        self._wild = [n + 1 if now else 0 for n, now in zip(self._wild, wild, strict=True)]
+        decision = Decision.NONE
+        if max(self._wild) >= LOST_STATES:
+            decision = Decision.LOST
+        elif settled:
+            decision = Decision.REACHED
+        elif 0 <= controller.last_tick <= tick:
+            decision = Decision.FAILED
+        if decision is not Decision.NONE and result.decision[row] == Decision.NONE:
+            result.decision[row], result.decided_tick[row] = decision, tick
+            result.decided_errors[row] = controller.errors()
+
+    def watch_momenta(self) -> None:
+        """Take the changes of momenta that thrust does not explain."""
+        change = (self._unexplained() - self._first).reshape(2, 3)
+        drift = self._result.momentum_drift[self._row]
+        np.maximum(drift, np.linalg.norm(change, axis=1), out=drift)
+
+    def _unexplained(self) -> Array:
+        return np.asarray(self._plant.momentum[:6] - self._plant.expected_momenta)
 
 
 def _schedule(flights: Flights, positions: Array) -> GaitSchedule:
@@ -182,6 +230,8 @@ def _account(plant: Plant, control_period: float, result: BatchResult, row: int)
     for name, value in (("peak_rate", plant.qdot), ("peak_effort", plant.effort)):
         peak = getattr(result, name)[row]
         np.maximum(peak, np.abs(value), out=peak)
+    np.minimum(result.lowest[row], plant.q, out=result.lowest[row])
+    np.maximum(result.highest[row], plant.q, out=result.highest[row])
     if isinstance(plant, EffortPlant):
         sizes = np.linalg.norm(plant.wrench.reshape(2, 3), axis=1)
         np.maximum(result.peak_wrench[row], sizes, out=result.peak_wrench[row])

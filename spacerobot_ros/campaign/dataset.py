@@ -198,7 +198,8 @@ class Dataset:
         parts = [parquet.read_table(part) for part in self._parts()]
         if not parts:
             raise ParameterError(f"The folder {self.folder} has no flights yet.")
-        return arrow.concat_tables(parts).sort_by("flight")
+        # Parts that an earlier version has written may lack columns.
+        return arrow.concat_tables(parts, promote_options="default").sort_by("flight")
 
     def _parts(self) -> Sequence[Path]:
         return sorted((self.folder / _FLIGHTS).glob("part-*.parquet"))
@@ -212,7 +213,8 @@ def _schema(campaign: Campaign) -> Any:
     for each in campaign.dispersions:
         fields.append((f"{DRAWN}{each.name}", text if each.target.text else real))
     fields += [(name, real) for name in metric_names(joint_names(campaign.scenario))]
-    fields += [("wall_time_s", real), ("plan_time_s", real), ("engine", text), ("versions", text)]
+    fields += [("wall_time_s", real), ("plan_time_s", real), ("engine", text)]
+    fields += [("fallback", text), ("versions", text)]
     return arrow.schema(fields)
 
 
@@ -228,6 +230,7 @@ def _record(row: Row) -> dict[str, Any]:
         "wall_time_s": row.wall_time,
         "plan_time_s": row.plan_time,
         "engine": row.engine,
+        "fallback": row.fallback,
         "versions": VERSIONS,
     }
 

@@ -1,4 +1,4 @@
-"""Draws flown in lanes: those that follow one schedule from start to end; others one by one.
+"""Draws flown in lanes: those that follow one schedule from start to end, and coordinated control.
 
 The planner's executive makes the plan of each draw, as in every engine. Where it would do anything
 but track that plan to its end and evaluate the goal (a correction, a joint that is limited or does
@@ -17,6 +17,7 @@ import numpy as np
 from spacerobot_ros.batch import Flights, FollowedSchedule, SensorErrors, Starts, fly_lanes
 from spacerobot_ros.batch.flights import BatchResult
 from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.controlled_lanes import control_refusal, fly_controlled
 from spacerobot_ros.campaign.draws import Draw, drawn_flight
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, node_robot, robots_of
 from spacerobot_ros.campaign.rows import Row
@@ -39,6 +40,9 @@ _MOST_TICKS = 4_000_000
 
 _MOST = 512
 """Flights of one batch."""
+
+_MOST_CONTROLLED = 256
+"""Likewise, with a controller."""
 
 _AT_END = 1e-6
 """A schedule has ended when every joint is this near its last position, m or rad."""
@@ -72,35 +76,66 @@ class LanesEngine:
             return why
         scenario = campaign.scenario
         plant = scenario.plant
-        if scenario.commanders != ("planner",) or plant.actuation != "velocity":
-            return "lanes follow the velocities of a planner alone"
         if plant.faults or any(each.name.startswith("faults") for each in campaign.dispersions):
             return "it has faults"
-        planner = scenario.planner
-        if planner.averaging > 1 or planner.drift_position or planner.drift_attitude:
-            return "the planner averages states, or watches the path"
-        if planner.replanning or planner.output != "commands":
-            return "the planner plans again on the way"
-        dispersed = [each.name for each in campaign.dispersions]
-        changing = (
-            *("plant.tick_rate", "plant.integration_step", "planner.tick_rate"),
-            *("planner.averaging", "planner.drift", "planner.replan", "planner.shape_"),
-            "planner.max_corrections",
-        )
-        if any(name.startswith(changing) for name in dispersed):
-            return "what lanes have in common is dispersed"
-        sensors = plant.sensors
-        joints = sensors.joint_noise or any(sensors.joint_bias)
-        if joints or any(name.startswith("plant.sensors.joint") for name in dispersed):
-            return "the joints are not measured as they are"
-        return ""
+        match scenario.commanders, plant.actuation:
+            case ("planner",), "velocity":
+                return _tracking_refusal(campaign)
+            case ("coordinated_control",), "effort":
+                return control_refusal(campaign)
+        return "lanes have velocities of a planner, or efforts of coordinated control"
 
     def fly(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
     ) -> Iterator[Row]:
         """Fly draws in batches."""
+        others: list[tuple[Draw, str]] = []
+        if "planner" in campaign.scenario.commanders:
+            yield from self._tracked(campaign, draws, stopped, others)
+        else:
+            yield from self._controlled(campaign, draws, stopped, others)
+        reasons = {draw.number: why for draw, why in others}
+        for row in self._flights.fly(campaign, [draw for draw, _ in others], stopped):
+            yield replace(row, fallback=reasons[row.draw.number])
+
+    def _controlled(
+        self,
+        campaign: Campaign,
+        draws: Sequence[Draw],
+        stopped: Callable[[], bool],
+        others: list[tuple[Draw, str]],
+    ) -> Iterator[Row]:
+        common = DrawnFlight.of(campaign.scenario)
+        for first in range(0, len(draws), _MOST_CONTROLLED):
+            if stopped():
+                return
+            batch = []
+            for draw in draws[first : first + _MOST_CONTROLLED]:
+                try:
+                    batch.append((draw, drawn_flight(campaign, draw, common)))
+                except SpaceRobotError as error:
+                    yield Row.failed(draw, error, self.name)
+            if not batch:
+                continue
+            try:
+                flown = fly_controlled(campaign, batch)
+            except SpaceRobotError as error:  # Of one of them: they tell it each by itself.
+                others += [(draw, str(error)) for draw, _ in batch]
+                continue
+            for draw, flight in flown:
+                if isinstance(flight, str):
+                    others.append((draw, flight))
+                else:
+                    yield Row.of(campaign, draw, flight, self.name)
+
+    def _tracked(
+        self,
+        campaign: Campaign,
+        draws: Sequence[Draw],
+        stopped: Callable[[], bool],
+        others: list[tuple[Draw, str]],
+    ) -> Iterator[Row]:
         common, batch = DrawnFlight.of(campaign.scenario), list[_Planned]()
-        others: list[Draw] = []
         for draw in draws:
             if stopped():
                 return
@@ -110,7 +145,7 @@ class LanesEngine:
                 yield Row.failed(draw, error, self.name)
                 continue
             if planned is None:
-                others.append(draw)
+                others.append((draw, "No schedule begins at the first state."))
                 continue
             batch.append(planned)
             if len(batch) >= _MOST or sum(each.schedule.ticks for each in batch) > _MOST_TICKS:
@@ -118,7 +153,6 @@ class LanesEngine:
                 batch = []
         if batch:
             yield from self._flown(campaign, batch, others)
-        yield from self._flights.fly(campaign, others, stopped)
 
     def _planned(self, draw: Draw, flight: DrawnFlight) -> _Planned | None:
         """Have the executive plan a draw; None where it makes no plan for the first state."""
@@ -143,7 +177,7 @@ class LanesEngine:
         return _Planned(draw, flight, schedule, gait, taken)
 
     def _flown(
-        self, campaign: Campaign, batch: list[_Planned], others: list[Draw]
+        self, campaign: Campaign, batch: list[_Planned], others: list[tuple[Draw, str]]
     ) -> Iterator[Row]:
         """Fly a batch in lanes; what it cannot fly goes to ``others``."""
         began = time.perf_counter()
@@ -152,11 +186,37 @@ class LanesEngine:
         taken = (time.perf_counter() - began) / len(batch)
         for row, planned in enumerate(batch):
             flight = _flight(result, row, planned, flights, ends[row])
-            if flight is None or flight.duration > campaign.longest:
-                others.append(planned.draw)
+            if isinstance(flight, str):
+                others.append((planned.draw, flight))
+            elif flight.duration > campaign.longest:
+                others.append((planned.draw, "It is interrupted on the way."))
             else:
                 made = Row.of(campaign, planned.draw, flight, self.name)
                 yield replace(made, wall_time=taken + planned.plan_time)
+
+
+def _tracking_refusal(campaign: Campaign) -> str:
+    """Return why lanes cannot follow the schedules of a campaign, as a clause; empty if so."""
+    scenario = campaign.scenario
+    plant = scenario.plant
+    planner = scenario.planner
+    if planner.averaging > 1 or planner.drift_position or planner.drift_attitude:
+        return "the planner averages states, or watches the path"
+    if planner.replanning or planner.output != "commands":
+        return "the planner plans again on the way"
+    dispersed = [each.name for each in campaign.dispersions]
+    changing = (
+        *("plant.tick_rate", "plant.integration_step", "planner.tick_rate"),
+        *("planner.averaging", "planner.drift", "planner.replan", "planner.shape_"),
+        "planner.max_corrections",
+    )
+    if any(name.startswith(changing) for name in dispersed):
+        return "what lanes have in common is dispersed"
+    sensors = plant.sensors
+    joints = sensors.joint_noise or any(sensors.joint_bias)
+    if joints or any(name.startswith("plant.sensors.joint") for name in dispersed):
+        return "the joints are not measured as they are"
+    return ""
 
 
 def _has_noise(flight: DrawnFlight) -> bool:
@@ -219,23 +279,23 @@ def _padded(positions: Array, ticks: int) -> Array:
 
 def _flight(
     result: BatchResult, row: int, planned: _Planned, flights: Flights, end: int
-) -> FlightArrays | None:
-    """Return a flight whose goal is decided at the end of its schedule; None for any other."""
+) -> FlightArrays | str:
+    """Return a flight whose goal is decided at the end of its schedule, or why it is not."""
     if row in result.failures:
-        return None
+        return "The plant refuses it."
     if any(counts[row].any() for counts in result.limited.values()):
-        return None
+        return "A joint is limited."
     scenario, schedule = planned.flight.scenario, planned.schedule
     measured, q = result.measured_pose[row, end], result.measured_q[row, end]
     band = max(_AT_END, scenario.planner.shape_deadband)
     if np.abs(schedule.positions[-1] - q).max(initial=0.0) > band:
-        return None
+        return "A joint does not follow."
     error = PoseError.between(measured[:3], measured[3:], scenario.goal, q)
     left = remaining_error(error, schedule.controls)
     outcome, sentence = Outcome.REACHED, f"The goal is reached: {left}."
     if not scenario.planner.tolerance.admits(error, schedule.controls):
         if scenario.planner.max_corrections:
-            return None
+            return "It is corrected."
         outcome = Outcome.FAILED
         sentence = f"The goal is not reached: {left} after 0 correction(s)."
     kept = slice(0, end + 1)

@@ -15,7 +15,7 @@ from pathlib import Path
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.draws import Draw, drawn_flight
 from spacerobot_ros.campaign.rows import Row
-from spacerobot_ros.campaign.targets import DrawnFlight
+from spacerobot_ros.campaign.targets import DrawnFlight, description_of
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.arrays import FlightArrays, Outcome
 from spacerobot_ros.flight.lockstep import Robots, fly_scenario, require_flyable
@@ -96,11 +96,24 @@ class FlightsEngine(_OneByOneEngine):
 
 def robots_of(flight: DrawnFlight) -> Robots:
     """Return the models of a flight: built once for all draws that differ in masses alone."""
-    inertial, scenario = flight.inertial, flight.scenario
-    if inertial is None:
-        return Robots.of(scenario, _built)
-    weighing = node_robot("plant", flight).with_inertial(inertial)
-    return replace(Robots.of(scenario, _built), plant=weighing)
+    robots = nominal_robots(flight.scenario)
+    if flight.inertial is None:
+        return robots
+    weighing = node_robot("plant", flight).with_inertial(flight.inertial)
+    return replace(robots, plant=weighing)
+
+
+def nominal_robots(scenario: Scenario) -> Robots:
+    """Return the models of a scenario without dispersions of masses, the same ones each time."""
+    plant = description_of(scenario).urdf
+
+    def built(node: str, config: RobotConfig) -> SpaceRobot | None:
+        text = config.robot_description
+        if not (config.robot or text):
+            text = plant  # What commanders believe in that name no robot.
+        return _built(node, text, config)
+
+    return Robots.of(scenario, built)
 
 
 def node_robot(node: str, flight: DrawnFlight) -> SpaceRobot:
@@ -110,12 +123,12 @@ def node_robot(node: str, flight: DrawnFlight) -> SpaceRobot:
     return robot
 
 
-def _built(node: str, config: RobotConfig) -> SpaceRobot | None:
+def _built(node: str, text: str, config: RobotConfig) -> SpaceRobot | None:
     """Return the robot of a node, the same one as long as the node believes in it."""
     error, seed = 0.0, 0
     if isinstance(config, BelievedRobotConfig):
         error, seed = config.model_error, config.model_error_seed
-    return _built_once(node, config.robot_description, config.robot, error, seed)
+    return _built_once(node, text, config.robot, error, seed)
 
 
 @lru_cache(maxsize=32)

@@ -33,6 +33,8 @@ class Row:
         Whether the goal was reached and every criterion met.
     engine
         What flew it.
+    fallback
+        Why another engine than the campaign's flew it; empty: none did.
     wall_time, plan_time
         What the flight, and planning in it, took, s.
     """
@@ -43,6 +45,7 @@ class Row:
     metrics: Mapping[str, float] = field(default_factory=dict)
     passed: bool = False
     engine: str = ""
+    fallback: str = ""
     wall_time: float = math.nan
     plan_time: float = math.nan
 

@@ -236,7 +236,7 @@ class CoordinatedController:
         """Return the errors of the last command's outputs from the reference."""
         worst = {"position": 0.0, "attitude": 0.0, "joints": 0.0}
         for label, error in zip(self.law.outputs.labels, self.law.error, strict=True):
-            kind = _kind(label)
+            kind = error_kind(label)
             worst[kind] = max(worst[kind], abs(float(error)))
         return Errors(**worst)
 
@@ -255,7 +255,7 @@ class CoordinatedController:
         law, far = self.law, self._profile.distances()
         Kp, Kd = law.gain_diagonals
         reach = np.abs(law.error) + Kd / Kp * np.abs(law.error_rate)
-        kinds = [_kind(label) for label in law.outputs.labels]
+        kinds = [error_kind(label) for label in law.outputs.labels]
         bounds = np.empty(len(kinds))
         for kind in set(kinds):
             of_kind = np.array([each == kind for each in kinds])
@@ -327,7 +327,7 @@ class CoordinatedController:
         return law.command(state, reference)
 
 
-def _kind(label: str) -> str:
+def error_kind(label: str) -> str:
     """Return which of :class:`Errors` the error of an output is."""
     group, _, axis = label.partition(".")
     return "joints" if group == "joint" else "attitude" if axis[0] == "r" else "position"

@@ -301,9 +301,9 @@ class ControlExecutive:
     def _watch_rates(self, qdot: Array) -> None:
         """Give up where a joint stays far beyond its rate: its motor does not master it."""
         rates = self.controller.joint_rates
-        too_fast = self.controller.largest_rate_share(qdot) > _LOST_RATE
+        too_fast = self.controller.largest_rate_share(qdot) > LOST_RATE
         self._lost_rates = self._lost_rates + 1 if too_fast else 0
-        if self._lost_rates < _LOST_STATES or self._not_in_charge:
+        if self._lost_rates < LOST_STATES or self._not_in_charge:
             return
         joint = int(np.argmax(np.abs(qdot) / rates))
         name = self.controller.law.robot.joint_names[joint]
@@ -318,7 +318,7 @@ class ControlExecutive:
             self._error_bounds = self.controller.error_bounds(margins.as_errors())
         share = self.controller.law.largest_error_share(self._error_bounds)
         self._lost_errors = self._lost_errors + 1 if share > 1.0 else 0
-        if self._lost_errors >= _LOST_STATES:
+        if self._lost_errors >= LOST_STATES:
             errors = self.controller.errors()
             away = f"{errors.position:.3g} m, {errors.attitude:.3g} rad"
             self._lose(f"the errors grow, the robot is {away} from the reference")
@@ -449,10 +449,10 @@ class ControlExecutive:
                 raise ValueError("a refusal has a sentence of its own")
 
 
-_LOST_RATE = 1.5
+LOST_RATE = 1.5
 """How many times its largest rate a joint is no more mastered at."""
 
-_LOST_STATES = 3
+LOST_STATES = 3
 """States one after the other that say so: one bad measurement does not."""
 
 _GAP, _GAP_PERIODS = 1.0, 10

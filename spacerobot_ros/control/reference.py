@@ -185,7 +185,7 @@ def profile_expression(
 
     ``numbers`` are those of :func:`profile_numbers`, ``time`` is since the start, s.
     """
-    sizes = [1, *([3, 3, 4, 4, 3, 1, 3, 4] * (base + end_effector)), *([n, n, n] if n else [])]
+    sizes = _profile_sizes(base, end_effector, n)
     duration, *rest = ca.vertsplit(numbers, np.cumsum([0, *sizes]).tolist())
     u = ca.fmax(time, 0) / duration
     s = u**3 * (10 + u * (6 * u - 15))
@@ -203,6 +203,15 @@ def profile_expression(
         moving += [r + s * d, rate * d, acceleration * d]
         resting += [goal, ca.SX.zeros(2 * n)]
     return ca.if_else(time < duration, ca.vertcat(*moving), ca.vertcat(*resting))
+
+
+def profile_size(base: bool, end_effector: bool, n: int) -> int:
+    """Return how many numbers :func:`profile_numbers` returns."""
+    return sum(_profile_sizes(base, end_effector, n))
+
+
+def _profile_sizes(base: bool, end_effector: bool, n: int) -> list[int]:
+    return [1, *([3, 3, 4, 4, 3, 1, 3, 4] * (base + end_effector)), *([n, n, n] if n else [])]
 
 
 class HeldVelocityReference:

@@ -32,6 +32,8 @@ needs_compiler = pytest.mark.skipif(cxx_compiler() is None, reason="there is no 
 NUMBERS = (
     *("pose", "twist", "q", "qdot", "momentum", "measured_pose", "measured_q"),
     *("peak_rate", "peak_effort", "peak_wrench", "impulse", "reached_time", "reached_state"),
+    *("lowest", "highest", "decision", "decided_tick", "decided_errors", "end_tick", "end_state"),
+    "momentum_drift",
 )
 
 SHAPE = np.array([-1.0, 1.05])

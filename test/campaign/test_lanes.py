@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from support.campaigns import campaign
 
-from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.engines import chosen_engine
 from spacerobot_ros.campaign.lanes import LanesEngine
@@ -55,6 +55,76 @@ def test_the_same_draw_is_the_same_flight_in_every_engine(tolerance: float, most
     assert 0 < corrected < 12 if tolerance < 0.01 and most else not corrected
     failed = [row.outcome for row in lanes.values()].count("failed")
     assert 0 < failed < 12 if not most else not failed
+
+
+CONTROL: dict[str, Any] = {
+    "plant.initial_joint_velocities": [0.1, -0.05],
+    "coordinated_control.profile": "quintic",
+    "coordinated_control.settle_time": 0.2,
+    "coordinated_control.time_limit": 2.0,
+    "coordinated_control.position_tolerance": 0.022,
+    "coordinated_control.attitude_tolerance": 0.01,
+    **{f"coordinated_control.motion.{name}": 5.0 for name in ("speed", "acceleration")},
+    **{f"coordinated_control.motion.angular_{name}": 5.0 for name in ("speed", "acceleration")},
+    **{
+        f"coordinated_control.gains.{of}.{name}": value
+        for of in ("base_position", "base_attitude", "end_effector_position")
+        for name, value in (("kp", 3000.0), ("kd", 400.0))
+    },
+}
+"""A spacecraft and its arm fly to their goals in two seconds, or do not."""
+
+CONTROLLED: dict[str, Any] = {
+    "mass.*": {"norm": {"loc": 1.0, "scale": 0.03}},
+    "com.base_link.x": {"norm": {"scale": 0.01}},
+    "goal.position.x": {"norm": {"scale": 0.02}},
+    "initial.rotvec.z": {"norm": {"scale": 0.02}},
+    "end_effector_goal.position.y": {"norm": {"scale": 0.02}},
+    "plant.sensors.position_noise": {"uniform": [0.0, 0.002]},
+    "plant.sensors.joint_rate_noise": {"uniform": [0.0, 0.0001]},
+    "plant.sensors.position_bias[0]": {"uniform": [0.0, 0.001]},
+    "coordinated_control.gains.base_position.kd": {"uniform": [400.0, 60.0]},
+}
+
+
+def controlled(**given: Any) -> Campaign:
+    """Return a campaign of coordinated control, of flights that are short."""
+    wanted = {"scenario": "coordinated_control", "disperse": CONTROLLED, "seed": 3, **given}
+    return parse_campaign("controlled", {**wanted, "set": {**CONTROL, **given.get("set", {})}})
+
+
+def assert_same_flights(made: Campaign) -> tuple[dict[int, Row], dict[int, Row]]:
+    lanes, one_by_one = flown(LanesEngine(), made), flown(FlightsEngine(), made)
+    assert lanes.keys() == one_by_one.keys() == set(range(made.flights))
+    for number, row in one_by_one.items():
+        other = lanes[number]
+        deviation, at = largest_deviation(row.metrics, other.metrics)
+        assert deviation < TOLERANCE, (number, at, deviation)
+        assert (row.outcome, row.reason) == (other.outcome, other.reason)
+        assert row.passed is other.passed
+    return lanes, one_by_one
+
+
+def test_coordinated_control_in_lanes_is_that_of_the_plant_and_the_controller() -> None:
+    """Masses, noise, biases, goals, starts and gains differ; some come too late."""
+    made = controlled(flights=9)
+    assert chosen_engine(made, "auto").name == "lanes"
+    lanes, _ = assert_same_flights(made)
+    assert {row.engine for row in lanes.values()} == {"lanes"}
+    assert {row.outcome for row in lanes.values()} == {"reached", "failed"}
+    assert len({row.metrics["duration_s"] for row in lanes.values()}) > 3
+
+
+def test_flights_in_lanes_are_interrupted_or_left_to_the_controller() -> None:
+    """The longest time ends them all; joints that seem to race have control given up."""
+    lanes, _ = assert_same_flights(controlled(flights=3, longest=0.305))
+    assert {row.outcome for row in lanes.values()} == {"interrupted"}
+    wild = {"plant.sensors.joint_rate_noise": {"choice": [0.0, 8.0]}}
+    lanes, one_by_one = assert_same_flights(controlled(flights=6, disperse=wild, longest=0.5))
+    lost = {number for number, row in one_by_one.items() if row.outcome == "aborted"}
+    assert 0 < len(lost) < 6
+    assert {n for n, row in lanes.items() if row.engine == "flights"} == lost
+    assert {lanes[number].fallback for number in lost} == {"Control is lost."}
 
 
 def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:

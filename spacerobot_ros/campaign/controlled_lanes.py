@@ -1,0 +1,215 @@
+"""Draws of coordinated control flown in lanes, to the decision about their goals.
+
+The decision is that of the controller's executive. Where control is lost, the draw is flown again
+by the engine ``flights``: what the executive does then is not in lanes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from spacerobot_ros.batch import Controlled, Decision, Flights, SensorErrors, Starts, fly_lanes
+from spacerobot_ros.batch.flights import BatchResult
+from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.draws import Draw
+from spacerobot_ros.campaign.one_by_one import node_robot, nominal_robots
+from spacerobot_ros.campaign.targets import DrawnFlight
+from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.status import ControllerState, ControllerStatus
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.arrays import Commands, FlightArrays, Outcome
+from spacerobot_ros.flight.scenario import Scenario
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.inertial_parameters import InertialParameters
+from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.simulation.initial_state import InitialState
+
+_FREE = "coordinated_control.gains."
+"""Parameters of the controller that may differ from lane to lane."""
+
+_COMMON = (
+    *("plant.tick_rate", "plant.integration_step", "plant.thrusters", "plant.end_effector_frame"),
+    *("plant.beyond_limits", "plant.latched_faults", "plant.actuation", "plant.robot"),
+)
+"""Parameters of the plant that may not."""
+
+_STATES = {
+    Decision.REACHED: (ControllerState.REACHED, Outcome.REACHED, "The goal is reached"),
+    Decision.FAILED: (ControllerState.FAILED, Outcome.FAILED, "The goal is not reached in time"),
+}
+
+
+def control_refusal(campaign: Campaign) -> str:
+    """Return why lanes cannot fly a campaign of coordinated control, as a clause; empty if so."""
+    scenario = campaign.scenario
+    plant = scenario.plant
+    if plant.thrusters:
+        return "its thrusters are on or off"
+    if plant.beyond_limits != "clip":
+        return "the plant refuses commands beyond limits"
+    for dispersion in campaign.dispersions:
+        name = dispersion.name
+        own = name.startswith("coordinated_control.") and not name.startswith(_FREE)
+        if own or name.startswith(_COMMON):
+            return f"'{name}' differs, which lanes have in common"
+    try:
+        law = build_controller(nominal_robots(scenario).controller, scenario.controller).law
+    except SpaceRobotError as error:
+        return str(error)
+    if law.fixed_inputs is None:
+        return f"the law '{law.name}' needs more than its function"
+    for key, goal in _goals(scenario).items():
+        if goal is not None and not getattr(law.outputs.selection, key):
+            return f"the law '{law.name}' does not control the {key.replace('_', '-')}"
+    return ""
+
+
+def fly_controlled(
+    campaign: Campaign, batch: Sequence[tuple[Draw, DrawnFlight]]
+) -> list[tuple[Draw, FlightArrays | str]]:
+    """Fly draws together, to the decisions about their goals.
+
+    Returns
+    -------
+    list
+        Each draw with what its row needs of its flight, or with why another engine is to fly it.
+
+    Raises
+    ------
+    SpaceRobotError
+        One of them cannot be flown.
+    """
+    began = time.perf_counter()
+    flights = _flights(campaign, [flight for _, flight in batch])
+    result = fly_lanes(flights)
+    taken = (time.perf_counter() - began) / len(batch)
+    found: list[tuple[Draw, FlightArrays | str]] = []
+    for row, (draw, drawn) in enumerate(batch):
+        flight = _flight(result, row, drawn, flights)
+        if not isinstance(flight, str):
+            flight = replace(flight, wall_time=taken)
+        found.append((draw, flight))
+    return found
+
+
+def _goals(scenario: Scenario) -> dict[str, Goal | None]:
+    return {"base": scenario.goal, "end_effector": scenario.end_effector_goal}
+
+
+def _flights(campaign: Campaign, drawn: Sequence[DrawnFlight]) -> Flights:
+    scenario = campaign.scenario
+    plant, controller = scenario.plant, scenario.controller
+    robot = node_robot("plant", drawn[0])
+    configs = [each.scenario.plant for each in drawn]
+    goals = [_goals(each.scenario) for each in drawn]
+    free = any(each.name.startswith(_FREE) for each in campaign.dispersions)
+    gains = tuple(each.scenario.controller.gains for each in drawn) if free else ()
+    nominal = InertialParameters.of(drawn[0].nominal)
+    return Flights(
+        robot=robot,
+        actuation="effort",
+        control_period=plant.control_period,
+        ticks=_ticks(campaign.longest, plant.period_ns),
+        starts=Starts.of(robot, [InitialState.of(config) for config in configs]),
+        program=Controlled(
+            controller,
+            base=_poses([each["base"] for each in goals]),
+            end_effector=_poses([each["end_effector"] for each in goals]),
+            gains=gains,
+            robot=nominal_robots(scenario).controller,
+            until_decided=True,
+        ),
+        inertial=InertialParameters.stacked([each.inertial or nominal for each in drawn]),
+        sensors=SensorErrors.of(robot, [config.sensors for config in configs]),
+        integration_step=plant.integration_step,
+    )
+
+
+def _poses(goals: Sequence[Goal | None]) -> Array | None:
+    """Return goals as they are received, (N, 7)."""
+    checked = [Goal.checked(each.position, each.quaternion) for each in goals if each is not None]
+    if not checked:
+        return None
+    return np.array([np.concatenate([each.position, each.quaternion]) for each in checked])
+
+
+def _ticks(longest: float, period_ns: int) -> int:
+    """Return the first tick at which a flight is interrupted."""
+    tick = max(1, int(longest * 1e9 / period_ns) - 1)
+    while tick * period_ns / 1e9 < longest:
+        tick += 1
+    return tick
+
+
+def _flight(
+    result: BatchResult, row: int, drawn: DrawnFlight, flights: Flights
+) -> FlightArrays | str:
+    """Return what its row needs of a flight, or why it is not decided in lanes."""
+    decision = Decision(int(result.decision[row]))
+    decided, period_ns = int(result.decided_tick[row]), drawn.scenario.plant.period_ns
+    if row in result.failures:
+        return "The plant refuses it."
+    if decision is Decision.LOST:
+        return "Control is lost."
+    if decided == 0:
+        return "It ends before it begins."
+    n, end = flights.robot.n, result.end_state[row]
+    duration = int(result.end_tick[row]) * period_ns / 1e9
+    statuses = [(0, ControllerStatus(ControllerState.TRACKING))]
+    if decision is Decision.NONE:
+        outcome = Outcome.INTERRUPTED
+        sentence = f"Interrupted after {duration:.6g} s of simulated time."
+    else:
+        state, outcome, clause = _STATES[decision]
+        position, attitude, _ = result.decided_errors[row].tolist()
+        sentence = f"{clause}: {position:.3g} m, {attitude:.3g} rad from it."
+        statuses.append((decided * period_ns, ControllerStatus(state, sentence)))
+    force, torque = result.peak_wrench[row].tolist()
+    linear, angular = result.momentum_drift[row].tolist()
+    none = np.zeros(0, np.int64)
+    return FlightArrays(
+        scenario=drawn.scenario,
+        robot=drawn.nominal,
+        outcome=outcome,
+        sentence=sentence,
+        control_period=flights.control_period,
+        time=np.array([0.0, duration]),
+        pose=end[2 * n : 2 * n + 7][np.newaxis],
+        twist=end[2 * n + 7 : 2 * n + 13][np.newaxis],
+        # Rows with the extremes: metrics ask for no more.
+        q=np.vstack([result.lowest[row], result.highest[row], end[:n]]),
+        qdot=np.maximum(result.peak_rate[row], np.abs(flights.starts.qdot[row]))[np.newaxis],
+        effort=result.peak_effort[row][np.newaxis],
+        momentum=np.array([np.zeros(7), [linear, 0.0, 0.0, angular, 0.0, 0.0, 0.0]]),
+        quantities=_end_effector(flights.robot, drawn, end),
+        commands={
+            "joint_commands": Commands(none, np.zeros((0, n))),
+            "base_wrench": Commands(none, np.array([[force, 0.0, 0.0, torque, 0.0, 0.0]])),
+        },
+        statuses=tuple(statuses),
+        schedules=(),
+        events=(),
+        status=statuses[-1][1],
+        gait=None,
+        plan_time=0.0,
+        wall_time=math.nan,
+    )
+
+
+def _end_effector(robot: SpaceRobot, drawn: DrawnFlight, end: Array) -> dict[str, Array]:
+    link = robot.description.end_effector(drawn.scenario.plant.end_effector_frame)
+    if not link:
+        return {}
+    n = robot.n
+    R_BE, r_BE_B = robot.link_pose(link, end[:n])
+    pose = end[2 * n : 2 * n + 7]
+    R_WB = matrix_from_quaternion(pose[3:])
+    placed = np.append(pose[:3] + R_WB @ r_BE_B, quaternion_from_matrix(R_WB @ R_BE))
+    return {"end_effector_pose": placed[np.newaxis]}
