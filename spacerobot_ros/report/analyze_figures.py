@@ -207,8 +207,11 @@ def _distribution(axes: Axes, conditions: Array) -> None:
 def _map(axes: Axes, x: Array, y: Array, values: Array, norm: Normalize) -> None:
     levels = np.linspace(norm.vmin or 0.0, norm.vmax or 1.0, _LEVELS + 1)
     axes.contourf(x, y, values, levels, norm=norm, cmap="RdBu_r")
-    axes.contour(x, y, values, levels, colors=MUTED, linewidths=0.35)
-    axes.contour(x, y, values, [0.0], colors=INK, linewidths=0.8)
+    for lines, color, linewidth in ((levels, MUTED, 0.35), (np.zeros(1), INK, 0.8)):
+        # Matplotlib before 3.7 warns where there is nothing to draw.
+        inside = lines[(values.min() < lines) & (lines < values.max())]
+        if len(inside):
+            axes.contour(x, y, values, inside, colors=color, linewidths=linewidth)
     axes.grid(False)
     for spine in axes.spines.values():
         spine.set_visible(True)

@@ -142,7 +142,9 @@ def test_no_published_figures_for_another_goal_another_method_or_no_flight(
     assert run(monkeypatch, SUMMARY | {"state": state}, *words).stdout == LINES
 
 
-def test_what_the_command_line_changes_reaches_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_command_line_changes_reaches_the_flight(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     from spacerobot_ros.session import run as flights
 
     taken: list[Any] = []
@@ -152,6 +154,7 @@ def test_what_the_command_line_changes_reaches_the_flight(monkeypatch: pytest.Mo
         return RunResult(SUMMARY)
 
     monkeypatch.setattr(flights, "run_scenario", fly)
+    monkeypatch.chdir(tmp_path)
     runner = CliRunner()
     runner.invoke(main, ["run", "sliding_masses"])
     scenario, bag, processes = taken

@@ -74,7 +74,7 @@ def with_arrays(content: bytes, change: Callable[[dict[str, Any]], None]) -> byt
         arrays: dict[str, Any] = {name: file[name] for name in file.files}
     change(arrays)
     changed = io.BytesIO()
-    np.savez(changed, allow_pickle=True, **arrays)
+    np.savez(changed, **arrays)
     return changed.getvalue()
 
 

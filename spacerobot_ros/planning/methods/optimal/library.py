@@ -82,7 +82,7 @@ class SolutionLibrary:
         """Return it as an archive of numpy."""
         file = io.BytesIO()
         key = np.array(self.key)
-        np.savez(file, allow_pickle=False, key=key, turns=self.turns, shapes=self.shapes)
+        np.savez(file, key=key, turns=self.turns, shapes=self.shapes)
         return file.getvalue()
 
     @classmethod

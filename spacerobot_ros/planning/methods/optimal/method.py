@@ -407,7 +407,7 @@ class _KeptPlan:
         """Return it as an archive of numpy."""
         file = io.BytesIO()
         noted = np.array(json.dumps(self.notes))
-        np.savez(file, allow_pickle=False, positions=self.positions, notes=noted)
+        np.savez(file, positions=self.positions, notes=noted)
         return file.getvalue()
 
     @classmethod
