@@ -211,6 +211,19 @@ def configured(kind: type[C], values: Mapping[str, Any], prefix: str = "") -> C:
     return _configured(kind, kind(), values, prefix)
 
 
+def reconfigured(config: C, values: Mapping[str, Any]) -> C:
+    """Return a configuration with other values by full name; those left out stay as they are.
+
+    Parts that nothing is changed of are the same objects.
+
+    Raises
+    ------
+    ParameterError
+        A value is refused; the sentence names the parameter.
+    """
+    return _reconfigured(config, type(config)(), values, "")
+
+
 def values_of(config: Any, prefix: str = "") -> dict[str, Value]:
     """Return the value of every parameter of a configuration by full name."""
     return {f"{prefix}{name}": value for name, _, value in _fields_of(config)}
@@ -246,6 +259,36 @@ def _configured(kind: type[C], defaults: Any, values: Mapping[str, Any], prefix:
                 for entry, options in default.items()
             }
     return kind(**chosen)
+
+
+def _reconfigured(config: C, defaults: Any, values: Mapping[str, Any], prefix: str) -> C:
+    chosen: dict[str, Any] = {}
+    for each in fields(config):  # type: ignore[arg-type]
+        name, default = f"{prefix}{each.name}", getattr(defaults, each.name)
+        if _PARAMETER in each.metadata:
+            if name in values:
+                declaration = _named(each.metadata[_PARAMETER], name, default)
+                chosen[each.name] = declaration.checked(values[name])
+        elif _GROUP in each.metadata:
+            if _any_below(f"{name}.", values):
+                before = getattr(config, each.name)
+                chosen[each.name] = _reconfigured(before, default, values, f"{name}.")
+        elif _REGISTERED in each.metadata:
+            before = getattr(config, each.name)
+            changed = {
+                entry: _reconfigured(
+                    before.get(entry, options), options, values, f"{prefix}{entry}."
+                )
+                for entry, options in default.items()
+                if _any_below(f"{prefix}{entry}.", values)
+            }
+            if changed:
+                chosen[each.name] = {**before, **changed}
+    return replace(config, **chosen) if chosen else config  # type: ignore[type-var]
+
+
+def _any_below(prefix: str, names: Iterable[str]) -> bool:
+    return any(name.startswith(prefix) for name in names)
 
 
 def _leaves(config: type[Any] | Any, prefix: str) -> Iterator[tuple[Parameter, Value]]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from spacerobot_ros.campaign.metrics import METRICS, is_metric
@@ -15,6 +16,7 @@ from spacerobot_ros.campaign.targets import Target, targets_of
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.parameter_files import CONFIGS
 from spacerobot_ros.flight.scenario import Scenario, scenario_or_robot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import suggestion
 
 SAMPLERS = ("random", "latin_hypercube", "sobol", "halton", "saltelli")
@@ -55,11 +57,13 @@ class Distribution:
         """Whether texts are drawn."""
         return any(isinstance(choice, str) for choice in self.choices)
 
-    def at(self, u: float) -> Any:
-        """Return the value below which a share ``u`` (0 to 1) of all lies."""
+    def at(self, shares: Array) -> list[Any]:
+        """Return the values below which shares (N,), 0 to 1, of all lie."""
         if self.choices:
-            return self.choices[min(int(u * len(self.choices)), len(self.choices) - 1)]
-        return float(_scipy(self.name)(**self.arguments).ppf(u))
+            last = len(self.choices) - 1
+            return [self.choices[min(int(u * (last + 1)), last)] for u in shares.tolist()]
+        found: list[float] = np.asarray(_scipy(self.name).ppf(shares, **self.arguments)).tolist()
+        return found
 
     def __str__(self) -> str:
         if self.choices:

@@ -22,6 +22,10 @@ _SMALLEST = 1e-12
 """Shares are at least so far from 0 and 1, where many distributions are infinite."""
 
 
+_BLOCK = 256
+"""Draws that are made at once."""
+
+
 @dataclass(frozen=True)
 class Draw:
     """What is drawn for one flight.
@@ -52,6 +56,8 @@ class Draws:
 
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign
+        self._block, self._made = -1, list[Draw]()
+        """The block of draws that was made last."""
         self.shares = self._spread()
         """(N, D) the shares of their distributions below the values; none is drawn that way where
         each flight draws its own."""
@@ -61,19 +67,36 @@ class Draws:
 
     def __getitem__(self, number: int) -> Draw:
         """Return a draw by its number."""
+        block, place = divmod(number, _BLOCK)
+        if block != self._block:
+            self._made, self._block = self._drawn(block * _BLOCK), block
+        return self._made[place]
+
+    def _drawn(self, first: int) -> list[Draw]:
+        """Return the draws of a block, whose values are computed at once.
+
+        The block is whole even where the campaign ends within it: what a value is does not depend
+        on how many there are.
+        """
         campaign = self._campaign
-        own = np.random.SeedSequence(campaign.seed, spawn_key=(number,))
-        seed = int(own.generate_state(1)[0] >> 1)
+        numbers = range(first, first + _BLOCK)
+        seeds = [np.random.SeedSequence(campaign.seed, spawn_key=(number,)) for number in numbers]
+        shares = np.full((_BLOCK, len(campaign.dispersions)), 0.5)
         if self.shares is None:
-            shares = np.random.default_rng(own.spawn(1)[0]).random(len(campaign.dispersions))
+            for row, own in zip(shares, seeds, strict=True):
+                row[:] = np.random.default_rng(own.spawn(1)[0]).random(len(row))
         else:
-            shares = self.shares[number]
+            given = self.shares[first : first + _BLOCK]
+            shares[: len(given)] = given
         shares = np.clip(shares, _SMALLEST, 1.0 - _SMALLEST)
-        values = {
-            each.name: each.distribution.at(float(u))
-            for each, u in zip(campaign.dispersions, shares, strict=True)
-        }
-        return Draw(number, seed, values)
+        columns = [
+            each.distribution.at(u) for each, u in zip(campaign.dispersions, shares.T, strict=True)
+        ]
+        made = []
+        for place, own in enumerate(seeds):
+            values = dict(zip(campaign.names, (column[place] for column in columns), strict=True))
+            made.append(Draw(first + place, int(own.generate_state(1)[0] >> 1), values))
+        return made
 
     def __iter__(self) -> Iterator[Draw]:
         return (self[number] for number in range(len(self)))

@@ -29,6 +29,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning import GaitSchedule, PoseError
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import PlannerStatus, remaining_error
 from spacerobot_ros.simulation.initial_state import InitialState
 
@@ -68,6 +69,8 @@ class LanesEngine:
     def __init__(self) -> None:
         self._flights = FlightsEngine()
         self._plans: dict[str, tuple[GaitSchedule, PlannerStatus, float]] = {}
+        self._planner: tuple[PlannerConfig, str] | None = None
+        """The planner's configuration of the last draw, mostly that of all, and its text."""
 
     def refusal(self, campaign: Campaign) -> str:
         """Return why not, as a clause."""
@@ -135,7 +138,7 @@ class LanesEngine:
         stopped: Callable[[], bool],
         others: list[tuple[Draw, str]],
     ) -> Iterator[Row]:
-        common, batch = DrawnFlight.of(campaign.scenario), list[_Planned]()
+        common, batch, ticks = DrawnFlight.of(campaign.scenario), list[_Planned](), 0
         for draw in draws:
             if stopped():
                 return
@@ -148,15 +151,20 @@ class LanesEngine:
                 others.append((draw, "No schedule begins at the first state."))
                 continue
             batch.append(planned)
-            if len(batch) >= _MOST or sum(each.schedule.ticks for each in batch) > _MOST_TICKS:
+            ticks += planned.schedule.ticks
+            if len(batch) >= _MOST or ticks > _MOST_TICKS:
                 yield from self._flown(campaign, batch, others)
-                batch = []
+                batch, ticks = [], 0
         if batch:
             yield from self._flown(campaign, batch, others)
 
     def _planned(self, draw: Draw, flight: DrawnFlight) -> _Planned | None:
         """Have the executive plan a draw; None where it makes no plan for the first state."""
-        key = _key(flight)
+        noisy = _has_noise(flight)
+        planner = flight.scenario.planner
+        if self._planner is None or self._planner[0] is not planner:
+            self._planner = planner, repr(values_of(planner))
+        key = self._planner[1] + _key(flight, noisy)
         if key not in self._plans:
             began = time.perf_counter()
             period = flight.scenario.plant.control_period
@@ -166,11 +174,11 @@ class LanesEngine:
             ((begins_ns, schedule),) = first.schedules
             if begins_ns or schedule.partial or not schedule.ticks:
                 return None
-            if not _has_noise(flight):
+            if not noisy:
                 self._plans.clear()
             self._plans[key] = schedule, first.gait, time.perf_counter() - began
         schedule, gait, taken = self._plans[key]
-        if _has_noise(flight):
+        if noisy:
             del self._plans[key]
         else:
             self._plans[key] = schedule, gait, 0.0  # It was made once.
@@ -224,22 +232,22 @@ def _has_noise(flight: DrawnFlight) -> bool:
     return any(np.any(value) for name, value in sensors.items() if name != "seed")
 
 
-def _key(flight: DrawnFlight) -> str:
-    """Return all that the plan of a flight follows from, as a text."""
+def _key(flight: DrawnFlight, noisy: bool) -> str:
+    """Return what the plan of a flight follows from beside its planner, as a text."""
     scenario = flight.scenario
-    plant = values_of(scenario.plant)
-    if not _has_noise(flight):
-        plant.pop("sensors.seed")
+    plant = scenario.plant
+    if not noisy:
+        plant = replace(plant, sensors=replace(plant.sensors, seed=0))
     # The robot of the plant is only measured: at rest, whatever its masses are, unless it drifts.
-    moving = any(scenario.plant.linear_momentum) or any(scenario.plant.angular_momentum)
+    moving = any(plant.linear_momentum) or any(plant.angular_momentum)
     inertial = flight.inertial
     weight = None
-    if inertial is not None and (moving or scenario.plant.initial_center_of_mass):
+    if inertial is not None and (moving or plant.initial_center_of_mass):
         weight = inertial.vector.tolist()
     goal = [*scenario.goal.position, *scenario.goal.quaternion]
     shape = scenario.goal.joint_positions
     wanted = goal, None if shape is None else shape.tolist(), weight
-    return repr((plant, values_of(scenario.planner), wanted))
+    return f"{plant} {wanted}"
 
 
 def _flights(batch: list[_Planned]) -> tuple[Flights, list[int]]:

@@ -93,6 +93,8 @@ class DrawnFlight:
     @classmethod
     def of(cls, scenario: Scenario) -> DrawnFlight:
         """Return the flight without dispersions."""
+        for node in ("plant", *scenario.commanders):
+            scenario.config(node)  # Known to all flights that are made of this one.
         robot = description_of(scenario)
         count = len(robot.bodies)
         return cls(scenario, robot, np.ones(count), np.ones(count), np.zeros((count, 3)))
@@ -313,9 +315,12 @@ def _pose(name: str, kind: str, rest: str, scenario: Scenario) -> Target:
         else:
             turned = quaternion_multiply(goal.quaternion, quaternion_from_rotvec(offset))
             goal = replace(goal, quaternion=turned)
+        scenario = flight.scenario
         if kind == "goal":
-            return replace(flight, scenario=replace(flight.scenario, goal=goal))
-        return replace(flight, scenario=replace(flight.scenario, end_effector_goal=goal))
+            moved = scenario.with_poses(goal, scenario.end_effector_goal)
+        else:
+            moved = scenario.with_poses(scenario.goal, goal)
+        return replace(flight, scenario=moved)
 
     return Target(name, apply, "m" if part == "position" else "rad", replaces=name)
 

@@ -28,7 +28,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_from_matrix,
     quaternion_from_rotvec,
 )
-from spacerobot_ros.parameters import Value, configured, declared, values_of
+from spacerobot_ros.parameters import Value, configured, declared, reconfigured, values_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.resources import (
@@ -128,6 +128,10 @@ class Scenario:
     has_goal: bool = True
     _configs: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     """What :meth:`config` has returned, by node."""
+    _changes: dict[str, tuple[Any, dict[str, Any]]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+    """By node, a configuration of another scenario and in what that of this one differs."""
 
     def config(self, node: str) -> Any:
         """Return the configuration of a node: defaults, the file's parameters, the overrides.
@@ -143,7 +147,9 @@ class Scenario:
 
     def _configured(self, node: str) -> Any:
         known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
-        values = {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
+        before, values = self._changes.get(
+            node, (None, {**self.in_file.get(node, {}), **self.overrides.get(node, {})})
+        )
         for name, value in values.items():
             if name not in (*known, *_OF_EVERY_NODE):
                 raise ParameterError(f"Node '{node}' has no parameter '{name}'.")
@@ -151,6 +157,8 @@ class Scenario:
                 is_number = isinstance(known[name].default, (int, float))
                 values[name] = number_in(value) if is_number else value
         try:
+            if before is not None:
+                return reconfigured(before, values)
             return configured(CONFIGS[node], values)
         except ParameterError as error:
             raise ParameterError(f"Node '{node}': {error}") from error
@@ -253,7 +261,25 @@ class Scenario:
     def with_overrides(self, node: str, values: Mapping[str, Any]) -> Scenario:
         """Return the scenario with more parameters of one node set."""
         merged = {**self.overrides, node: {**self.overrides.get(node, {}), **values}}
-        return replace(self, overrides=merged)
+        made = self._replaced(overrides=merged)
+        known = made._configs.pop(node, None)
+        if known is not None:
+            made._changes[node] = known, dict(values)
+        elif node in made._changes:
+            before, earlier = made._changes[node]
+            made._changes[node] = before, {**earlier, **values}
+        return made
+
+    def with_poses(self, goal: Goal, end_effector_goal: Goal | None) -> Scenario:
+        """Return the scenario with other goals."""
+        return self._replaced(goal=goal, end_effector_goal=end_effector_goal)
+
+    def _replaced(self, **changes: Any) -> Scenario:
+        """Return another scenario with the configurations that are known of this one."""
+        made = replace(self, **changes)
+        made._configs.update(self._configs)
+        made._changes.update(self._changes)
+        return made
 
     def in_real_time(self, factor: float) -> Scenario:
         """Return the scenario on the wall clock times a factor, planned beside the flight."""
