@@ -67,6 +67,8 @@ class Draws:
 
     def __getitem__(self, number: int) -> Draw:
         """Return a draw by its number."""
+        if not 0 <= number < len(self):
+            raise IndexError(f"There is no draw {number} of {len(self)}.")
         block, place = divmod(number, _BLOCK)
         if block != self._block:
             self._made, self._block = self._drawn(block * _BLOCK), block

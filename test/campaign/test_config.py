@@ -121,6 +121,24 @@ def test_a_draw_does_not_depend_on_how_many_there_are(sampler: str) -> None:
     assert other[5].seed != few[5].seed
 
 
+def test_draws_that_are_made_together_are_those_that_are_made_alone() -> None:
+    """Values are computed for many draws at once, and are those that scipy gives for each."""
+    made = campaign(disperse={"mass.*": NORM, "com.*": {"t": [4.0, 0.0, 0.01]}}, flights=300)
+    whole = list(Draws(made))
+    assert [draw.number for draw in whole] == list(range(300))
+    for number in (299, 256, 255, 3):
+        draw = Draws(made)[number]
+        assert draw == whole[number]
+        own = np.random.SeedSequence(made.seed, spawn_key=(number,))
+        shares = np.random.default_rng(own.spawn(1)[0]).random(len(made.dispersions))
+        for each, u in zip(made.dispersions, shares, strict=True):
+            kind = getattr(stats, each.distribution.name)
+            expected = kind(**each.distribution.arguments).ppf(u)
+            assert draw.values[each.name] == pytest.approx(expected, rel=1e-13)
+    with pytest.raises(IndexError):
+        Draws(made)[300]
+
+
 def test_a_latin_hypercube_has_one_draw_in_each_slice() -> None:
     made = campaign(disperse={"mass": {"uniform": [0, 1]}}, sampler="latin_hypercube", flights=20)
     slices = sorted(int(20 * draw.values["mass"]) for draw in Draws(made))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,6 +72,32 @@ def test_overrides_go_before_the_file_and_have_the_declared_types() -> None:
     }
     with pytest.raises(ParameterError, match="Node 'plant' has no parameter 'tick_rte'"):
         scenario.with_settings(["plant.tick_rte=10"]).parameters("plant")
+
+
+def test_overrides_of_a_scenario_that_is_known_are_those_of_a_new_one() -> None:
+    """What was checked before is not checked again, and what is replaced does not stay."""
+    steps: list[tuple[str, dict[str, Any]]] = [
+        ("plant", {"sensors.seed": 4, "initial_position": [1, 2, 3]}),
+        ("planner", {"optimal.starts": 3, "resume_file": "x"}),
+        ("plant", {"sensors.seed": 5}),
+        ("plant", {"tick_rate": "40"}),
+    ]
+    for look_between in (False, True):
+        fresh = scenario = load_scenario("sliding_masses")
+        before = scenario.plant, scenario.planner
+        for node, values in steps:
+            fresh = replace(fresh.with_overrides(node, values))  # Knows nothing.
+            scenario = scenario.with_overrides(node, values)
+            if look_between:
+                assert scenario.config(node) == fresh.config(node)
+        assert scenario.plant == fresh.plant
+        assert scenario.planner == fresh.planner
+        assert scenario.plant.sensors.seed == 5
+        assert scenario.plant.tick_rate == 40.0
+        assert (load_scenario("sliding_masses").plant, scenario.plant.faults) == (before[0], ())
+        for bad, words in (({"sensors.sed": 1}, "no parameter"), ({"tick_rate": -1}, "tick_rate")):
+            with pytest.raises(ParameterError, match=words):
+                _ = scenario.with_overrides("plant", bad).plant
 
 
 def test_another_goal_has_no_published_figures() -> None:
