@@ -160,7 +160,7 @@ class MotionSearch:
         for candidate in sorted(candidates, key=lambda each: each.duration)[:_REFINED]:
             try:
                 held = self._commanded(fine, boundary, limits, candidate, motion, budget, stop)
-                attitudes = np.array([quaternion_multiply(quaternion, x) for x in held.quaternions])
+                attitudes = quaternion_multiply(quaternion, held.quaternions)
                 self._constraints.check(held.positions, attitudes, self._period)
             except CandidateError as reason:
                 rejection = str(reason)

@@ -73,12 +73,10 @@ class InitialGuesses:
                 for _ in range(_CANDIDATES)
             ]
             shapes = self._paths(np.array(rounds), boundary.start, final, limits)
-            yield min(
-                self._candidates(shapes, limits),
-                key=lambda each: float(
-                    np.linalg.norm(attitude_error(each.quaternions[-1], boundary.turn))
-                ),
-            )
+            candidates = self._candidates(shapes, limits)
+            # The cosine of half the angle that is left.
+            near = np.abs([each.quaternions[-1] @ boundary.turn for each in candidates])
+            yield candidates[int(near.argmax())]
 
     def _direct(self, start: Array, final: Array) -> Array:
         s = self._instants

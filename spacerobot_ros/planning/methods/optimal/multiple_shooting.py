@@ -35,6 +35,8 @@ _OPTIONS = {
     "ipopt.linear_solver": "mumps",
     "ipopt.mu_strategy": "monotone",
     "ipopt.constr_viol_tol": 1e-6,
+    # Steps are not solved for a second time to the last bit.
+    "ipopt.fast_step_computation": "yes",
 }
 
 
@@ -232,14 +234,19 @@ class _Watch(ca.Callback):
         """Return the size of a report."""
         return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)])
 
-    def eval(self, arguments: list[ca.DM]) -> list[float]:
+    def has_eval_buffer(self) -> bool:
+        """Return that iterates are read where the solver has them: they come by the thousand."""
+        return True
+
+    def eval_buffer(
+        self, arguments: tuple[memoryview, ...], results: tuple[memoryview, ...]
+    ) -> int:
         """Look at an iterate."""
-        f = float(arguments[1])
-        if f < self._least:
-            g = arguments[2].full().ravel()
-            worst = max(float((self._lower - g).max()), float((g - self._upper).max()))
+        x, f, g = (np.frombuffer(each) for each in arguments[:3])
+        if f[0] < self._least:
+            worst = max((self._lower - g).max(), (g - self._upper).max())
             if worst <= _FEASIBLE:
-                self.best, self._least = arguments[0].full().ravel(), f
+                self.best, self._least = x.copy(), float(f[0])
         self._iterates += 1
         stops = (
             # The first iterate is the guess itself.
@@ -247,4 +254,5 @@ class _Watch(ca.Callback):
             or self._stop.cancellation.requested
             or self._stop.expired(found=self.best is not None)
         )
-        return [float(stops)]
+        np.frombuffer(results[0])[:] = stops
+        return 0

@@ -342,12 +342,20 @@ class ManoeuvreSearch:
         grid: MultipleShooting,
         full: MultipleShooting,
     ) -> list[Manoeuvre]:
-        """Return manoeuvres made of the best solutions on a grid, after a step to the full one."""
+        """Return manoeuvres made of the best solutions on a grid, after a step to the full one.
+
+        Where the search ended because solutions agree, the next one is refined only if it promises
+        a shorter time than what became of the best.
+        """
         found: list[Manoeuvre] = []
         costs: list[float] = []
+        agreed = progress.agreed(solutions)
         for solution in sorted(solutions, key=progress.cost):
             cost = progress.cost(solution)
             if found and (len(found) == _REFINED or cost > _FAR_BEHIND * costs[0]):
+                break
+            least = min((one.solution_time for one in found), default=math.inf)
+            if agreed and solution.duration > (1 - _SAME) * least:
                 break
             if any(abs(cost - other) <= _SAME * other for other in costs):
                 continue
@@ -460,7 +468,7 @@ class ManoeuvreSearch:
             held = self._holder.hold(trajectory, boundary, final, limits, fixed=fixed)
         if held is None:
             raise CandidateError("held commands could not be brought to the goal within the limits")
-        attitudes = np.array([quaternion_multiply(quaternion, x) for x in held.quaternions])
+        attitudes = quaternion_multiply(quaternion, held.quaternions)
         self._constraints.check(held.positions, attitudes, self._period)
         duration = (len(held.positions) - 1) * self._period
         return Manoeuvre(held, duration, trajectory.duration)
