@@ -67,9 +67,7 @@ def chain() -> SpaceRobot:
     ("coarse", "fine", "made"),
     [
         pytest.param([6.0, 5.0, 5.0, 5.0], [5.4], [5.4], id="the next one promises nothing"),
-        pytest.param(
-            [5.3, 5.0, 5.0, 5.0], [5.6, 5.4], [5.6, 5.4], id="the best one was overrated"
-        ),
+        pytest.param([5.3, 5.0, 5.0, 5.0], [5.6, 5.4], [5.6, 5.4], id="the best one was overrated"),
         pytest.param([5.2, 5.0, 5.1, 5.3, 5.4], [4.0, 4.1], [4.0, 4.1], id="none agree"),
         pytest.param([5.6, 5.0, 5.7, 5.8, 5.9], [4.0], [4.0], id="the others are far behind"),
     ],
