@@ -365,21 +365,6 @@ def test_noise_is_averaged_over_the_last_measurements() -> None:
     np.testing.assert_allclose(Rotation.from_quat(quaternion).as_rotvec(), [0.0, 0.0, 0.02])
 
 
-def test_turns_so_far_tell_how_the_rest_will_be_off() -> None:
-    """A base that turns a tenth more about z than predicted, and noise of a milliradian."""
-    rng = np.random.default_rng(3)
-    angles = np.linspace(0.0, 0.6, 61)
-    about_z = np.array([0.0, 0.0, 1.0])
-    predicted = Rotation.from_rotvec(angles[:, None] * about_z)
-    path = BasePath(np.arange(61.0), np.zeros((61, 3)), predicted.as_quat())
-    deviation = PathDeviation(path, 5)
-    for k in range(40):
-        noise = Rotation.from_rotvec(1e-3 * rng.normal(size=3))
-        measured = Rotation.from_rotvec(1.1 * angles[k] * about_z) * noise
-        deviation.add(k, np.zeros(3), measured.as_quat())
-    np.testing.assert_allclose(deviation.extra_turn(39), 0.1 * 0.21 * about_z, atol=3e-3)
-
-
 def test_noise_of_joints_is_not_taken_for_another_shape() -> None:
     loop = flying(shape_deadband=1e-3)
     shape = loop.plant.q + np.array([4e-4, 0.0, 5e-3])

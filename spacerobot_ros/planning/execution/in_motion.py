@@ -19,7 +19,7 @@ from spacerobot_ros.planning.execution.worker import PlanningWorker
 _MOST_ATTEMPTS = 2
 """Plans in motion that are tried for a goal: each takes over twice as late as the one before."""
 
-_NEAR_ENOUGH, _AIM = (0.6, 0.8), (0.1, 0.6)
+_NEAR_ENOUGH, _AIM = (0.6, 0.8), (0.4, 0.6)
 """Shares of the tolerances, early and late in a motion: within the first the remaining motion is
 not planned again; where it is, the second may be left."""
 
@@ -95,11 +95,9 @@ class InMotion:
         if stamp_ns < self._replan_ns or pursuit.schedule.partial:
             return None
         self._replan_ns = stamp_ns + round(config.replanning * 1e9)
-        position, quaternion, extra = self._tracker.end
+        position, quaternion = self._tracker.end
         goal, within = pursuit.identified.goal, config.tolerance
-        # Where the base will be, by what its turns so far tell of the model.
-        expected = quaternion_multiply(quaternion, quaternion_from_rotvec(extra))
-        error = PoseError.between(position, expected, goal)
+        error = PoseError.between(*self._tracker.expected_end, goal)
         late = pursuit.ends_at - stamp_ns / 1e9 < _LATE * pursuit.manoeuvre_time
         near = Tolerance(*(_NEAR_ENOUGH[late] * x for x in (within.position, within.attitude)))
         if near.admits(error, pursuit.schedule.controls & POSE):

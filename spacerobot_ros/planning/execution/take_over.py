@@ -23,6 +23,7 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
+from spacerobot_ros.planning.execution.mass_estimate import MassEstimate
 
 
 @dataclass(frozen=True)
@@ -61,33 +62,6 @@ class TakeOver:
         return cls(start_ns + tick * period_ns, positions[now : tick + 1].copy(), motion)
 
 
-_PRIOR = 0.02
-"""Weight of no error of the model, rad^2: noise of a milliradian, and errors of a few per cent."""
-
-_WINDOW = 8
-"""Instants of a path from the turns between which the error of the model is learnt."""
-
-
-class TurnModelError:
-    """By how much a base turns otherwise than predicted, since its masses are not quite known.
-
-    Where the prediction is the rotation vector w, in base components, it turns by ``w + E w``. The
-    estimate of E is that of least squares over all measurements.
-    """
-
-    def __init__(self) -> None:
-        self._squares, self._products = _PRIOR * np.eye(3), np.zeros((3, 3))
-
-    def add(self, predicted: Array, error: Array) -> None:
-        """Add that the base turned by ``predicted + error`` instead of ``predicted``, (3,) each."""
-        self._squares += np.outer(predicted, predicted)
-        self._products += np.outer(error, predicted)
-
-    def expected(self, predicted: Array) -> Array:
-        """Return E w (3,) for a turn w that is predicted."""
-        return np.asarray(self._products @ np.linalg.solve(self._squares, predicted))
-
-
 class PathDeviation:
     """By how much the measured base is off a predicted path, averaged over the last measurements.
 
@@ -97,31 +71,38 @@ class PathDeviation:
         The prediction.
     count
         Measurements to average.
-    model
-        What is known of the robot's turns, and is learnt from these measurements.
+    sensitivity
+        (K, 6, P) how the path depends on masses and inertias, see :class:`.PathSensitivity`; None:
+        it is not known.
+    masses
+        What was learnt of these, and is learnt from these measurements.
     """
 
-    def __init__(self, path: BasePath, count: int, model: TurnModelError | None = None) -> None:
+    def __init__(
+        self,
+        path: BasePath,
+        count: int,
+        sensitivity: Array | None = None,
+        masses: MassEstimate | None = None,
+    ) -> None:
         self._path = path
-        self._recent: deque[Array] = deque(maxlen=count)
-        self._model = model or TurnModelError()
-        self._window: deque[tuple[int, Array]] = deque(maxlen=_WINDOW)
+        self._recent: deque[tuple[int, Array]] = deque(maxlen=count)
+        if sensitivity is None or masses is None:
+            sensitivity, masses = np.zeros((len(path.time), 6, 0)), MassEstimate(0)
+        self._sensitivity, self._masses = sensitivity, masses
+        masses.next_path()
 
     def add(self, k: int, position: Array, quaternion: Array) -> None:
         """Add a measured position (3,) and attitude (4,) at instant k of the path."""
         predicted = self._path.quaternion[k]
         turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, quaternion)
-        self._recent.append(np.concatenate([position - self._path.position[k], turn]))
-        self._window.append((k, turn))
-        if len(self._window) == _WINDOW:
-            begin, offset = self._window[0]
-            to_base = matrix_from_quaternion(self._path.quaternion[begin]).T
-            turned = attitude_error(self._path.quaternion[begin], predicted)
-            self._model.add(turned, to_base @ (turn - offset))
+        deviation = np.concatenate([position - self._path.position[k], turn])
+        self._recent.append((k, deviation))
+        self._masses.add(self._sensitivity[k], deviation)
 
     def pose(self, k: int) -> tuple[Array, Array]:
         """Return where the base is at instant k: position (3,) and attitude (4,)."""
-        mean = self._mean()
+        mean = self._mean(k)
         turn = quaternion_from_rotvec(mean[3:])
         return (
             self._path.position[k] + mean[:3],
@@ -129,27 +110,28 @@ class PathDeviation:
         )
 
     def end(self, k: int) -> tuple[Array, Array]:
-        """Return where the path leads to from instant k, if the base turns as predicted."""
+        """Return where the path leads to from instant k, if the base moves as predicted."""
         position, quaternion = self.pose(k)
-        turn = quaternion_from_rotvec(self._mean()[3:])
+        turn = quaternion_from_rotvec(self._mean(k)[3:])
         way = self._path.position[-1] - self._path.position[k]
+        ahead = attitude_error(self._path.quaternion[k], self._path.quaternion[-1])
         return (
             position + matrix_from_quaternion(turn) @ way,
-            quaternion_multiply(quaternion, quaternion_from_rotvec(self._ahead(k))),
+            quaternion_multiply(quaternion, quaternion_from_rotvec(ahead)),
         )
 
-    def extra_turn(self, k: int) -> Array:
-        """Return by what rotation vector (3,) the base will turn more from instant k to the end."""
-        attitudes, extra = self._path.quaternion, np.zeros(3)
-        to_end = matrix_from_quaternion(attitudes[-1]).T
-        for i in range(k, len(attitudes) - 1, _WINDOW):
-            following = attitudes[min(i + _WINDOW, len(attitudes) - 1)]
-            more = self._model.expected(attitude_error(attitudes[i], following))
-            extra += to_end @ matrix_from_quaternion(following) @ more
-        return extra
+    def expected_end(self, k: int) -> tuple[Array, Array]:
+        """Return where it leads to by what is known of the masses: (3,) and (4,)."""
+        position, quaternion = self.end(k)
+        more = self._of_masses(k, -1)
+        turn = quaternion_from_rotvec(more[3:])
+        return position + more[:3], quaternion_multiply(turn, quaternion)
 
-    def _ahead(self, k: int) -> Array:
-        return attitude_error(self._path.quaternion[k], self._path.quaternion[-1])
+    def _of_masses(self, begin: int, end: int) -> Array:
+        """Return what errors of masses add to the deviation (6,) from one instant to another."""
+        return np.asarray((self._sensitivity[end] - self._sensitivity[begin]) @ self._masses.errors)
 
-    def _mean(self) -> Array:
-        return np.asarray(np.mean(self._recent, axis=0)) if self._recent else np.zeros(6)
+    def _mean(self, k: int) -> Array:
+        if not self._recent:
+            return np.zeros(6)
+        return np.asarray(np.mean([d + self._of_masses(i, k) for i, d in self._recent], axis=0))

@@ -13,8 +13,9 @@ from spacerobot_ros.model.rotations import attitude_error
 from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.mass_estimate import MassEstimate, PathSensitivity
 from spacerobot_ros.planning.execution.stuck_joints import StuckJointWatch
-from spacerobot_ros.planning.execution.take_over import PathDeviation, TakeOver, TurnModelError
+from spacerobot_ros.planning.execution.take_over import PathDeviation, TakeOver
 
 _AT_END = 1e-6
 """A schedule has ended when every joint is this near its last position, m or rad."""
@@ -188,8 +189,8 @@ class TrackingErrorCheck:
         Largest distance and angle that are near enough, m and rad; 0: any.
     average
         Measured poses whose mean deviation from the path counts for plans in motion; 0: none are.
-    model
-        What is learnt of the robot's turns meanwhile.
+    sensitivity, masses
+        How the path depends on masses (see :class:`.PathDeviation`), and what is learnt of these.
     """
 
     def __init__(
@@ -199,10 +200,11 @@ class TrackingErrorCheck:
         position: float,
         attitude: float,
         average: int = 0,
-        model: TurnModelError | None = None,
+        sensitivity: Array | None = None,
+        masses: MassEstimate | None = None,
     ) -> None:
         self._path = schedule.path
-        self._deviation = PathDeviation(schedule.path, average, model)
+        self._deviation = PathDeviation(schedule.path, average, sensitivity, masses)
         self._position, self._attitude = position or np.inf, attitude or np.inf
         self._stamps = start_ns + (schedule.path.time * 1e9).round().astype(np.int64)
         self._slack = round(schedule.control_period * 0.5e9)
@@ -228,9 +230,14 @@ class TrackingErrorCheck:
         return self._deviation.pose(self._next)
 
     @property
-    def end(self) -> tuple[Array, Array, Array]:
-        """Where the path leads to by the mean deviation: (3,), (4,), and the extra turn (3,)."""
-        return *self._deviation.end(self._next), self._deviation.extra_turn(self._next)
+    def end(self) -> tuple[Array, Array]:
+        """Where the path leads to by the mean deviation: position (3,), attitude (4,)."""
+        return self._deviation.end(self._next)
+
+    @property
+    def expected_end(self) -> tuple[Array, Array]:
+        """Where it leads to by what is known of the masses, too."""
+        return self._deviation.expected_end(self._next)
 
     def error(self, position: Array, quaternion: Array) -> TrackingError | None:
         """Return the tracking error of a pose that is due, None if it is small enough."""
@@ -263,7 +270,8 @@ class TrajectoryTracker:
         self._follower: ScheduleFollower | BrakingFollower | None = None
         self._holding = False
         """Whether the position of the setpoint is the shape to hold."""
-        self._model = TurnModelError()
+        self._sensitivity = PathSensitivity(robot) if config.replanning > 0 else None
+        self._masses = MassEstimate(0 if self._sensitivity is None else self._sensitivity.count)
         band = 2 * config.shape_deadband
         self._watch = StuckJointWatch(robot.n, config.stuck_ticks, config.control_period, band)
 
@@ -285,9 +293,12 @@ class TrajectoryTracker:
         config = self._config
         gain = config.shape_gain if self._commands_plant else 0.0
         self._follower = ScheduleFollower(schedule, stamp_ns, gain, config.shape_deadband)
+        sensitivity = None
+        if average and self._sensitivity is not None:
+            sensitivity = self._sensitivity.along(schedule)
         self._check = TrackingErrorCheck(
             *(schedule, stamp_ns, config.drift_position, config.drift_attitude),
-            *(average, self._model),
+            *(average, sensitivity, self._masses),
         )
         self._watch.restart()
 
@@ -343,9 +354,14 @@ class TrajectoryTracker:
         return replace(state, position=position, quaternion=quaternion)
 
     @property
-    def end(self) -> tuple[Array, Array, Array]:
-        """Where the path leads to by the mean deviation: (3,), (4,), and the extra turn (3,)."""
+    def end(self) -> tuple[Array, Array]:
+        """Where the path leads to by the mean deviation: position (3,), attitude (4,)."""
         return self._check.end
+
+    @property
+    def expected_end(self) -> tuple[Array, Array]:
+        """Where it leads to by what is known of the masses, too."""
+        return self._check.expected_end
 
     def error(self, state: RobotState) -> TrackingError | None:
         """Return the tracking error of a state that is due, None if it is small enough."""
