@@ -102,9 +102,20 @@ class ViewerFigures:
         )
 
 
-def run_viewer_benchmark(seconds: float, show: Callable[[str], None]) -> dict[str, float]:
+def run_viewer_benchmark(
+    seconds: float, show: Callable[[str], None], *, priorities: bool = True
+) -> dict[str, float]:
     """Fly the servicer in real time in separate processes, twice ``seconds`` without a viewer and
     twice with one, in turns, and return the figures by name.
+
+    Parameters
+    ----------
+    seconds
+        Wall time of a turn, s.
+    show
+        Shows a line to people.
+    priorities
+        Whether the kernel is asked to let the plant and its controller go first.
 
     Raises
     ------
@@ -128,7 +139,7 @@ def run_viewer_benchmark(seconds: float, show: Callable[[str], None]) -> dict[st
         try:
             stopped = closing.enter_context(ended_on_request())
             goals = _Goals(stack)
-            prioritised = prioritise(stack)
+            prioritised = priorities and prioritise(stack)
             stack.start(None)
             for viewed in (False, True, False, True):
                 with ExitStack() as beside:

@@ -45,6 +45,11 @@ from spacerobot_ros.cli.options import PATH, json_option, write_json
     "and a browser in turns of S s; updates received, deadlines missed.",
 )
 @click.option(
+    "--no-priorities",
+    is_flag=True,
+    help="... and leave plant and controller at the priority of everything else (--viewer).",
+)
+@click.option(
     "--planning",
     "goals",
     type=click.IntRange(min=1),
@@ -91,6 +96,7 @@ def command(
     rates: tuple[float, ...],
     soak: float | None,
     viewed: float | None,
+    no_priorities: bool,
     goals: int | None,
     starts: int | None,
     library: int | None,
@@ -121,7 +127,7 @@ def command(
     elif viewed is not None:
         from spacerobot_ros.benchmarks.viewing import run_viewer_benchmark
 
-        figures = run_viewer_benchmark(viewed, click.echo)
+        figures = run_viewer_benchmark(viewed, click.echo, priorities=not no_priorities)
     elif goals is not None:
         from spacerobot_ros.benchmarks.planning import run_planning_benchmark
 

@@ -195,11 +195,11 @@ def joints(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -> str
         cells = [escape(joint.name), f"{_fixed(q[i], 3)} {joint.unit}", bar]
         cells += [_of(qdot[i], fastest[i]), _of(effort[i], strongest[i])]
         rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
-    titles = ("joint", "at", "in its range", "rate", "effort")
+    titles = ("joint", "at", "in range", "rate", "effort")
     heads = "".join(f"<th>{title}</th>" for title in titles)
     if not rows:
         return padded("The robot has no joints.")
-    style = "border-spacing:6px 2px;text-align:left;white-space:nowrap"
+    style = "border-spacing:4px 2px;text-align:left;white-space:nowrap;font-size:.9em"
     table = f'<table style="{style}"><tr>{heads}</tr>{"".join(rows)}</table>'
     return padded(f'<div style="overflow-x:auto">{table}</div>')
 
@@ -215,7 +215,7 @@ def _bar(share: float, level: int) -> str:
     place = 100 * min(1.0, max(0.0, share))
     color = _LEVELS[level]
     return (
-        f'<div style="width:56px;height:8px;background:{_QUIET}55;border-radius:4px;'
+        f'<div style="width:44px;height:8px;background:{_QUIET}55;border-radius:4px;'
         f'position:relative"><div style="position:absolute;left:{place:.0f}%;top:-2px;width:4px;'
         f'height:12px;margin-left:-2px;background:{color};border-radius:2px"></div></div>'
     )

@@ -21,6 +21,7 @@ from spacerobot_ros.viewer.content import (
     COLORS,
     goal_of,
     quaternion_from_rpy,
+    quiet,
     rpy_from_quaternion,
     verdict,
 )
@@ -70,6 +71,7 @@ class GoalEditor:
         self._changed_at: float | None = None
         self._check = Check(Verdict.UNCHECKED)
         gui = server.gui
+        self._none_taken = gui.add_html(quiet("A recording takes no goals."), visible=False)
         self._verdict = gui.add_html(verdict(self._check))
         # Any: mypy takes viser's values for read-only.
         self._position: Any = gui.add_vector3("Goal (m)", (0.0, 0.0, 0.0), step=0.01)
@@ -174,6 +176,7 @@ class GoalEditor:
         fields = (self._verdict, self._position, self._angles, self._to_robot)
         for handle in (*fields, *self._gizmos.values()):
             handle.visible = visible
+        self._none_taken.visible = not visible
 
     def goals(self) -> dict[Part, Goal]:
         """Return the goals to send.

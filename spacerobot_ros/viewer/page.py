@@ -163,6 +163,7 @@ class Page:
             if replays != (before.replay is not None):
                 self._buttons.show(visible=not replays)
                 self._editor.show(visible=not replays)
+                self._faults.show_menu(visible=not replays)
             if self._drawing is not None and state.measured is not None:
                 self._draw_robot(state, state.measured)
             self._time_line.show(state, now)

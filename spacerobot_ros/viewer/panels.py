@@ -159,6 +159,13 @@ class Faults:
             self._kind.value = before
         self._show_kind()
 
+    def show_menu(self, *, visible: bool) -> None:
+        """Show or hide what breaks something: a replay only shows what was broken."""
+        for handle in (self._kind, self._target, self._lasts, self._inject, self._clear):
+            handle.visible = visible
+        self._meaning.visible = visible
+        self._value.visible = visible and self._has_value
+
     def show(self, state: StackState) -> None:
         """Show which faults are active."""
         if state.measured is not None:
@@ -175,8 +182,14 @@ class Faults:
         if before in names:
             self._target.value = before
         kind = KINDS.get(self._kind.value)
-        self._value.visible = kind is not None and bool(kind.value)
+        self._value.visible = self._has_value and self._kind.visible
         self._meaning.content = "" if kind is None else content.quiet(kind.value)
+
+    @property
+    def _has_value(self) -> bool:
+        """Whether the fault that is chosen has a number."""
+        kind = KINDS.get(self._kind.value)
+        return kind is not None and bool(kind.value)
 
     def _on_inject(self) -> None:
         try:

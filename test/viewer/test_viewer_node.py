@@ -288,6 +288,8 @@ def test_a_replay_has_a_time_line(harness: Harness) -> None:
     assert (line._slider.min, line._slider.max) == (0.0, 20.0)
     assert line._folder.visible
     assert not page._buttons._fly.visible, "a recording takes no goals"
+    assert page._editor._none_taken.visible
+    assert not any(h.visible for h in (page._faults._inject, page._faults._value))
     stack.press(line._slider, 7.5)
     stack.until(lambda: stack.probe.count("/replay/seek") == 1, "the jump")
     assert stack.probe.last("/replay/seek").data == 7.5
