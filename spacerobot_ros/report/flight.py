@@ -19,7 +19,7 @@ from spacerobot_ros.model.description import Array, Joint, Pose
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
 from spacerobot_ros.planning import METHODS, Goal, PoseError
-from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
 from spacerobot_ros.report.events import FlightEvent
 from spacerobot_ros.report.signals import Cycles, Signal, find_cycles, nearest_rotvec
 from spacerobot_ros.report.solids import SolidRobot
@@ -321,16 +321,9 @@ class Flight:
         """Time from the first schedule for the last goal to its end, s, with what was waited in
         between; None where no schedule was flown.
         """
-        schedules = self.executing
-        if not schedules:
-            return None
-        index = last = self.statuses.index(schedules[-1])
-        while index and (before := self.statuses[index - 1]).executing:
-            if before.goal != schedules[-1].goal:
-                break
-            index -= 1
-        ended = [s.time for s in self.statuses[last + 1 :] if s.state in _FOLLOWED]
-        return (ended[0] if ended else self.end) - self.statuses[index].time
+        reports = ((s.time, s.report) for s in self.statuses)
+        planned = ((time, report) for time, report in reports if isinstance(report, PlannerStatus))
+        return time_to_end(planned, self.end)
 
     @cached_property
     def drawn(self) -> SolidRobot | None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import rclpy
@@ -15,7 +15,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
 from spacerobot_ros.bag.recorded_robot import columns
-from spacerobot_ros.control.status import ControllerState, ControllerStatus, tracking_time
+from spacerobot_ros.control.status import ControllerStatus, tracking_time
 from spacerobot_ros.errors import RecordingError, SpaceRobotError
 from spacerobot_ros.flight.arrays import Outcome, Status
 from spacerobot_ros.flight.scenario import Scenario
@@ -24,10 +24,12 @@ from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.nodes.common.process import use_loopback_discovery, use_private_discovery
 from spacerobot_ros.nodes.plant.diagnostics import PROPELLANT
 from spacerobot_ros.planning import PoseError
-from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.stack import InProcessStack, Stack
 from spacerobot_ros.termination import ended_on_request
+
+_Status = TypeVar("_Status", PlannerStatus, ControllerStatus)
 
 Progress = Callable[[float, float], None]
 """Called with simulated time and the time the present schedule ends, s."""
@@ -153,7 +155,12 @@ def _summary(stack: Stack, wall_time: float) -> dict[str, Any]:
         "position_error_m": error.distance,
         "attitude_error_rad": error.angle,
         "sim_time_s": sim_time,
-        "manoeuvre_time_s": planner.manoeuvre_time_s or _tracking_time(robots) or sim_time,
+        "manoeuvre_time_s": (
+            planner.manoeuvre_time_s
+            or _time_to_end(robots, float(time[-1]))
+            or _tracking_time(robots)
+            or sim_time
+        ),
         "plan_time_s": stack.statistics.plan_time_s,
         "wall_time_s": wall_time,
         "ticks": ticks,
@@ -202,15 +209,29 @@ def _files(path: Path) -> list[Bag]:
     return [read_bag(part) for part in ([path] if path.exists() or not parts else parts)]
 
 
+def _time_to_end(robots: Sequence[RecordedRobot], end_s: float) -> float | None:
+    """Return how long the schedules for the last goal took with what was waited in between."""
+    statuses = _statuses(robots, "planner/status", PlannerStatus.from_values)
+    return time_to_end(statuses, max(end_s, statuses[-1][0]) if statuses else end_s)
+
+
 def _tracking_time(robots: Sequence[RecordedRobot]) -> float | None:
     """Return how long a controller flew, None where none did."""
-    states: list[tuple[float, ControllerState]] = []
-    for series in filter(None, (robot.get("controller/status") for robot in robots)):
+    statuses = _statuses(robots, "controller/status", ControllerStatus.from_values)
+    return tracking_time((time, status.state) for time, status in statuses)
+
+
+def _statuses(
+    robots: Sequence[RecordedRobot], topic: str, read: Callable[[dict[str, str]], _Status]
+) -> list[tuple[float, _Status]]:
+    """Return the statuses of a commander with their log times, s."""
+    found = []
+    for series in filter(None, (robot.get(topic) for robot in robots)):
         for time_ns, message in series.messages():
             values = {pair.key: pair.value for pair in message.values}
             with suppress(SpaceRobotError):
-                states.append((time_ns / 1e9, ControllerStatus.from_values(values).state))
-    return tracking_time(states)
+                found.append((time_ns / 1e9, read(values)))
+    return found
 
 
 def _truth(

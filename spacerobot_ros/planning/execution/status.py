@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 
@@ -189,3 +189,34 @@ def _note(text: str) -> list[float] | float | str:
     except ValueError:
         return text
     return numbers[0] if len(numbers) == 1 else numbers
+
+
+def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
+    """Return the time from the first schedule for the last goal to its end, s, with what was waited
+    in between, such as for a planner that was started again; None where no schedule was flown.
+
+    Parameters
+    ----------
+    statuses
+        Time (s) and status.
+    end_s
+        When it ends where no status says so.
+    """
+    given = list(statuses)
+    schedules = [i for i, (_, status) in enumerate(given) if status.state is PlannerState.EXECUTING]
+    if not schedules:
+        return None
+    first = last = schedules[-1]
+    for i in reversed(range(last)):
+        before, schedule = given[i][1], given[last][1]
+        same_id = before.goal_id and before.goal_id == schedule.goal_id
+        if before.state.decided or not (same_id or before.goal == schedule.goal):
+            break
+        if before.state is PlannerState.EXECUTING:
+            first = i
+    ended = [
+        time
+        for time, status in given[last + 1 :]
+        if status.state.decided and status.state is not PlannerState.REFUSED
+    ]
+    return (ended[0] if ended else end_s) - given[first][0]
