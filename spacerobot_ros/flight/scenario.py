@@ -147,9 +147,7 @@ class Scenario:
 
     def _configured(self, node: str) -> Any:
         known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
-        before, values = self._changes.get(
-            node, (None, {**self.in_file.get(node, {}), **self.overrides.get(node, {})})
-        )
+        before, values = self._changes.get(node, (None, self._given(node)))
         for name, value in values.items():
             if name not in (*known, *_OF_EVERY_NODE):
                 raise ParameterError(f"Node '{node}' has no parameter '{name}'.")
@@ -162,6 +160,10 @@ class Scenario:
             return configured(CONFIGS[node], values)
         except ParameterError as error:
             raise ParameterError(f"Node '{node}': {error}") from error
+
+    def _given(self, node: str) -> dict[str, Any]:
+        """Return what the file and the overrides set of a node, as it is written there."""
+        return {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
 
     @property
     def plant(self) -> PlantConfig:
@@ -197,7 +199,7 @@ class Scenario:
             A parameter of the node is refused.
         """
         values = values_of(self.config(node))
-        given = {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
+        given = self._given(node)
         # An empty list is every list's default, and has no type that ROS could know it by.
         found = {name: values[name] for name in given if name in values and values[name] != ()}
         if "use_sim_time" in given:
