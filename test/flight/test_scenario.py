@@ -53,6 +53,9 @@ planner: {ros__parameters: {lie_bracket: {t1: 5}, world_frame: "1e1"}}
     assert scenario.planner.world_frame == "1e1"
     changed = scenario.with_settings(["planner.lie_bracket.t1=7"])
     assert changed.planner.options["lie_bracket"].t1 == 7.0
+    # Likewise of a scenario whose configurations nobody has looked at.
+    unread = load_scenario(str(path)).with_settings(["planner.lie_bracket.t1=7"])
+    assert unread.planner.options["lie_bracket"].t1 == 7.0
 
 
 def test_overrides_go_before_the_file_and_have_the_declared_types() -> None:
