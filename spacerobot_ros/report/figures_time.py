@@ -21,7 +21,7 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.report.events import LANE, draw_events
 from spacerobot_ros.report.flight import Flight, Target
 from spacerobot_ros.report.plates import Group, Plate
-from spacerobot_ros.report.signals import Cycles, Signal, envelope
+from spacerobot_ros.report.signals import Cycles, Indices, Signal, envelope
 from spacerobot_ros.report.style import (
     COLUMNS,
     FAINT,
@@ -401,7 +401,7 @@ def _last_cycles(axes: Axes, group: Group, cycles: Cycles) -> None:
 
 
 def errors_plate(flight: Flight) -> Plate | None:
-    """Goal minus measured pose of base and end-effector, in the components under control."""
+    """Goal minus pose of base and end-effector, in the components under control."""
     if not flight.outputs and not flight.tool_goals:
         return None
     groups = []
@@ -423,8 +423,8 @@ def errors_plate(flight: Flight) -> Plate | None:
     if not groups:
         return None
     what = (
-        "Goal minus measured, in the world frame, for the components under control; attitude as "
-        "the remaining rotation vector"
+        "Goal minus pose, in the world frame, for the components under control; attitude as the "
+        "remaining rotation vector"
     )
     return time_plate(flight, "errors", "Output errors", what, groups)
 
@@ -441,6 +441,35 @@ def pose_errors(pose: Signal, targets: Sequence[Target]) -> Signal:
             times.append(part.time)
             values.append(np.hstack([left, rotvecs_from_quaternions(turn)]))
     return Signal(np.concatenate(times), np.concatenate(values))
+
+
+def sensors_plate(flight: Flight) -> Plate | None:
+    """How far measured poses and joints are from what they were; None where sensors do not err."""
+    true = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
+    pose, at = _at_the_same_times(flight.sensed_pose, true)
+    turn = quaternion_multiply(pose.values[:, 3:], quaternion_inverse(true.values[at, 3:]))
+    offset = pose.values[:, :3] - true.values[at, :3]
+    errors = Signal(pose.time, np.hstack([offset, rotvecs_from_quaternions(turn)]))
+    groups = _axis_groups(errors, (("base position", "m"), ("base attitude", "rad")))
+    shape, at = _at_the_same_times(flight.sensed_shape, flight.shape)
+    if len(shape):
+        bent = Signal(shape.time, shape.values - flight.shape.values[at])
+        units = {"m": "m", "rad": "rad"}
+        groups += _joint_groups(flight, bent, "joints", units, lambda joint: [], _JOINTS_A_PANEL)
+    groups = [group for group in groups if np.any(group.signal.values)]
+    if not groups:
+        return None
+    what = "Measured minus true, at the stamps of what was measured"
+    return time_plate(flight, "sensors", "Errors of the sensors", what, groups)
+
+
+def _at_the_same_times(measured: Signal, true: Signal) -> tuple[Signal, Indices]:
+    """Return the samples that have a true one of their time, and which that is."""
+    if not len(true):
+        return Signal.none(measured.width), np.zeros(0, int)
+    at = np.clip(np.searchsorted(true.time, measured.time - 1e-9), 0, len(true) - 1)
+    same = np.abs(true.time[at] - measured.time) < 1e-9
+    return Signal(measured.time[same], measured.values[same]), at[same]
 
 
 def twist_plate(flight: Flight) -> Plate | None:

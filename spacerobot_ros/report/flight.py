@@ -121,6 +121,7 @@ class Flight:
         About the bag, and the robot in it.
     position, quaternion, attitude
         Pose of the base link in the world: (N, 3) m, (N, 4) and exponential coordinates (N, 3).
+        This and what follows is as it was, and not as sensors that err have measured it.
     twist
         Velocity and angular velocity of the base link in its frame (N, 6), m/s and rad/s.
     shape, rates, efforts
@@ -144,6 +145,9 @@ class Flight:
         Changes of state of the nodes; none in bags of earlier versions.
     meshes
         Triangles of the meshes that the bag carries, by their URIs.
+    sensed_pose, sensed_shape
+        Pose of the base link (M, 7) and joint positions (M, n) as measured while sensors err; empty
+        where they do not.
     """
 
     file_name: str
@@ -170,6 +174,8 @@ class Flight:
     planned: list[Array]
     events: list[FlightEvent] = field(default_factory=list)
     meshes: dict[str, TriangleMesh] = field(default_factory=dict)
+    sensed_pose: Signal = field(default_factory=lambda: Signal.none(7))
+    sensed_shape: Signal = field(default_factory=lambda: Signal.none(0))
 
     # -- what it is called --------------------------------------------------------------------
 
@@ -294,6 +300,14 @@ class Flight:
         if self.goal is None or not len(self.position):
             return None
         return PoseError.between(self.position.values[-1], self.quaternion[-1], self.goal)
+
+    @property
+    def sensed_error(self) -> PoseError | None:
+        """Remaining error of the last measured pose to the goal, where sensors err."""
+        if self.goal is None or not len(self.sensed_pose):
+            return None
+        last = self.sensed_pose.values[-1]
+        return PoseError.between(last[:3], last[3:], self.goal)
 
     def goal_rotvec(self, goal: Goal) -> Array:
         """Attitude of a goal (3,), rad, with the number of turns nearest to the last attitude."""

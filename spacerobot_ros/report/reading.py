@@ -42,7 +42,8 @@ def read_flight(path: Path) -> Flight:
     ]
     robot = _Recorded(bag, min(prefixes, default=""))
     names, nozzles = robot.joint_names, robot.names("thrusters")
-    base = robot.signal("odom", "pose.pose")
+    base = robot.true("odom", "pose.pose")
+    shape = robot.true("joint_states", "position", len(names))
     position, quaternion = Signal(base.time, base.values[:, :3]), base.values[:, 3:]
     description = _description(robot)
     return Flight(
@@ -54,9 +55,9 @@ def read_flight(path: Path) -> Flight:
         position=position,
         quaternion=quaternion,
         attitude=Signal(base.time, rotvecs(quaternion)),
-        shape=robot.signal("joint_states", "position", len(names)),
-        twist=robot.signal("odom", "twist.twist"),
-        rates=robot.signal("joint_states", "velocity", len(names)),
+        shape=shape,
+        twist=robot.true("odom", "twist.twist"),
+        rates=robot.true("joint_states", "velocity", len(names)),
         momentum=_momentum_balance(robot),
         tool=robot.signal("end_effector_pose", "pose"),
         wrench=robot.signal("base_wrench", "wrench"),
@@ -75,6 +76,8 @@ def read_flight(path: Path) -> Flight:
         ],
         events=robot.events(),
         meshes=meshes_in(description, bag.attachments) if description is not None else {},
+        sensed_pose=robot.sensed("odom", "pose.pose"),
+        sensed_shape=robot.sensed("joint_states", "position", len(names)),
     )
 
 
@@ -108,6 +111,27 @@ class _Recorded(RecordedRobot):
         time = (self._times(series) - self._began)[whole]
         order = np.argsort(time, kind="stable")
         return Signal(time[order], values[whole][order])
+
+    def true(self, name: str, path: str, width: int | None = None) -> Signal:
+        """Return :meth:`signal` as it would be with perfect sensors, where these erred."""
+        measured = self.signal(name, path, width)
+        true = self.signal(f"{name}_true", path, width)
+        if not len(true):
+            return measured
+        before = measured.time < true.time[0]
+        return Signal(
+            np.concatenate([measured.time[before], true.time]),
+            np.concatenate([measured.values[before], true.values]),
+        )
+
+    def sensed(self, name: str, path: str, width: int | None = None) -> Signal:
+        """Return :meth:`signal` where sensors erred: only then, and while they did."""
+        true, measured = self.get(f"{name}_true"), self.signal(name, path, width)
+        if true is None:
+            return Signal.none(measured.width)
+        began = self._times(true)[0] - self._began
+        since = measured.time >= began - 1e-9
+        return Signal(measured.time[since], measured.values[since])
 
     def events(self) -> list[FlightEvent]:
         """Return the events that figures show."""

@@ -32,6 +32,11 @@ class Signal:
     def __len__(self) -> int:
         return len(self.time)
 
+    @classmethod
+    def none(cls, width: int) -> Signal:
+        """Return a signal without samples."""
+        return cls(np.empty(0), np.empty((0, width)))
+
     @property
     def width(self) -> int:
         """Number of values in a sample."""

@@ -31,11 +31,13 @@ class Table:
 def headline(flight: Flight) -> list[tuple[str, str, str]]:
     """Label, value and a note for each of the numbers that stand on top."""
     rows: list[tuple[str, str, str]] = []
-    error, tool = flight.final_error, flight.tool_error
+    error, tool, sensed = flight.final_error, flight.tool_error, flight.sensed_error
     if error is not None:
         if flight.position_counts:
-            rows.append(("Position error", f"{error.distance:.3g} m", ""))
+            note = "" if sensed is None else f"measured: {sensed.distance:.3g} m"
+            rows.append(("Position error", f"{error.distance:.3g} m", note))
         angle = f"{math.degrees(error.angle):.3g}°"
+        angle += "" if sensed is None else f"; measured: {sensed.angle:.3g} rad"
         rows.append(("Attitude error", f"{error.angle:.3g} rad", angle))
     if tool is not None:
         turned = set(flight.controls("end_effector")) & {3, 4, 5}
@@ -84,6 +86,9 @@ def result_table(flight: Flight) -> Table:
             rows.append(("Position error", left))
         angle = f"{error.angle:.4g} rad = {math.degrees(error.angle):.4g}°"
         rows.append(("Attitude error", f"{angle}{_tolerance(flight, 'attitude', 'rad')}"))
+    if (sensed := flight.sensed_error) is not None:
+        parts = [f"{sensed.distance:.4g} m"] if flight.position_counts else []
+        rows.append(("Errors as measured", ", ".join([*parts, f"{sensed.angle:.4g} rad"])))
     if flight.tool_error is not None:
         rows += _tool_rows(flight, flight.tool_error)
     if flight.manoeuvre_time is not None:

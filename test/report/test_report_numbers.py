@@ -29,6 +29,7 @@ from spacerobot_ros.report.figures_time import (
     pose_errors,
     position_group,
     position_plate,
+    sensors_plate,
     shape_groups,
     thrusters_plate,
 )
@@ -373,6 +374,40 @@ def test_errors_are_goal_minus_measured_in_the_world(tmp_path: Path) -> None:
     np.testing.assert_allclose(errors.values[0], [0.3, 0.0, 3.0, 0.0, -0.1, 0.0], atol=1e-12)
     np.testing.assert_allclose(errors.values[-1], [0.3, 0.0, -0.4, 0.0, -0.3, 0.0], atol=1e-12)
     np.testing.assert_array_equal(errors.time, [0.0, 0.5, 1.0, 1.0, 1.5])
+
+
+def test_where_sensors_err_the_numbers_are_true_and_the_measured_ones_beside_them(
+    tmp_path: Path,
+) -> None:
+    def more(say: Any, time: float, k: int) -> None:
+        if k:  # They begin to err after the first state.
+            true = (0.95, 2.0, 3.4 * (k == 3), 0.0, 0.0, HALF[0], HALF[1])
+            say("/odom_true", odometry(time, *true, *STILL), time)
+            shape = [0.125 - 0.25 * k, 0.75 * k - 0.4]
+            say("/joint_states_true", joint_states(time, NAMES, shape, [0.0, 0.6]), time)
+
+    found = flight(tmp_path, more=more)
+    np.testing.assert_array_equal(found.position.values[:, 0], [0.7, 0.95, 0.95, 0.95])
+    np.testing.assert_allclose(found.shape.values[:, 1], [-0.5, 0.35, 1.1, 1.85])
+    assert found.rates.values[:, 1].tolist() == [0.0, 0.6, 0.6, 0.6]
+    assert found.final_error is not None
+    assert found.final_error.distance == pytest.approx(math.hypot(0.05, 0.4))
+    top = {label: (value, note) for label, value, note in headline(found)}
+    assert top["Position error"] == ("0.403 m", "measured: 0.5 m")
+    assert top["Attitude error"][1].endswith("; measured: 0.3 rad")
+    assert rows_of(found)["Errors as measured"] == "0.5 m, 0.3 rad"
+    plate = sensors_plate(found)
+    assert plate is not None
+    position, attitude, turn = plate.groups
+    np.testing.assert_allclose(position.signal.values, [[-0.25, 0, 0]] * 3, atol=1e-15)
+    np.testing.assert_allclose(position.signal.time, [0.5, 1.0, 1.5])
+    np.testing.assert_allclose(attitude.signal.values[0], [0, 0, -0.2], atol=1e-12)
+    assert list(turn.names) == ["turn"], "the slider's sensor does not err"
+    np.testing.assert_allclose(turn.signal.values, [[-0.1]] * 3)
+    # Without such sensors all is as before.
+    plain = flight(tmp_path, name="plain.mcap")
+    assert sensors_plate(plain) is None
+    assert "Errors as measured" not in rows_of(plain)
 
 
 def test_an_attitude_error_is_along_axes_of_the_world(tmp_path: Path) -> None:
