@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from spacerobot_ros.events import EventKind
 from spacerobot_ros.report.events import mark_of
 from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.report.live import Live, own_file
@@ -36,11 +37,7 @@ def charts_of(flight: Flight, plates: Sequence[Plate | str | None]) -> Live:
     charts = {
         "end": flight.end,
         "charts": [_chart(group) for group in groups],
-        "events": [
-            {"time": each.time, "sentence": each.event.sentence, "text": each.text, **mark}
-            for each in sorted(flight.events, key=lambda each: each.time)[:_MOST_EVENTS]
-            for mark in [mark_of(each.event.kind)]
-        ],
+        "events": _events(flight),
     }
     return Live(
         data={"charts": charts},
@@ -48,6 +45,19 @@ def charts_of(flight: Flight, plates: Sequence[Plate | str | None]) -> Live:
         style=own_file("vendor/uPlot.min.css"),
         notices=(("uPlot", own_file("vendor/uPlot.LICENSE.txt")),),
     )
+
+
+def _events(flight: Flight) -> list[dict[str, Any]]:
+    """Return what happened; the last of several of one kind at once, which is seen, counts them."""
+    found = []
+    together: dict[tuple[float, EventKind], list[str]] = {}
+    for each in sorted(flight.events, key=lambda each: each.time)[:_MOST_EVENTS]:
+        sentences = together.setdefault((each.time, each.event.kind), [])
+        text = f"{each.text} (+{len(sentences)})" if sentences else each.text
+        sentences.append(each.event.sentence)
+        said = {"time": each.time, "sentence": " ".join(sentences), "text": text}
+        found.append({**said, **mark_of(each.event.kind)})
+    return found
 
 
 def chart_numbers(plates: Sequence[Plate | str | None]) -> dict[str, str]:

@@ -14,6 +14,7 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.report.figures_time import DASHES, NO_STATES
 from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.report.plates import Plate
+from spacerobot_ros.report.signals import Indices
 from spacerobot_ros.report.solids import Canvas, Solids, View
 from spacerobot_ros.report.style import (
     COLUMNS,
@@ -83,14 +84,18 @@ def _instants(flight: Flight) -> list[int]:
         places = [0.0, 0.5 * cycles.start, cycles.start]
         places += [cycles.start + cycles.period * (cycles.count * k // 3) for k in (1, 2, 3)]
         found = np.searchsorted(time, np.array(places) - 1e-9)
-        return np.unique([*np.minimum(found, len(time) - 1), len(time) - 1]).tolist()
+        return _ending_at(len(time) - 1, found)
     moved = np.column_stack([flight.position.values, flight.attitude.values, flight.joints])
     extent = np.maximum(np.ptp(moved, axis=0), 1e-3)
     steps = np.linalg.norm(np.diff(moved, axis=0) / extent, axis=1)
     progress = np.append(0.0, np.cumsum(steps))
     wanted = np.linspace(0.0, progress[-1], _INSTANTS) if progress[-1] > 0 else np.zeros(1)
-    found = np.minimum(np.searchsorted(progress, wanted), len(time) - 1)
-    return np.unique([*found, len(time) - 1]).tolist()
+    return _ending_at(len(time) - 1, np.searchsorted(progress, wanted))
+
+
+def _ending_at(last: int, found: Indices) -> list[int]:
+    """Return indices, each once, with the last recorded state instead of the last of them."""
+    return np.unique([*np.minimum(found[:-1], last), last]).tolist()
 
 
 def draw_robot(axes: Axes, solids: Solids, points: Array, view: View) -> None:

@@ -108,7 +108,9 @@ def _tiles(flight: Flight) -> str:
     made = []
     for label, value, note in headline(flight):
         small = f"<small>{escape(note)}</small>" if note else ""
-        made.append(f"<div><dt>{escape(label)}</dt><dd>{escape(value)}{small}</dd></div>")
+        # Names of methods may be broken where they have an underscore.
+        shown = escape(value).replace("_", "_<wbr>")
+        made.append(f"<div><dt>{escape(label)}</dt><dd>{shown}{small}</dd></div>")
     return f'<dl class="tiles">{"".join(made)}</dl>' if made else ""
 
 

@@ -13,7 +13,8 @@ from support.flight_bags import GOAL, TICK, Story, goal_value, tell
 from support.html_page import leave_blank
 
 from spacerobot_ros.report import write_report
-from spacerobot_ros.report.charts import thinned
+from spacerobot_ros.report.charts import charts_of, thinned
+from spacerobot_ros.report.figures_time import shape_plate
 from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.report.signals import Signal
@@ -87,6 +88,25 @@ def test_charts_have_the_numbers_of_the_bag(window: Browser, flight: Flight) -> 
     k = int(np.argmin(np.abs(flight.position.time - 4.0)))
     for value in flight.position.values[k]:
         assert f"{float(f'{value:.4g}'):g}"[:5] in words
+
+
+def test_events_of_one_kind_at_once_are_counted(tmp_path: Path) -> None:
+    faults = ("joint_slow j 0.5 at 1", "actuator_bias j 0.01 at 1", "joint_stuck j at 2")
+    events = [
+        (float(fault[-1]), {"event": "fault_injected", "time": fault[-1], "fault": fault})
+        for fault in faults
+    ]
+    events += [(1.0, {"event": "stuck_joint", "time": "1", "joints": "j"})]
+    story = Story(np.zeros((60, 3)), events=sorted(events, key=lambda event: event[0]))
+    flight = read_flight(tell(tmp_path / "faults.mcap", story))
+    plate = shape_plate(flight)
+    data = charts_of(flight, [plate]).data["charts"]["events"]
+    assert [event["text"] for event in data] == [
+        "fault on: joint_slow j 0.5 at 1",
+        "fault on: actuator_bias j 0.01 at 1 (+1)",
+        "stuck joint: j",
+        "fault on: joint_stuck j at 2",
+    ]
 
 
 @with_browser

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from support.flight_bags import TICK, cyclic_shapes, rates_of
@@ -9,6 +12,7 @@ from support.flight_bags import TICK, cyclic_shapes, rates_of
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.report.figures_shape import _signed_area
+from spacerobot_ros.report.figures_space import _instants
 from spacerobot_ros.report.signals import Cycles, Signal, envelope, find_cycles, rotvecs
 from spacerobot_ros.report.solids import Canvas, Edge, Face, View
 
@@ -85,6 +89,18 @@ def test_change_is_since_the_first_sample_of_a_window() -> None:
     part = Signal(np.array([0.0, 1.0, 2.0]), values).between(1.0, 2.0).since_first()
     np.testing.assert_array_equal(part.values, [[0.0, 0.0], [3.0, 2.0]])
     np.testing.assert_array_equal(part.time, [1.0, 2.0])
+
+
+def test_the_robot_is_drawn_at_six_instants_though_it_rests_at_the_end() -> None:
+    def flight(joints: Array) -> Any:
+        still = Signal(np.linspace(0.0, 1.0, len(joints)), np.zeros((len(joints), 3)))
+        return SimpleNamespace(position=still, attitude=still, joints=joints, cycles=None)
+
+    moving = np.arange(101.0)[:, np.newaxis] * [0.5, -0.25, 0.125]
+    rest = np.repeat(moving[-1:], 40, axis=0)
+    found = _instants(flight(np.vstack([moving, rest])))
+    np.testing.assert_allclose(found, [0, 20, 40, 60, 80, 140], atol=1)
+    assert _instants(flight(rest)) == [39]
 
 
 def test_areas_are_positive_counter_clockwise() -> None:

@@ -25,7 +25,7 @@ def leave_blank(patch: pytest.MonkeyPatch) -> None:
 class Page(HTMLParser):
     """A parsed report: its tables as rows of cells, its figures as SVG, all text and attributes."""
 
-    _VOID = ("meta", "link", "img", "input", "br")
+    _VOID = ("meta", "link", "img", "input", "br", "wbr")
 
     def __init__(self, text: str) -> None:
         super().__init__()

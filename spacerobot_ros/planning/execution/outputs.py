@@ -114,3 +114,8 @@ class OutputQueue:
                 notes={} if schedule is None else schedule.notes,
             )
         )
+
+
+def gait_by(method: str) -> str:
+    """Return what a method has made, such as "an optimal gait", for sentences."""
+    return f"{'an' if method[:1] in tuple('aeiou') else 'a'} {method} gait"

@@ -9,7 +9,7 @@ from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Toler
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
-from spacerobot_ros.planning.execution.outputs import OutputQueue, Pursuit, Severity
+from spacerobot_ros.planning.execution.outputs import OutputQueue, Pursuit, Severity, gait_by
 from spacerobot_ros.planning.execution.state_machine import PlanReason
 from spacerobot_ros.planning.execution.take_over import TakeOver
 from spacerobot_ros.planning.execution.tracker import TrackingError
@@ -122,7 +122,7 @@ class PlanDesk:
             method, duration = result.schedule.method, result.schedule.duration
             self._out.happened(
                 EventKind.PLAN_READY,
-                f"The plan is a {method} gait of {duration:.6g} s.",
+                f"The plan is {gait_by(method)} of {duration:.6g} s.",
                 ticket.identified,
                 method=method,
                 duration_s=f"{duration:.9g}",

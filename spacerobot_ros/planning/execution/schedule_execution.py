@@ -20,6 +20,7 @@ from spacerobot_ros.planning.execution.outputs import (
     Pursuit,
     ScheduleStart,
     Severity,
+    gait_by,
 )
 from spacerobot_ros.planning.execution.plan_desk import PlanDesk, ReadyPlan
 from spacerobot_ros.planning.execution.state_average import StateAverage
@@ -186,11 +187,10 @@ class ScheduleExecution:
             self._go(Event.PLANNED, Phase.EXECUTING)
         else:
             self._go(Event.TAKEN_OVER, Phase.EXECUTING)
-        article = "an" if schedule.method[:1] in tuple("aeiou") else "a"
         from_where = "" if start_ns is None else ", which begins in motion"
         self._out.report(
             PlannerState.EXECUTING,
-            f"Executing {article} {schedule.method} gait of {schedule.duration:.6g} s{from_where}.",
+            f"Executing {gait_by(schedule.method)} of {schedule.duration:.6g} s{from_where}.",
             pursuit.identified,
             pursuit,
             remaining,
