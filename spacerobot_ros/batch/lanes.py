@@ -308,7 +308,7 @@ class _Block:
             bias_row=rows.first("joint_bias"),
             noise_row=rows.first("joint_noise"),
             n=n,
-            noisy=flights.sensors is not None,
+            noisy=self._noise.commanded_by,
             gain=0.0,
             deadband=0.0,
             instants=pointer(instants),
@@ -376,7 +376,6 @@ class _Block:
         # A tick of no duration under no command reports the start.
         driver.start(job)
         self._set("h", np.full(len(self._rows_of_lanes), flights.control_period))
-        whole = self._tick.controller is not None
         alive = self._memory[:, self._rows.first("alive")]
         for begin in range(0, flights.ticks, _CHUNK_TICKS):
             if not alive.any():
@@ -384,7 +383,7 @@ class _Block:
             end = min(begin + _CHUNK_TICKS, flights.ticks)
             # The state at the end is measured too.
             last = end + (end == flights.ticks)
-            normals = self._noise.drawn(begin, last, alive, whole)
+            normals = self._noise.drawn(begin, last, alive)
             if normals is not None:
                 job.normals = normals.ctypes.data
                 job.normals_from, job.normals_ticks, job.normals_width = begin, *normals.shape[1:3]
@@ -514,6 +513,7 @@ class _Noise:
 
     def __init__(self, flights: Flights, rows: Counts) -> None:
         self._errors: SensorErrors | None = flights.sensors
+        self._whole = isinstance(flights.program, Controlled)
         self._instants = flights.instants
         self._n = flights.robot.n
         self._rows = rows
@@ -526,24 +526,39 @@ class _Noise:
         ]
         self._at_instants = np.zeros((len(rows), len(self._instants), 12 + 2 * self._n))
 
-    def drawn(self, begin: int, end: int, alive: Array, whole: bool) -> Array | None:
+    @property
+    def commanded_by(self) -> bool:
+        """Whether commands follow from what is measured with errors: schedules look at joints."""
+        errors = self._errors
+        if errors is None:
+            return False
+        joints = errors.noise[self._rows, 4].any() or errors.joint_bias[self._rows].any()
+        return bool(self._whole or joints)
+
+    def drawn(self, begin: int, end: int, alive: Array) -> Array | None:
         """Draw for the states at the ticks from ``begin`` to before ``end``; return what falls to
-        joint positions, (groups, ticks, n, lanes), or where ``whole`` to everything. None where
-        nothing errs. ``alive`` (groups, lanes): others need none any more.
+        joint positions, (groups, ticks, n, lanes), or with a controller to everything. None where
+        no command follows from it. ``alive`` (groups, lanes): others need none any more.
         """
         if self._errors is None:
             return None
         ticks, width = end - begin, 12 + 2 * self._n
-        columns = slice(0, width) if whole else slice(12, 12 + self._n)
-        kept = np.zeros((len(self._rows), ticks, columns.stop - columns.start))
+        columns = slice(0, width) if self._whole else slice(12, 12 + self._n)
+        kept = None
+        if self.commanded_by:
+            kept = np.zeros((len(self._rows), ticks, columns.stop - columns.start))
         chosen = [(i, tick - begin) for i, tick in enumerate(self._instants) if begin <= tick < end]
+        drawn = np.empty((ticks, width))
         for index, generator in enumerate(self._generators):
             if generator is None or not alive.flat[index]:
                 continue
-            drawn = generator.standard_normal((ticks, width))
-            kept[index] = drawn[:, columns]
+            generator.standard_normal(out=drawn)
+            if kept is not None:
+                kept[index] = drawn[:, columns]
             for instant, tick in chosen:
                 self._at_instants[index, instant] = drawn[tick]
+        if kept is None:
+            return None
         grouped = kept.reshape(-1, alive.shape[1], *kept.shape[1:])
         return np.ascontiguousarray(np.moveaxis(grouped, 1, 3))
 
