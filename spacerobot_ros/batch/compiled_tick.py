@@ -100,6 +100,7 @@ class CompiledTick:
             parameters = [each for each in given if not each[0].startswith("gains.")]
             believed = program.robot or flights.robot
             key = (*key, believed, repr(parameters), repr(program.config.motion))
+            key = (*key, _count(flights))
         if key not in model.derived:
             model.derived[key] = cls._new(flights, model)
         found: CompiledTick = model.derived[key]
@@ -128,4 +129,9 @@ class CompiledTick:
         control = controller.function()
         sizes |= {name: control.nnz_in(i) for i, name in enumerate(CONTROL_INPUTS)}
         sizes |= {name: control.nnz_out(i) for i, name in enumerate(CONTROL_OUTPUTS)}
-        return cls(Driver(flight, report, control), layout, sizes, controller)
+        driver = Driver(flight, report, control, _count(flights))
+        return cls(driver, layout, sizes, controller)
+
+
+def _count(flights: Flights) -> int:
+    return 0 if flights.thrusters is None else len(flights.thrusters.names)

@@ -12,7 +12,7 @@ enum Program { HELD = 0, FOLLOWED = 1, CONTROLLED = 2 };
 
 enum Decision { NONE = 0, REACHED = 1, FAILED = 2, LOST = 3 };  // about the goal of a controller
 
-enum Pending { NOTHING = 0, COMMIT = 1, TICK = 2 };
+enum Pending { NOTHING = 0, COMMIT = 1, TICK = 2, FIRE = 3 };
 
 struct Job {
   V *memory;               // groups x rows
@@ -58,6 +58,11 @@ struct Job {
   V *ended;                // (groups, report rows): the state at the end
   // CONTROLLED: momenta as they are and as thrust explains them; the largest change of either.
   long long momentum_row, expected_row, first_momenta_row, drift_row;
+  // Thrusters: by thruster what is solved for it (7) and its wrench (6); weights (6) of a wrench;
+  // shortest pulses, s, and flows, kg/s. Rows of the wanted wrench and of the modulation.
+  const double *thruster_matrix, *thruster_wrenches, *thruster_weights;
+  const double *thruster_shortest, *thruster_flow;
+  long long wanted_row, owed_row, left_row, on_row, levels_row, unallocated_row, propellant_row;
 };
 
 static bool any(V flags) {
@@ -171,6 +176,8 @@ static void command(const Job &job, long long g, long long tick, V *group) {
     }
   }
 }
+
+#include "thrusters.hpp"
 
 #ifdef CONTROL
 // Decide about the goals of a group, by the errors of the command at a tick.
@@ -311,11 +318,19 @@ extern "C" long long fly_until(const Job *job, long long until) {
     while (job->at[g] < until && any(group[job->alive_row])) {
       const long long tick = job->at[g];
 #ifdef CONTROL
-      if (job->pending[g] != TICK && control(*job, g, tick, group)) {
+      if (job->pending[g] != TICK && job->pending[g] != FIRE && control(*job, g, tick, group)) {
         job->pending[g] = TICK;
         ++waiting;
         break;
       }
+#if THRUSTERS > 0
+      if (job->pending[g] != FIRE && allocate(*job, group)) {
+        job->pending[g] = FIRE;
+        ++waiting;
+        break;
+      }
+      fire(*job, group);
+#endif
       job->pending[g] = NOTHING;
       evaluate(*job, group, true);
 #else

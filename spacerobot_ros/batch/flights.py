@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.laws.law import Gains
+from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -302,6 +303,8 @@ class Flights:
     instants
         Ticks after which the state is reported, ascending, 0 the start; the last is the end unless
         given.
+    thrusters
+        What gives a controller's wrench, in pulses; None: it is given as it is commanded.
 
     Raises
     ------
@@ -321,6 +324,7 @@ class Flights:
     sensors: SensorErrors | None = None
     integration_step: float = 0.0
     instants: tuple[int, ...] = field(default=())
+    thrusters: ThrusterTable | None = None
 
     def __post_init__(self) -> None:
         count, robot = len(self), self.robot
@@ -354,6 +358,8 @@ class Flights:
 
     def _require_program(self) -> None:
         count, n = len(self), self.robot.n
+        if self.thrusters is not None and not isinstance(self.program, Controlled):
+            raise ParameterError("Thrusters give the wrench of a controller only.")
         match self.program:
             case FollowedSchedule(positions=positions):
                 if self.actuation != "velocity":
@@ -424,9 +430,11 @@ class BatchResult:
     peak_effort
         (N, n) largest effort of a joint in a tick, N or N m; zero under velocity actuation.
     peak_wrench
-        (N, 2) largest force (N) and torque (N m) on the base.
+        (N, 2) largest force (N) and torque (N m) that were commanded on the base.
     impulse
-        (N, 2) integrals of the sizes of force (N s) and torque (N m s) over time.
+        (N, 2) integrals of the sizes of these over time, N s and N m s.
+    propellant
+        (N,) what thrusters have used, kg; NaN without.
     limited
         (N, n) ticks in which each joint was limited, by what limited it, as the plant counts.
     fallback_ticks
@@ -468,6 +476,7 @@ class BatchResult:
     peak_effort: Array
     peak_wrench: Array
     impulse: Array
+    propellant: Array
     limited: Mapping[str, Counts]
     fallback_ticks: Counts
     reached_time: Array
@@ -505,6 +514,7 @@ class BatchResult:
             peak_effort=np.zeros((N, n)),
             peak_wrench=np.zeros((N, 2)),
             impulse=np.zeros((N, 2)),
+            propellant=np.full(N, np.nan if flights.thrusters is None else 0.0),
             limited={name: np.zeros((N, n), np.int64) for name in (first, "stroke")},
             fallback_ticks=np.zeros(N, np.int64),
             reached_time=np.full(N, np.nan),

@@ -5,6 +5,8 @@
 #include <math.h>
 #include <stdlib.h>
 
+#include <algorithm>
+
 typedef double Numbers __attribute__((vector_size(8 * LANES)));
 typedef long long Bits __attribute__((vector_size(8 * LANES)));
 

@@ -35,6 +35,7 @@ from spacerobot_ros.batch.native import Job, Span
 from spacerobot_ros.batch.scalar import fly_one_by_one, plant_of
 from spacerobot_ros.control.executive import LOST_STATES
 from spacerobot_ros.control.reference import ReferenceProfile
+from spacerobot_ros.control.thrusters import ThrusterModulator
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.compilation import NoLibraryError
 from spacerobot_ros.model.description import Array
@@ -54,8 +55,8 @@ _CHUNK_TICKS = 2000
 
 _HELD, _FOLLOWED, _CONTROLLED = 0, 1, 2
 
-_COMMIT, _TICK = 1, 2
-"""What a group waits for: to commit a tick, or to take one."""
+_COMMIT, _TICK, _FIRE = 1, 2, 3
+"""What a group waits for: to commit a tick, to take one, or to fire thrusters."""
 
 _PROGRAMS = {HeldCommands: _HELD, FollowedSchedule: _FOLLOWED, Controlled: _CONTROLLED}
 
@@ -169,6 +170,10 @@ class _Block:
         self._rows_of_lanes = np.concatenate([rows, np.repeat(rows[-1:], wanted - len(rows))])
         n = flights.robot.n
         effort = flights.actuation == "effort"
+        self._modulator = None
+        if flights.thrusters is not None:
+            self._modulator = ThrusterModulator(flights.thrusters, flights.control_period)
+        thrusters = 0 if flights.thrusters is None else len(flights.thrusters.names)
         self._rows = rows_ = _Rows(
             {
                 **{"measured": n, "normals": 0, "time": 0, "since": 0, "begun": 0},
@@ -178,7 +183,8 @@ class _Block:
                 **{"limits": n if effort else 2 * n, "peak_rate": n, "peak_effort": n},
                 **{"peak_wrench": 2, "impulse": 2, "lowest": n, "highest": n},
                 **{"wild_count": 2, "decision": 1, "decided": 1, "decided_errors": 3, "ended": 1},
-                **{"first_momenta": 6, "drift": 2},
+                **{"first_momenta": 6, "drift": 2, "propellant": 1, "unallocated": 1},
+                **{"wanted": 6, "owed": 6, "left": thrusters, "on": thrusters, "levels": thrusters},
             }
         )
         self._memory = _aligned((self._groups, rows_.count, self._lanes))
@@ -292,7 +298,7 @@ class _Block:
             peak_count=len(peaks),
             stop_row=rows.first("limited", 1 + n) if effort else -1,
             alive_row=rows.first("alive"),
-            wrench_row=rows.first("realised", n) if effort else -1,
+            wrench_row=self._commanded_wrench() if effort else -1,
             wrench_peak_row=rows.first("peak_wrench"),
             impulse_row=rows.first("impulse"),
             period=flights.control_period,
@@ -335,11 +341,32 @@ class _Block:
             last_tick=-1 if self._tick.controller is None else self._tick.controller.last_tick,
             ends=isinstance(program, Controlled) and program.until_decided,
             expected_row=rows.first("next_state", 2 * n + 4),
+            **{
+                f"{name}_row": rows.first(name)
+                for name in ("wanted", "owed", "left", "on", "levels", "unallocated", "propellant")
+            },
+            **{f"thruster_{name}": pointer(x) for name, x in self._thruster_numbers().items()},
         )
         if isinstance(program, FollowedSchedule):
             job.gain = min(program.shape_gain, 1.0 / flights.control_period)
             job.deadband = program.deadband
         return job, kept
+
+    def _commanded_wrench(self) -> int:
+        """Return the row where the wrench begins that is commanded."""
+        if self._modulator is not None:
+            return self._rows.first("wanted")
+        return self._rows.first("realised", self._flights.robot.n)
+
+    def _thruster_numbers(self) -> dict[str, Array]:
+        """Return what the driver knows of thrusters, by the ends of its names."""
+        modulator = self._modulator
+        if modulator is None:
+            return {}
+        matrix, weights = modulator.allocation.problem
+        numbers = {"matrix": matrix.T, "wrenches": modulator.table.wrenches.T, "weights": weights}
+        numbers |= {"shortest": modulator.table.min_on_time, "flow": modulator.table.mass_flow}
+        return {name: np.ascontiguousarray(x, dtype=float) for name, x in numbers.items()}
 
     def _table(self) -> Array:
         """Return commands (ticks, width), or (groups, ticks, width, lanes) where they differ."""
@@ -409,12 +436,17 @@ class _Block:
         self._set("bounds", np.array([bounds for _, bounds in begun]))
 
     def _help(self, result: BatchResult, failures: dict[int, str]) -> None:
-        """Do what lanes that wait cannot: give a command, or take a tick of the scalar plant."""
+        """Do what lanes that wait cannot: give a command, allocate it to thrusters, or take a tick
+        of the scalar plant.
+        """
         rows, alive = self._rows, self._rows["alive"]
+        kinds = {
+            _COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._take),
+            _TICK: (rows["exact"].start, self._command),
+            _FIRE: (rows["unallocated"].start, self._allocate),
+        }
         for group in np.flatnonzero(self._pending):
-            stop = rows.first("limited", 1 + self._flights.robot.n)
-            waits = stop if self._pending[group] == _COMMIT else rows.first("exact")
-            help_lane = self._take if self._pending[group] == _COMMIT else self._command
+            waits, help_lane = kinds[int(self._pending[group])]
             lanes = (self._memory[group, waits] != 0.0) & (self._memory[group, alive][0] != 0.0)
             for lane in np.flatnonzero(lanes):
                 index = int(group * self._lanes + lane)
@@ -436,6 +468,19 @@ class _Block:
         self._memory[group, self._rows["command"], lane] = command
         if index < len(self._flown):
             result.fallback_ticks[row] += 1
+
+    def _allocate(self, group: int, lane: int, index: int, result: BatchResult) -> None:
+        modulator, period = self._modulator, self._flights.control_period
+        assert modulator is not None
+        memory = {
+            name: self._memory[group, self._rows[name], lane]
+            for name in ("owed", "wanted", "left", "levels")
+        }
+        outstanding = memory["owed"] + period * memory["wanted"]
+        most = modulator.table.min_on_time + period - memory["left"]
+        memory["levels"][:] = modulator.allocation.allocate(outstanding, most).levels
+        if index < len(self._flown):
+            result.fallback_ticks[self._rows_of_lanes[index]] += 1
 
     def _take(self, group: int, lane: int, index: int, result: BatchResult) -> None:
         row, n = int(self._rows_of_lanes[index]), self._flights.robot.n
@@ -474,6 +519,8 @@ class _Block:
             result.limited["stroke"][rows] = limits[:, n:]
         for name in ("lowest", "highest"):
             getattr(result, name)[rows] = self._get(name)[:count]
+        if self._modulator is not None:
+            result.propellant[rows] = self._get("propellant")[:count, 0]
         if self._tick.controller is not None:
             self._write_decisions(result, rows)
         pose, q = self._noise.measured(result.pose[rows], result.q[rows])

@@ -114,6 +114,10 @@ class Job(ctypes.Structure):
         *((name, _WHOLE) for name in ("lost_states", "last_tick", "ends", "ended_row")),
         ("ended", _POINTER),
         *((f"{name}_row", _WHOLE) for name in ("momentum", "expected", "first_momenta", "drift")),
+        *((f"thruster_{name}", _POINTER) for name in ("matrix", "wrenches", "weights")),
+        *((f"thruster_{name}", _POINTER) for name in ("shortest", "flow")),
+        *((f"{name}_row", _WHOLE) for name in ("wanted", "owed", "left", "on", "levels")),
+        *((f"{name}_row", _WHOLE) for name in ("unallocated", "propellant")),
     ]
 
 
@@ -126,6 +130,8 @@ class Driver:
         The tick with the results that every tick needs, and with those of reports as well.
     control
         The command for a state; None: it follows from tables.
+    thrusters
+        How many give its wrench; 0: it is given as it is commanded.
 
     Raises
     ------
@@ -134,11 +140,15 @@ class Driver:
     """
 
     def __init__(
-        self, flight: ca.Function, report: ca.Function, control: ca.Function | None = None
+        self,
+        flight: ca.Function,
+        report: ca.Function,
+        control: ca.Function | None = None,
+        thrusters: int = 0,
     ) -> None:
         self.unit = vector_unit()
         functions = [flight, report] if control is None else [flight, report, control]
-        self._library = _library(functions, self.unit)
+        self._library = _library(functions, self.unit, thrusters)
         self._start = self._library.start_flights
         self._fly = self._library.fly_until
         for function in (self._start, self._fly):
@@ -162,25 +172,28 @@ class Driver:
         return int(self._fly(ctypes.byref(job), tick))
 
 
-def _library(functions: Sequence[ca.Function], unit: VectorUnit) -> ctypes.CDLL:
+def _library(functions: Sequence[ca.Function], unit: VectorUnit, thrusters: int) -> ctypes.CDLL:
     """Return the library, with the vector functions of the C library if it has them."""
     try:
-        return _compiled(functions, unit, unit.libmvec)
+        return _compiled(functions, unit, unit.libmvec, thrusters)
     except NoLibraryError:
         if not unit.libmvec:
             raise
-        return _compiled(functions, unit, "")
+        return _compiled(functions, unit, "", thrusters)
 
 
-def _compiled(functions: Sequence[ca.Function], unit: VectorUnit, libmvec: str) -> ctypes.CDLL:
+def _compiled(
+    functions: Sequence[ca.Function], unit: VectorUnit, libmvec: str, thrusters: int
+) -> ctypes.CDLL:
     renamed = [_renamed(function, f"vector_{function.name()}") for function in functions]
     body = _SELECTION.sub(r"where(\1,\2)", vector_source(renamed, "V"))
-    parts = [_definitions(functions, unit, libmvec), _file("lanes.hpp"), body]
+    parts = [_definitions(functions, unit, libmvec, thrusters), _file("lanes.hpp"), body]
     parts += [
         f"#define {name} {function.name()}"
         for name, function in zip(("FLIGHT", "REPORT", "CONTROL"), renamed, strict=False)
     ]
-    parts += [_file("driver.hpp"), *(_trial(function) for function in functions)]
+    driver = _file("driver.hpp").replace('#include "thrusters.hpp"\n', _file("thrusters.hpp"))
+    parts += [driver, *(_trial(function) for function in functions)]
     # Vectors as arguments between functions of this file: no other is called with them.
     flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *unit.flags)
     libraries = ("-lmvec",) if libmvec else ()
@@ -194,8 +207,11 @@ def _renamed(function: ca.Function, name: str) -> ca.Function:
     return ca.Function(name, inputs, outputs, function.name_in(), function.name_out())
 
 
-def _definitions(functions: Sequence[ca.Function], unit: VectorUnit, libmvec: str) -> str:
+def _definitions(
+    functions: Sequence[ca.Function], unit: VectorUnit, libmvec: str, thrusters: int
+) -> str:
     numbers = {
+        "THRUSTERS": thrusters,
         "LANES": unit.lanes,
         "WORK_SIZE": max(function.sz_w() for function in functions) + 1,
         "ARGUMENT_POINTERS": max(function.sz_arg() for function in functions) + 1,

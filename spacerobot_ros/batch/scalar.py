@@ -26,10 +26,10 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.tracker import ScheduleFollower
 from spacerobot_ros.simulation.building import PLANTS
 from spacerobot_ros.simulation.config import SensorConfig
-from spacerobot_ros.simulation.effort_plant import EffortPlant
 from spacerobot_ros.simulation.faults import FaultyPlant
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import Sensors
+from spacerobot_ros.simulation.thrusters import ThrusterPlant
 
 
 def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> BatchResult:
@@ -54,11 +54,13 @@ def _fly(
     flights: Flights, row: int, result: BatchResult, controller: BatchController | None
 ) -> None:
     plant = plant_of(flights, row)
-    assert controller is None or isinstance(plant, EffortPlant)
+    thrusters = None
+    if flights.thrusters is not None:
+        plant = thrusters = ThrusterPlant(plant, flights.control_period, flights.thrusters)
     config = SensorConfig() if flights.sensors is None else flights.sensors.config(row)
-    faulty = FaultyPlant(plant, (), flights.control_period, wrench=isinstance(plant, EffortPlant))
+    faulty = FaultyPlant(plant, (), flights.control_period, wrench=flights.actuation == "effort")
     sensors = Sensors(faulty, config, flights.control_period)
-    control = None if controller is None else _Control(controller, row, result, plant)  # type: ignore[arg-type]
+    control = None if controller is None else _Control(controller, row, result, plant)
     commands: _Commands | _Control = control or _Commands(flights, row)
     last = flights.ticks
     wanted = iter(flights.instants)
@@ -73,14 +75,17 @@ def _fly(
             if tick == last:
                 result.end_tick[row] = tick
                 break
-            plant.step(*commands.at(tick, sensors if sensors.used else plant))
-            _account(plant, flights.control_period, result, row)
+            commanded = commands.at(tick, sensors if sensors.used else plant)
+            plant.step(*commanded)
+            _account(plant, commanded, flights.control_period, result, row)
             if control is not None:
                 control.watch_momenta()
                 if control.ends:
                     last = tick + 1
         if control is not None:
             result.end_state[row] = control.truth
+        if thrusters is not None:
+            result.propellant[row] = thrusters.propellant
     finally:
         for name, counts in plant.limit_counts.items():
             result.limited[name][row] = counts
@@ -134,7 +139,7 @@ class _Control:
     """What a controller commands in one flight, tick by tick, and what becomes of its goal."""
 
     def __init__(
-        self, controller: BatchController, row: int, result: BatchResult, plant: EffortPlant
+        self, controller: BatchController, row: int, result: BatchResult, plant: Plant
     ) -> None:
         self._controller, self._row, self._result, self._plant = controller, row, result, plant
         self._since: int | None = None
@@ -225,14 +230,16 @@ def _report(plant: Plant, sensors: Sensors, result: BatchResult, row: int, colum
         getattr(result, name)[row, column] = value
 
 
-def _account(plant: Plant, control_period: float, result: BatchResult, row: int) -> None:
+def _account(
+    plant: Plant, commanded: list[Array], control_period: float, result: BatchResult, row: int
+) -> None:
     """Take the peaks and integrals of a tick."""
     for name, value in (("peak_rate", plant.qdot), ("peak_effort", plant.effort)):
         peak = getattr(result, name)[row]
         np.maximum(peak, np.abs(value), out=peak)
     np.minimum(result.lowest[row], plant.q, out=result.lowest[row])
     np.maximum(result.highest[row], plant.q, out=result.highest[row])
-    if isinstance(plant, EffortPlant):
-        sizes = np.linalg.norm(plant.wrench.reshape(2, 3), axis=1)
+    if len(commanded) > 1:
+        sizes = np.linalg.norm(commanded[1].reshape(2, 3), axis=1)
         np.maximum(result.peak_wrench[row], sizes, out=result.peak_wrench[row])
         result.impulse[row] += control_period * sizes

@@ -21,6 +21,7 @@ from spacerobot_ros.campaign.one_by_one import node_robot, nominal_robots
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
+from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.arrays import Commands, FlightArrays, Outcome
 from spacerobot_ros.flight.scenario import Scenario
@@ -46,12 +47,18 @@ _STATES = {
 }
 
 
-def control_refusal(campaign: Campaign) -> str:
-    """Return why lanes cannot fly a campaign of coordinated control, as a clause; empty if so."""
+def control_refusal(campaign: Campaign, *, asked: bool) -> str:
+    """Return why lanes cannot fly a campaign of coordinated control, as a clause; empty if they do.
+
+    Thrusters that are on or off multiply rounding: of 1e-15 m at the start they make 1e-3 s at the
+    end. Flights in lanes are then not the very same, and are flown where they are ``asked`` for.
+    """
     scenario = campaign.scenario
     plant = scenario.plant
-    if plant.thrusters:
-        return "its thrusters are on or off"
+    if plant.thrusters and not asked:
+        return "its thrusters are on or off, which multiplies rounding: ask for lanes by name"
+    if plant.thrusters and plant.thrusters_excluded:
+        return "some of its thrusters are not used"
     if plant.beyond_limits != "clip":
         return "the plant refuses commands beyond limits"
     for dispersion in campaign.dispersions:
@@ -112,6 +119,7 @@ def _flights(campaign: Campaign, drawn: Sequence[DrawnFlight]) -> Flights:
     free = any(each.name.startswith(_FREE) for each in campaign.dispersions)
     gains = tuple(each.scenario.controller.gains for each in drawn) if free else ()
     nominal = InertialParameters.of(drawn[0].nominal)
+    table = find_thrusters(plant.thrusters, robot.description) if plant.thrusters else None
     return Flights(
         robot=robot,
         actuation="effort",
@@ -129,6 +137,7 @@ def _flights(campaign: Campaign, drawn: Sequence[DrawnFlight]) -> Flights:
         inertial=InertialParameters.stacked([each.inertial or nominal for each in drawn]),
         sensors=SensorErrors.of(robot, [config.sensors for config in configs]),
         integration_step=plant.integration_step,
+        thrusters=table,
     )
 
 
@@ -174,6 +183,9 @@ def _flight(
     force, torque = result.peak_wrench[row].tolist()
     linear, angular = result.momentum_drift[row].tolist()
     none = np.zeros(0, np.int64)
+    quantities = _end_effector(flights.robot, drawn, end)
+    if flights.thrusters is not None:
+        quantities["propellant"] = result.propellant[row].reshape(1, 1)
     return FlightArrays(
         scenario=drawn.scenario,
         robot=drawn.nominal,
@@ -188,7 +200,7 @@ def _flight(
         qdot=np.maximum(result.peak_rate[row], np.abs(flights.starts.qdot[row]))[np.newaxis],
         effort=result.peak_effort[row][np.newaxis],
         momentum=np.array([np.zeros(7), [linear, 0.0, 0.0, angular, 0.0, 0.0, 0.0]]),
-        quantities=_end_effector(flights.robot, drawn, end),
+        quantities=quantities,
         commands={
             "joint_commands": Commands(none, np.zeros((0, n))),
             "base_wrench": Commands(none, np.array([[force, 0.0, 0.0, torque, 0.0, 0.0]])),

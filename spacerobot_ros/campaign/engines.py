@@ -29,7 +29,7 @@ def chosen_engine(campaign: Campaign, wanted: str) -> Engine:
     """
     if wanted != "auto":
         engine = ALL[wanted]()
-        why = engine.refusal(campaign)
+        why = engine.refusal(campaign, asked=True)
         if why:
             raise SpaceRobotError(f"The engine '{wanted}' cannot fly this campaign: {why}")
         return engine

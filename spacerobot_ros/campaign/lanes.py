@@ -72,7 +72,7 @@ class LanesEngine:
         self._planner: tuple[PlannerConfig, str] | None = None
         """The planner's configuration of the last draw, mostly that of all, and its text."""
 
-    def refusal(self, campaign: Campaign) -> str:
+    def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
         """Return why not, as a clause."""
         why = self._flights.refusal(campaign)
         if why:
@@ -85,7 +85,7 @@ class LanesEngine:
             case ("planner",), "velocity":
                 return _tracking_refusal(campaign)
             case ("coordinated_control",), "effort":
-                return control_refusal(campaign)
+                return control_refusal(campaign, asked=asked)
         return "lanes have velocities of a planner, or efforts of coordinated control"
 
     def fly(

@@ -65,7 +65,7 @@ class FlightsEngine(_OneByOneEngine):
 
     name = "flights"
 
-    def refusal(self, campaign: Campaign) -> str:
+    def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
         """Return why not, as a clause."""
         try:
             require_flyable(campaign.scenario)
@@ -144,7 +144,7 @@ class RosEngine(_OneByOneEngine):
 
     name = "ros"
 
-    def refusal(self, campaign: Campaign) -> str:
+    def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
         """Return why not, as a clause."""
         return "it kills nodes on the way" if campaign.scenario.kills else ""
 

@@ -82,8 +82,12 @@ class Engine(Protocol):
     name: str
     least: int
 
-    def refusal(self, campaign: Campaign) -> str:
-        """Return why this engine cannot fly a campaign, as a clause; empty if it can."""
+    def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
+        """Return why this engine does not fly a campaign, as a clause; empty if it does.
+
+        ``asked``: it is named, not chosen; what it flies then may differ from other engines by more
+        than rounding.
+        """
 
     def fly(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]

@@ -84,6 +84,13 @@ class ThrusterAllocation:
         self._columns = self._matrix[:, usable]
         self._extended = np.vstack([self._columns, _THRIFT * self._cost[usable]])
 
+    @property
+    def problem(self) -> tuple[Array, Array]:
+        """What is solved for a wanted wrench: the matrix (7, m) of the levels, whose last row is
+        their cost, and the weights (6,) of the wrench on the other side.
+        """
+        return self._extended, self._weights
+
     def allocate(self, wanted: Array, most: Array) -> Allocation:
         """Return the levels (m,), each within ``most`` (m,), that make ``wanted`` (6,), or as much
         of it as they can.
@@ -161,9 +168,10 @@ class ThrusterModulator:
         count = len(table.names)
         # Numbers without rational relations: no sums of costs are equal either.
         favour = np.sin(np.arange(1.0, count + 1.0) ** 2)
-        self._allocation = ThrusterAllocation(
+        self.allocation = ThrusterAllocation(
             self._wrenches, table.mass_flow * (1.0 + _FAVOUR * favour)
         )
+        """How wrenches are distributed over the thrusters."""
         self._excluded: list[str] = []
         for name in excluded:
             self.exclude(name)
@@ -197,7 +205,7 @@ class ThrusterModulator:
         ParameterError
             There is no thruster of that name.
         """
-        self._allocation.exclude(self.table.index(name))
+        self.allocation.exclude(self.table.index(name))
         self._excluded.append(name)
 
     def reset(self) -> None:
@@ -222,7 +230,7 @@ class ThrusterModulator:
         """
         h, shortest = self._control_period, self._shortest
         wanted = self.owed + h * wrench
-        shares = self._allocation.allocate(wanted, shortest + h - self._left)
+        shares = self.allocation.allocate(wanted, shortest + h - self._left)
         self.unmet[:] = (wanted - shares.met) / h
         self.unmet_periods += bool(np.any(np.abs(self.unmet) > _UNMET))
         levels = np.where(shares.levels > _ROUNDING * h, shares.levels, 0.0)
