@@ -71,6 +71,12 @@ from spacerobot_ros.cli.options import PATH, json_option, write_json
     help="... and plan them with a library of the manoeuvres to N other goals, too.",
 )
 @click.option(
+    "--first-plans",
+    is_flag=True,
+    help="Instead: plan for robots of 7, 12 and 14 joints with an empty cache, and in the next "
+    "process; CPU time.",
+)
+@click.option(
     "--campaign",
     is_flag=True,
     help="Instead: thousands of flights in lanes against the plant's own tick and MuJoCo's rollout "
@@ -100,6 +106,7 @@ def command(
     goals: int | None,
     starts: int | None,
     library: int | None,
+    first_plans: bool,
     campaign: bool,
     json_file: Path | None,
     against: Path | None,
@@ -132,6 +139,10 @@ def command(
         from spacerobot_ros.benchmarks.planning import run_planning_benchmark
 
         figures = run_planning_benchmark(goals, against, starts, library, click.echo)
+    elif first_plans:
+        from spacerobot_ros.benchmarks.first_plans import run_first_plan_benchmark
+
+        figures = run_first_plan_benchmark(against, click.echo)
     elif against is not None:
         from spacerobot_ros.benchmarks.against import compare_checkouts
 

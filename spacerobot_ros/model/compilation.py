@@ -47,8 +47,9 @@ _LONG_FLAGS = ("-O0", *_COMMON_FLAGS)
 """For functions of ten thousands of operations: a tenth of the time to compile, half the speed,
 still seven times that of the virtual machine."""
 
-_WORTH_KEEPING = 20_000
-"""Operations from which on it takes longer to derive a function than to read it."""
+_WORTH_KEEPING = 5000
+"""Operations from which on it takes a tenth of a second to derive a function, ten times what it
+takes to read it."""
 
 _COMPILE_TIMEOUT = 120.0
 """Time that the compiler has for one function, s: ten times what the largest takes."""

@@ -211,7 +211,7 @@ def _interval(
     X_next, s_next, v_next = ca.SX.sym("X+", 4), ca.SX.sym("s+", n), ca.SX.sym("v+", n)
     h, direction = ca.SX.sym("h"), ca.SX.sym("direction", 3)
     z = ca.vertcat(h, X, s, v, a, X_next, s_next, v_next)
-    rotation, rotation_jac, rotation_hess = _rotation(robot)
+    rotation, (rotation_jac, rotation_hess) = _rotation(robot), _rotation_derivatives(robot)
 
     points = [_at(tau, s, h * v, h * v_next) for tau in GAUSS]
     rates = [rotation(point) for point in points]
@@ -284,16 +284,22 @@ def _at(tau: float, s: ca.SX, u: ca.SX, u_next: ca.SX) -> ca.SX:
     return ca.vertcat(s + (tau - 1 / 2) * u + tau**2 / 2 * change, u + tau * change)
 
 
-def _rotation(robot: SpaceRobot) -> tuple[ca.Function, ca.Function, ca.Function]:
-    """Return the base's rotation ``w = -D^-1 D_q u`` (3,) of ``[q; u]``, Jacobian and Hessian.
+def _rotation(robot: SpaceRobot) -> ca.Function:
+    """Return the base's rotation ``w = -D^-1 D_q u`` (3,) of ``[q; u]``."""
+    q, u = ca.SX.sym("q", robot.n), ca.SX.sym("u", robot.n)
+    D, D_q = robot.function("locked_inertia", compile=False)(q)
+    return ca.Function("rotation", [ca.vertcat(q, u)], [-solve_positive_definite(D, D_q @ u)])
 
-    The Hessian is that of ``mu' w``, by differentiating ``D w + D_q u = 0`` twice.
+
+def _rotation_derivatives(robot: SpaceRobot) -> tuple[ca.Function, ca.Function]:
+    """Return the Jacobian of the rotation w, and the Hessian of ``mu' w``.
+
+    By differentiating ``D w + D_q u = 0`` once and twice.
     """
     n = robot.n
-    locked_inertia = robot.function("locked_inertia", compile=False)
     q, u, w, mu = (ca.SX.sym(name, k) for name, k in (("q", n), ("u", n), ("w", 3), ("mu", 3)))
     point = ca.vertcat(q, u)
-    D, D_q = locked_inertia(q)
+    D, D_q = robot.function("locked_inertia", compile=False)(q)
     at = -solve_positive_definite(D, D_q @ u)
     momentum = D @ w + D_q @ u
     W = -solve_positive_definite(D, ca.jacobian(momentum, point))
@@ -303,7 +309,6 @@ def _rotation(robot: SpaceRobot) -> tuple[ca.Function, ca.Function, ca.Function]
     hessian = ca.hessian(weighted, point)[0] + mixed + mixed.T
     W, hessian = ca.substitute([W, hessian], [w, eta], [at, adjoint])
     return (
-        ca.Function("rotation", [point], [at]),
         ca.Function("rotation_jac", [point], [W]),
         ca.Function("rotation_hess", [point, mu], [hessian]),
     )
@@ -317,7 +322,7 @@ def magnus(first: ca.SX, second: ca.SX) -> ca.SX:
 def turn_function(robot: SpaceRobot) -> ca.Function:
     """Return ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step, base components."""
     q, u, u_next = (ca.SX.sym(name, robot.n) for name in ("q", "u", "u_next"))
-    rotation = _rotation(robot)[0]
+    rotation = _rotation(robot)
     rates = [rotation(_at(tau, q + u / 2, u, u_next)) for tau in GAUSS]
     return ca.Function("turn", [q, u, u_next], [ca.cse(magnus(*rates))])
 
