@@ -12,8 +12,8 @@ MOST_CPU = {7: 8.0, 12: 20.0, 14: 40.0}
 
 
 def test_a_first_plan_is_measured() -> None:
-    found = first_plans.first_plan(robot_file("planar_chain"))
-    assert found["joints"] == 2
+    found = first_plans.first_plan(robot_file("three_joint_arm"))
+    assert found["joints"] == 3
     assert 0 < found["plan_cpu_s"] < found["cpu_s"]
 
 
