@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -55,8 +56,35 @@ class SlowWorker(HeldWorker):
         return super().poll()
 
 
-def loop_of(robot: str, method: GaitMethod | None, **parameters: Any) -> Loop:
-    loop = Loop(
+class BalancedLoop(Loop):
+    """Holds the momentum of all bodies, by Pinocchio, against zero at every tick."""
+
+    largest = 0.0
+    """kg m/s and kg m^2/s about the origin of the base."""
+
+    def tick(self, count: int = 1, *, base: bool = True) -> None:
+        for _ in range(count):
+            super().tick(base=base)
+            self.largest = max(self.largest, float(np.abs(momentum(self.plant)).max()))
+
+
+@cache
+def oracle_of(model: SpaceRobot) -> PinocchioOracle:
+    urdf = (share_directory() / "urdf" / f"{model.description.name}.urdf").read_text("utf-8")
+    return PinocchioOracle(urdf, model.joint_names)
+
+
+def momentum(plant: VelocityPlant) -> Array:
+    """Return the momentum (6,) of all bodies by Pinocchio, from what the plant reports."""
+    oracle = oracle_of(plant.robot)
+    oracle.place(plant.q, plant.pose[3:], plant.pose[:3])
+    u = oracle.joint_velocities(plant.qdot)
+    u[:6] = plant.twist
+    return np.asarray((oracle.own_mass_matrix() @ u)[:6])
+
+
+def loop_of(robot: str, method: GaitMethod | None, **parameters: Any) -> BalancedLoop:
+    loop = BalancedLoop(
         {"method": "optimal", "optimal.cache": 0, **parameters},
         robot=robot,
         initial=InitialState(joint_positions=SHAPES[robot]),
@@ -106,23 +134,28 @@ def require_limits(loop: Loop, robot: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", sorted(SHAPES))
-def test_a_goal_that_is_changed_halfway_is_reached_without_a_stop(robot: str) -> None:
-    rng = np.random.default_rng(11)
-    method: GaitMethod | None = None
-    shares, stops = [], 0
-    for _ in range(10):
-        pair = goals(robot, rng)
-        stopping = loop_of(robot, method, takeover_time=0.0)
-        method = stopping.held._method
-        stop_and_go = flown(stopping, *pair)
-        moving = loop_of(robot, method, takeover_time=PLANNING_TIME[robot])
-        shares.append(flown(moving, *pair) / stop_and_go)
-        require_limits(moving, robot)
-        stops += any(t.target is Phase.BRAKING for t in moving.transitions)
-    print(robot, "time over that of stop and go:", np.round(shares, 3), "stops:", stops)
-    assert stops == 0
-    assert np.median(shares) < 0.78
+def test_a_goal_that_is_changed_halfway_is_reached_without_a_stop() -> None:
+    """Ten goals for each of two robots, against flights that stop before they are planned for."""
+    shares: dict[str, list[float]] = {}
+    began = time.process_time()
+    for robot in SHAPES:
+        rng = np.random.default_rng(11)
+        method: GaitMethod | None = None
+        for _ in range(10):
+            pair = goals(robot, rng)
+            stopping = loop_of(robot, method, takeover_time=0.0)
+            method = stopping.held._method
+            stop_and_go = flown(stopping, *pair)
+            moving = loop_of(robot, method, takeover_time=PLANNING_TIME[robot])
+            shares.setdefault(robot, []).append(flown(moving, *pair) / stop_and_go)
+            require_limits(moving, robot)
+            assert moving.largest < 1e-9
+            assert all(t.target is not Phase.BRAKING for t in moving.transitions)
+        print(robot, "time over that of stop and go:", np.round(shares[robot], 3))
+    medians = {robot: np.median(each).round(3) for robot, each in shares.items()}
+    of_all = np.median(list(shares.values()))
+    print(f"medians {medians}, of all {of_all:.3f}; {time.process_time() - began:.0f} s CPU")
+    assert of_all <= 0.75
 
 
 class NoisyState(PlantState):
@@ -248,18 +281,11 @@ def test_no_momentum_arises_where_a_plan_takes_over() -> None:
         loop.tick()
     loop.tick(loop.starts[0].schedule.ticks // 2)
     loop.propose(other)
-    model = robot_of(robot)
-    urdf = (share_directory() / "urdf" / f"{robot}.urdf").read_text("utf-8")
-    oracle, slowest = PinocchioOracle(urdf, model.joint_names), np.inf
+    slowest = np.inf
     for _ in range(25):
         loop.tick()
-        plant = loop.plant
-        oracle.place(plant.q, plant.pose[3:], plant.pose[:3])
-        u = oracle.joint_velocities(plant.qdot)
-        u[:6] = plant.twist
-        momentum = (oracle.own_mass_matrix() @ u)[:6]
-        assert np.abs(momentum).max() < 1e-9
-        slowest = min(slowest, np.abs(plant.qdot).max())
+        slowest = min(slowest, np.abs(loop.plant.qdot).max())
+    assert loop.largest < 1e-9
     assert len(loop.starts) == 2
     assert slowest > 0.1, "it never stops"
     require_limits(loop, robot)

@@ -156,8 +156,29 @@ def test_a_goal_that_is_refused_in_motion_is_planned_for_from_rest(
     loop.propose(OTHER)
     status = loop.until(PlannerState.REACHED)
     assert (status.goal_id, loop.error_to(OTHER)[0] < 1e-3) == ("goal-2", True)
-    assert any("planned for from rest, since in motion it is not: It" in n for n in loop.notices)
+    refusals = [n for n in loop.notices if "since in motion it is not: It is too far." in n]
+    assert ["once more, from a later tick" in n for n in refusals] == [True, False]
+    assert "planned for from rest" in refusals[1]
     assert "refused" not in loop.states
+
+
+def test_a_goal_that_is_refused_in_motion_is_planned_for_from_a_later_tick(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    loop = flying(ticks=80)
+    plan, asked = StubMethod.plan, []
+
+    def later_only(self: StubMethod, request: Any, *rest: Any) -> Any:
+        asked.append(len(loop.commands))
+        monkeypatch.setattr(stub_of(loop), "refusing", len(asked) == 1)
+        return plan(self, request, *rest)
+
+    monkeypatch.setattr(MovingStub, "plan", later_only)
+    loop.propose(OTHER)
+    assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
+    begins = [round(start.stamp_ns / TICK_NS) for start in loop.starts]
+    assert begins[1] == asked[1] + 2 * AHEAD
+    assert all(t.target is not Phase.BRAKING for t in loop.transitions)
 
 
 def test_a_goal_out_of_reach_leaves_the_earlier_one_as_it_is() -> None:

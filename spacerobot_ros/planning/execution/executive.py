@@ -408,8 +408,9 @@ class Executive(ScheduleExecution):
                 self._go(Event.PLANNED, Phase.TAKING_OVER)
             case PlanReason.IN_MOTION, Refused(reason=reason):
                 self._plan_again_for(ticket.identified)
-                self._in_motion.attempt_failed(for_good=True)
-                sentence = f"The goal is planned for from rest, since in motion it is not: {reason}"
+                self._in_motion.attempt_failed()
+                how = "once more, from a later tick" if self._in_motion.tries_again else "from rest"
+                sentence = f"The goal is planned for {how}, since in motion it is not: {reason}"
                 self._out.notice(Severity.WARNING, sentence)
                 self._go(Event.REFUSED, Phase.EXECUTING)
             case PlanReason.SHRINKING_HORIZON, Refused(reason=reason):

@@ -58,9 +58,14 @@ class InMotion:
         """Begin with a new goal: all attempts are left."""
         self._attempts = 0
 
-    def attempt_failed(self, *, for_good: bool = False) -> None:
-        """Note that a plan for the new goal was late; or, for good, that there is none."""
-        self._attempts = _MOST_ATTEMPTS if for_good else self._attempts + 1
+    def attempt_failed(self) -> None:
+        """Note that a plan for the new goal was late, or that there is none from its tick."""
+        self._attempts += 1
+
+    @property
+    def tries_again(self) -> bool:
+        """Whether an attempt is left: joints that brake at a limit, say, do not a little later."""
+        return self._attempts < _MOST_ATTEMPTS
 
     def begin_schedule(self, config: PlannerConfig, schedule: GaitSchedule, begins_ns: int) -> int:
         """Begin with a schedule; return how many measured poses are to be averaged meanwhile."""
@@ -73,7 +78,7 @@ class InMotion:
         self, config: PlannerConfig, pursuit: Pursuit | None, stamp_ns: int, q: Array
     ) -> TakeOver | None:
         """Return when a plan for a new goal takes over; None where it must begin at rest."""
-        if pursuit is None or self._attempts >= _MOST_ATTEMPTS or not self._able(config, pursuit):
+        if pursuit is None or not self.tries_again or not self._able(config, pursuit):
             return None
         return self._tracker.take_over(stamp_ns, q, config.takeover_time * 2**self._attempts)
 
