@@ -54,6 +54,8 @@ ROBOTS = {
     "dual_arm": "a servicing satellite with two arms",
 }
 
+OUT_OF_REACH = "out of reach by a long search"
+
 PERIOD = 0.05
 TOLERANCE = Tolerance(1e-3, 1e-3, 1e-3)
 
@@ -81,6 +83,8 @@ class Outcome:
     """What became of a goal.
 
     ``result`` is ``met``, ``missed`` (by the second integration), or the class of the refusal.
+    ``beyond`` is how far a position that was not found lies from the nearest one of a long search
+    for shapes, m; -1: there was none.
     """
 
     number: int
@@ -92,6 +96,7 @@ class Outcome:
     cpu: float = 0.0
     error: float = -1.0
     sentence: str = ""
+    beyond: float = -1.0
 
 
 def tasks(robot: SpaceRobot, count: int) -> Iterator[Task]:
@@ -128,6 +133,36 @@ def tasks(robot: SpaceRobot, count: int) -> Iterator[Task]:
                 moved = moved * rng.uniform(1.0, 6.0)
             goal = replace(goal, position=moved)
         yield Task(number, kind, size, state, goal)
+
+
+def out_of_reach(robot: SpaceRobot, task: Task, starts: int = 100) -> float:
+    """Return how far the position of a goal is from the nearest one that any shape brings, m.
+
+    Without thrust the centre of mass stays. The shapes are those to which a minimisation comes from
+    many random ones, which knows nothing of the planner's own search.
+    """
+    from scipy.optimize import minimize
+
+    turned, state = Rotation.from_quat(task.goal.quaternion), task.state
+    center = Rotation.from_quat(state.quaternion).apply(robot.center_of_mass(state.q))
+    wanted = turned.inv().apply(state.position + center - task.goal.position)
+    rng, scale = np.random.default_rng(task.number), float(np.linalg.norm(wanted)) + 1e-3
+
+    def beside(q: Array) -> float:
+        return float(np.sum((robot.center_of_mass(q) - wanted) ** 2)) / scale**2
+
+    lower, upper = shape_box(robot)
+    found = [
+        minimize(
+            beside,
+            rng.uniform(lower, upper),
+            method="L-BFGS-B",
+            bounds=list(zip(lower, upper, strict=True)),
+            options={"maxiter": 300, "ftol": 1e-15, "gtol": 1e-10},
+        ).fun
+        for _ in range(starts)
+    ]
+    return scale * float(np.sqrt(min(found)))
 
 
 def corners(positions: Array) -> Array:
@@ -261,7 +296,24 @@ def kept(name: str) -> list[Outcome]:
     if not file.is_file():
         return []
     lines = file.read_text("utf-8").splitlines()
-    return [Outcome(**json.loads(line)) for line in lines]
+    # What was looked at again stands below.
+    latest = {each.number: each for each in (Outcome(**json.loads(line)) for line in lines)}
+    return list(latest.values())
+
+
+def keep(name: str, outcome: Outcome) -> None:
+    """Keep what became of a goal."""
+    with (KEPT / f"{name}.jsonl").open("a", encoding="utf-8") as file:
+        file.write(json.dumps(asdict(outcome)) + "\n")
+
+
+def confirm(name: str, robot: SpaceRobot) -> None:
+    """Look for the positions that were not found by a long search of another kind."""
+    lost = {each.number: each for each in kept(name) if each.result == "not found"}
+    for task in tasks(robot, max(lost, default=-1) + 1):
+        outcome = lost.get(task.number)
+        if outcome is not None and task.kind == "position" and outcome.beyond < 0:
+            keep(name, replace(outcome, beyond=out_of_reach(robot, task)))
 
 
 def run(name: str, count: int) -> None:
@@ -273,14 +325,21 @@ def run(name: str, count: int) -> None:
         if task.number in done:
             continue
         outcome = trials.outcome(task)
-        with (KEPT / f"{name}.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(asdict(outcome)) + "\n")
+        keep(name, outcome)
         flown = f"{outcome.duration:.6g} s by {outcome.method}" if outcome.method else ""
         print(
             f"{name} {task.number + 1}/{count}: {task.kind}, {task.size:.3g} rad: {outcome.result} "
             f"{flown}{outcome.sentence} ({outcome.cpu:.1f} s CPU)",
             flush=True,
         )
+    confirm(name, trials.robot)
+
+
+def classes(outcomes: Sequence[Outcome]) -> Counter[str]:
+    """Return how many goals came to what; positions that no search reaches count apart."""
+    return Counter(
+        OUT_OF_REACH if each.beyond > TOLERANCE.position else each.result for each in outcomes
+    )
 
 
 def row(name: str, count: int) -> dict[str, Any] | None:
@@ -290,7 +349,7 @@ def row(name: str, count: int) -> dict[str, Any] | None:
         return None
     robot = SpaceRobot.from_file(robot_file(name))
     base = robot.description.bodies[0].inertia.mass
-    results = Counter(outcome.result for outcome in outcomes)
+    results = classes(outcomes)
     met = [outcome for outcome in outcomes if outcome.result == "met"]
     return {
         "robot": name,

@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from foreign_robots.run import ROBOTS, TABLE, TOLERANCE, Trials, integrated, tasks, worst_error
+from foreign_robots.run import (
+    OUT_OF_REACH,
+    ROBOTS,
+    TABLE,
+    TOLERANCE,
+    Outcome,
+    Trials,
+    classes,
+    integrated,
+    out_of_reach,
+    tasks,
+    worst_error,
+)
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.model import SpaceRobot
@@ -63,6 +76,31 @@ def test_tasks_are_the_same_every_time_and_of_all_kinds() -> None:
             one.goal.quaternion
         )
         assert turn.magnitude() == pytest.approx(one.size)
+
+
+def test_a_long_search_finds_the_positions_that_shapes_bring() -> None:
+    """The position of a shape is within reach; one far beyond the longest arm is not."""
+    robot = SpaceRobot.from_file(Path(robot_file("seven_joint_arm")))
+    task = next(each for each in tasks(robot, 12) if each.kind == "position")
+    lower, upper = robot.lower, robot.upper
+    shape = lower + 0.4 * (np.clip(upper, None, 3.0) - lower)
+    start, turned = task.state, Rotation.from_quat(task.goal.quaternion)
+    center = Rotation.from_quat(start.quaternion).apply(robot.center_of_mass(start.q))
+    within = center - turned.apply(robot.center_of_mass(shape))
+    for goal, nearest in ((within, 0.0), (within + 100 * center / np.linalg.norm(center), 99.0)):
+        asked = replace(task, goal=replace(task.goal, position=goal))
+        found = out_of_reach(robot, asked, starts=2)
+        assert found < 1e-4 if nearest == 0 else found > nearest
+
+
+def test_positions_that_no_search_reaches_are_counted_apart() -> None:
+    outcomes = [
+        Outcome(0, "position", 0.1, "not found", beyond=0.02),
+        Outcome(1, "position", 0.1, "not found", beyond=1e-5),
+        Outcome(2, "attitude", 0.1, "not found"),
+        Outcome(3, "attitude", 0.1, "met"),
+    ]
+    assert classes(outcomes) == {OUT_OF_REACH: 1, "not found": 2, "met": 1}
 
 
 @pytest.mark.slow
