@@ -378,7 +378,8 @@ def main() -> None:
         if given.fresh:
             (KEPT / f"{name}.jsonl").unlink(missing_ok=True)
         run(name, given.goals)
-    rows = [found for name in ROBOTS if (found := row(name, given.goals))]
+    earlier = {each["robot"]: each for each in json.loads(TABLE.read_text("utf-8"))}
+    rows = [row(name, given.goals) or earlier[name] for name in ROBOTS]
     print(json.dumps(rows, indent=1))
     if not given.no_table:
         TABLE.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
