@@ -116,9 +116,11 @@ def export(
     Raises
     ------
     RecordingError
-        There is something at ``path``, a file cannot be written, or a library is not installed.
+        There is something at ``path``, its name is that of another format, a file cannot be
+        written, or a library is not installed.
     """
     target = Path(path)
+    _require_suffix(target, format)
     if os.path.lexists(target):
         raise RecordingError(f"There is something at {target} already: name another place.")
     write = {
@@ -139,6 +141,19 @@ def export(
     except OSError as error:
         raise RecordingError(f"{target} cannot be written: {error.strerror}.") from error
     return Export(target, rows)
+
+
+def _require_suffix(target: Path, format: ExportFormat) -> None:
+    """Refuse names that say something else than what is made."""
+    suffix = target.suffix.lower()
+    if format is ExportFormat.MAT:
+        if suffix not in ("", ".mat"):
+            raise RecordingError(f"A file in MAT is called .mat, and not '{target.name}'.")
+    elif suffix in {f".{each.value}" for each in ExportFormat}:
+        raise RecordingError(
+            f"Tables in {format.value} are a folder with a file for each topic, which is not "
+            f"called '{target.name}'."
+        )
 
 
 def _place(made: Path, target: Path) -> None:

@@ -29,6 +29,7 @@ from spacerobot_ros.bag.rosbag2 import QosProfile
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.bag.tables import TopicTable, table_of
 from spacerobot_ros.errors import RecordingError, RobotDescriptionError
+from spacerobot_ros.resources import suggestion
 
 if TYPE_CHECKING:
     import pandas
@@ -137,7 +138,7 @@ class Bag:
         rows = self._overview()
         wide = max((len(row[0]) for row in rows), default=0)
         lines = [f"  {name:<{wide}}  {count:>7}  {kind}" for name, count, kind in rows]
-        return "\n".join([f"{self._headline()}:", *lines])
+        return "\n".join([f"{self._headline()}{':' if lines else ''}", *lines])
 
     def _repr_html_(self) -> str:
         rows = "".join(
@@ -357,6 +358,7 @@ class Bag:
         if not channels:
             raise RecordingError(
                 f"The bag {self.path} has no topic {topic}: it has {_listed(list(self.topics))}."
+                f"{suggestion(topic, [*self.topics, *(name[1:] for name in self.topics)])}"
             )
         if len({channel.schema_id for channel in channels}) > 1:
             raise RecordingError(f"The topic {topic} of the bag {self.path} has several types.")

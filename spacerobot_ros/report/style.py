@@ -100,7 +100,8 @@ def _use(path: Path) -> None:
     try:
         settings = mpl.rc_params_from_file(path, use_default_template=False)
     except (OSError, ValueError, KeyError) as error:
-        raise SpaceRobotError(f"The style file {path} cannot be read: {error}.") from error
+        why = getattr(error, "strerror", None) or error
+        raise SpaceRobotError(f"The style file {path} cannot be read: {why}.") from error
     finally:
         logger.removeFilter(said)
     if said.sentences:

@@ -261,6 +261,17 @@ def test_what_cannot_be_exported_leaves_nothing_behind(tmp_path: Path, bag: Bag)
     with pytest.raises(RecordingError, match="cannot be written"):
         export([], bag.path / "below", ExportFormat.CSV)
 
+    for name, kind, mention in (
+        ("flight.csv", ExportFormat.MAT, "A file in MAT is called .mat, and not 'flight.csv'."),
+        ("flight.xlsx", ExportFormat.MAT, "A file in MAT"),
+        ("flight.CSV", ExportFormat.CSV, "csv are a folder"),
+        ("flight.mat", ExportFormat.PARQUET, "parquet are a folder"),
+    ):
+        with pytest.raises(RecordingError) as refusal:
+            export([], tmp_path / name, kind)
+        assert_one_sentence(str(refusal.value), mention)
+        assert not (tmp_path / name).exists()
+
     def damaged() -> Iterator[TopicTable]:
         yield bag.table("events")
         raise RecordingError("damaged")
