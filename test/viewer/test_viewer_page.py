@@ -68,11 +68,15 @@ class Watched:
         return str(values.get(key, ""))
 
     def wait(self, topic: str, key: str, value: str) -> None:
-        self._harness.spin_until(
-            lambda: self.probe.count(topic) and self.value(topic, key) == value,
-            f"{key} of {topic} is {value}",
-            timeout=60.0,
-        )
+        try:
+            self._harness.spin_until(
+                lambda: self.probe.count(topic) and self.value(topic, key) == value,
+                f"{key} of {topic} is {value}",
+                timeout=60.0,
+            )
+        except AssertionError as error:
+            said = [each.message for each in self.probe.messages[topic][-3:]]
+            raise AssertionError(f"{error}; last it said {said}") from error
 
 
 def test_a_mission_is_flown_from_the_page(
