@@ -23,6 +23,9 @@ from spacerobot_ros.flight.recorded import recorded_flight
 from spacerobot_ros.flight.scenario import Scenario, scenario_text
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import BelievedRobotConfig, RobotConfig, robot_of
+from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.methods.registry import build_method
 
 
 class _OneByOneEngine(ABC):
@@ -96,7 +99,10 @@ class FlightsEngine(_OneByOneEngine):
 
 def robots_of(flight: DrawnFlight) -> Robots:
     """Return the models of a flight: built once for all draws that differ in masses alone."""
-    robots = nominal_robots(flight.scenario)
+    scenario = flight.scenario
+    robots = nominal_robots(scenario)
+    if "planner" in scenario.commanders:
+        robots = replace(robots, method=_method(robots.planner, scenario.planner))
     if flight.inertial is None:
         return robots
     weighing = node_robot("plant", flight).with_inertial(flight.inertial)
@@ -114,6 +120,23 @@ def nominal_robots(scenario: Scenario) -> Robots:
         return _built(node, text, config)
 
     return Robots.of(scenario, built)
+
+
+_METHODS: list[tuple[SpaceRobot, PlannerConfig, GaitMethod]] = []
+"""The method that was built last, if one was, for a robot and the configuration of its planner."""
+
+
+def _method(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
+    """Return the method of a planner: its solvers serve all flights, and no plan heeds another."""
+    for known, before, method in _METHODS:
+        if known is robot and (before is config or before == config):
+            return method
+    made = build_method(
+        *(config.method, robot, config.control_period, config.integration_step),
+        config.method_options,
+    )
+    _METHODS[:] = [(robot, config, made)]
+    return made
 
 
 def node_robot(node: str, flight: DrawnFlight) -> SpaceRobot:

@@ -44,6 +44,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.robot_source import RobotConfig, robot_from_text, robot_of
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
@@ -84,6 +85,8 @@ class Robots:
     controller: SpaceRobot
     description: RobotDescription | None = None
     """Of the plant, with the URDF that is recorded; None: as its model has it."""
+    method: GaitMethod | None = None
+    """What plans, for the planner's robot and configuration; None: it is built for this flight."""
 
     @classmethod
     def of(
@@ -221,7 +224,7 @@ class _LockstepFlight:
         commanders = scenario.commanders
         self._decider = commanders[0]
         if "planner" in commanders:
-            self._planner = _Planner(robots.planner, scenario.planner)
+            self._planner = _Planner(robots.planner, scenario.planner, robots.method)
         if "coordinated_control" in commanders:
             self._controller = _Controller(
                 robots.controller, scenario.controller, self._on_status, self._report_event
@@ -477,8 +480,9 @@ _DECISIONS = {
 class _Planner:
     """What a planner node does with states."""
 
-    def __init__(self, robot: SpaceRobot, config: PlannerConfig) -> None:
-        self.executive = Executive(robot, config, PlanningWorker(robot, config), GoalFile(""))
+    def __init__(self, robot: SpaceRobot, config: PlannerConfig, method: GaitMethod | None) -> None:
+        worker = PlanningWorker(robot, config, method)
+        self.executive = Executive(robot, config, worker, GoalFile(""))
         self._measured = _Measured()
 
     def answer(self, stamp_ns: int, q: Array, base: BaseMeasurement | None) -> None:
