@@ -119,6 +119,7 @@ def _figure(
         if both.size:
             ends = [both.min(), both.max()]
             panel.plot(ends, ends, color=INK, linewidth=0.8, linestyle=":")
+        panel.locator_params(nbins=5)
         panel.set_xlabel(f"{first.campaign.name}: {name}")
         panel.set_ylabel(second.campaign.name)
     return picture(figure, "pairs", "Every draw in both designs; dotted: no difference.")

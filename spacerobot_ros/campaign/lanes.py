@@ -20,7 +20,7 @@ from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.controlled_lanes import control_refusal, fly_controlled
 from spacerobot_ros.campaign.draws import Draw, drawn_flight
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, node_robot, robots_of
-from spacerobot_ros.campaign.rows import Row
+from spacerobot_ros.campaign.rows import LANES, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.arrays import Commands, FlightArrays, Outcome
@@ -63,7 +63,7 @@ class _Planned:
 class LanesEngine:
     """Many flights at once, on vector registers."""
 
-    name = "lanes"
+    name = LANES
     least = 64
 
     def __init__(self) -> None:

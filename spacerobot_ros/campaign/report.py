@@ -7,7 +7,7 @@ import io
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -45,6 +45,8 @@ _SHOWN = 6
 Flags = npt.NDArray[np.bool_]
 
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
+_TEXTS = ("outcome", "reason", "engine", "fallback", "versions")
 
 _ALWAYS = ("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "propellant_kg")
 
@@ -102,7 +104,7 @@ class Results:
         columns: dict[str, Any] = {}
         for name in table.column_names:
             values = table[name].to_pylist()
-            if name in ("outcome", "reason", "engine", "versions") or _is_text(values):
+            if name in _TEXTS or _is_text(values):
                 columns[name] = values
             else:
                 columns[name] = np.array([np.nan if v is None else v for v in values], dtype=float)
@@ -156,12 +158,10 @@ class Results:
                 known = indices[each.metric].get(each.cause)
                 if known is not None:
                     a, b, c, d = known
-                    each = Influence(
-                        each.cause, each.metric, each.correlation, each.p, (a, b), (c, d)
-                    )
+                    each = replace(each, first=(a, b), total=(c, d))
                 with_indices.append(each)
             found = with_indices
-        return sorted(found, key=lambda each: -abs(each.correlation))
+        return sorted(found, key=lambda each: -each.strength)
 
     def worst(self) -> list[int]:
         """Return the rows of the worst flights: those that were not flown or did not pass first."""
@@ -198,7 +198,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     lines = [f"success     {results.success}"]
     lines += [f"required    {c}: {results.requirement(c)}" for c in results.campaign.criteria]
     for each in results.influences()[:3]:
-        lines.append(f"driver      {each.cause} of {each.metric}: {each.correlation:+.2f}")
+        lines.append(f"driver      {each}")
     return lines
 
 
@@ -369,7 +369,12 @@ def _outcomes(results: Results) -> str:
         counts = Counter(re.sub(r"-?\d[\d.e+-]*", "…", reason) for reason in reasons)
         for sentence, count in counts.most_common(4):
             rows.append([outcome, f"{count}", sentence])
-    return table(["outcome", "flights", "sentence"], rows, "outcomes")
+    made = table(["outcome", "flights", "sentence"], rows, "outcomes")
+    left = Counter(text for text in results.columns.get("fallback", ()) if text)
+    if left:
+        counted = ", ".join(f"{text.rstrip('.')} ({count})" for text, count in left.most_common(6))
+        made += f'<p class="facts">Left to another engine: {escape(counted)}</p>'
+    return made
 
 
 def _percentiles(results: Results) -> str:
@@ -399,6 +404,7 @@ def _histograms(results: Results) -> str:
             for bound in (bounds[name].minimum, bounds[name].maximum):
                 if np.isfinite(bound) and abs(bound) < 10 * (np.abs(there).max() + 1e-12):
                     panel.axvline(bound, color=PALETTE[1], linewidth=1.5)
+        panel.locator_params(axis="x", nbins=6)
         panel.set_xlabel(named(name))
         panel.set_ylabel("flights")
     caption = (
@@ -414,13 +420,15 @@ def _drivers(results: Results, found: Sequence[Influence]) -> str:
     rows = []
     for each in found[:15]:
         cells = [each.cause, each.metric, f"{each.correlation:+.3f}", f"{each.p:.2g}"]
+        cells += [f"{each.departure:+.3f}", f"{each.p_departure:.2g}"]
         if sobol:
             for index in (each.first, each.total):
                 cells.append("" if index is None else f"{index[0]:.3f} ± {index[1]:.3f}")
         rows.append(cells)
-    head = ["drawn", "metric", "rank correlation", "p"]
+    head = ["drawn", "metric", "rank correlation", "p", "of the distance from the median", "p"]
     head += ["Sobol, first order", "Sobol, total"] if sobol else []
-    note = "Spearman's rank correlations, the strongest first; p: as large by chance."
+    note = "Spearman's rank correlations, the strongest first; p: as large by chance. What grows "
+    note += "to both sides correlates with the distance from the median."
     if not sobol:
         note += " The sampler 'saltelli' adds Sobol indices."
     return f'<p class="facts">{escape(note)}</p>' + table(head, rows, "drivers")
@@ -441,7 +449,7 @@ def _scatter(results: Results, found: Sequence[Influence]) -> str:
             panel.plot(x[of], y[of], ".", ms=3, alpha=0.5, color=colour, rasterized=True)
         panel.set_xlabel(each.cause)
         panel.set_ylabel(named(each.metric))
-        panel.set_title(f"{each.correlation:+.2f}", fontsize=8.5)
+        panel.locator_params(axis="x", nbins=5)
     caption = "The strongest drivers; orange: flights that did not pass."
     return picture(figure, "scatter", caption)
 
@@ -453,8 +461,8 @@ def _worst_table(results: Results) -> str:
         number = int(results.numbers[row])
         values = [f"{results.columns[name][row]:.4g}" for name in names]
         command = f"spacerobot campaign rerun {results.folder} {number}"
-        rows.append([str(number), results.columns["outcome"][row], *values, command])
-    head = ["flight", "outcome", *map(named, names), "to fly it again, with a bag"]
+        rows.append([str(number), command, results.columns["outcome"][row], *values])
+    head = ["flight", "to fly it again, with a bag", "outcome", *map(named, names)]
     return table(head, rows, "worst")
 
 

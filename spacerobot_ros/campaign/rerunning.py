@@ -10,7 +10,7 @@ from pathlib import Path
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
-from spacerobot_ros.campaign.rows import Row
+from spacerobot_ros.campaign.rows import LANES, Row
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.recorded import recorded_flight
 
@@ -34,6 +34,9 @@ class Rerun:
         What the dataset says became of the goal; empty where it does not have the flight.
     bag
         Where its bag is.
+    comparable
+        Whether the flight is to be that of the dataset: thrusters that are on or off multiply the
+        rounding by which lanes differ from the stack.
     """
 
     row: Row
@@ -41,11 +44,12 @@ class Rerun:
     at: str
     outcome: str
     bag: Path
+    comparable: bool = True
 
     @property
     def same(self) -> bool:
-        """Whether it is the flight in the dataset, or not known there."""
-        if self.deviation is None:
+        """Whether it is the flight in the dataset, not known there, or not comparable."""
+        if self.deviation is None or not self.comparable:
             return True
         return self.outcome == self.row.outcome and self.deviation <= TOLERANCE
 
@@ -66,6 +70,8 @@ class Rerun:
             where = f" ({self.at})" if self.at else ""
             deviation = f"largest deviation {self.deviation:.2g}{where}"
             lines.append(f"dataset     {self.outcome}; {deviation}")
+        if not self.comparable:
+            lines.append("It was flown in lanes: thrusters that are on or off multiply rounding.")
         return lines
 
 
@@ -95,15 +101,16 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     known = known_flight(dataset, campaign, number)
     if known is None:
         return Rerun(row, None, "", "", bag)
-    outcome, metrics = known
+    outcome, engine, metrics = known
     deviation, at = largest_deviation(metrics, row.metrics)
-    return Rerun(row, deviation, at, outcome, bag)
+    comparable = engine != LANES or not campaign.scenario.plant.thrusters
+    return Rerun(row, deviation, at, outcome, bag, comparable)
 
 
 def known_flight(
     dataset: Dataset, campaign: Campaign, number: int
-) -> tuple[str, dict[str, float]] | None:
-    """Return the outcome and the metrics of a flight in a dataset; None if it is not there."""
+) -> tuple[str, str, dict[str, float]] | None:
+    """Return outcome, engine and metrics of a flight in a dataset; None if it is not there."""
     if number not in dataset.done():
         return None
     table = dataset.table()
@@ -113,7 +120,7 @@ def known_flight(
         for name in table.column_names
         if isinstance(record[name], float) and not name.startswith(("draw.", "wall_", "plan_"))
     ]
-    return record["outcome"], {name: record[name] for name in names}
+    return record["outcome"], record["engine"], {name: record[name] for name in names}
 
 
 def largest_deviation(

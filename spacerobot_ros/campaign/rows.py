@@ -13,6 +13,9 @@ from spacerobot_ros.campaign.metrics import measured
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.arrays import FlightArrays
 
+LANES = "lanes"
+"""The engine that flies many at once."""
+
 ERROR = "error"
 """The outcome of a flight that could not be flown; the reason says why."""
 

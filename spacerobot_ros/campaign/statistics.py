@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -74,6 +74,9 @@ class Influence:
         Spearman's rank correlation.
     p
         Probability of one as large by chance.
+    departure, p_departure
+        Likewise, of the distance of what is drawn from its median: an error that grows to both
+        sides correlates with no side.
     first, total
         Sobol indices with their intervals (half widths), where the sampler allows for them.
     """
@@ -82,8 +85,25 @@ class Influence:
     metric: str
     correlation: float
     p: float
+    departure: float = 0.0
+    p_departure: float = 1.0
     first: tuple[float, float] | None = None
     total: tuple[float, float] | None = None
+
+    @property
+    def strength(self) -> float:
+        """What influences are sorted by: the total index, or the larger correlation."""
+        if self.total is not None:
+            return self.total[0]
+        return max(abs(self.correlation), abs(self.departure))
+
+    def __str__(self) -> str:
+        name = f"{self.cause} of {self.metric}"
+        if self.total is not None:
+            return f"{name}: total Sobol index {self.total[0]:.2f}"
+        if abs(self.departure) > abs(self.correlation):
+            return f"{name}: {self.departure:+.2f} with its distance from the median"
+        return f"{name}: {self.correlation:+.2f}"
 
 
 def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> list[Influence]:
@@ -101,8 +121,15 @@ def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> lis
         for cause, drawn in causes.items():
             if np.ptp(drawn[there]) == 0.0:
                 continue
-            result = spearmanr(drawn[there], values[there])
-            found.append(Influence(cause, metric, float(result.statistic), float(result.pvalue)))
+            x, y = drawn[there], values[there]
+            away = np.abs(x - np.median(x))
+            side = spearmanr(x, y)
+            made = Influence(cause, metric, float(side.statistic), float(side.pvalue))
+            if np.ptp(away) > 0.0:
+                both = spearmanr(away, y)
+                numbers = float(both.statistic), float(both.pvalue)
+                made = replace(made, departure=numbers[0], p_departure=numbers[1])
+            found.append(made)
     return found
 
 

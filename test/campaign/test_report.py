@@ -1,0 +1,160 @@
+"""Statistics of campaigns against known results, and the pages that show them, in a browser."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+from support.campaigns import campaign
+from support.chromium import browser, chromium
+
+from spacerobot_ros.campaign.comparing import write_comparison
+from spacerobot_ros.campaign.config import Campaign, passed
+from spacerobot_ros.campaign.dataset import Dataset
+from spacerobot_ros.campaign.draws import Draw, Draws
+from spacerobot_ros.campaign.report import Results, write_campaign_report
+from spacerobot_ros.campaign.rows import Row
+from spacerobot_ros.errors import ParameterError
+
+NAMES = ("com.base_link.x", "com.base_link.y", "com.base_link.z")
+
+TURNS: dict[str, Any] = {
+    name: {"uniform": {"loc": -math.pi, "scale": 2 * math.pi}} for name in NAMES
+}
+
+
+def ishigami(draw: Draw) -> float:
+    """Ishigami and Homma's function, whose Sobol indices are known (a = 7, b = 0.1)."""
+    x, y, z = (draw.values[name] for name in NAMES)
+    return math.sin(x) + 7.0 * math.sin(y) ** 2 + 0.1 * z**4 * math.sin(x)
+
+
+def filled(folder: Path, made: Campaign, error: Callable[[Draw], float]) -> Path:
+    """Write a dataset whose flights have such position errors, and nothing else."""
+    dataset = Dataset(folder)
+    dataset.begin(made)
+    rows = []
+    for draw in Draws(made):
+        metrics = {"position_error_m": error(draw), "manoeuvre_time_s": 4.0}
+        outcome = "reached" if metrics["position_error_m"] < 0.05 else "failed"
+        ok = passed(made.criteria, outcome, metrics)
+        left = "It is corrected." if draw.number % 50 == 0 else ""
+        rows.append(Row(draw, outcome, f"{outcome}.", metrics, ok, "lanes", left, 0.01, 0.0))
+    dataset.add(rows)
+    dataset.close()
+    return folder
+
+
+def test_sobol_indices_are_those_of_a_function_that_is_known(tmp_path: Path) -> None:
+    made = campaign(disperse=TURNS, sampler="saltelli", flights=1024 * 5, seed=3)
+    results = Results.of(filled(tmp_path, made, ishigami))
+    found = {each.cause: each for each in results.influences()}
+    first, total = (0.3139, 0.4424, 0.0), (0.5576, 0.4424, 0.2437)
+    for name, one, all_together in zip(NAMES, first, total, strict=True):
+        indices = found[name].first, found[name].total
+        assert indices[0] is not None
+        assert indices[1] is not None
+        assert indices[0][0] == pytest.approx(one, abs=0.06)
+        assert indices[1][0] == pytest.approx(all_together, abs=0.06)
+        assert 0.0 < indices[1][1] < 0.12
+    assert [each.cause for each in results.influences()] == list(NAMES)
+    # An incomplete sample has none.
+    few = campaign(disperse=TURNS, sampler="random", flights=40, seed=3)
+    others = Results.of(filled(tmp_path / "few", few, ishigami)).influences()
+    assert all(each.total is None for each in others)
+
+
+def bowl(draw: Draw) -> float:
+    """An error that grows to both sides of one mass, and a little with another."""
+    mass, other = draw.values["mass.mass_1"], draw.values["mass.mass_2"]
+    return float(0.01 + 0.4 * abs(mass - 1.0) + 0.02 * (other - 1.0))
+
+
+MASSES: dict[str, Any] = {
+    f"mass.mass_{i}": {"uniform": {"loc": 0.9, "scale": 0.2}} for i in (1, 2, 3)
+}
+CRITERIA = {"position_error_m": {"max": 0.03}}
+
+
+def test_what_grows_to_both_sides_is_found(tmp_path: Path) -> None:
+    made = campaign(disperse=MASSES, flights=200, seed=8, criteria=CRITERIA)
+    results = Results.of(filled(tmp_path, made, bowl))
+    strongest = results.influences()[0]
+    assert (strongest.cause, strongest.metric) == ("mass.mass_1", "position_error_m")
+    assert abs(strongest.correlation) < 0.3
+    assert strongest.departure > 0.9
+    x, y = results.drawn["mass.mass_1"], results.columns["position_error_m"]
+    expected = stats.spearmanr(np.abs(x - np.median(x)), y)
+    assert strongest.departure == pytest.approx(expected.statistic)
+    assert "distance from the median" in str(strongest)
+    worst = results.worst()
+    errors = results.columns["position_error_m"]
+    assert [errors[row] for row in worst] == sorted(errors, reverse=True)[:10]
+
+
+def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
+    """The second one is 2 mm better on the average, and much alike from draw to draw."""
+    made = campaign(disperse=MASSES, flights=120, seed=8, criteria=CRITERIA)
+
+    def better(draw: Draw) -> float:
+        return bowl(draw) - 0.002 + 0.001 * math.sin(draw.number)
+
+    one, two = filled(tmp_path / "one", made, bowl), filled(tmp_path / "two", made, better)
+    lines = write_comparison((one, two), tmp_path / "report.html")
+    draws = list(Draws(made))
+    a, b = np.array([bowl(draw) for draw in draws]), np.array([better(draw) for draw in draws])
+    interval = stats.ttest_rel(b, a).confidence_interval(0.95)
+    (line,) = [line for line in lines if line.startswith("position_error_m")]
+    numbers = [float(x) for x in re.findall(r"-?\d\.\d+(?:e-?\d+)?", line)]
+    assert numbers == pytest.approx([(b - a).mean(), interval.low, interval.high], rel=1e-3)
+    only = int(((b <= 0.03) & (a > 0.03)).sum()), int(((a <= 0.03) & (b > 0.03)).sum())
+    assert only[0] > 0
+    assert f"{only[1]} only short, {only[0]} only short" in lines[0]
+    p = stats.binomtest(only[1], sum(only)).pvalue
+    assert f"p = {p:.2g}" in lines[0]
+    # The other way round every difference has the other sign.
+    again = write_comparison((two, one), tmp_path / "again.html")
+    (line,) = [line for line in again if line.startswith("position_error_m")]
+    assert f"{(a - b).mean():.4g}" in line
+    other = campaign(disperse=MASSES, flights=120, seed=9, criteria=CRITERIA)
+    three = filled(tmp_path / "three", other, bowl)
+    with pytest.raises(ParameterError, match="do not have the same draws: 'seed' is 8 and 9"):
+        write_comparison((one, three), tmp_path / "no.html")
+
+
+@pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with")
+def test_the_pages_open_without_a_complaint_and_need_nothing_else(tmp_path: Path) -> None:
+    made = campaign(disperse=MASSES, flights=120, seed=8, criteria=CRITERIA)
+    one = filled(tmp_path / "one", made, bowl)
+    two = filled(tmp_path / "two", made, lambda draw: bowl(draw) - 0.001)
+    page, comparison = one / "report.html", tmp_path / "comparison.html"
+    lines = write_campaign_report(one, page)
+    write_comparison((one, two), comparison)
+    share = sum(bowl(draw) <= 0.03 for draw in Draws(made))
+    assert f"({share} of 120;" in lines[0]
+    with browser(tmp_path / "profile") as window:
+        for each, tables, figures in ((page, 6, 3), (comparison, 1, 1)):
+            for width in (1280, 390):
+                window.complaints.clear()
+                window.requests.clear()
+                window.open(each, width, 900)
+                assert window.complaints == []
+                outside = [url for url in window.requests if not url.startswith("data:")]
+                assert outside == [each.as_uri()]
+                assert window.evaluate("document.documentElement.scrollWidth") <= width
+                assert window.evaluate("document.querySelectorAll('table').length") == tables
+                drawn = "[...document.images].filter(x => x.complete && x.naturalWidth > 300)"
+                assert window.evaluate(f"{drawn}.length") == figures
+        window.open(page)
+        words = unescape(window.evaluate("document.body.innerText"))
+    assert f"{share} of 120" in words
+    assert "Left to another engine: It is corrected (3)" in words
+    worst = max(Draws(made), key=bowl).number
+    assert f"spacerobot campaign rerun {one} {worst}" in words
