@@ -24,7 +24,7 @@ from support.planner_loop import (
 )
 
 from spacerobot_ros.events import Event as FlightEvent
-from spacerobot_ros.planning import BasePath
+from spacerobot_ros.planning import BasePath, RobotState
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile
 from spacerobot_ros.planning.execution.in_motion import InMotion
@@ -384,6 +384,23 @@ def test_noise_is_averaged_over_the_last_measurements() -> None:
     position, quaternion = deviation.pose(4)
     np.testing.assert_allclose(position, [0.25, 0.0, 0.0])
     np.testing.assert_allclose(Rotation.from_quat(quaternion).as_rotvec(), [0.0, 0.0, 0.02])
+
+
+def test_a_base_that_is_off_as_its_joints_lag_is_on_its_way_to_the_end() -> None:
+    """The base of this robot is at an eighth of its sliders' way, to the other side."""
+    loop = flying(ticks=80, replan_period=1.0)
+    tracker, schedule = loop.executive._tracker, loop.starts[0].schedule
+    assert tracker.check_due(loop.measured.stamp_ns)
+    k = round((loop.measured.stamp_ns - loop.starts[0].stamp_ns) / TICK_NS)
+    lag = np.array([-0.04, 0.02, 0.03])
+    pose = schedule.path.position[k] - lag / 8, schedule.path.quaternion[k]
+    averaged = tracker.averaged(RobotState(*pose, schedule.positions[k] + lag))
+    np.testing.assert_allclose(averaged.position, pose[0], atol=1e-9)
+    for position, _ in (tracker.end, tracker.expected_end):
+        np.testing.assert_allclose(position, schedule.path.position[-1], atol=5e-5)
+    off = tracker.averaged(RobotState(*pose, schedule.positions[k]))
+    np.testing.assert_allclose(off.position, pose[0], atol=1e-9)
+    np.testing.assert_allclose(tracker.end[0], schedule.path.position[-1] - lag / 8, atol=1e-6)
 
 
 def test_noise_of_joints_is_not_taken_for_another_shape() -> None:

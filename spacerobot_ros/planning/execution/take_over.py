@@ -87,32 +87,34 @@ class PathDeviation:
     ) -> None:
         self._path = path
         self._recent: deque[tuple[int, Array]] = deque(maxlen=count)
+        self._lag = np.zeros(6)
         if sensitivity is None or masses is None:
             sensitivity, masses = np.zeros((len(path.time), 6, 0)), MassEstimate(0)
         self._sensitivity, self._masses = sensitivity, masses
         masses.next_path()
 
-    def add(self, k: int, position: Array, quaternion: Array) -> None:
-        """Add a measured position (3,) and attitude (4,) at instant k of the path."""
+    def add(self, k: int, position: Array, quaternion: Array, lag: Array | float = 0.0) -> None:
+        """Add a measured position (3,) and attitude (4,) at instant k of the path.
+
+        ``lag`` (6,) is what the base is off by, displacement over turn in W, because the joints are
+        not where the path has them. It goes when they come there.
+        """
         predicted = self._path.quaternion[k]
         turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, quaternion)
-        deviation = np.concatenate([position - self._path.position[k], turn])
+        deviation = np.concatenate([position - self._path.position[k], turn]) - lag
+        self._lag[:] = lag
         self._recent.append((k, deviation))
         self._masses.add(self._sensitivity[k], deviation)
 
     def pose(self, k: int) -> tuple[Array, Array]:
         """Return where the base is at instant k: position (3,) and attitude (4,)."""
-        mean = self._mean(k)
-        turn = quaternion_from_rotvec(mean[3:])
-        return (
-            self._path.position[k] + mean[:3],
-            quaternion_multiply(turn, self._path.quaternion[k]),
-        )
+        return self._displaced(k, self._mean(k) + self._lag)
 
     def end(self, k: int) -> tuple[Array, Array]:
         """Return where the path leads to from instant k, if the base moves as predicted."""
-        position, quaternion = self.pose(k)
-        turn = quaternion_from_rotvec(self._mean(k)[3:])
+        mean = self._mean(k)
+        position, quaternion = self._displaced(k, mean)
+        turn = quaternion_from_rotvec(mean[3:])
         way = self._path.position[-1] - self._path.position[k]
         ahead = attitude_error(self._path.quaternion[k], self._path.quaternion[-1])
         return (
@@ -126,6 +128,11 @@ class PathDeviation:
         more = self._of_masses(k, -1)
         turn = quaternion_from_rotvec(more[3:])
         return position + more[:3], quaternion_multiply(turn, quaternion)
+
+    def _displaced(self, k: int, deviation: Array) -> tuple[Array, Array]:
+        turn = quaternion_from_rotvec(deviation[3:])
+        position = self._path.position[k] + deviation[:3]
+        return position, quaternion_multiply(turn, self._path.quaternion[k])
 
     def _of_masses(self, begin: int, end: int) -> Array:
         """Return what errors of masses add to the deviation (6,) from one instant to another."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import attitude_error
+from spacerobot_ros.model.rotations import attitude_error, matrix_from_quaternion
 from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -203,7 +203,8 @@ class TrackingErrorCheck:
         sensitivity: Array | None = None,
         masses: MassEstimate | None = None,
     ) -> None:
-        self._path = schedule.path
+        self._path, self._positions = schedule.path, schedule.positions
+        self._period = schedule.control_period
         self._deviation = PathDeviation(schedule.path, average, sensitivity, masses)
         self._position, self._attitude = position or np.inf, attitude or np.inf
         self._stamps = start_ns + (schedule.path.time * 1e9).round().astype(np.int64)
@@ -220,9 +221,15 @@ class TrackingErrorCheck:
             self._next += 1
         return self._next < len(stamps) and stamps[self._next] <= stamp_ns + self._slack
 
-    def add(self, position: Array, quaternion: Array) -> None:
-        """Take a pose that is due into the mean deviation from the path."""
-        self._deviation.add(self._next, position, quaternion)
+    @property
+    def shape(self) -> Array:
+        """The shape (n,) that the schedule has where a pose is due."""
+        time = self._path.time[self._next]
+        return np.asarray(self._positions[round(time / self._period)])
+
+    def add(self, position: Array, quaternion: Array, lag: Array) -> None:
+        """Take a pose that is due, and how far it lags (6,), into the mean deviation."""
+        self._deviation.add(self._next, position, quaternion, lag)
 
     @property
     def pose(self) -> tuple[Array, Array]:
@@ -264,7 +271,7 @@ class TrajectoryTracker:
         self.setpoint = Setpoint(np.zeros(robot.n), np.zeros(robot.n))
         self.stuck: list[int] = []
         """Joints that do not follow; they are commanded to rest."""
-        self._config = config
+        self._robot, self._config = robot, config
         # A controller closes its own loop round the reference.
         self._commands_plant = config.output == "commands"
         self._follower: ScheduleFollower | BrakingFollower | None = None
@@ -349,9 +356,17 @@ class TrajectoryTracker:
 
     def averaged(self, state: RobotState) -> RobotState:
         """Return a state that is due with its pose by the mean deviation from the path."""
-        self._check.add(state.position, state.quaternion)
+        self._check.add(state.position, state.quaternion, self._lag(state))
         position, quaternion = self._check.pose
         return replace(state, position=position, quaternion=quaternion)
+
+    def _lag(self, state: RobotState) -> Array:
+        """Return what the base of a state that is due is off by as the joints lag, in W (6,)."""
+        way = state.q - self._check.shape
+        way[np.abs(way) <= self._config.shape_deadband] = 0.0
+        twist = -self._robot.connection(state.q) @ way
+        R = matrix_from_quaternion(state.quaternion)
+        return np.concatenate([R @ twist[:3], R @ twist[3:]])
 
     @property
     def end(self) -> tuple[Array, Array]:
