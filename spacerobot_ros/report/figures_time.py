@@ -64,6 +64,9 @@ _JOINTS_A_PANEL = 6
 _SMALLEST = 1e-9
 """Forces and torques that are rounding errors, N or N m."""
 
+_SMALLEST_ERROR = 1e-12
+"""Errors of sensors that are rounding errors, m or rad."""
+
 BAND = (
     "Where a trace has more samples than the picture has columns, the band spans the smallest and "
     "the largest value in each slice of time."
@@ -456,7 +459,7 @@ def sensors_plate(flight: Flight) -> Plate | None:
         bent = Signal(shape.time, shape.values - flight.shape.values[at])
         units = {"m": "m", "rad": "rad"}
         groups += _joint_groups(flight, bent, "joints", units, lambda joint: [], _JOINTS_A_PANEL)
-    groups = [group for group in groups if np.any(group.signal.values)]
+    groups = [g for g in groups if np.abs(g.signal.values).max(initial=0.0) > _SMALLEST_ERROR]
     if not groups:
         return None
     what = "Measured minus true, at the stamps of what was measured"

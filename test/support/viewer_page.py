@@ -228,6 +228,7 @@ def _fields(label: str) -> str:
     return (
         "(() => { let at = [...document.querySelectorAll('label, div, p, span')]"
         f".filter(each => each.textContent.trim() === {json.dumps(label)}).pop();"
-        "while (at && !at.querySelector('input')) at = at.parentElement;"
-        "return [...at.querySelectorAll('input')]; })()"
+        # Sliders have hidden ones.
+        "while (at && !at.querySelector('input:not([type=hidden])')) at = at.parentElement;"
+        "return [...at.querySelectorAll('input:not([type=hidden])')]; })()"
     )

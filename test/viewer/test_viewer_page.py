@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
+from sensor_msgs.msg import JointState
 from support.chromium import browser, chromium
 from support.ros_harness import Harness, Probe
 from support.viewer_page import ROOT, Page, Processes, processes
@@ -49,8 +51,8 @@ class Watched:
 
     def __init__(self, harness: Harness) -> None:
         self._harness = harness
-        topics = {"odom": Odometry, "plant/status": DiagnosticStatus}
-        topics["planner/status"] = DiagnosticStatus
+        topics: dict[str, Any] = {"odom": Odometry, "plant/status": DiagnosticStatus}
+        topics |= {"planner/status": DiagnosticStatus, "joint_states": JointState}
         latched = ("plant/status", "planner/status")
         self.probe: Probe = harness.probe(topics, latched=latched)
 
@@ -62,6 +64,10 @@ class Watched:
     def position(self) -> Array:
         p = self.probe.last("odom").pose.pose.position
         return np.array([p.x, p.y, p.z])
+
+    @property
+    def joints(self) -> Array:
+        return np.array(self.probe.last("joint_states").position)
 
     def value(self, topic: str, key: str) -> str:
         values = {pair.key: pair.value for pair in self.probe.last(topic).values}
@@ -97,7 +103,8 @@ def test_a_mission_is_flown_from_the_page(
         assert watched.value("planner/status", "state") == "idle", "opening it moves nothing"
 
         # The gizmo is dragged along the vertical axis, and the goal is checked anew.
-        reach = reach_of(load_robot(ROOT / "urdf" / "sliding_masses.urdf"))
+        robot = load_robot(ROOT / "urdf" / "sliding_masses.urdf")
+        reach = reach_of(robot)
         tip, to = (np.array([0.0, 0.0, z * reach]) for z in (0.40, 0.46))
         camera = reach * CAMERA
         page.drag(page.pixel(tip, camera), page.pixel(to, camera))
@@ -159,9 +166,17 @@ def test_a_mission_is_flown_from_the_page(
         page.tick("Final joint positions")
         page.wait_for_text("At the end")
         page.type("slider_1 (m)", (0.1,))
+        page.wait_for_text("Goal refused")
+        # The centre of mass stays: the base moves by the part of the slider's mass.
+        bodies = {body.name: body.inertia.mass for body in robot.bodies}
+        x = round(-0.1 * bodies["mass_1"] / robot.total_mass, 4)
+        page.type(POSITION, (x, 0, 0))
         page.wait_for_text("Goal reachable", without="The goal moves.")
         page.press("Fly")
+        watched.wait("planner/status", "state", "executing")
         watched.wait("planner/status", "state", "reached")
+        watched.hear()
+        np.testing.assert_allclose(watched.joints, [0.1, 0, 0], atol=5e-3)
 
         # How often it is drawn on a quiet machine is measured by `spacerobot bench --viewer`.
         assert page.frames_per_s(3.0, time.monotonic) > 1.0
