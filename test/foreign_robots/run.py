@@ -371,13 +371,17 @@ def main() -> None:
     parser.add_argument("--goals", type=int, default=100, help="goals a robot")
     parser.add_argument("--only", default="", help="robots whose name contains this")
     parser.add_argument("--fresh", action="store_true", help="forget what is done")
+    parser.add_argument("--only-table", action="store_true", help="plan nothing more")
     parser.add_argument("--no-table", action="store_true", help="leave the documents as they are")
     given = parser.parse_args()
     names = [name for name in ROBOTS if given.only in name]
     for name in names:
         if given.fresh:
             (KEPT / f"{name}.jsonl").unlink(missing_ok=True)
-        run(name, given.goals)
+        if not given.only_table:
+            run(name, given.goals)
+        elif kept(name):
+            confirm(name, SpaceRobot.from_file(robot_file(name)))
     earlier = {each["robot"]: each for each in json.loads(TABLE.read_text("utf-8"))}
     rows = [row(name, given.goals) or earlier[name] for name in ROBOTS]
     print(json.dumps(rows, indent=1))
