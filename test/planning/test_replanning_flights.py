@@ -203,6 +203,7 @@ class Trial:
 TRIALS = {
     "three_joint_arm": Trial(SHAPES["three_joint_arm"], 0.3, (0.3, 0.8)),
     "servicer": Trial(np.zeros(6), 0.4, (0.4, 1.0)),
+    "planar_chain": Trial(SHAPES["planar_chain"], 0.15, (0.8, 2.0)),
 }
 
 
@@ -231,13 +232,20 @@ def with_wrong_masses(
     loop.method = worker._method
     loop.executive = Executive(robot_of(robot), loop.config, worker)
     rng = np.random.default_rng(seed)
-    axis = rng.normal(size=3)
+    axis = np.array([0.0, 0.0, 1.0]) if robot == "planar_chain" else rng.normal(size=3)
     turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(*trial.turns))
     loop.propose(Goal.checked(np.zeros(3), turn.as_quat()))
     loop.until(PlannerState.REACHED, PlannerState.FAILED)
     first, last = loop.starts[0], loop.starts[-1]
     took = (last.stamp_ns - first.stamp_ns) / 1e9 + last.schedule.duration
     return loop, took / first.schedule.duration
+
+
+def test_the_shrinking_horizon_makes_up_for_wrong_masses() -> None:
+    for horizon, state in ((True, "reached"), (False, "failed")):
+        loop, share = with_wrong_masses("planar_chain", 1, None, horizon=horizon)
+        assert loop.states[-1] == state
+        assert share < 1.15
 
 
 @pytest.mark.slow
