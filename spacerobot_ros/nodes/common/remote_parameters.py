@@ -14,6 +14,11 @@ from rclpy.parameter import parameter_value_to_python
 _MOST_LOOKS = 200
 """Looks after which a node that does not answer has no such services."""
 
+_SETTLED = 3
+"""Looks after which the node has met the client, too. Before that its answer would hold it up for a
+tenth of a second, and be lost.
+"""
+
 _LOST_AFTER = 50
 """Looks after which an answer is lost: the middleware drops it where it has not met the client."""
 
@@ -30,7 +35,7 @@ class RemoteParameters:
     """
 
     def __init__(self, node: Node, name: str) -> None:
-        self._node, self._name = node, name
+        self._node, self.name = node, name
         self.values: dict[str, str] | None = None
         """Every parameter that is set, as a JSON text by its full name; None before the answer."""
         self._steps = self._ask()
@@ -57,14 +62,15 @@ class RemoteParameters:
 
     def _call(self, kind: Any, service: str, request: Any) -> Generator[bool, None, Any]:
         """Return the answer of a service; None if it is late."""
-        client: Client = self._node.create_client(kind, f"{self._name}/{service}")
+        client: Client = self._node.create_client(kind, f"{self.name}/{service}")
         try:
-            future, asked_at = None, 0
+            future, asked_at, ready = None, 0, 0
             for look in range(_MOST_LOOKS):
                 if future is not None and future.done():
                     return future.result()
+                ready = ready + 1 if client.service_is_ready() else 0
                 lost = future is None or look - asked_at >= _LOST_AFTER
-                if lost and client.service_is_ready():
+                if lost and ready > _SETTLED:
                     future, asked_at = client.call_async(request), look
                 yield False
             return None

@@ -136,6 +136,7 @@ class ViewerNode(FlightNode):
         self._callers: dict[tuple[str, type[Any]], Client] = {}
         self._remote_values: dict[str, dict[str, str]] = {}
         self._asking: dict[str, RemoteParameters] = {}
+        self._to_ask_again: set[str] = set()
         self._planner_state: PlannerState | None = None
         self._sent = 0
         self._shape_wanted = False
@@ -319,20 +320,27 @@ class ViewerNode(FlightNode):
                 self._ask(key)
 
     def _ask(self, key: str) -> None:
-        """Ask a node for its parameters."""
-        before = self._asking.pop(key, None)
+        """Ask a node for its parameters; once more where that is being done."""
+        name, before = self._full_names[key], self._asking.get(key)
+        if before is not None and before.name == name:
+            # Its answer is waited for: without a reader it would hold the node up.
+            self._to_ask_again.add(key)
+            return
         if before is not None:
             before.close()
-        self._asking[key] = RemoteParameters(self, self._full_names[key])
+        self._asking[key] = RemoteParameters(self, name)
 
     def _look_for_parameters(self) -> None:
         for key, asking in tuple(self._asking.items()):
             if not asking.look():
                 continue
-            if asking.values is None:
-                self._ask(key)  # It reports a status: it is there, and busy.
-                continue
             del self._asking[key]
+            if asking.values is None or key in self._to_ask_again:
+                # One without an answer reports a status: it is there, and busy.
+                self._to_ask_again.discard(key)
+                self._ask(key)
+            if asking.values is None:
+                continue
             if asking.values == self._remote_values.get(key):
                 continue
             self._remote_values[key] = asking.values
