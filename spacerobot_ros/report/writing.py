@@ -9,6 +9,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.report.figures_errors import errors_plate, sensors_plate
 from spacerobot_ros.report.figures_shape import cycles_plate, loops_plate
 from spacerobot_ros.report.figures_space import (
     configurations_plate,
@@ -23,13 +24,11 @@ from spacerobot_ros.report.figures_time import (
     attitude_plate,
     draw_whole,
     efforts_plate,
-    errors_plate,
     momentum_plate,
     pose_plate,
     position_group,
     position_plate,
     rates_plate,
-    sensors_plate,
     shape_groups,
     shape_plate,
     thrusters_plate,

@@ -23,13 +23,12 @@ from support.made_bags import array, joint_states, made_bag, odometry, pose, sta
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.report.figures_errors import pose_errors, sensors_plate
 from spacerobot_ros.report.figures_time import (
     attitude_group,
     joint_unit,
-    pose_errors,
     position_group,
     position_plate,
-    sensors_plate,
     shape_groups,
     thrusters_plate,
 )
