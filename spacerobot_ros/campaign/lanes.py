@@ -42,8 +42,12 @@ _MOST_TICKS = 4_000_000
 _MOST = 512
 """Flights of one batch."""
 
-_MOST_CONTROLLED = 256
+_MOST_CONTROLLED = 128
 """Likewise, with a controller."""
+
+_LONGEST_BATCH = 4.0
+"""Wall s after which a batch is flown with those that are planned: what ends the campaign loses no
+more."""
 
 _AT_END = 1e-6
 """A schedule has ended when every joint is this near its last position, m or rad."""
@@ -139,6 +143,7 @@ class LanesEngine:
         others: list[tuple[Draw, str]],
     ) -> Iterator[Row]:
         common, batch, ticks = DrawnFlight.of(campaign.scenario), list[_Planned](), 0
+        began = time.perf_counter()
         for draw in draws:
             if stopped():
                 return
@@ -152,9 +157,10 @@ class LanesEngine:
                 continue
             batch.append(planned)
             ticks += planned.schedule.ticks
-            if len(batch) >= _MOST or ticks > _MOST_TICKS:
+            late = time.perf_counter() - began > _LONGEST_BATCH
+            if late or len(batch) >= _MOST or ticks > _MOST_TICKS:
                 yield from self._flown(campaign, batch, others)
-                batch, ticks = [], 0
+                batch, ticks, began = [], 0, time.perf_counter()
         if batch:
             yield from self._flown(campaign, batch, others)
 
