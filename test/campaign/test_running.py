@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from support.campaigns import campaign
 
-from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset
+from spacerobot_ros.campaign.draws import Draws
+from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
 from spacerobot_ros.campaign.rerunning import TOLERANCE, largest_deviation, rerun_flight
 from spacerobot_ros.campaign.rows import ERROR, Row
@@ -68,8 +70,6 @@ def test_the_numbers_of_a_row_are_those_of_its_flight(tmp_path: Path) -> None:
 
 
 def _draw(made: Campaign, number: int) -> Any:
-    from spacerobot_ros.campaign.draws import Draws
-
     return Draws(made)[number]
 
 
@@ -158,3 +158,40 @@ def test_a_row_that_is_another_flight_is_noticed(tmp_path: Path) -> None:
     lost = {**row.metrics, "duration_s": float("nan")}
     assert not largest_deviation(row.metrics, lost)[0] <= 1.0
     assert isinstance(row, Row)
+
+
+SERVICER: dict[str, Any] = {
+    "mass.*": {"uniform": {"loc": 0.95, "scale": 0.1}},
+    "com.base_link.*": {"norm": {"scale": 0.01}},
+    "goal.position.x": {"norm": {"scale": 0.02}},
+    "end_effector_goal.rotvec.z": {"norm": {"scale": 0.02}},
+    "initial.joints.elbow_pitch": {"norm": {"scale": 0.01}},
+    "plant.sensors.position_noise": {"uniform": [0.0, 0.00005]},
+    "plant.sensors.joint_rate_noise": {"uniform": [0.0, 0.0001]},
+    "coordinated_control.gains.base_attitude.kd": {"uniform": [390.0, 20.0]},
+}
+NEARLY: dict[str, Any] = {
+    "coordinated_control.time_limit": 31.5,
+    "plant.sensors.attitude_bias": [0.0001, 0.0, 0.0],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("own_domain")
+@pytest.mark.parametrize(("settings", "outcome"), [({}, "reached"), (NEARLY, "failed")])
+def test_the_servicer_is_the_same_in_lanes_one_by_one_and_in_the_stack(
+    settings: dict[str, Any], outcome: str
+) -> None:
+    section = {"scenario": "servicer", "flights": 3, "seed": 5, "disperse": SERVICER}
+    made = parse_campaign("servicer", {**section, "set": settings})
+    draws = list(Draws(made))
+    lanes = list(LanesEngine().fly(made, draws, lambda: False))
+    one_by_one = list(FlightsEngine().fly(made, draws, lambda: False))
+    stack = list(RosEngine().fly(made, draws[:2], lambda: False))
+    assert [row.engine for row in lanes] == ["lanes"] * 3
+    assert {row.outcome for row in lanes} == {outcome}
+    for rows_of in (one_by_one, stack):
+        for here, there in zip(lanes, rows_of, strict=False):
+            assert (here.outcome, here.reason) == (there.outcome, there.reason)
+            deviation, at = largest_deviation(there.metrics, here.metrics)
+            assert deviation < TOLERANCE, (there.engine, at)
