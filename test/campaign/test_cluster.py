@@ -30,7 +30,7 @@ GIVEN: dict[str, Any] = {
     "seed": 8,
     "engine": "flights",
 }
-_LONGEST = 300.0
+_LONGEST = 900.0
 
 
 @dataclass(frozen=True)

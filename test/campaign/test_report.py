@@ -53,7 +53,7 @@ def filled(folder: Path, made: Campaign, error: Callable[[Draw], float]) -> Path
 
 
 def test_sobol_indices_are_those_of_a_function_that_is_known(tmp_path: Path) -> None:
-    made = campaign(disperse=TURNS, sampler="saltelli", flights=1024 * 5, seed=3)
+    made = campaign(disperse=TURNS, sampler="saltelli", flights=512 * 5, seed=3)
     results = Results.of(filled(tmp_path, made, ishigami))
     found = {each.cause: each for each in results.influences()}
     first, total = (0.3139, 0.4424, 0.0), (0.5576, 0.4424, 0.2437)
@@ -61,9 +61,9 @@ def test_sobol_indices_are_those_of_a_function_that_is_known(tmp_path: Path) -> 
         indices = found[name].first, found[name].total
         assert indices[0] is not None
         assert indices[1] is not None
-        assert indices[0][0] == pytest.approx(one, abs=0.06)
-        assert indices[1][0] == pytest.approx(all_together, abs=0.06)
-        assert 0.0 < indices[1][1] < 0.12
+        assert indices[0][0] == pytest.approx(one, abs=0.08)
+        assert indices[1][0] == pytest.approx(all_together, abs=0.08)
+        assert 0.0 < indices[1][1] < 0.15
     assert [each.cause for each in results.influences()] == list(NAMES)
     # An incomplete sample has none.
     few = campaign(disperse=TURNS, sampler="random", flights=40, seed=3)
