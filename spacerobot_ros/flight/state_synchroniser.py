@@ -84,8 +84,13 @@ class StateSynchroniser:
         return False
 
     def forget_pose(self) -> None:
-        """Take no later odom for a contradiction: the plant shows another state of one time."""
+        """Take no later odom for a contradiction: the plant shows another state of one time.
+
+        Nor is it the pose of joints that were handed over before.
+        """
         self.odom, self._odom_fresh = b"", False
+        if not self._joints_fresh:
+            self.joint_states = b""
 
     def put_joint_states(self, raw: bytes) -> None:
         """Accept a joint_states message; see :meth:`overdue` for the state before."""

@@ -250,6 +250,24 @@ def test_another_pose_of_one_time_is_a_contradiction_unless_the_plant_was_reset(
     assert not states.put_odom(serialize_message(here))
 
 
+@pytest.mark.parametrize("pose_required", [False, True])
+def test_a_pose_after_a_reset_is_not_that_of_joints_before_it(*, pose_required: bool) -> None:
+    states = StateSynchroniser(pose_required=pose_required)
+    states.put_odom(odom(3))
+    states.put_joint_states(joints(3))
+    assert states.ready() is Pairing.WHOLE
+    states.forget_pose()
+    states.put_odom(odom(3))
+    assert states.ready() is None
+    states.put_joint_states(joints(3))
+    assert states.ready() is Pairing.WHOLE
+    # Joints that were not handed over may be those after the reset.
+    states.put_joint_states(joints(4))
+    states.forget_pose()
+    states.put_odom(odom(4))
+    assert states.ready() in (Pairing.WHOLE, Pairing.LATE_POSE)
+
+
 def test_a_topic_that_is_required_again_keeps_its_message() -> None:
     states = StateSynchroniser(pose_required=True)
     states.require("joint_reference")
