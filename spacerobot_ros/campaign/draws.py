@@ -126,7 +126,7 @@ class Draws:
         return np.asarray(engine.random(campaign.flights))
 
     def _saltelli(self, size: int) -> Array:
-        from spacerobot_ros.campaign.extras import salib
+        from spacerobot_ros.campaign.extras import salib, sobol_problem
 
         base = self._campaign.flights // (size + 2)
         if base < 2:
@@ -135,7 +135,7 @@ class Draws:
                 "dispersion(s)."
             )
         base = 2 ** int(np.log2(base))
-        problem = {"num_vars": size, "names": list(self._campaign.names), "bounds": [[0, 1]] * size}
+        problem = sobol_problem(self._campaign.names)
         sample = salib("sample.sobol").sample
         seed = int(np.random.SeedSequence(self._campaign.seed).generate_state(1)[0] >> 1)
         return np.asarray(sample(problem, base, calc_second_order=False, seed=seed))

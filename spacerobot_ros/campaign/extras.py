@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Sequence
 from typing import Any
+
+import numpy as np
 
 from spacerobot_ros.errors import SpaceRobotError
 
@@ -29,3 +32,10 @@ def needed(module: str) -> Any:
 def salib(module: str) -> Any:
     """Return a module of SALib; see :func:`needed`."""
     return needed(f"SALib.{module}")
+
+
+def sobol_problem(names: Sequence[str]) -> dict[str, Any]:
+    """Return what SALib calls the problem: quantities of these names, from 0 to 1."""
+    # An array, because SALib 1.5 has pandas sort out the names, and pandas 3 takes no list.
+    listed = np.array(list(names), dtype=object)
+    return {"num_vars": len(listed), "names": listed, "bounds": [[0, 1]] * len(listed)}

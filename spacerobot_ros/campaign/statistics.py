@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.campaign.extras import salib
+from spacerobot_ros.campaign.extras import salib, sobol_problem
 from spacerobot_ros.model.description import Array
 
 Flags = npt.NDArray[np.bool_]
@@ -143,7 +143,7 @@ def sobol_indices(
     """
     if not np.all(np.isfinite(values)) or np.ptp(values) == 0.0:
         return {}
-    problem = {"num_vars": len(names), "names": list(names), "bounds": [[0, 1]] * len(names)}
+    problem = sobol_problem(names)
     result = salib("analyze.sobol").analyze(problem, values, calc_second_order=False, seed=0)
     keys = ("S1", "S1_conf", "ST", "ST_conf")
     columns = zip(*(np.asarray(result[key]).tolist() for key in keys), strict=True)
