@@ -63,6 +63,17 @@ class _Planned:
     gait: PlannerStatus
     plan_time: float
 
+    @classmethod
+    def of(
+        cls,
+        draw: Draw,
+        flight: DrawnFlight,
+        plan: tuple[GaitSchedule, PlannerStatus] | None,
+        began: float,
+    ) -> _Planned | None:
+        """Return a draw whose planning ``began`` at a wall time, s; None without a plan."""
+        return None if plan is None else cls(draw, flight, *plan, time.perf_counter() - began)
+
 
 class LanesEngine:
     """Many flights at once, on vector registers."""
@@ -72,7 +83,8 @@ class LanesEngine:
 
     def __init__(self) -> None:
         self._flights = FlightsEngine()
-        self._plans: dict[str, tuple[GaitSchedule, PlannerStatus, float]] = {}
+        self._kept: tuple[str, tuple[GaitSchedule, PlannerStatus] | None] | None = None
+        """The last plan from a state that was measured without noise, and what it follows from."""
         self._planner: tuple[PlannerConfig, str] | None = None
         """The planner's configuration of the last draw, mostly that of all, and its text."""
 
@@ -166,29 +178,17 @@ class LanesEngine:
 
     def _planned(self, draw: Draw, flight: DrawnFlight) -> _Planned | None:
         """Have the executive plan a draw; None where it makes no plan for the first state."""
-        noisy = _has_noise(flight)
+        began = time.perf_counter()
+        if _has_noise(flight):
+            # What is measured differs from draw to draw.
+            return _Planned.of(draw, flight, _first_plan(flight), began)
         planner = flight.scenario.planner
         if self._planner is None or self._planner[0] is not planner:
             self._planner = planner, repr(values_of(planner))
-        key = self._planner[1] + _key(flight, noisy)
-        if key not in self._plans:
-            began = time.perf_counter()
-            period = flight.scenario.plant.control_period
-            first = fly_scenario(flight.scenario, robots=robots_of(flight), longest=period)
-            if len(first.schedules) != 1 or first.gait is None:
-                return None
-            ((begins_ns, schedule),) = first.schedules
-            if begins_ns or schedule.partial or not schedule.ticks:
-                return None
-            if not noisy:
-                self._plans.clear()
-            self._plans[key] = schedule, first.gait, time.perf_counter() - began
-        schedule, gait, taken = self._plans[key]
-        if noisy:
-            del self._plans[key]
-        else:
-            self._plans[key] = schedule, gait, 0.0  # It was made once.
-        return _Planned(draw, flight, schedule, gait, taken)
+        key = self._planner[1] + _key(flight)
+        if self._kept is None or self._kept[0] != key:
+            self._kept = key, _first_plan(flight)
+        return _Planned.of(draw, flight, self._kept[1], began)
 
     def _flown(
         self, campaign: Campaign, batch: list[_Planned], others: list[tuple[Draw, str]]
@@ -238,12 +238,22 @@ def _has_noise(flight: DrawnFlight) -> bool:
     return any(np.any(value) for name, value in sensors.items() if name != "seed")
 
 
-def _key(flight: DrawnFlight, noisy: bool) -> str:
-    """Return what the plan of a flight follows from beside its planner, as a text."""
+def _first_plan(flight: DrawnFlight) -> tuple[GaitSchedule, PlannerStatus] | None:
+    """Have the executive plan for the first state; None where it makes no such plan."""
+    period = flight.scenario.plant.control_period
+    first = fly_scenario(flight.scenario, robots=robots_of(flight), longest=period)
+    if len(first.schedules) != 1 or first.gait is None:
+        return None
+    ((begins_ns, schedule),) = first.schedules
+    if begins_ns or schedule.partial or not schedule.ticks:
+        return None
+    return schedule, first.gait
+
+
+def _key(flight: DrawnFlight) -> str:
+    """Return what the plan of a flight without noise follows from beside its planner, as a text."""
     scenario = flight.scenario
-    plant = scenario.plant
-    if not noisy:
-        plant = replace(plant, sensors=replace(plant.sensors, seed=0))
+    plant = replace(scenario.plant, sensors=replace(scenario.plant.sensors, seed=0))
     # The robot of the plant is only measured: at rest, whatever its masses are, unless it drifts.
     moving = any(plant.linear_momentum) or any(plant.angular_momentum)
     inertial = flight.inertial
