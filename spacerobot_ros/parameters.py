@@ -208,7 +208,7 @@ def configured(kind: type[C], values: Mapping[str, Any], prefix: str = "") -> C:
     ParameterError
         A value is refused; the sentence names the parameter.
     """
-    return _configured(kind, kind(), values, prefix)
+    return _reconfigured(kind(), kind(), values, prefix)
 
 
 def reconfigured(config: C, values: Mapping[str, Any]) -> C:
@@ -240,25 +240,6 @@ def require_known(owner: str, config: type[Any], names: Iterable[str]) -> None:
     unknown = sorted(set(names) - {parameter.name for parameter in declared(config)})
     if unknown:
         raise ParameterError(f"{owner} has no option '{unknown[0]}'.")
-
-
-def _configured(kind: type[C], defaults: Any, values: Mapping[str, Any], prefix: str) -> C:
-    chosen: dict[str, Any] = {}
-    for each in fields(kind):  # type: ignore[arg-type]
-        name, default = f"{prefix}{each.name}", getattr(defaults, each.name)
-        if _PARAMETER in each.metadata:
-            chosen[each.name] = default
-            if name in values:
-                declaration = _named(each.metadata[_PARAMETER], name, default)
-                chosen[each.name] = declaration.checked(values[name])
-        elif _GROUP in each.metadata:
-            chosen[each.name] = _configured(type(default), default, values, f"{name}.")
-        elif _REGISTERED in each.metadata:
-            chosen[each.name] = {
-                entry: _configured(type(options), options, values, f"{prefix}{entry}.")
-                for entry, options in default.items()
-            }
-    return kind(**chosen)
 
 
 def _reconfigured(config: C, defaults: Any, values: Mapping[str, Any], prefix: str) -> C:

@@ -86,6 +86,8 @@ class ReplayNode(FlightNode):
 
     def configure(self) -> None:
         """Open the bag and make its publishers and the services."""
+        # A configuration that failed has left its bag and files.
+        self.cleanup()
         config = self.config
         if not config.bag:
             raise ParameterError("Parameter 'bag' is empty; name the MCAP file to replay.")
@@ -365,7 +367,11 @@ def _described(send: Callable[[bytes], None], meshes: MeshFolder) -> Callable[[b
     """Return what sends robot descriptions with the files of the meshes that only the bag has."""
 
     def send_with_files(data: bytes) -> None:
-        text = deserialize_message(data, String).data
+        try:
+            text = deserialize_message(data, String).data
+        except RuntimeError:  # It is replayed as it was recorded, like every other message.
+            send(data)
+            return
         located = meshes.described(text)
         send(data if located == text else serialize_message(String(data=located)))
 

@@ -310,6 +310,49 @@ def test_meshes_that_only_the_bag_has_are_files_while_it_is_replayed(
     assert not file.parent.exists()
 
 
+def carrying(path: Path, description: bytes, *, meshes: bool = True) -> Path:
+    """Write a bag with one robot_description, a stream of two messages, and perhaps a mesh."""
+    with BagWriter(path) as writer:
+        writer.write(writer.add_topic("/robot_description", STRING), description, BEGAN, BEGAN)
+        stream = writer.add_topic("/stream", STRING, LATCHED)
+        writer.write(stream, string("a"), BEGAN, BEGAN)
+        writer.write(stream, string("b"), BEGAN + SPACING, BEGAN)
+        if meshes:
+            corners = np.array([[0, 0, 0], [3, 0, 0], [0, 2, 0]], float)
+            mesh = stl_of(TriangleMesh(corners, np.array([[0, 1, 2]])))
+            writer.add_attachment("mesh/package://gone/a.stl", mesh, "model/stl", BEGAN)
+    return path
+
+
+def test_a_description_that_cannot_be_read_does_not_end_the_replay_of_a_bag_with_meshes(
+    harness: Harness, tmp_path: Path
+) -> None:
+    played = Played(harness, carrying(tmp_path / "a.mcap", b"\0\1\0\0\xff\xff\xff\x7fabc"))
+    played.finish()
+    harness.spin_until(lambda: played.probe.count("/stream") == 2, "all are heard")
+    assert played.codes == [0]
+    assert played.node.messages_replayed == 3
+
+
+def test_meshes_of_a_configuration_that_failed_are_not_those_of_the_next_bag(
+    harness: Harness, tmp_path: Path
+) -> None:
+    line = "<mesh filename='package://gone/a.stl'/>"
+    with_mesh = carrying(tmp_path / "a.mcap", string(line))
+    without = carrying(tmp_path / "b.mcap", string(line), meshes=False)
+    probe = harness.probe({"/robot_description": String})
+    wrong = {"bag": str(with_mesh), "remap": "/stream:=/no/topic//name", "hold": True}
+    replay: ReplayNode = harness.make(ReplayNode, wrong, autostart=False)
+    with pytest.raises(SpaceRobotError, match="that is no topic name"):
+        replay.start()
+    replay.set_parameters_atomically(
+        [Parameter("bag", value=str(without)), Parameter("remap", value="")]
+    )
+    replay.start()
+    harness.spin_until(lambda: bool(probe.count("/robot_description")), "it is heard")
+    assert probe.last("/robot_description").data == line
+
+
 def test_a_loop_goes_on_until_it_is_told_to_stop(harness: Harness, bag: Path) -> None:
     played = Played(harness, bag, loop=True, start=0.5, topics="/stream", rate=2.0)
     harness.spin_until(lambda: played.probe.count("/stream") >= 25, "three turns are heard")

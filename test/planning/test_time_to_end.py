@@ -32,6 +32,24 @@ def test_it_counts_from_the_first_schedule_for_the_last_goal() -> None:
     assert time_to_end(again, 21.0) == 1.0
 
 
+def test_a_goal_that_was_refused_in_between_ends_nothing() -> None:
+    flown = [
+        said(1.0, "executing", "a", HERE),
+        said(3.0, "planning", "b"),
+        said(3.5, "refused", "b", THERE),
+        said(6.0, "planning", "a"),
+        said(7.0, "executing", "a", HERE),
+        said(9.0, "aborted", "a"),
+    ]
+    assert time_to_end(flown, 12.0) == 8.0
+    # One that was flown in between does.
+    flown[2] = said(3.5, "executing", "b", THERE)
+    assert time_to_end(flown, 12.0) == 2.0
+    # So does the refusal of the same pose: what follows is another attempt.
+    flown[2] = said(3.5, "refused", "b", HERE)
+    assert time_to_end(flown, 12.0) == 2.0
+
+
 def test_it_goes_on_where_a_planner_was_started_again() -> None:
     flown = [
         said(0.25, "executing", "a", HERE),

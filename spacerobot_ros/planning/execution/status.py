@@ -192,15 +192,21 @@ def _note(text: str) -> list[float] | float | str:
 
 
 def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
-    """Return the time from the first schedule for the last goal to its end, s, with what was waited
-    in between, such as for a planner that was started again; None where no schedule was flown.
+    """Return the time, s, from the beginning of the first schedule for the last goal to the end.
+
+    Waiting in between, such as for a planner that was started again, is part of it.
 
     Parameters
     ----------
     statuses
-        Time (s) and status.
+        Time (s) and status, in order of time.
     end_s
-        When it ends where no status says so.
+        When the flight ended, s: the end where no status reports that the goal was decided.
+
+    Returns
+    -------
+    float | None
+        None where no schedule was flown.
     """
     given = list(statuses)
     schedules = [i for i, (_, status) in enumerate(given) if status.state is PlannerState.EXECUTING]
@@ -208,15 +214,24 @@ def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -
         return None
     first = last = schedules[-1]
     for i in reversed(range(last)):
-        before, schedule = given[i][1], given[last][1]
-        same_id = before.goal_id and before.goal_id == schedule.goal_id
-        if before.state.decided or not (same_id or before.goal == schedule.goal):
-            break
-        if before.state is PlannerState.EXECUTING:
-            first = i
+        before = given[i][1]
+        match before.state, _same_goal(before, given[last][1]):
+            case PlannerState.EXECUTING, True:
+                first = i
+            case (PlannerState.PLANNING, _) | (PlannerState.REFUSED, False):
+                # A goal that is refused does not end the earlier one.
+                pass
+            case _:
+                break
     ended = [
         time
         for time, status in given[last + 1 :]
         if status.state.decided and status.state is not PlannerState.REFUSED
     ]
     return (ended[0] if ended else end_s) - given[first][0]
+
+
+def _same_goal(first: PlannerStatus, second: PlannerStatus) -> bool:
+    """Whether two statuses are about one goal, or about two of the same pose."""
+    same_id = bool(first.goal_id) and first.goal_id == second.goal_id
+    return same_id or first.goal == second.goal
