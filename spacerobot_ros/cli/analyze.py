@@ -23,11 +23,14 @@ _MOST_ROWS = 12
 
 @click.command("analyze")
 @click.argument("robot")
-@click.option("--shape", metavar="'Q1 Q2 ...'", help="Shape to look at, m or rad [the best].")
-@picture_option("Picture to draw (.png, .svg, .pdf) [out/ROBOT_curvature.png].")
-@json_option("Write the findings.")
+@click.option("--shape", metavar="'Q1 Q2 ...'", help="Shape to analyse, m or rad [the best].")
+@picture_option("Picture of the curvature (.png, .svg, .pdf) [out/ROBOT_curvature.png].")
+@json_option("Write the findings as JSON.")
 def command(robot: str, shape: str | None, picture: Path | None, json_file: Path | None) -> None:
-    """Say what loops of the joints of ROBOT (a name or a URDF file) can do, and draw it."""
+    """Analyse what loops of the joints of ROBOT do to its base.
+
+    ROBOT is a name or a URDF file. The methods that suit it are listed.
+    """
     from spacerobot_ros.model import SpaceRobot
     from spacerobot_ros.planning.analysis import analyze
     from spacerobot_ros.resources import robot_file

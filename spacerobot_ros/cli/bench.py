@@ -7,19 +7,26 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from spacerobot_ros.cli.errors import fail
 from spacerobot_ros.cli.options import PATH, json_option, write_json
 
 
 @click.command("bench")
-@click.option("--ticks", default=20_000, show_default=True, type=click.IntRange(min=100))
+@click.option(
+    "--ticks",
+    default=20_000,
+    show_default=True,
+    type=click.IntRange(min=100),
+    help="Ticks to fly in lockstep.",
+)
 @click.option(
     "--real-time",
     "seconds",
     type=click.FloatRange(min=5.0),
     metavar="S",
-    help="Instead: fly for S s in real time, in separate processes; deadlines, losses, memory.",
+    help="Instead: fly in real time for S s, in separate processes; deadlines, losses, memory.",
 )
 @click.option(
     "--rate",
@@ -27,13 +34,13 @@ from spacerobot_ros.cli.options import PATH, json_option, write_json
     multiple=True,
     type=click.FloatRange(min=1.0, max=1e4),
     metavar="HZ",
-    help="... with so many commands a second. May be repeated.  [default: 100]",
+    help="With --real-time: commands a second. May be repeated.  [default: 100]",
 )
 @click.option(
     "--soak",
     type=click.FloatRange(min=10.0),
     metavar="S",
-    help="Instead: fly for S s in real time with a goal every 12 s; whether memory, descriptors "
+    help="Instead: fly in real time for S s with a goal every 12 s; whether memory, descriptors "
     "and threads of all processes stay flat. With --json also a picture beside it.",
 )
 @click.option(
@@ -41,48 +48,47 @@ from spacerobot_ros.cli.options import PATH, json_option, write_json
     "viewed",
     type=click.FloatRange(min=5.0),
     metavar="S",
-    help="Instead: fly the servicer in real time, in separate processes, without and with a viewer "
-    "and a browser in turns of S s; updates received, deadlines missed.",
+    help="Instead: fly the servicer in real time, in separate processes, in turns of S s without "
+    "and with a viewer and a browser; updates received, deadlines missed.",
 )
 @click.option(
     "--no-priorities",
     is_flag=True,
-    help="... and leave plant and controller at the priority of everything else (--viewer).",
+    help="With --viewer: give plant and controller the same priority as all other processes.",
 )
 @click.option(
     "--planning",
     "goals",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Instead: plan N cold goals of four robots; CPU time. With --against also the ratios of "
-    "times and durations.",
+    help="Instead: plan N goals for each of four robots, without the cache of plans; CPU time. "
+    "With --against also ratios of durations.",
 )
 @click.option(
     "--long-search",
     "starts",
     type=click.IntRange(min=1),
     metavar="N",
-    help="... and compare the durations with those of a search from N guesses.",
+    help="With --planning: compare the durations with those of a search from N initial guesses.",
 )
 @click.option(
     "--library",
     type=click.IntRange(min=1),
     metavar="N",
-    help="... and plan them with a library of the manoeuvres to N other goals, too.",
+    help="With --planning: plan also with a library of the manoeuvres to N other goals.",
 )
 @click.option(
     "--first-plans",
     is_flag=True,
-    help="Instead: plan for robots of 7, 12 and 14 joints with an empty cache, and in the next "
-    "process; CPU time.",
+    help="Instead: plan for robots of 7, 12 and 14 joints, first with an empty cache, then in "
+    "another process; CPU time.",
 )
 @click.option(
     "--campaign",
     is_flag=True,
-    help="Instead: thousands of flights in lanes against the plant's own tick and MuJoCo's rollout "
-    "in the same run; CPU time.",
+    help="Instead: fly thousands of flights in lanes, and the same in the plant and in MuJoCo's "
+    "rollout; CPU time.",
 )
-@json_option("Write the figures.")
 @click.option(
     "--against",
     type=PATH,
@@ -94,8 +100,9 @@ from spacerobot_ros.cli.options import PATH, json_option, write_json
     default=3,
     show_default=True,
     type=click.IntRange(min=1),
-    help="How often each checkout is measured; the medians are compared.",
+    help="With --against: how often each checkout is measured; the medians are compared.",
 )
+@json_option("Write the figures as JSON.")
 def command(
     ticks: int,
     seconds: float | None,
@@ -112,10 +119,12 @@ def command(
     against: Path | None,
     rounds: int,
 ) -> None:
-    """Measure the speed of the stack against a bare ping-pong in the same run.
+    """Measure the speed of the stack on this machine.
 
-    Exit code 1: something grows (--soak).
+    The speed of a bare ping-pong of messages is measured beside it. Exit code 1: memory,
+    descriptors or threads grow (--soak).
     """
+    _require_one_benchmark()
     figures: Mapping[str, Any]
     if soak is not None:
         from spacerobot_ros.benchmarks.soak import run_soak
@@ -161,3 +170,31 @@ def command(
         figures = real_time.run_benchmark(seconds, rates or (100.0,), click.echo)
     if json_file is not None:
         write_json(json_file, figures)
+
+
+_BENCHMARKS = (*("--real-time", "--soak", "--viewer", "--planning", "--first-plans", "--campaign"),)
+"""Options that each choose another benchmark."""
+
+_OF_ONE = {
+    "--rate": "--real-time",
+    "--no-priorities": "--viewer",
+    "--long-search": "--planning",
+    "--library": "--planning",
+}
+"""Options that count with one benchmark alone."""
+
+
+def _require_one_benchmark() -> None:
+    """Refuse options that would have no effect."""
+    context = click.get_current_context()
+    given = {
+        option.opts[0]
+        for option in context.command.params
+        if option.name and context.get_parameter_source(option.name) is ParameterSource.COMMANDLINE
+    }
+    chosen = [name for name in _BENCHMARKS if name in given]
+    if len(chosen) > 1:
+        raise click.UsageError(f"{' and '.join(chosen)} are benchmarks of their own: choose one.")
+    for name, benchmark in _OF_ONE.items():
+        if name in given and benchmark not in given:
+            raise click.UsageError(f"{name} is an option of {benchmark}.")

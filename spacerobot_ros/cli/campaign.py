@@ -24,31 +24,45 @@ class _Campaigns(click.Group):
     """A group whose first command, ``fly``, need not be named."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        if args and args[0] not in (*self.commands, "--help"):
+        if args and args[0] not in (*self.commands, *ctx.help_option_names):
             args = ["fly", *args]
         return super().parse_args(ctx, args)
 
 
 @click.group("campaign", cls=_Campaigns)
 def command() -> None:
-    """Fly a scenario many times, with masses, sensors, starts, goals and faults that differ.
+    """Fly a scenario many times with dispersed parameters.
 
     `spacerobot campaign FILE.yaml` is short for `spacerobot campaign fly FILE.yaml`.
     """
 
 
 def _cluster_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    # A decorator adds its option before those of the decorators below it.
     for option in (
-        click.option("--flights", type=click.IntRange(min=1), help="How many [as the file says]."),
-        click.option("--engine", type=click.Choice(_ENGINES), default="auto", help="What flies."),
+        click.option(
+            "--scheduler",
+            default="",
+            metavar="tcp://HOST:PORT",
+            help="Address of a dask scheduler, whose workers fly.",
+        ),
         click.option(
             "--workers",
             type=click.IntRange(min=0),
             default=2,
             show_default=True,
-            help="Processes on this machine; 0: this one.",
+            help="Worker processes on this machine; 0: none, fly in this process.",
         ),
-        click.option("--scheduler", default="", metavar="tcp://HOST:PORT", help="Of a cluster."),
+        click.option(
+            "--engine",
+            type=click.Choice(_ENGINES),
+            default="auto",
+            show_default=True,
+            help="What flies the draws.",
+        ),
+        click.option(
+            "--flights", type=click.IntRange(min=1), help="Number of flights [as in FILE]."
+        ),
     ):
         function = option(function)
     return function
@@ -58,8 +72,14 @@ def _cluster_options(function: Callable[..., Any]) -> Callable[..., Any]:
 @click.argument("file", type=PATH, required=False)
 @_cluster_options
 @click.option("--out", type=PATH, help="Folder of the results [out/NAME].")
-@click.option("--report", type=PATH, help="Where the report goes [OUT/report.html].")
-@click.option("--compare", type=PATH, nargs=2, metavar="A.yaml B.yaml", help="Fly two designs.")
+@click.option("--report", type=PATH, help="Report to write [OUT/report.html].")
+@click.option(
+    "--compare",
+    type=PATH,
+    nargs=2,
+    metavar="A.yaml B.yaml",
+    help="Instead of FILE: fly two designs on the same draws.",
+)
 def fly(
     file: Path | None,
     flights: int | None,
@@ -70,9 +90,10 @@ def fly(
     report: Path | None,
     compare: tuple[Path, Path] | None,
 ) -> None:
-    """Fly the campaign of FILE and write the report; a campaign that was ended goes on.
+    """Fly the campaign of FILE and write its dataset and report.
 
-    Exit code 0: everything was flown; 2: bad input; 130 after Ctrl-C, which keeps what was flown.
+    A campaign that was interrupted is continued. Exit code 0: all flights were flown; 2: bad input;
+    130: Ctrl-C, the flights so far are kept.
     """
     from spacerobot_ros.campaign.running import Cluster
 
@@ -91,18 +112,21 @@ def fly(
 
 @command.command("report")
 @click.argument("folder", metavar="DIR", type=PATH)
-@click.option("--report", type=PATH, help="Where it goes [DIR/report.html].")
+@click.option("--report", type=PATH, help="Report to write [DIR/report.html].")
 def report_command(folder: Path, report: Path | None) -> None:
-    """Write the report of the flights in DIR."""
+    """Write the report of the flights in DIR again."""
     _write_report(folder, report)
 
 
 @command.command("rerun")
 @click.argument("folder", metavar="DIR", type=PATH)
 @click.argument("number", metavar="N", type=click.IntRange(min=0))
-@click.option("--bag", type=PATH, help="Where its bag goes [DIR/flight_N.mcap].")
+@click.option("--bag", type=PATH, help="Bag to write [DIR/flight_N.mcap].")
 def rerun(folder: Path, number: int, bag: Path | None) -> None:
-    """Fly flight N of DIR alone, through the whole ROS stack, with a bag of all topics."""
+    """Fly flight N of DIR alone through ROS, and record a bag.
+
+    Exit code 0: it is the flight of the dataset; 1: it is another one; 2: bad input.
+    """
     from spacerobot_ros.campaign.rerunning import rerun_flight
 
     path = bag or folder / f"flight_{number}.mcap"

@@ -21,7 +21,9 @@ FORMATS = ("csv", "parquet", "mat")
     show_default=True,
     help="csv and parquet: a folder with a file for each topic; mat: one file for MATLAB.",
 )
-@click.option("--out", "-o", type=PATH, help="The folder or file to make [BAG_csv, BAG.mat].")
+@click.option(
+    "--out", "-o", type=PATH, help="Folder or file to write [BAG_csv, BAG_parquet or BAG.mat]."
+)
 @click.option(
     "--topic",
     "topics",
@@ -30,7 +32,10 @@ FORMATS = ("csv", "parquet", "mat")
     help="Only this topic, with or without the slash before it. May be repeated.",
 )
 def command(bag: Path, format_name: str, out: Path | None, topics: tuple[str, ...]) -> None:
-    """Write the topics of a BAG as tables for pandas, MATLAB and others; nothing is overwritten."""
+    """Write the topics of a BAG as tables for other programs.
+
+    Existing files and folders are not overwritten.
+    """
     from spacerobot_ros.bag import read_bag
     from spacerobot_ros.bag.export import ExportFormat, export
 

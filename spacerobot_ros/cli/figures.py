@@ -23,25 +23,32 @@ def _millimetres(context: click.Context, option: click.Parameter, text: str) -> 
 
 @click.command("figures")
 @bag_argument
-@click.option("--only", metavar="NAME,NAME", default="", help="These only, such as pose,joints.")
+@click.option(
+    "--only", metavar="NAME,NAME", default="", help="Draw only these figures, such as pose,joints."
+)
 @click.option(
     "--format",
     "format_name",
     type=click.Choice(FORMATS),
     default="pdf",
     show_default=True,
-    help="Text in PDF and SVG can be searched and edited.",
+    help="Format of the files; text in PDF and SVG can be searched and edited.",
 )
 @click.option(
     "--width",
     callback=_millimetres,
     default="88mm",
     show_default=True,
-    help="In mm, cm, in or pt; 88mm is a column.",
+    help="Width of a figure in mm, cm, in or pt; 88mm is one column.",
 )
-@click.option("--style", type=PATH, metavar="FILE.mplstyle", help="Fonts, sizes, lines, colours.")
-@click.option("--events", is_flag=True, help="What happened, below time axes.")
-@click.option("--out", "-o", type=PATH, help="Folder [BAG_figures].")
+@click.option(
+    "--style",
+    type=PATH,
+    metavar="FILE.mplstyle",
+    help="Style file of matplotlib: fonts, sizes, lines, colours.",
+)
+@click.option("--events", is_flag=True, help="Show events below the time axes.")
+@click.option("--out", "-o", type=PATH, help="Folder of the figures [BAG_figures].")
 def command(
     bag: Path,
     only: str,
@@ -51,9 +58,10 @@ def command(
     events: bool,
     out: Path | None,
 ) -> None:
-    """Draw figures of a BAG for a paper, each a file; older ones of their names are replaced.
+    """Draw figures of a BAG for a paper, one file each.
 
-    Exit code 1: the bag has nothing for one that --only names.
+    Files of the same names are replaced. Exit code 1: the bag lacks the data of a figure that
+    --only names.
     """
     from spacerobot_ros.report import write_figures
     from spacerobot_ros.report.style import PictureFormat

@@ -10,12 +10,20 @@ from spacerobot_ros.cli.options import note_large_angles
 
 @click.command("goal", context_settings={"ignore_unknown_options": True})
 @click.argument("pose", nargs=-1, type=float, metavar="X Y Z [QX QY QZ QW]")
-@click.option("--rotvec", nargs=3, type=float, metavar="RX RY RZ", help="Attitude instead (rad).")
 @click.option(
-    "--rpy-deg", nargs=3, type=float, metavar="ROLL PITCH YAW", help="... about fixed axes (deg)."
+    "--rotvec", nargs=3, type=float, metavar="RX RY RZ", help="Attitude as a rotation vector (rad)."
 )
-@click.option("--namespace", default="", help="Of the stack.")
-@click.option("--timeout", default=0.0, help="Wall time to wait for the end, s; 0: for ever.")
+@click.option(
+    "--rpy-deg",
+    nargs=3,
+    type=float,
+    metavar="ROLL PITCH YAW",
+    help="Attitude by turns about the fixed axes x, y, z in this order (deg).",
+)
+@click.option("--namespace", default="", help="Namespace of the stack.")
+@click.option(
+    "--timeout", default=0.0, help="Longest wait for the result, s of wall time; 0: no limit."
+)
 def command(
     pose: tuple[float, ...],
     rotvec: tuple[float, float, float] | None,
@@ -23,10 +31,10 @@ def command(
     namespace: str,
     timeout: float,
 ) -> None:
-    """Send a goal pose to a running stack and follow it until it is reached or refused.
+    """Send a goal pose to a running stack, and wait for the result.
 
     Exit code 0: the goal was reached; 1: it was not; 2: bad input; 130: Ctrl-C has ended the
-    command, which leaves the goal to the stack.
+    command, and the stack still pursues the goal.
     """
     if len(pose) not in (3, 7):
         raise click.UsageError("A goal is X Y Z, or X Y Z QX QY QZ QW.")

@@ -20,7 +20,7 @@ from spacerobot_ros.cli.options import PATH, settings_option
     default=80,
     show_default=True,
     type=click.IntRange(min=1),
-    help="Goals that are planned.",
+    help="Number of random goals to plan.",
 )
 @click.option(
     "--within",
@@ -29,10 +29,12 @@ from spacerobot_ros.cli.options import PATH, settings_option
     default=(0.3, 60.0),
     metavar="M DEG",
     show_default=True,
-    help="... at most so far from the start.",
+    help="Largest distance (m) and angle (deg) of the goals from the start.",
 )
 @click.option(
-    "--out", type=PATH, help="Write it here, for planner.optimal.library.  [default: the cache]"
+    "--out",
+    type=PATH,
+    help="File to write, for the parameter planner.optimal.library [in the cache].",
 )
 def command(
     scenario: str,
@@ -41,10 +43,10 @@ def command(
     within: tuple[float, float],
     out: Path | None,
 ) -> None:
-    """Make a library of manoeuvres of a SCENARIO or a ROBOT: guesses for quicker plans.
+    """Make a library of manoeuvres, by which plans are found faster.
 
-    Plans of the same robot, start, limits and options begin with the two that are nearest to their
-    goal. Exit code 1: no goal is reachable; 2: bad input.
+    Plans of the same robot, start, limits and options take the two manoeuvres that are nearest to
+    their goal as initial guesses. Exit code 1: no goal is reachable; 2: bad input.
     """
     from spacerobot_ros.cli.plan import problem_of
     from spacerobot_ros.planning import PlanRequest

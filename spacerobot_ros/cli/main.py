@@ -44,7 +44,7 @@ class CommandGroup(click.Group):
 )
 @click.version_option(__version__, prog_name="spacerobot")
 def main() -> None:
-    """Fly free-floating space robots: plan gaits, run them through ROS 2, record and report."""
+    """Plan, fly, record and report the motion of free-floating space robots with ROS 2."""
 
 
 if __name__ == "__main__":

@@ -17,10 +17,10 @@ from spacerobot_ros.cli.progress import display
 @click.argument("robot", metavar="URDF")
 @click.option("--out", type=PATH, help="Scenario file to write [NAME.yaml].")
 def command(robot: str, out: Path | None) -> None:
-    """Begin with a robot of your own, a URDF or xacro file: check it, plan, write a scenario.
+    """Check a robot of your own, plan a first turn, write a scenario.
 
-    Exit code 0: a scenario that reaches its goal is written; 1: no method reaches one; 2: the robot
-    is refused.
+    URDF is a URDF or xacro file, or the name of a robot. Exit code 0: a scenario that reaches its
+    goal is written; 1: no method reaches one; 2: the robot is refused.
     """
     from spacerobot_ros.bag import free_name
     from spacerobot_ros.cli.analyze import lines_of

@@ -32,14 +32,14 @@ _rotvec_option = click.option(
     nargs=3,
     type=float,
     metavar="RX RY RZ",
-    help="Attitude of the goal as exponential coordinates (rad).",
+    help="Attitude of the goal as a rotation vector (rad).",
 )
 _rpy_option = click.option(
     "--goal-rpy-deg",
     nargs=3,
     type=float,
     metavar="ROLL PITCH YAW",
-    help="... or about the fixed axes x, y, z in this order (deg).",
+    help="Attitude of the goal by turns about the fixed axes x, y, z in this order (deg).",
 )
 
 
@@ -89,7 +89,13 @@ def note_large_angles(rotvec: Sequence[float], other: str) -> None:
         )
 
 
-settings_option = click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE")
+settings_option = click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="NODE.PARAMETER=VALUE",
+    help="Set a parameter of a node. May be repeated.",
+)
 
 
 class Registered(_Choice):
@@ -118,7 +124,7 @@ class Registered(_Choice):
 
 METHODS = "spacerobot_ros.planning.methods.registry:METHODS"
 view_option = click.option(
-    "--view", is_flag=True, help="Serve a page that shows the robot and steers it."
+    "--view", is_flag=True, help="Serve a page on which the robot is watched and steered."
 )
 
 

@@ -44,10 +44,18 @@ _NO_GOAL = GoalOptions(None, None, None)
     help="Gait method.",
 )
 @settings_option
-@json_option("Write schedule, path.")
-@picture_option("Draw both (.png, .svg, .pdf).")
-@click.option("--compare", "comparing", is_flag=True, help="Fly every method, print a table.")
-@click.option("--random", "count", type=click.IntRange(min=1), help="Fly so many random goals.")
+@json_option("Write schedule and predicted path as JSON.")
+@picture_option("Draw schedule and predicted path (.png, .svg, .pdf).")
+@click.option(
+    "--compare", "comparing", is_flag=True, help="Plan by every method, and print a table."
+)
+@click.option(
+    "--random",
+    "count",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Instead: plan N random goals, and print figures of all.",
+)
 @click.option(
     "--within",
     nargs=2,
@@ -55,9 +63,11 @@ _NO_GOAL = GoalOptions(None, None, None)
     default=(0.3, 180.0),
     metavar="M DEG",
     show_default=True,
-    help="... at most so far from the start.",
+    help="With --random: largest distance (m) and angle (deg) of the goals from the start.",
 )
-@click.option("--beside", type=Registered(METHODS), help="... by this method too.")
+@click.option(
+    "--beside", type=Registered(METHODS), help="With --random: plan them by this method too."
+)
 def command(
     scenario: str,
     goal: GoalOptions,
@@ -70,10 +80,10 @@ def command(
     within: tuple[float, float],
     beside: str | None,
 ) -> None:
-    """Plan a gait without ROS, for a SCENARIO or a ROBOT, and fly it in the plant.
+    """Plan a gait of a SCENARIO or a ROBOT without ROS.
 
-    Exit code 0: it ends within tolerance; 1: it does not, or the goal cannot be reached; 2: bad
-    input.
+    The gait is simulated. Exit code 0: it ends within tolerance; 1: it does not, or the goal cannot
+    be reached; 2: bad input.
     """
     from spacerobot_ros.simulation.trials import Trial, compare, try_method
 

@@ -14,15 +14,26 @@ from spacerobot_ros.cli.options import bag_argument, view_option, viewing_if
 @click.command("replay")
 @bag_argument
 @click.option(
-    "--rate", default=1.0, show_default=True, metavar="FACTOR", help="Bag time over wall time."
+    "--rate", default=1.0, show_default=True, metavar="FACTOR", help="Bag time per wall time."
 )
 @click.option(
-    "--start", default=0.0, metavar="SECONDS", help="Where to begin, from the first message."
+    "--start",
+    default=0.0,
+    metavar="SECONDS",
+    help="Where to begin, counted from the first message.",
 )
 @click.option("--duration", default=0.0, metavar="SECONDS", help="How much to replay [all].")
 @click.option("--loop", is_flag=True, help="Begin again at the end.")
-@click.option("--topic", "topics", multiple=True, metavar="TOPIC", help="Replay this one [all].")
-@click.option("--remap", multiple=True, metavar="OLD:=NEW", help="Publish a topic as another.")
+@click.option(
+    "--topic",
+    "topics",
+    multiple=True,
+    metavar="TOPIC",
+    help="Replay only this topic [all]. May be repeated.",
+)
+@click.option(
+    "--remap", multiple=True, metavar="OLD:=NEW", help="Publish topic OLD as NEW. May be repeated."
+)
 @click.option(
     "--clock",
     is_flag=False,
@@ -30,9 +41,9 @@ from spacerobot_ros.cli.options import bag_argument, view_option, viewing_if
     default=0.0,
     type=float,
     metavar="[HZ]",
-    help="Publish bag time on /clock, 100 times a second unless told [what the bag has].",
+    help="Publish bag time on /clock HZ times a second (100 without a number) [as recorded].",
 )
-@click.option("--paused", is_flag=True, help="Begin paused; see the services of the node.")
+@click.option("--paused", is_flag=True, help="Begin paused.")
 @view_option
 @click.option("--wait", default=3.0, show_default=True, help="Longest wait for readers (s).")
 def command(
@@ -48,10 +59,10 @@ def command(
     wait: float,
     view: bool,
 ) -> None:
-    """Publish what a BAG holds on its topics, in the rhythm in which it was recorded.
+    """Publish the messages of a BAG again, at their recorded times.
 
-    While it lasts, its services /replay/pause, /replay/resume and /replay/step steer it. With
-    --view it stands still at the end, until Ctrl-C, and can be played again.
+    The services /replay/pause, /replay/resume and /replay/step control it. With --view it stays
+    paused at the end until Ctrl-C, and can be played again.
     """
     values: dict[str, Any] = {
         "bag": str(bag),

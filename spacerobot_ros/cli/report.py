@@ -11,17 +11,17 @@ from spacerobot_ros.cli.options import PATH, bag_argument, picture_option
 
 @click.command("report")
 @bag_argument
-@click.option("--output", "-o", type=PATH, help="HTML file [beside the bag].")
+@click.option("--output", "-o", type=PATH, help="HTML file [BAG.html].")
 @picture_option("Also draw an overview (.png, .svg, .pdf).")
 @click.option(
     "--beside",
     multiple=True,
     type=PATH,
     metavar="BAG",
-    help="Another run to compare with: a row of numbers and its path. May be repeated.",
+    help="Bag of another flight to compare with. May be repeated.",
 )
 def command(bag: Path, output: Path | None, picture: Path | None, beside: tuple[Path, ...]) -> None:
-    """Make a picture report of a BAG."""
+    """Write an HTML report of a BAG, with pictures and a 3D view."""
     from spacerobot_ros.report import write_picture, write_report
 
     target = output or bag.with_suffix(".html")

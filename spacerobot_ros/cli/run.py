@@ -32,18 +32,20 @@ if TYPE_CHECKING:
 @click.command("run")
 @click.argument("scenario", metavar="SCENARIO|ROBOT")
 @goal_options
-@click.option("--method", type=Registered(METHODS, LAWS), help="Gait method, or control law.")
+@click.option(
+    "--method", type=Registered(METHODS, LAWS), help="Gait method or control law [the scenario's]."
+)
 @settings_option
-@click.option("--bag", type=PATH, help="New bag to write [out/SCENARIO.mcap, or the next free].")
-@json_option("Write the result.")
-@click.option("--report", type=PATH, help="Write a picture report (HTML).")
+@click.option("--bag", type=PATH, help="Bag to write [out/SCENARIO.mcap, or the next free name].")
+@json_option("Write the result as JSON.")
+@click.option("--report", type=PATH, help="Write a report with pictures and a 3D view (HTML).")
 @click.option(
     "--realtime",
     is_flag=False,
     flag_value=1.0,
     type=click.FloatRange(min=0.0, min_open=True),
     metavar="[FACTOR]",
-    help="Run on the wall clock, FACTOR times as fast.",
+    help="Run on the wall clock, FACTOR times as fast (1 without a number).",
 )
 @click.option("--processes", is_flag=True, help="Give each node a process of its own.")
 @view_option
@@ -59,11 +61,13 @@ def command(
     processes: bool,
     view: bool,
 ) -> None:
-    """Fly SCENARIO (a name or a parameter file), or a ROBOT (a name or a URDF file), to its goal.
+    """Fly a SCENARIO or a ROBOT to its goal, and record a bag.
+
+    A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file.
 
     Exit code 0: the goal was reached within tolerance; 1: it was not; 2: bad input. A signal ends
-    the flight early; what was flown is recorded and summed up, and the exit code is 128 plus the
-    number of the signal: 130 after Ctrl-C.
+    the flight early: the bag and the summary cover it until then, and the exit code is 128 plus the
+    number of the signal, 130 after Ctrl-C.
     """
     chosen = _chosen(scenario, goal, method, settings, realtime)
     from spacerobot_ros.bag import free_name

@@ -11,9 +11,12 @@ from spacerobot_ros.cli.options import PATH, bag_argument
 
 @click.command("salvage")
 @bag_argument
-@click.option("--output", "-o", type=PATH, help="The new bag [BAG-salvaged.mcap].")
+@click.option("--output", "-o", type=PATH, help="Bag to write [BAG-salvaged.mcap].")
 def command(bag: Path, output: Path | None) -> None:
-    """Make a complete bag of a BAG that was cut off or is damaged; that one stays as it is."""
+    """Make a complete bag of a BAG that was cut off or is damaged.
+
+    The damaged BAG is not changed.
+    """
     from spacerobot_ros.bag.salvage import salvage_bag
 
     saved = salvage_bag(bag, output)

@@ -12,16 +12,18 @@ from spacerobot_ros.cli.options import PATH, settings_option, view_option, viewi
 @click.command("up")
 @click.argument("scenario", metavar="SCENARIO|ROBOT")
 @settings_option
-@click.option("--bag", type=PATH, help="Record into this bag.")
+@click.option("--bag", type=PATH, help="Bag to write [none].")
 @click.option(
     "--rate",
     default=1.0,
     show_default=True,
     type=click.FloatRange(min=0.0, min_open=True),
-    help="Simulated over wall time.",
+    help="Simulated time per wall time.",
 )
 @click.option("--processes", is_flag=True, help="Give each node a process of its own.")
-@click.option("--namespace", default="", help="Of all nodes and topics, /clock and /tf among them.")
+@click.option(
+    "--namespace", default="", help="Namespace of all nodes and topics, also of /clock and /tf."
+)
 @view_option
 def command(
     scenario: str,
@@ -32,9 +34,10 @@ def command(
     namespace: str,
     view: bool,
 ) -> None:
-    """Run the nodes of SCENARIO, or of a ROBOT (a name or a URDF file), in real time.
+    """Keep the nodes of a SCENARIO or a ROBOT running in real time.
 
-    They end at Ctrl-C, SIGTERM or SIGHUP; goals come by topic.
+    A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. Send goals by topic or
+    with the command spacerobot goal. Ctrl-C, SIGTERM or SIGHUP ends the nodes.
     """
     from spacerobot_ros.flight.scenario import scenario_or_robot
 

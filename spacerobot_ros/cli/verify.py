@@ -17,12 +17,12 @@ from spacerobot_ros.cli.options import bag_argument
     default=1e-9,
     show_default=True,
     type=click.FloatRange(min=0.0),
-    help="Deviation that is no difference (SI units; relative above 1).",
+    help="Largest deviation that counts as equal (SI units; relative above 1).",
 )
 def command(bag: Path, tolerance: float) -> None:
-    """Fly a BAG again by the commands in it, and compare what its plant published.
+    """Re-simulate a BAG from its commands, and compare the states.
 
-    Exit code 0: all is as the commands make it; 1: it is not; 2: bad input.
+    Exit code 0: every recorded state follows from the commands; 1: one does not; 2: bad input.
     """
     from spacerobot_ros.verification.comparison import verify_bag
 
