@@ -409,8 +409,8 @@ class Executive(ScheduleExecution):
             case PlanReason.IN_MOTION, Refused(reason=reason):
                 self._plan_again_for(ticket.identified)
                 self._in_motion.attempt_failed()
-                how = "once more, from a later tick" if self._in_motion.tries_again else "from rest"
-                sentence = f"The goal is planned for {how}, since in motion it is not: {reason}"
+                again = "from a later tick" if self._in_motion.tries_again else "from rest"
+                sentence = f"No plan begins in motion, so the goal is planned for {again}: {reason}"
                 self._out.notice(Severity.WARNING, sentence)
                 self._go(Event.REFUSED, Phase.EXECUTING)
             case PlanReason.SHRINKING_HORIZON, Refused(reason=reason):

@@ -64,7 +64,9 @@ class InMotion:
 
     @property
     def tries_again(self) -> bool:
-        """Whether an attempt is left: joints that brake at a limit, say, do not a little later."""
+        """Whether an attempt is left: a plan that fails from one tick, as where joints brake at a
+        limit, may succeed from a later one.
+        """
         return self._attempts < _MOST_ATTEMPTS
 
     def begin_schedule(self, config: PlannerConfig, schedule: GaitSchedule, begins_ns: int) -> int:

@@ -1,9 +1,10 @@
-"""What the motion of a base tells of the masses of its robot, and of where it will be at the end.
+"""Estimation of errors of masses and inertias from the measured motion of the base.
 
-At zero momentum the base turns by the shape's path and by ratios of masses and inertias alone. So
-where it turns otherwise than predicted, these are not quite the model's. The estimate is linear
-(Gauss-Newton about the model): to first order in the errors of masses and inertias, all deviations
-of a base path are sums of their sensitivities, and the least squares of many noisy poses say which.
+At zero momentum the path of the shape and ratios of masses and inertias alone determine how the
+base turns. Where it turns otherwise than predicted, the model's masses and inertias are wrong. To
+first order the deviation of the base path is linear in their relative errors: a sensitivity of the
+path multiplies each. Linear least squares over many noisy poses, with a prior on the errors, give
+the estimate (one step of Gauss-Newton about the model).
 """
 
 from __future__ import annotations
@@ -19,27 +20,28 @@ from spacerobot_ros.model.rotations import hat, matrix_from_quaternion
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 
 _SHAPES = 48
-"""The model is called for so many shapes along a path, at most."""
+"""Largest number of shapes along a path for which the model is evaluated."""
 
 _STEP = 1e-6
-"""Relative step of the difference quotients."""
+"""Relative step of the finite differences."""
 
 _SPREAD = 0.1
-"""Standard deviation of the factors by which masses and inertias differ from the model's."""
+"""Standard deviation of the relative errors of masses and inertias, before any measurement."""
 
 _NOISE = 1e-3
-"""Standard deviation of a measured pose, rad and m."""
+"""Standard deviation of each component of a measured pose, m or rad."""
 
 
 class PathSensitivity:
-    """How a base path depends on masses and inertias: P parameters, two a body.
+    """Derivatives of a base path by P parameters: relative errors of masses and inertias.
 
-    Each is a relative error, of the mass or of the tensor of inertia of one body.
+    The first P / 2 are those of the masses of the bodies, the others those of their inertia
+    tensors.
 
     Parameters
     ----------
     robot
-        The model that has predicted the path.
+        The model by which the path is predicted.
     """
 
     def __init__(self, robot: SpaceRobot) -> None:
@@ -48,8 +50,11 @@ class PathSensitivity:
 
     @cached_property
     def _model(self) -> tuple[ca.Function, Array]:
-        """What turns the base by its shape, and the centre of mass, of robots that weigh otherwise;
-        and the arguments (k, 1 + P) that make them so.
+        """A function of shape and inertial arguments, and the arguments (k, 1 + P) of variants.
+
+        The function returns the angular velocity of the base per joint rate (3 n,) and the centre
+        of mass (3,), both in base components. The variants are the model itself, then the model
+        with each parameter changed by a small step.
         """
         robot, bodies = self._robot, self.count // 2
         factors = 1 + np.vstack([np.zeros(self.count), _STEP * np.eye(self.count)])
@@ -61,39 +66,42 @@ class PathSensitivity:
         return ca.Function("model", [q, p], [ca.vec(-connection[3:, :]), center]), arguments.T
 
     def _derivatives(self, shapes: Array) -> tuple[Array, Array]:
-        """Return the derivatives, by the parameters, of the turn by each joint (M, n, 3, P), in
-        base components, and of the centre of mass (M, 3, P) in shapes (M, n).
+        """Return derivatives by the parameters, for shapes (M, n), in base components.
+
+        They are those of the turn by each joint (M, n, 3, P) and of the centre of mass (M, 3, P).
         """
         model, arguments = self._model
-        robots = arguments.shape[1]
-        of_all = model.map(len(shapes) * robots)(
-            np.repeat(shapes, robots, axis=0).T, np.tile(arguments, len(shapes))
+        variants = arguments.shape[1]
+        of_all = model.map(len(shapes) * variants)(
+            np.repeat(shapes, variants, axis=0).T, np.tile(arguments, len(shapes))
         )
-        turns, centers = (np.asarray(each).T.reshape(len(shapes), robots, -1) for each in of_all)
+        turns, centers = (np.asarray(each).T.reshape(len(shapes), variants, -1) for each in of_all)
         by_turn, by_center = (
             (each[:, 1:] - each[:, :1]).transpose(0, 2, 1) / _STEP for each in (turns, centers)
         )
         return by_turn.reshape(len(shapes), self._robot.n, 3, self.count), by_center
 
     def along(self, schedule: GaitSchedule) -> Array:
-        """Return the derivatives (K, 6, P) of the poses of a schedule's predicted path.
+        """Return the derivatives (K, 6, P) of the K poses of a schedule's predicted path.
 
-        Displacements (m) over turns (rotation vectors, rad), all in W; where the path begins is
-        known.
+        The first three components are those of the position, m, the others those of the attitude
+        (rotation vector, rad), all in W. The derivatives of the first pose are zero, because it is
+        measured.
         """
         path = schedule.path
         knots = len(path.time)
         ticks = (path.time / schedule.control_period).round().astype(int)
         shapes = schedule.positions[ticks]
         R = np.array([matrix_from_quaternion(each) for each in path.quaternion])
-        # The model changes little from shape to shape: it is called for some, and interpolated.
+        # The model changes little from shape to shape: it is evaluated for some of them, and
+        # interpolated in between.
         instants: Array = np.arange(knots, dtype=float)
         called = np.unique(np.linspace(0, knots - 1, _SHAPES).round().astype(int))
         turns, centers = self._derivatives(shapes[called])
         by_joint = _interpolated(instants[:-1] + 0.5, called, turns)
         in_base = np.einsum("kjap,kj->kap", by_joint, np.diff(shapes, axis=0))
-        by_way = (R[:-1] + R[1:]) / 2 @ in_base
-        turned = np.concatenate([np.zeros((1, *by_way.shape[1:])), np.cumsum(by_way, axis=0)])
+        steps = (R[:-1] + R[1:]) / 2 @ in_base
+        turned = np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
         # The centre of mass of the system stays where it is: r = r_cm - R c.
         arms = [hat(A @ self._robot.center_of_mass(q)) for A, q in zip(R, shapes, strict=True)]
         moved = np.array(arms) @ turned - R @ _interpolated(instants, called, centers)
@@ -101,7 +109,7 @@ class PathSensitivity:
 
 
 def _interpolated(at: Array, known: Array, values: Array) -> Array:
-    """Return values (M, ...) that are known at M instants, linearly in between."""
+    """Return values at instants, linearly between those (M, ...) at M known instants."""
     place = np.interp(at, known, np.arange(len(known)))
     before = np.clip(place.astype(int), 0, max(len(known) - 2, 0))
     share = (place - before).reshape(-1, *[1] * (values.ndim - 1))
@@ -110,35 +118,37 @@ def _interpolated(at: Array, known: Array, values: Array) -> Array:
 
 
 class MassEstimate:
-    """The errors of masses and inertias (P,) that explain the deviations from paths so far.
+    """Estimate of the relative errors of masses and inertias (P,), from deviations of base paths.
 
-    Each path has an offset of its own, as where it begins is measured; it is left out of account.
+    The first pose of each path is measured with an error. So each path has an unknown constant
+    offset, which is eliminated from the normal equations.
 
     Parameters
     ----------
     count
-        P.
+        P, the number of parameters.
     """
 
     def __init__(self, count: int) -> None:
-        self._known = (_NOISE / _SPREAD) ** 2 * np.eye(count)
-        self._told = np.zeros(count)
+        # Information of the prior and of all earlier paths: matrix and vector.
+        self._information = (_NOISE / _SPREAD) ** 2 * np.eye(count)
+        self._vector = np.zeros(count)
         self._errors: Array | None = None
         self._begin()
 
     def _begin(self) -> None:
-        count = len(self._told)
+        count = len(self._vector)
         self._poses = 0
         self._sum_J, self._sum_y = np.zeros((6, count)), np.zeros(6)
         self._squares, self._products = np.zeros((count, count)), np.zeros(count)
 
     def next_path(self) -> None:
-        """Begin with another path; what was learnt is kept."""
-        self._known, self._told = self._sums()
+        """Begin with another path; the information of the earlier ones is kept."""
+        self._information, self._vector = self._normal_equations()
         self._begin()
 
     def add(self, sensitivity: Array, deviation: Array) -> None:
-        """Add a pose that deviates by (6,) where the path has the sensitivity (6, P)."""
+        """Add the deviation (6,) of a pose, where the path has the sensitivity (6, P)."""
         self._poses += 1
         self._sum_J += sensitivity
         self._sum_y += deviation
@@ -150,12 +160,12 @@ class MassEstimate:
     def errors(self) -> Array:
         """The relative errors (P,) of masses, then of inertias."""
         if self._errors is None:
-            self._errors = np.asarray(np.linalg.solve(*self._sums()))
+            self._errors = np.asarray(np.linalg.solve(*self._normal_equations()))
         return self._errors
 
-    def _sums(self) -> tuple[Array, Array]:
-        """Return the normal equations, without what an offset explains."""
+    def _normal_equations(self) -> tuple[Array, Array]:
+        """Return their matrix and right side, without the part that a constant offset explains."""
         n = max(self._poses, 1)
         squares = self._squares - self._sum_J.T @ self._sum_J / n
         products = self._products - self._sum_J.T @ self._sum_y / n
-        return self._known + squares, self._told + products
+        return self._information + squares, self._vector + products

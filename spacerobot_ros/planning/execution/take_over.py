@@ -72,10 +72,10 @@ class PathDeviation:
     count
         Measurements to average.
     sensitivity
-        (K, 6, P) how the path depends on masses and inertias, see :class:`.PathSensitivity`; None:
-        it is not known.
+        (K, 6, P) derivatives of the path by errors of masses and inertias, as
+        :class:`.PathSensitivity` returns them; None: these errors are not estimated.
     masses
-        What was learnt of these, and is learnt from these measurements.
+        The estimate of these errors, which the measurements improve.
     """
 
     def __init__(
@@ -96,8 +96,9 @@ class PathDeviation:
     def add(self, k: int, position: Array, quaternion: Array, lag: Array | float = 0.0) -> None:
         """Add a measured position (3,) and attitude (4,) at instant k of the path.
 
-        ``lag`` (6,) is what the base is off by, displacement over turn in W, because the joints are
-        not where the path has them. It goes when they come there.
+        ``lag`` (6,) is the part of its deviation, displacement (m) and rotation vector (rad) in W,
+        that comes from joints which lag behind the schedule. It vanishes when they catch up, so it
+        is no part of the mean deviation.
         """
         predicted = self._path.quaternion[k]
         turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, quaternion)
@@ -123,7 +124,7 @@ class PathDeviation:
         )
 
     def expected_end(self, k: int) -> tuple[Array, Array]:
-        """Return where it leads to by what is known of the masses: (3,) and (4,)."""
+        """Return where the path leads to with the estimated errors of masses: (3,) and (4,)."""
         position, quaternion = self.end(k)
         more = self._of_masses(k, -1)
         turn = quaternion_from_rotvec(more[3:])
@@ -135,7 +136,7 @@ class PathDeviation:
         return position, quaternion_multiply(turn, self._path.quaternion[k])
 
     def _of_masses(self, begin: int, end: int) -> Array:
-        """Return what errors of masses add to the deviation (6,) from one instant to another."""
+        """Return the change of the deviation (6,) between instants by errors of masses."""
         return np.asarray((self._sensitivity[end] - self._sensitivity[begin]) @ self._masses.errors)
 
     def _mean(self, k: int) -> Array:

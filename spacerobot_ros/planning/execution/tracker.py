@@ -190,7 +190,8 @@ class TrackingErrorCheck:
     average
         Measured poses whose mean deviation from the path counts for plans in motion; 0: none are.
     sensitivity, masses
-        How the path depends on masses (see :class:`.PathDeviation`), and what is learnt of these.
+        Derivatives of the path by errors of masses, and their estimate: see
+        :class:`.PathDeviation`.
     """
 
     def __init__(
@@ -228,7 +229,7 @@ class TrackingErrorCheck:
         return np.asarray(self._positions[round(time / self._period)])
 
     def add(self, position: Array, quaternion: Array, lag: Array) -> None:
-        """Take a pose that is due, and how far it lags (6,), into the mean deviation."""
+        """Take a pose that is due into the mean deviation, without the part (6,) of lagging joints."""
         self._deviation.add(self._next, position, quaternion, lag)
 
     @property
@@ -243,7 +244,7 @@ class TrackingErrorCheck:
 
     @property
     def expected_end(self) -> tuple[Array, Array]:
-        """Where it leads to by what is known of the masses, too."""
+        """Where the path leads to with the estimated errors of masses: (3,), (4,)."""
         return self._deviation.expected_end(self._next)
 
     def error(self, position: Array, quaternion: Array) -> TrackingError | None:
@@ -361,12 +362,12 @@ class TrajectoryTracker:
         return replace(state, position=position, quaternion=quaternion)
 
     def _lag(self, state: RobotState) -> Array:
-        """Return what the base of a state that is due is off by as the joints lag, in W (6,)."""
-        way = state.q - self._check.shape
-        way[np.abs(way) <= self._config.shape_deadband] = 0.0
-        twist = -self._robot.connection(state.q) @ way
-        R = matrix_from_quaternion(state.quaternion)
-        return np.concatenate([R @ twist[:3], R @ twist[3:]])
+        """Return the deviation (6,) in W of the base that comes from joints which lag."""
+        lag = state.q - self._check.shape
+        lag[np.abs(lag) <= self._config.shape_deadband] = 0.0
+        displacement_B = -self._robot.connection(state.q) @ lag
+        R_WB = matrix_from_quaternion(state.quaternion)
+        return np.concatenate([R_WB @ displacement_B[:3], R_WB @ displacement_B[3:]])
 
     @property
     def end(self) -> tuple[Array, Array]:
@@ -375,7 +376,7 @@ class TrajectoryTracker:
 
     @property
     def expected_end(self) -> tuple[Array, Array]:
-        """Where it leads to by what is known of the masses, too."""
+        """Where the path leads to with the estimated errors of masses: (3,), (4,)."""
         return self._check.expected_end
 
     def error(self, state: RobotState) -> TrackingError | None:
