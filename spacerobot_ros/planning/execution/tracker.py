@@ -229,7 +229,7 @@ class TrackingErrorCheck:
         return np.asarray(self._positions[round(time / self._period)])
 
     def add(self, position: Array, quaternion: Array, lag: Array) -> None:
-        """Take a pose that is due into the mean deviation, without the part (6,) of lagging joints."""
+        """Add a pose that is due to the mean deviation, without the part (6,) of lagging joints."""
         self._deviation.add(self._next, position, quaternion, lag)
 
     @property
