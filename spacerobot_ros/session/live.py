@@ -108,6 +108,8 @@ def send_goal(
                 lambda: clocks["own"] or clocks["global"] or time.time_ns(),
                 namespace=namespace,
                 name=f"goal_{decider}",
+                # Joint positions that somebody has had an earlier goal end in are not this goal's.
+                joint_names=tuple if decider == "planner" else None,
             )
             for decider in ("planner", "coordinated_control")
         ]
@@ -148,6 +150,9 @@ def _with_decider(
             if client.is_connected() and client.has_decider():
                 latest = time.monotonic() + _LATCHED
                 while client.status is None and time.monotonic() < latest:
+                    executor.spin_once(timeout_sec=0.05)
+                # Its other readers may have been found in the meantime.
+                while not client.is_connected() and time.monotonic() < deadline:
                     executor.spin_once(timeout_sec=0.05)
                 return client
     raise SpaceRobotError(

@@ -13,6 +13,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
@@ -46,7 +47,8 @@ class MissionClient:
     now
         Returns the time that goals are stamped with, ns: the simulated time where there is one.
     joint_names
-        Returns the robot's joints, where goals have a shape; None: they have none.
+        Returns the robot's joints, where goals may end in joint positions of their own, or where
+        those of an earlier goal may be in force; None: no goal of this stack has any.
     end_effector
         Whether there will be goals for the end-effector.
     on_end
@@ -79,12 +81,16 @@ class MissionClient:
         self._sent = 0
         self._goal_id: str | None = None
         self._goal_topic = self.node.create_publisher(PoseStamped, "goal_pose", STREAM)
+        self._sends: list[Publisher] = [self._goal_topic]
+        self._shape_topic: Publisher | None = None
         if joint_names is not None:
             self._shape_topic = self.node.create_publisher(JointState, "goal_joint_states", STREAM)
+            self._sends.append(self._shape_topic)
         if end_effector:
             self._end_effector_topic = self.node.create_publisher(
                 PoseStamped, "end_effector/goal_pose", STREAM
             )
+            self._sends.append(self._end_effector_topic)
         topic, self._read = STATUS_TOPICS[decider]
         self._status_topic = self.node.create_subscription(
             DiagnosticStatus, topic, self._on_status, LATCHED
@@ -106,11 +112,14 @@ class MissionClient:
         return self.status.ends_at_s if isinstance(self.status, PlannerStatus) else 0.0
 
     def is_connected(self, readers: int = 1) -> bool:
-        """Whether everything that this node publishes has that many readers."""
+        """Whether every goal has that many readers, and joint positions all that are known.
+
+        Planners of others need not take joint positions.
+        """
         return all(
-            publisher.get_subscription_count() >= readers
-            for publisher in self.node.publishers
-            if publisher.topic_name not in ("/rosout", "/parameter_events")
+            publisher.get_subscription_count()
+            >= (self.node.count_subscribers(publisher.topic_name) if shapes else readers)
+            for publisher, shapes in ((each, each is self._shape_topic) for each in self._sends)
         )
 
     def has_decider(self) -> bool:
@@ -120,15 +129,20 @@ class MissionClient:
     def send(self, goal: Goal, end_effector: Goal | None = None) -> None:
         """Publish goal poses of the base and, where there is one, of the end-effector.
 
-        Both have the same stamp, which is no other goal's: the status names them by it.
+        Both have the same stamp, which is no other goal's: the status names them by it. A planner
+        keeps the joint positions that a goal is to end in for the goals after it: so each goal is
+        sent with its own, and one without any is sent with none.
         """
         self._sent += 1
         stamp = Time()
         stamp.sec, stamp.nanosec = divmod(self._now() + self._sent, _SECOND)
         self._goal_id = GoalIds().of(stamp.sec, stamp.nanosec)
-        if goal.joint_positions is not None and self._joint_names is not None:
+        if self._shape_topic is not None and self._joint_names is not None:
+            shape = goal.joint_positions
             self._shape_topic.publish(
-                JointState(name=list(self._joint_names()), position=goal.joint_positions.tolist())
+                JointState()
+                if shape is None
+                else JointState(name=list(self._joint_names()), position=shape.tolist())
             )
         self._goal_topic.publish(self._pose(goal, stamp))
         if end_effector is not None:
@@ -137,9 +151,8 @@ class MissionClient:
     def await_delivery(self) -> None:
         """Wait until those that take goals have received what was sent."""
         end = time.monotonic() + _LONGEST_DELIVERY
-        for publisher in self.node.publishers:
-            if publisher.topic_name not in ("/rosout", "/parameter_events"):
-                publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
+        for publisher in self._sends:
+            publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
 
     def follow(
         self, executor: EventsExecutor, look: Callable[[], bool], period: float = _LOOK_PERIOD

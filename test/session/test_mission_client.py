@@ -9,6 +9,7 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import JointState
 from support.ros_harness import LATCHED, Harness, Probe
 
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
@@ -41,12 +42,15 @@ class Mission:
             decider,
             "world",
             lambda: NOW,
+            joint_names=lambda: ("a", "b"),
             end_effector=True,
             on_end=self.on_end,
             context=harness.context,
         )
         harness.add(self.client.node)
-        self.commander: Probe = harness.probe(TOPICS)
+        # A controller takes no joint positions, and goals are sent to it all the same.
+        shapes = {"goal_joint_states": JointState} if decider == "planner" else {}
+        self.commander: Probe = harness.probe({**TOPICS, **shapes})
         self.status = self.commander.create_publisher(DiagnosticStatus, STATUS[decider], LATCHED)
         harness.spin_until(lambda: self.client.is_connected() and self.client.has_decider())
         harness.spin_until(lambda: self.status.get_subscription_count() == 1)
@@ -54,10 +58,10 @@ class Mission:
     def on_end(self) -> None:
         self.ends += 1
 
-    def send(self, goal: Goal) -> str:
-        """Send a goal, and return its id as a commander makes it of the stamp."""
+    def send(self, tool: Goal, base: Goal = GOAL) -> str:
+        """Send goals, and return their id as a commander makes it of the stamp."""
         before = self.commander.count("end_effector/goal_pose")
-        self.client.send(GOAL, goal)
+        self.client.send(base, tool)
         self.harness.spin_until(
             lambda: (
                 self.commander.count("end_effector/goal_pose") > before
@@ -159,3 +163,13 @@ def test_the_pose_of_a_goal_is_that_of_the_message(harness: Harness) -> None:
         p, o = pose.position, pose.orientation
         np.testing.assert_array_equal([p.x, p.y, p.z], goal.position)
         np.testing.assert_allclose([o.x, o.y, o.z, o.w], goal.quaternion, atol=1e-15)
+
+
+def test_joint_positions_of_an_earlier_goal_are_not_those_of_the_next(harness: Harness) -> None:
+    mission = Mission(harness, "planner")
+    shaped = Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], np.array([0.5, -0.25]))
+    for base in (GOAL, shaped, GOAL):
+        mission.send(GOAL, base)
+    shapes = mission.commander.messages["goal_joint_states"]
+    assert [list(each.name) for each in shapes] == [[], ["a", "b"], []], "those of each goal"
+    assert list(shapes[1].position) == [0.5, -0.25]
