@@ -112,14 +112,17 @@ def share_flown(state: StackState) -> float:
     return min(1.0, max(0.0, 1.0 - left / planner.manoeuvre_time_s))
 
 
-def head(state: StackState) -> str:
-    """Return the state of the stack as HTML."""
+def head(state: StackState, *, described: bool = True) -> str:
+    """Return the state of the stack as HTML; ``described``: whether a robot is known."""
     lines = []
     quiet = silence(state)
     if quiet:
         lines.append(_line(quiet, 2))
+    elif not described:
+        lines.append(_line("No robot is shown: nothing valid has come on robot_description.", 2))
     for name, seconds in sorted(state.silent.items()):
         lines.append(_line(f"Node '{name}' is silent for {math.floor(seconds)} s.", 2))
+    lines.extend(_line(f"Node '{name}' is not active.", 1) for name in sorted(state.inactive))
     if state.measured is not None:
         left = time_to_go(state)
         text = f"t = {state.measured.time_s:.2f} s"

@@ -67,7 +67,6 @@ class GoalEditor:
         self._gizmos: dict[str, Any] = {}
         self._poses: dict[str, Array] = {}
         self._ghost: RobotDrawing | None = None
-        self._shape: Array | None = None
         self._changed_at: float | None = None
         self._check = Check(Verdict.UNCHECKED)
         gui = server.gui
@@ -116,8 +115,10 @@ class GoalEditor:
         """Begin anew with another robot, whose scene is empty; None: there is none."""
         self._gizmos.clear()
         self._poses.clear()
-        self._ghost, self._shape, self._changed_at = None, None, None
+        self._ghost, self._changed_at = None, None
         self._reach, self._robot = reach, robot
+        # What is known of the goal of another robot is of no use: it has other joints.
+        self.show_check(Check(Verdict.UNCHECKED))
         self._final.show_robot(robot)
 
     def place(self, base: Array, tool: Array | None, q: Array, now: float) -> None:
@@ -219,10 +220,10 @@ class GoalEditor:
 
     def show_check(self, check: Check) -> None:
         """Show what is known of the goal."""
-        if check == self._check:
-            return
         self._check = check
-        self._verdict.content = verdict(check)
+        text = verdict(check)
+        if text != self._verdict.content:
+            self._verdict.content = text
         if self._ghost is not None:
             self._ghost.paint(COLORS[check.verdict])
             if check.shape is not None:

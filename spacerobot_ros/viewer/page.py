@@ -34,7 +34,7 @@ _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
 """Wall s from one drawing of the slower parts to the next."""
 
 CAMERA = np.array([1.1, -1.4, 0.8])
-"""Where a page looks from when it is opened, in lengths of the robot."""
+"""From the robot to where a page looks at it from when it is opened, in lengths of the robot."""
 
 _LIGHT, _DARK = "light", "dark"
 
@@ -82,6 +82,15 @@ class Page:
         with tabs.add_tab("Log"):
             self._log = Log(gui)
         self._editor.on_to_robot(self._goal_to_robot)
+        look = gui.add_button(
+            "Look at the robot", color="gray", hint="Have this browser look at where it is now."
+        )
+
+        @look.on_click
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                defer(lambda: self._aim(event.client.camera))
+
         self._style = gui.add_button("Dark or light", color="gray")
         themes: dict[int, bool] = {}
 
@@ -107,7 +116,8 @@ class Page:
         self, robot: RobotDescription | None, table: ThrusterTable | None = None
     ) -> None:
         """Begin anew with another robot; None: there is none."""
-        self._robot, self._table, self._drawing = robot, table, None
+        self._robot, self._table, self._drawing, self._last = robot, table, None, None
+        self._around: scene.Surroundings | None = None
         self._server.scene.reset()
         reach = 1.0 if robot is None else scene.reach_of(robot)
         self._reach, self._trail = reach, Trail(0.003 * reach)
@@ -119,8 +129,6 @@ class Page:
             self._server.scene, _ROBOT, robot, on_note=lambda text: self.note(Notice(text, 1))
         )
         self._drawing.base.visible = False  # Nobody knows where it is yet.
-        self._around = scene.Surroundings(self._server.scene, reach, _ROBOT)
-        self._aim_cameras()
 
     def show_thrusters(self, table: ThrusterTable | None) -> None:
         """Take the places of the thrusters, which are known later than the robot."""
@@ -183,6 +191,12 @@ class Page:
         if measured is self._last:
             return
         self._last = measured
+        if self._around is None:
+            center = measured.pose[:3]
+            self._around = scene.Surroundings(self._server.scene, self._reach, _ROBOT, center)
+            self._aim(self._server.initial_camera)
+            for client in self._server.get_clients().values():
+                self._aim(client.camera)
         drawing.base.visible = True
         drawing.place(measured.pose)
         drawing.bend(measured.q)
@@ -202,7 +216,7 @@ class Page:
             )
 
     def _draw_texts(self, state: StackState) -> None:
-        text = content.head(state)
+        text = content.head(state, described=self._robot is not None)
         if text != self._head.content:
             self._head.content = text
         share = content.share_flown(state)
@@ -222,13 +236,10 @@ class Page:
         self._due[what] = self._now + period
         return True
 
-    def _aim_cameras(self) -> None:
-        """Have pages look at the robot that is there now."""
-        position = self._reach * CAMERA
-        self._server.initial_camera.position = position
-        self._server.initial_camera.look_at = np.zeros(3)
-        for client in self._server.get_clients().values():
-            client.camera.position, client.camera.look_at = position, np.zeros(3)
+    def _aim(self, camera: Any) -> None:
+        """Have a camera look at where the robot is, or will be."""
+        at = np.zeros(3) if self._last is None else self._last.pose[:3]
+        camera.position, camera.look_at = at + self._reach * CAMERA, at
 
     # -- what users want ------------------------------------------------------------------------
 

@@ -281,7 +281,10 @@ class _Plot:
         self.history = History(len(names))
         series: list[Any] = [{"label": "t (s)"}]
         for i, name in enumerate(names):
-            series.append({"label": name, "stroke": _COLORS[i % len(_COLORS)], "width": 1.5})
+            turn, color = divmod(i, len(_COLORS))
+            look = {"label": name, "stroke": _COLORS[color], "width": 1.5}
+            # Colors come again with dashes, which are shorter every time.
+            series.append(look | ({"dash": (max(12 // turn, 2), 4)} if turn else {}))
         faint = {"stroke": f"{_AXIS}33"}
         axis: dict[str, Any] = {"stroke": _AXIS, "grid": faint, "ticks": faint}
         self.handle: Any = gui.add_uplot(

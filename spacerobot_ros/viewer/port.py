@@ -87,6 +87,8 @@ class StackState:
         What was last sent by anybody, by part.
     silent
         Nodes whose heartbeats have ended, by name, and for how many wall s.
+    inactive
+        Nodes that were deactivated or have ended in order, by name.
     """
 
     measured: Measured | None = None
@@ -101,6 +103,7 @@ class StackState:
     planned_path: Array | None = None
     goals: Mapping[Part, Goal] = field(default_factory=dict)
     silent: Mapping[str, float] = field(default_factory=dict)
+    inactive: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

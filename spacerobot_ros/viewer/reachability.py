@@ -8,6 +8,7 @@ JSON on its standard input and output.
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -26,11 +27,12 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.robot_source import robot_from_text
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured, declared
-from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
-from spacerobot_ros.planning.core.goal import RobotState
+from spacerobot_ros.planning.core.goal import RobotState, Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.progress import reported
+from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
 from spacerobot_ros.termination import Terminated, child_options, guarded
@@ -56,7 +58,7 @@ class Verdict(str, Enum):
     REFUSED = "refused"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Check:
     """What a check has come to.
 
@@ -293,11 +295,9 @@ class Planner:
         step = max(1, len(path) // _MOST_POINTS)
         duration = schedule.expected_duration
         sentence = f"Reachable in {duration:.4g} s by '{schedule.method}'."
-        if goal.joint_positions is not None and "shape" not in schedule.controls:
-            sentence += f" '{schedule.method}' does not heed the final joint positions."
         return {
             "verdict": Verdict.REACHABLE.value,
-            "sentence": sentence,
+            "sentence": f"{sentence}{_left_out(schedule, goal, request.tolerance)}",
             "duration_s": duration,
             "shape": schedule.positions[-1].tolist(),
             "path": np.vstack([path[:-1:step], path[-1:]]).tolist(),
@@ -311,6 +311,25 @@ class Planner:
         # The robot is that of the stack; the planner may have it from there as well.
         self._config = configured(PlannerConfig, {**values, "robot_description": "", "robot": ""})
         self._worker = PlanningWorker(robot_from_text(urdf, self._config), self._config)
+
+
+def _left_out(schedule: GaitSchedule, goal: Goal, tolerance: Tolerance) -> str:
+    """Return which parts of a goal a schedule does not heed, and how far off its end is there."""
+    path, controls = schedule.path, schedule.controls
+    error = PoseError.between(path.position[-1], path.quaternion[-1], goal)
+    parts = []
+    if "position" not in controls and error.distance > tolerance.position:
+        parts.append(("position", f"{error.distance:.3g} m"))
+    if "attitude" not in controls and error.angle > tolerance.attitude:
+        parts.append(("attitude", f"{math.degrees(error.angle):.3g} deg"))
+    if "shape" not in controls and goal.joint_positions is not None:
+        parts.append(("final joint positions", ""))
+    return "".join(
+        f" '{schedule.method}' does not heed the {part}"
+        # Where later schedules end is not known yet.
+        + (f": it ends {off} off." if off and not schedule.partial else ".")
+        for part, off in parts
+    )
 
 
 def _of_arm(question: Mapping[str, Any]) -> dict[str, Any]:

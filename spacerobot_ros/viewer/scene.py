@@ -264,11 +264,15 @@ class Surroundings:
         Length that the robot fits into, m.
     robot_path
         The node of the robot's base, on which the plumes hang.
+    center
+        (3,) point above which the grid lies, m.
     """
 
-    def __init__(self, scene: viser.SceneApi, reach: float, robot_path: str) -> None:
+    def __init__(self, scene: viser.SceneApi, reach: float, robot_path: str, center: Array) -> None:
         cell = 10.0 ** np.floor(np.log10(reach)) / 2
         cells, sections = _GRID
+        # Lines stay at round coordinates, wherever it is.
+        x, y, _ = 10 * cell * np.round(center / (10 * cell))
         scene.add_grid(
             "/grid",
             width=8 * reach,
@@ -277,7 +281,7 @@ class Surroundings:
             section_size=10 * cell,
             cell_color=cells,
             section_color=sections,
-            position=(0.0, 0.0, -1.2 * reach),
+            position=(x, y, center[2] - 1.2 * reach),
             fade_distance=12 * reach,
         )
         scene.add_frame("/world", axes_length=0.25 * reach, axes_radius=0.006 * reach)

@@ -58,10 +58,10 @@ class Mission:
     def on_end(self) -> None:
         self.ends += 1
 
-    def send(self, tool: Goal, base: Goal = GOAL) -> str:
+    def send(self, tool: Goal, goal: Goal = GOAL) -> str:
         """Send goals, and return their id as a commander makes it of the stamp."""
         before = self.commander.count("end_effector/goal_pose")
-        self.client.send(base, tool)
+        self.client.send(goal, tool)
         self.harness.spin_until(
             lambda: (
                 self.commander.count("end_effector/goal_pose") > before
@@ -168,8 +168,8 @@ def test_the_pose_of_a_goal_is_that_of_the_message(harness: Harness) -> None:
 def test_joint_positions_of_an_earlier_goal_are_not_those_of_the_next(harness: Harness) -> None:
     mission = Mission(harness, "planner")
     shaped = Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], np.array([0.5, -0.25]))
-    for base in (GOAL, shaped, GOAL):
-        mission.send(GOAL, base)
+    for goal in (GOAL, shaped, GOAL):
+        mission.send(GOAL, goal)
     shapes = mission.commander.messages["goal_joint_states"]
     assert [list(each.name) for each in shapes] == [[], ["a", "b"], []], "those of each goal"
     assert list(shapes[1].position) == [0.5, -0.25]

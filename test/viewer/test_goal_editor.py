@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterator
+from dataclasses import replace
 from queue import SimpleQueue
 from typing import Any
 
@@ -156,3 +157,22 @@ def test_a_goal_of_the_end_effector_that_appears_is_checked(server: Any) -> None
     goals = page.editor.goals_at_rest(LATER)
     assert goals is not None
     assert set(goals) == {"base", "end_effector"}
+
+
+def test_a_robot_with_other_joints_comes_after_a_goal_was_checked(server: Any) -> None:
+    page = Editor(server, "sliding_masses")
+    page.editor.place(POSE, None, np.zeros(3), 0.0)
+    reachable = Check(Verdict.REACHABLE, "Reachable in 1 s.", 1.0, shape=np.full(3, 0.1))
+    page.editor.show_check(reachable)
+    bent = page.ghost()
+    # The next plan may end in the same sentence, with another shape.
+    page.editor.show_check(replace(reachable, shape=np.full(3, 0.2)))
+    moved = [float(np.linalg.norm(a - b)) for a, b in zip(page.ghost(), bent, strict=True)]
+    np.testing.assert_allclose(moved, 0.1, atol=1e-9)
+    server.scene.reset()
+    other = load_robot(robot_file("servicer"))
+    page.editor.show_robot(other, reach_of(other))
+    assert "not checked" in page.editor._verdict.content
+    page.editor.place(POSE, None, np.zeros(6), 0.0)
+    page.editor.robot_is_at(POSE, np.full(6, 0.1))
+    assert len(page.ghost()) == 6

@@ -61,6 +61,18 @@ def test_joint_positions_of_a_goal_are_asked_for_and_a_method_without_them_says_
     assert "'lie_bracket' does not heed the final joint positions" in answer["sentence"]
 
 
+def test_what_a_method_leaves_as_it_comes_is_said_of_a_goal_that_counts_as_reachable() -> None:
+    chain = replace(
+        question(0.3, -0.4, 0.0, method="area_loop"),
+        urdf=load_robot(robot_file("three_joint_arm")).urdf,
+    )
+    answer = Planner().answer(as_asked(chain), Cancellation())
+    assert answer["verdict"] == "reachable", answer
+    assert "'area_loop' does not heed the position: it ends 0.5 m off." in answer["sentence"]
+    here = replace(chain, goal=Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]))
+    assert "heed" not in Planner().answer(as_asked(here), Cancellation())["sentence"]
+
+
 def test_a_refusal_has_the_sentence_of_the_planner_and_the_next_goal_is_planned() -> None:
     planner = Planner()
     refused = planner.answer(as_asked(question(9.0, 0.0, 0.0)), Cancellation())

@@ -72,6 +72,11 @@ def test_silence_is_said() -> None:
     assert content.silence(replace(STATE, age_s=5.9, replay=plays)) == "No state for 5 s."
     head = content.head(replace(STATE, silent={"/planner": 3.2}))
     assert "Node &#x27;/planner&#x27; is silent for 3 s." in head
+    assert "Node &#x27;/plant&#x27; is not active." in content.head(
+        replace(STATE, inactive=("/plant",))
+    )
+    assert "robot_description" not in content.head(STATE)
+    assert "nothing valid has come on robot_description" in content.head(STATE, described=False)
 
 
 def test_time_to_go_is_of_the_schedule_that_is_flown() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,10 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.viewer import scene
+from spacerobot_ros.viewer.config import ViewerConfig
+from spacerobot_ros.viewer.page import CAMERA, Page
+from spacerobot_ros.viewer.panels import _Plot
+from spacerobot_ros.viewer.port import Measured, StackState
 from spacerobot_ros.viewer.server import start_server, stop_server
 
 
@@ -114,6 +119,37 @@ def test_a_line_has_room_for_what_comes(server: Any) -> None:
         assert np.abs(drawn[count - 2 :, 1] - points[count - 1]).max() < 1e-5
         np.testing.assert_array_equal(drawn[count - 1 :, 0], drawn[count - 1 :, 1])
     assert rooms == [32, 32, 32, 64, 128, 128, 128, 128]
+
+
+def test_a_robot_far_from_the_origin_is_looked_at_and_has_a_grid_below(server: Any) -> None:
+    page = Page(server, ViewerConfig())
+    robot = load_robot(robot_file("sliding_masses"))
+    page.show_robot(robot)
+    reach, zeros = scene.reach_of(robot), np.zeros(3)
+    at, onward = np.array([1234.5, -67.0, 89.0]), np.array([50.0, 0.0, 0.0])
+    first = Measured(0.0, np.concatenate([at, [0.0, 0.0, 0.0, 1.0]]), zeros, zeros, zeros)
+    page.update(StackState(first, age_s=0.0), 1.0)
+    np.testing.assert_allclose(server.initial_camera.look_at, at)
+    np.testing.assert_allclose(server.initial_camera.position, at + reach * CAMERA)
+    grid = server.scene.get_handle_by_name("/grid")
+    assert np.abs(grid.position[:2] - at[:2]).max() < grid.width / 4
+    np.testing.assert_allclose(np.remainder(grid.position[:2], grid.section_size), 0.0, atol=1e-9)
+    assert at[2] - 2 * reach < grid.position[2] < at[2]
+    # It goes on, and a user looks for it: only that camera is moved.
+    later = replace(first, time_s=9.0, pose=first.pose + np.append(onward, np.zeros(4)))
+    page.update(StackState(later, age_s=0.0), 2.0)
+    np.testing.assert_allclose(server.initial_camera.look_at, at)
+    camera = type("Camera", (), {})()
+    page._aim(camera)
+    np.testing.assert_allclose(camera.look_at, at + onward)
+
+
+def test_curves_of_many_joints_differ(server: Any) -> None:
+    names = tuple(f"joint_{number}" for number in range(30))
+    server.gui.reset()
+    plot = _Plot(server.gui, "Joints", names)
+    looks = {(each["stroke"], each.get("dash")) for each in plot.handle.series[1:]}
+    assert len(looks) == 30
 
 
 def test_plumes_point_against_the_thrust() -> None:

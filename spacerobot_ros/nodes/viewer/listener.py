@@ -11,6 +11,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -30,7 +32,7 @@ from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.messages import goal_of
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
-from spacerobot_ros.nodes.common.watchdog import Pulse
+from spacerobot_ros.nodes.common.watchdog import Pulse, Role
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.status import PlantStatus
@@ -43,7 +45,7 @@ _SILENT_AFTER = 1.5
 """Wall s without a heartbeat after which a node that was active is silent."""
 
 _FORGOTTEN_AFTER = 60.0
-"""Wall s after which nothing more is said of it."""
+"""Wall s after which nothing more is said of it, nor of what it reported last."""
 
 _MOST_POINTS = 1000
 """Of a planned path."""
@@ -109,8 +111,13 @@ class Listener:
         self._expected = Latest(streams, Float64MultiArray, "momentum_expected")
         self._thrusters = Latest(streams, JointState, "thrusters")
         self._names: Sequence[str] = ()
-        self._beats: dict[str, tuple[float, str]] = {}
+        self._beats: dict[str, _Beat] = {}
         self._statuses: dict[str, Any] = {}
+        self._reporters: dict[str, str] = {}
+        """The full name of the node that gave each status."""
+        self._gone: dict[str, str] = {}
+        """Nodes whose reports are not shown, by name; until the node that is named beats again."""
+        self._looked = time.monotonic()
         self._planned: Array | None = None
         self._goals: dict[Part, Goal] = {}
         self.forget_state()
@@ -151,7 +158,13 @@ class Listener:
         """Take what has come, and return what is known now."""
         now = time.monotonic()
         self._take_streams(now)
-        statuses = self._statuses
+        self._look_for_nodes_that_are_gone(now)
+        beats = self._beats.items()
+        statuses = {
+            key: status
+            for key, status in self._statuses.items()
+            if self._reporters[key] not in self._gone
+        }
         return StackState(
             measured=self._measured,
             tool=self._tool_pose,
@@ -162,9 +175,16 @@ class Listener:
             planner=statuses.get("planner"),
             controller=statuses.get("controller"),
             replay=statuses.get("replay"),
-            planned_path=self._planned,
+            planned_path=None if self._reporters.get("planner") in self._gone else self._planned,
             goals=dict(self._goals),
-            silent=self._silent(now),
+            silent={
+                name: now - beat.at
+                for name, beat in beats
+                if beat.pulse is Pulse.ACTIVE and now - beat.at > _SILENT_AFTER
+            },
+            inactive=tuple(
+                name for name, beat in beats if beat.pulse is Pulse.INACTIVE and beat.role
+            ),
         )
 
     def time_ns(self) -> int:
@@ -227,6 +247,8 @@ class Listener:
             except SpaceRobotError:
                 return  # Somebody else's; theirs is shown nowhere.
             self._statuses[key] = status
+            self._reporters[key] = message.name
+            self._gone.pop(message.name, None)
             if isinstance(status, PlannerStatus) and len(status.goal) == 7:
                 self._goals["base"] = Goal(np.array(status.goal[:3]), np.array(status.goal[3:]))
             self._on_status(key, message.name)
@@ -248,17 +270,47 @@ class Listener:
             self._goals.pop(part, None)  # What becomes of it, its commander says.
 
     def _on_heartbeat(self, message: DiagnosticStatus) -> None:
-        self._beats[message.name] = time.monotonic(), message.message
+        with suppress(ValueError):  # Of no node of this package.
+            pulse = Pulse(message.message)
+            self._beats[message.name] = _Beat(time.monotonic(), pulse, message.hardware_id)
+            self._gone = {name: by for name, by in self._gone.items() if by != message.name}
 
-    def _silent(self, now: float) -> dict[str, float]:
-        self._beats = {
-            name: beat for name, beat in self._beats.items() if now - beat[0] < _FORGOTTEN_AFTER
-        }
-        return {
-            name: now - at
-            for name, (at, pulse) in self._beats.items()
-            if pulse == Pulse.ACTIVE.value and now - at > _SILENT_AFTER
-        }
+    def _look_for_nodes_that_are_gone(self, now: float) -> None:
+        """Show nothing more of nodes without heartbeats for long, nor of a replay that is over."""
+        if now - self._looked > _SILENT_AFTER:
+            # This process stood still: nobody else did.
+            gap = now - self._looked
+            self._beats = {n: replace(b, at=b.at + gap) for n, b in self._beats.items()}
+        self._looked = now
+        a_plant_runs = any(
+            beat.role == Role.PLANT.value and beat.is_alive(now) for beat in self._beats.values()
+        )
+        for name, beat in tuple(self._beats.items()):
+            is_replay = beat.role == Role.REPLAY.value
+            over = is_replay and a_plant_runs and not beat.is_alive(now)
+            if not over and (beat.pulse is Pulse.BUSY or now - beat.at <= _FORGOTTEN_AFTER):
+                continue
+            del self._beats[name]
+            self._gone[name] = name
+            if is_replay:
+                # What it has shown was reported by nodes that give no heartbeats here.
+                recorded = set(self._reporters.values()) - set(self._beats)
+                self._gone.update(dict.fromkeys(recorded, name))
+
+
+@dataclass(frozen=True)
+class _Beat:
+    """The last heartbeat of a node: when it came, wall s, its pulse and role."""
+
+    at: float
+    pulse: Pulse
+    role: str
+
+    def is_alive(self, now: float) -> bool:
+        """Whether the node is active and not silent."""
+        return self.pulse is Pulse.BUSY or (
+            self.pulse is Pulse.ACTIVE and now - self.at <= _SILENT_AFTER
+        )
 
 
 def _pose_of(pose: Pose) -> Array | None:

@@ -139,8 +139,6 @@ class ViewerNode(FlightNode):
         self._to_ask_again: set[str] = set()
         self._planner_state: PlannerState | None = None
         self._sent = 0
-        self._shape_wanted = False
-        """Whether a planner has been given joint positions to end in, by anybody."""
         self._to_send: tuple[Mapping[Part, Goal], float] | None = None
         self._unanswered: tuple[str, float] | None = None
         # Nobody spins this one: its messages wait until the page is drawn.
@@ -163,7 +161,6 @@ class ViewerNode(FlightNode):
         }
         self._shape_topic = self.create_publisher(JointState, "goal_joint_states", STREAM)
         self._fault_topic = self.create_publisher(String, "fault_injection", STREAM)
-        self.create_subscription(JointState, "goal_joint_states", self._on_shape, STREAM)
         self._seek_topic = self.create_publisher(Float64, "replay/seek", STREAM)
 
     def activate(self) -> None:
@@ -273,6 +270,8 @@ class ViewerNode(FlightNode):
         if message.data == self._urdf:
             return
         self._urdf = message.data
+        self._checker.cancel()  # What it would answer is of another robot.
+        self._to_send = None
         try:
             self._robot = parse_robot(message.data)
         except SpaceRobotError as error:
@@ -436,16 +435,13 @@ class ViewerNode(FlightNode):
             self._page.show_check(Check(Verdict.UNCHECKED, "It was sent before it was checked."))
 
     def _send_shape(self, goal: Goal) -> None:
-        """Have the goal that follows end in its joint positions, or in any if it has none."""
+        """Have the goal that follows end in its joint positions, or in any if it has none.
+
+        Planners keep those of earlier goals, which others may have sent before there was a viewer.
+        """
         shape, names = goal.joint_positions, () if self._robot is None else self._robot.joint_names
-        if shape is None and not self._shape_wanted:
-            return
-        self._shape_wanted = shape is not None
         wanted = JointState() if shape is None else JointState(name=names, position=shape.tolist())
         self._shape_topic.publish(wanted)
-
-    def _on_shape(self, message: JointState) -> None:
-        self._shape_wanted = bool(message.name)
 
     def _request(self, request: Request) -> None:
         """Call the service of everybody that has it."""
