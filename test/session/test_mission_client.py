@@ -58,10 +58,10 @@ class Mission:
     def on_end(self) -> None:
         self.ends += 1
 
-    def send(self, tool: Goal, goal: Goal = GOAL) -> str:
+    def send(self, end_effector: Goal, goal: Goal = GOAL) -> str:
         """Send goals, and return their id as a commander makes it of the stamp."""
         before = self.commander.count("end_effector/goal_pose")
-        self.client.send(goal, tool)
+        self.client.send(goal, end_effector)
         self.harness.spin_until(
             lambda: (
                 self.commander.count("end_effector/goal_pose") > before

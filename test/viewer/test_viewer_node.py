@@ -337,19 +337,26 @@ def test_an_address_that_others_reach_is_warned_of_and_a_wrong_one_is_refused(
     assert said.out.startswith("viewer      http://127.0.0.1:")
 
 
-def test_a_robot_that_changes_after_a_check_is_shown(harness: Harness) -> None:
+def test_a_robot_that_changes_after_a_check_is_shown(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stack = Stack(harness)
     page, sliders = stack.page, names_of(load_robot(robot_file("sliding_masses")))
     stack.describe()
     stack.until(lambda: stack.move(0.1, sliders) or page._editor.placed, "a goal")
     page.show_check(Check(Verdict.REACHABLE, "Reachable in 1 s.", 1.0, shape=np.zeros(3)))
     # A plan for the robot of before is not to be answered any more.
-    asked: list[str] = []
-    stack.viewer._checker.cancel = lambda: bool(asked.append("cancel"))
+    cancelled: list[bool] = []
+
+    def cancel() -> bool:
+        cancelled.append(True)
+        return False
+
+    monkeypatch.setattr(stack.viewer._checker, "cancel", cancel)
     stack.describe(load_robot(robot_file("servicer")).urdf)
     servicer = names_of(load_robot(robot_file("servicer")))
     stack.until(lambda: not page._editor.placed, "its scene is empty")
-    assert asked
+    assert cancelled
     stack.until(lambda: stack.move(0.3, servicer) or page._editor.placed, "its state")
     stack.until(lambda: stack.move(0.4, servicer) or page._last.pose[0] == 0.4, "and the next")
     assert stack.viewer.is_active
