@@ -66,10 +66,11 @@ class Page:
     def _build(self) -> None:
         gui, defer = self._server.gui, self._inbox.put
         gui.configure_theme(**self._theme(dark=self._config.dark))
-        self._head = gui.add_html(content.head(StackState()))
-        self._bar: Any = gui.add_progress_bar(0.0, visible=False)
+        # Buttons come first: a sentence that grows by a line must not move them under the mouse.
         self._time_line = TimeLine(gui, defer, self._want)
         self._buttons = Buttons(gui, defer, self._want, self._fly)
+        self._head = gui.add_html(content.head(StackState()))
+        self._bar: Any = gui.add_progress_bar(0.0, visible=False)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Goal"):
             self._editor = GoalEditor(self._server, defer, self._refuse)

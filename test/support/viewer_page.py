@@ -22,6 +22,9 @@ ROOT = Path(__file__).parents[2]
 FIELD_OF_VIEW = np.radians(75.0)
 """Of the page's camera, from top to bottom."""
 
+_PRESSES = 5
+"""How often a button that moves is pressed before it counts as one that nobody can press."""
+
 
 class Processes:
     """Nodes in processes of their own, as ``ros2 run`` starts them."""
@@ -138,12 +141,22 @@ class Page:
             f".find(each => each.textContent.trim() === {json.dumps(label)})"
         )
         self._window.wait_for(f"{element} !== undefined")
-        self._window.evaluate(f"{element}.scrollIntoView({{block: 'center'}})")
-        self.draw()
-        box = f"{element}.getBoundingClientRect()"
-        x, y = self._window.evaluate(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
-        self._window.mouse("mousePressed", x, y, held=True)
-        self._window.mouse("mouseReleased", x, y, held=True)
+        for _ in range(_PRESSES):
+            self._window.evaluate(
+                "window.hit = false; (each => { each.scrollIntoView({block: 'center'});"
+                "each.addEventListener('click', () => window.hit = true, {once: true}); })"
+                f"({element})"
+            )
+            self.draw()
+            x, y = self._window.evaluate(
+                f"(b => [b.x + b.width / 2, b.y + b.height / 2])({element}.getBoundingClientRect())"
+            )
+            self._window.mouse("mousePressed", x, y, held=True)
+            self._window.mouse("mouseReleased", x, y, held=True)
+            # A sentence above that grew by a line has moved the button from under the mouse.
+            if self._window.evaluate("window.hit"):
+                return
+        raise AssertionError(f"{label!r} was not under the mouse, {_PRESSES} times")
 
     def tick(self, label: str) -> None:
         """Press the checkbox with a label."""

@@ -78,7 +78,7 @@ class Watched:
             self._harness.spin_until(
                 lambda: self.probe.count(topic) and self.value(topic, key) == value,
                 f"{key} of {topic} is {value}",
-                timeout=60.0,
+                timeout=120.0,  # A browser that draws in software may leave little to the planner.
             )
         except AssertionError as error:
             said = [each.message for each in self.probe.messages[topic][-3:]]
