@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import importlib
 import os
 import re
@@ -29,6 +28,15 @@ COLUMNS = "_columns.csv"
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
 _LONGEST_NAME = 63
 """Of a variable in MATLAB, characters."""
+
+_KEYWORD = re.compile(
+    "break|case|catch|classdef|continue|else|elseif|end|for|function|global|if|otherwise|parfor|"
+    "persistent|return|spmd|switch|try|while"
+)
+"""Of MATLAB: no variable is called so."""
+
+_QUOTED = re.compile(r'[,"\r\n]')
+"""What a text in CSV is in quotes for."""
 
 
 class ExportFormat(str, Enum):
@@ -162,7 +170,9 @@ def _place(made: Path, target: Path) -> None:
         # Takes the place of an empty folder at most.
         made.rename(target)
     else:
-        os.link(made, target)
+        # Links would do with one call, but no USB stick has them.
+        os.close(os.open(target, os.O_CREAT | os.O_EXCL))
+        made.replace(target)
 
 
 def _umask() -> int:
@@ -189,22 +199,31 @@ def _free(name: str, taken: Mapping[str, Any]) -> str:
 
 
 def _write_csv(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
-    def rows(file: Path, head: list[str], columns: list[list[Any]]) -> None:
+    def rows(file: Path, head: list[str], columns: list[Iterable[str]]) -> None:
         with file.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(head)
-            writer.writerows(zip(*columns, strict=True))
+            stream.write(",".join(map(_in_csv, head)) + "\n")
+            stream.writelines(",".join(row) + "\n" for row in zip(*columns, strict=True))
 
     about: list[tuple[str, str, str, str]] = []
     for name, table in tables.items():
         columns = {"time": table.time, **table.columns}
         file = f"{name}.csv"
-        rows(folder / file, list(columns), [values.tolist() for values in columns.values()])
+        rows(
+            folder / file,
+            list(columns),
+            # Texts are objects, and numbers keep every digit.
+            [map(_in_csv if x.dtype == object else repr, x.tolist()) for x in columns.values()],
+        )
         units = {"time": "s", **table.units}
         about += [(table.topic, file, column, unit) for column, unit in units.items()]
     head = ["topic", "file", "column", "unit"]
-    rows(folder / COLUMNS, head, [list(each) for each in zip(*about, strict=True)] or [[]] * 4)
+    rows(folder / COLUMNS, head, [map(_in_csv, each) for each in zip(*about, strict=True)])
     return {table.topic: len(table) for table in tables.values()}
+
+
+def _in_csv(text: str) -> str:
+    """Return a text as CSV has it (RFC 4180); a lone carriage return ends a row for readers too."""
+    return '"' + text.replace('"', '""') + '"' if _QUOTED.search(text) else text
 
 
 def _write_parquet(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
@@ -231,15 +250,7 @@ def _write_mat(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
     about: dict[str, Any] = {}
     for table in tables.values():
         name = _identifier(table.topic.strip("/"), variables)
-        struct: dict[str, Any] = {"time": table.time[:, np.newaxis]}
-        for field in table.fields:
-            *way, last = field.path.split(".")
-            place = struct
-            for part in way:
-                place = place.setdefault(_existing(part), {})
-            values = field.values[:, np.newaxis] if field.values.ndim == 1 else field.values
-            place[_identifier(last, place)] = values
-        variables[name] = struct
+        variables[name] = _struct(table)
         about[name] = {
             "topic": table.topic,
             "type": table.type_name,
@@ -254,14 +265,28 @@ def _write_mat(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
     return {table.topic: len(table) for table in tables.values()}
 
 
-def _existing(part: str) -> str:
-    return _identifier(part, {})
+def _struct(table: TopicTable) -> dict[str, Any]:
+    """Return a topic as MATLAB has it: its fields (N, k) in structs of structs."""
+    struct: dict[str, Any] = {"time": table.time[:, np.newaxis]}
+    places: dict[tuple[str, ...], dict[str, Any]] = {(): struct}
+    for field in table.fields:
+        *way, last = field.path.split(".")
+        place = struct
+        for depth, part in enumerate(way, 1):
+            inner = places.setdefault(tuple(way[:depth]), {})
+            if not inner:
+                # Keys have dots too, and one may be called as a part of another is.
+                place[_identifier(part, place)] = inner
+            place = inner
+        values = field.values[:, np.newaxis] if field.values.ndim == 1 else field.values
+        place[_identifier(last, place)] = values
+    return struct
 
 
 def _identifier(name: str, taken: Mapping[str, Any]) -> str:
     """Return a name of a variable for MATLAB that is not taken."""
     made = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")
-    made = made if made[:1].isalpha() else f"x{made}"
+    made = f"x{made}" if _KEYWORD.fullmatch(made) or not made[:1].isalpha() else made
     return _free(made[: _LONGEST_NAME - 4], taken)
 
 

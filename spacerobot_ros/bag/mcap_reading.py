@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -97,7 +98,8 @@ def read_summary(path: Path, file: BinaryIO) -> Summary:
                 summary.metadata_indexes.append(metadata)
     if summary.statistics is None:
         raise RecordingError(
-            f"The bag {path} has no summary: 'spacerobot salvage {path}' makes one."
+            f"The bag {path} has no summary: 'spacerobot salvage {shlex.quote(str(path))}' makes "
+            "one."
         )
     _check_chunks(summary, end)
     return summary

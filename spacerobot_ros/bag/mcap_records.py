@@ -8,6 +8,7 @@ it claims to, and all chunks of a bag together inflate to no more than a limit. 
 from __future__ import annotations
 
 import os
+import shlex
 import stat
 import struct
 import zlib
@@ -140,7 +141,7 @@ def _require_both_ends(path: Path, file: BinaryIO) -> None:
     if length < 2 * size or file.read(size) != MCAP0_MAGIC:
         raise RecordingError(
             f"The bag {path} was cut short, its writer having been killed or its disk full: "
-            f"'spacerobot salvage {path}' makes a complete bag of what is in it."
+            f"'spacerobot salvage {shlex.quote(str(path))}' makes a complete bag of what is in it."
         )
     file.seek(0)
 

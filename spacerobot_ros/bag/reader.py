@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
+_TEXT = "std_msgs/msg/String"
+
 _DECODABLE, _DECODABLE_TIMES = 16_000_000, 50
 """Bytes of a topic that may become objects, which take ten times as much: so many, or so many times
 the size of the file."""
@@ -94,6 +96,7 @@ class Bag:
             self._decodable = max(_DECODABLE, _DECODABLE_TIMES * file_size(file))
         self._types = MessageTypes()
         self._series: dict[str, TopicSeries] = {}
+        self._kinds: dict[str, dict[str, bool]] = {}
 
     @cached_property
     def _channels_by_topic(self) -> dict[str, list[Channel]]:
@@ -321,22 +324,41 @@ class Bag:
         RecordingError
             There is no such topic, or the bag is damaged.
         """
-        return table_of(self[topic], self._sliding)
+        series = self[topic]
+        return table_of(series, self._sliding(series.topic.rpartition("/")[0]))
 
-    @cached_property
-    def _sliding(self) -> dict[str, bool]:
-        """Of each joint of the robots in the bag whether it slides."""
-        # The model takes as long to import as everything else here.
-        from spacerobot_ros.model.description import JointKind
-        from spacerobot_ros.model.urdf import parse_robot
+    def robot_descriptions(self, namespace: str = "") -> list[bytes]:
+        """Return what may be the URDF of the robot in a namespace, the likeliest first.
 
-        found: dict[str, bool] = {}
-        for name, text in self.attachments.items():
-            if name.endswith(".urdf"):
-                with suppress(RobotDescriptionError, UnicodeDecodeError):
-                    joints = parse_robot(text.decode()).movable_joints
-                    found |= {each.name: each.kind is JointKind.PRISMATIC for each in joints}
-        return found
+        That is the file attached for it, then the last message about it, then all other files.
+
+        Raises
+        ------
+        RecordingError
+            The bag is damaged.
+        """
+        topic = f"{namespace}/robot_description"
+        attached = {n: text for n, text in self.attachments.items() if n.endswith(".urdf")}
+        own = attached.pop(f"{topic.strip('/').replace('/', '.')}.urdf", None)
+        found = [] if own is None else [own]
+        if self.topics.get(topic) == _TEXT:
+            found += [text.encode() for text in self[topic].field("data")[-1:]]
+        return [*found, *attached.values()]
+
+    def _sliding(self, namespace: str) -> dict[str, bool]:
+        """Of each joint of the robot in a namespace whether it slides."""
+        if namespace not in self._kinds:
+            # The model takes as long to import as everything else here.
+            from spacerobot_ros.model.description import JointKind
+            from spacerobot_ros.model.urdf import parse_robot
+
+            kinds = self._kinds.setdefault(namespace, {})
+            with suppress(RecordingError):
+                for text in self.robot_descriptions(namespace):
+                    with suppress(RobotDescriptionError, UnicodeDecodeError):
+                        for joint in parse_robot(text.decode()).movable_joints:
+                            kinds.setdefault(joint.name, joint.kind is JointKind.PRISMATIC)
+        return self._kinds[namespace]
 
     def __getitem__(self, topic: str) -> TopicSeries:
         topic = self._recorded_name(topic)

@@ -21,6 +21,11 @@ from spacerobot_ros.topics import TOPICS
 _KEY_VALUES = "diagnostic_msgs/msg/KeyValue"
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _HEADER_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
+_TIMES = ("time", "time_ns", "stamp", "stamp_ns")
+"""Columns of every table; a field of these names is below ``message``."""
+
+_MOST_ENTRIES = 1000
+"""Of an array that becomes columns: more make no table, such as the bytes of an image."""
 
 _JOINT_UNITS = {
     "position": ("m", "rad"),
@@ -89,8 +94,9 @@ class TopicTable:
     time
         Log times in seconds, shape (N,): simulated time in a bag of this stack.
     fields
-        The columns, arrays in one piece. The first is ``stamp``, the time in the header in
-        seconds, where the messages have one.
+        The columns, arrays in one piece. The first is ``time_ns``, the log time in whole
+        nanoseconds. Where the messages have a header, its time follows: ``stamp`` in seconds and
+        ``stamp_ns``.
     """
 
     topic: str
@@ -120,10 +126,12 @@ class TopicTable:
 def table_of(series: TopicSeries, sliding: Mapping[str, bool] | None = None) -> TopicTable:
     """Return the messages of a topic as a table.
 
-    Numbers and texts become columns; an array that has the same length in every message becomes a
-    column for each entry, called by the joint or thruster where the messages name them; keys and
-    values of a status become a column for each key, empty where a message lacks it. All else,
-    such as the points of a path, is JSON in one column of texts.
+    Numbers and texts become columns; an array that has the same length in every message, of at most
+    a thousand entries, becomes a column for each, called by the joint or thruster where the
+    messages name them; keys and values of a status become a column for each key, empty where a
+    message lacks it. All else, such as the points of a path, is JSON in one column of texts.
+
+    Seconds are float64, which lose the last digits of wall time; nanoseconds are whole numbers.
 
     Parameters
     ----------
@@ -138,9 +146,10 @@ def table_of(series: TopicSeries, sliding: Mapping[str, bool] | None = None) -> 
         A message is damaged, or there is more than can be decoded.
     """
     names = _names(series)
-    found = []
+    found = [Field("time_ns", series.time_ns, ("ns",))]
     if series.stamped:
         found.append(Field("stamp", series.stamp, ("s",)))
+        found.append(Field("stamp_ns", series.stamp_ns, ("ns",)))
     for path in series.paths:
         if path in _HEADER_STAMP or (path == "name" and names):
             continue
@@ -163,7 +172,9 @@ def _fields(
     values = series.field(path)
     if series.element_type(path) == _KEY_VALUES:
         return _key_values(path, values)
-    if not isinstance(values, np.ndarray):
+    if path in _TIMES:
+        path = f"message.{path}"
+    if not isinstance(values, np.ndarray) or values[:1].size > _MOST_ENTRIES:
         texts = [x if isinstance(x, str) else json.dumps(_plain(x)) for x in values]
         return [Field(path, _objects(texts), ("",))]
     if values.ndim == 1:

@@ -34,8 +34,8 @@ from spacerobot_ros.campaign.statistics import (
     share,
     sobol_indices,
 )
-from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.output_files import write_output
 from spacerobot_ros.report.style import FAINT, INK, PALETTE
 
 _WORST = 10
@@ -221,11 +221,7 @@ def write_page(path: Path, title: str, body: Sequence[str]) -> None:
         + f"\n<footer><p>Made by spacerobot_ros {__version__}.</p></footer>\n"
         + "</main>\n</body>\n</html>\n"
     )
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise SpaceRobotError(f"The report {path} cannot be written: {error}.") from error
+    write_output(path, text)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], identity: str) -> str:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from spacerobot_ros.cli.options import json_option, picture_option, write, write_json
+from spacerobot_ros.cli.options import json_option, picture_option, write_json
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.output_files import write_output
 
 if TYPE_CHECKING:
     from spacerobot_ros.model import SpaceRobot
@@ -49,7 +50,7 @@ def command(robot: str, shape: str | None, picture: Path | None, json_file: Path
     if drawn is None:
         click.echo(f"{'picture':<13}none: no loops of the joints turn the base")
         return
-    write(target, drawn)
+    write_output(target, drawn)
     click.echo(f"{'picture':<13}{target}")
 
 

@@ -42,8 +42,10 @@ def command(bag: Path, format_name: str, out: Path | None, topics: tuple[str, ..
     opened = read_bag(bag)
     stem = opened.path.with_suffix("")
     beside = stem.with_suffix(".mat") if format_name == "mat" else Path(f"{stem}_{format_name}")
-    tables = (opened.table(topic) for topic in topics or opened)
+    chosen = dict.fromkeys(opened[topic].topic for topic in topics) or opened.keys()
+    tables = (opened.table(topic) for topic in chosen)
     made = export(tables, out or beside, ExportFormat(format_name))
-    for topic, rows in made.rows.items():
-        click.echo(f"{topic:<27} {rows} rows")
+    for topic in chosen:
+        rows = made.rows.get(topic)
+        click.echo(f"{topic:<27} {'no messages, left out' if rows is None else f'{rows} rows'}")
     click.echo(f"{'tables':<27} {made.path}")

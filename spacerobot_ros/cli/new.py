@@ -11,6 +11,7 @@ import click
 from spacerobot_ros.cli.errors import fail
 from spacerobot_ros.cli.options import PATH
 from spacerobot_ros.cli.progress import display
+from spacerobot_ros.output_files import write_output
 
 
 @click.command("new")
@@ -53,7 +54,6 @@ def command(robot: str, out: Path | None) -> None:
     # Beside the scenario the robot is found by its name from anywhere.
     from_there = os.path.relpath(file.resolve(), target.resolve().parent)
     named = from_there if is_path(robot) else robot
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.write_text(scenario_text(problem, best.method, named), encoding="utf-8")
+    write_output(target, scenario_text(problem, best.method, named))
     click.echo(f"\n{best.method} is the fastest: {best.duration:.4g} s. The scenario is {target}:")
     click.echo(f"  spacerobot run {shlex.quote(str(target))}")

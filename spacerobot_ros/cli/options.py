@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
+from spacerobot_ros.output_files import write_output
+
 if TYPE_CHECKING:
     from spacerobot_ros.flight.scenario import Scenario
 
@@ -162,15 +164,9 @@ def picture_option(help: str) -> Any:
     return click.option("--picture", type=PATH, callback=checked, help=help)
 
 
-def write(path: Path, content: bytes) -> None:
-    """Write a file and the folders that it is in."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(content)
-
-
 def write_json(path: Path, content: Any, indent: int | None = 2) -> None:
     """Write a JSON file and the folders that it is in."""
-    write(path, (json.dumps(content, indent=indent) + "\n").encode())
+    write_output(path, json.dumps(content, indent=indent) + "\n")
 
 
 def numbers(values: Iterable[float], digits: int = 5) -> str:

@@ -20,11 +20,11 @@ from spacerobot_ros.cli.options import (
     json_option,
     picture_option,
     settings_option,
-    write,
     write_json,
 )
 from spacerobot_ros.cli.progress import display
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.output_files import write_output
 
 if TYPE_CHECKING:
     from spacerobot_ros.simulation.trials import Problem, Record, Trial
@@ -117,7 +117,7 @@ def command(
         from spacerobot_ros.report.plan_figures import draw
         from spacerobot_ros.report.style import PictureFormat
 
-        write(picture, draw(problem, trial, PictureFormat.of(picture)))
+        write_output(picture, draw(problem, trial, PictureFormat.of(picture)))
         click.echo(f"picture     {picture}")
     if not trial.reached:
         fail(f"The goal is not reached within the planner's tolerance: {left}.")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import os
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
+from spacerobot_ros.output_files import write_output
 from spacerobot_ros.topics import TOPICS
 
 if TYPE_CHECKING:
@@ -59,10 +62,15 @@ class Animation:
         size = len(self.html) / 1e6
         return f"<Animation, {size:.1f} MB of HTML: show it in a notebook, or save(PATH)>"
 
-    def save(self, path: str) -> None:
-        """Write the animation as a page of its own."""
-        with open(path, "w", encoding="utf-8") as file:
-            file.write(f'<!DOCTYPE html>\n<meta charset="utf-8">\n{self.html}\n')
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the animation as a page of its own; an older file is replaced.
+
+        Raises
+        ------
+        SpaceRobotError
+            The file cannot be written.
+        """
+        write_output(Path(path), f'<!DOCTYPE html>\n<meta charset="utf-8">\n{self.html}\n')
 
 
 def table(flight: FlightArrays) -> pd.DataFrame:

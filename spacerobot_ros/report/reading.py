@@ -157,9 +157,7 @@ def _momentum_balance(robot: _Recorded) -> Signal:
 
 
 def _description(robot: _Recorded) -> RobotDescription | None:
-    texts = [data for name, data in robot.bag.attachments.items() if name.endswith(".urdf")]
-    texts += [message.data.encode() for _, message in robot.messages("robot_description")[-1:]]
-    for text in texts:
+    for text in robot.bag.robot_descriptions(robot.namespace):
         try:
             return parse_robot(text.decode())
         except (RobotDescriptionError, UnicodeDecodeError):

@@ -9,6 +9,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.output_files import write_output
 from spacerobot_ros.report.figures_errors import errors_plate, sensors_plate
 from spacerobot_ros.report.figures_shape import cycles_plate, loops_plate
 from spacerobot_ros.report.figures_space import (
@@ -113,7 +114,7 @@ def write_report(bag: Path, html: Path, beside: Sequence[Path] = ()) -> None:
     with drawing():
         plates = [*(plate(flight) for plate in _PLATES), path_plate(flight, others)]
         text = page(flight, player_of(scene_of(flight)), plates, others)
-    _write(html, text.encode())
+    write_output(html, text)
 
 
 def write_figures(
@@ -170,8 +171,8 @@ def write_figures(
         for name in only or [name for name in FIGURES if name not in ("position", "attitude")]:
             plate = FIGURES[name](flight)
             if isinstance(plate, Plate):
-                made[name] = folder / f"{name}.{format.value}"
-                _write(folder / f"{name}.{format.value}", picture_of(plate.figure, format))
+                made[name] = path = folder / f"{name}.{format.value}"
+                write_output(path, picture_of(plate.figure, format))
             else:
                 made[name] = plate or "The flight is of another kind."
     return made
@@ -192,7 +193,7 @@ def write_picture(bag: Path, picture: Path) -> None:
     if not len(flight.position):
         raise SpaceRobotError(NO_STATES)
     with drawing():
-        _write(picture, picture_of(_overview(flight), format, _PICTURE_WIDTH))
+        write_output(picture, picture_of(_overview(flight), format, _PICTURE_WIDTH))
 
 
 def _overview(flight: Flight) -> Figure:
@@ -223,11 +224,3 @@ def _overview(flight: Flight) -> Figure:
     title = f"{flight.scenario}: {flight.description}" if flight.description else flight.scenario
     figure.text(0.1 / WIDTH, 1 - 0.24 / up, title, size=10.5, weight="bold")
     return figure
-
-
-def _write(path: Path, data: bytes) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
-    except OSError as error:
-        raise SpaceRobotError(f"The file {path} cannot be written: {error.strerror}.") from error

@@ -144,7 +144,7 @@ def test_units_are_those_of_the_robot_and_the_topic() -> None:
     assert units["odom"]["twist.twist.angular.z"] == "rad/s"
     assert units["joint_states"]["position[wrist_roll]"] == "rad"
     assert units["joint_states"]["effort[wrist_roll]"] == "N m"
-    assert set(units["thrusters"].values()) == {"s", "", "1", "N"}
+    assert set(units["thrusters"].values()) == {"ns", "s", "", "1", "N"}
     assert units["momentum"]["data[angular_x]"] == "kg m^2/s"
     assert units["momentum"]["data[kinetic_energy]"] == "J"
     assert units["base_wrench"]["wrench.torque.y"] == "N m"

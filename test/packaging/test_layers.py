@@ -33,6 +33,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("planning",),
         ("model",),
         ("events", "parameters", "private_files", "resources", "termination", "topics"),
+        ("output_files",),
         ("errors",),
         ("__init__",),
     ),
