@@ -194,8 +194,8 @@ class _Block:
         """The scalar plants of flights that have touched a stop, by their lane in the block."""
         self._ended: dict[int, int] = {}
         """The ticks that flights could not take, by their lane in the block."""
-        self._profiles: list[ReferenceProfile] = []
-        """Those of the flights in lanes, with a controller."""
+        self._profiles: dict[int, ReferenceProfile] = {}
+        """Those of the flights with a controller, by their lane in the block."""
         self._place(model, p)
         self._job, self._kept = self._prepared()
 
@@ -414,25 +414,38 @@ class _Block:
                 job.normals = normals.ctypes.data
                 job.normals_from, job.normals_ticks, job.normals_width = begin, *normals.shape[1:3]
             if not begin:
-                self._begin_control()
+                self._begin_control(failures)
             while driver.fly_until(job, end):
                 self._help(result, failures)
         self._write(result)
 
-    def _begin_control(self) -> None:
+    def _end(self, index: int, tick: int, why: str, failures: dict[int, str]) -> None:
+        """End the flight of a lane at a tick that it cannot take."""
+        group, lane = divmod(index, self._lanes)
+        self._memory[group, self._rows["alive"], lane] = 0.0
+        if index < len(self._flown):
+            failures[int(self._flown[index])] = why
+            self._ended[index] = tick
+
+    def _begin_control(self, failures: dict[int, str]) -> None:
         """Begin the references of all flights at what is measured first."""
         controller = self._tick.controller
         if controller is None:
             return
         self._tick.driver.measure_starts(self._job)
         states = self._get("measured")
-        begun = [
-            controller.begin(int(row), control_state(state))
-            for row, state in zip(self._rows_of_lanes, states, strict=True)
-        ]
-        self._profiles = [profile for profile, _ in begun]
-        self._set("profile", np.array([controller.numbers(each) for each in self._profiles]))
-        self._set("bounds", np.array([bounds for _, bounds in begun]))
+        numbers = np.zeros((len(states), self._tick.sizes["profile"]))
+        most = np.zeros((len(states), self._tick.sizes["bounds"]))
+        for index, (row, state) in enumerate(zip(self._rows_of_lanes, states, strict=True)):
+            try:
+                profile, most[index] = controller.begin(int(row), control_state(state))
+            except SpaceRobotError as error:
+                self._end(index, 0, str(error), failures)
+                continue
+            self._profiles[index] = profile
+            numbers[index] = controller.numbers(profile)
+        self._set("profile", numbers)
+        self._set("bounds", most)
 
     def _help(self, result: BatchResult, failures: dict[int, str]) -> None:
         """Do what lanes that wait cannot: give a command, allocate it to thrusters, or take a tick
@@ -452,10 +465,7 @@ class _Block:
                 try:
                     help_lane(int(group), int(lane), index, result)
                 except SpaceRobotError as error:
-                    self._memory[group, alive, lane] = 0.0
-                    if index < len(self._flown):
-                        failures[int(self._flown[index])] = str(error)
-                        self._ended[index] = int(self._at[group])
+                    self._end(index, int(self._at[group]), str(error), failures)
 
     def _command(self, group: int, lane: int, index: int, result: BatchResult) -> None:
         controller, row = self._tick.controller, int(self._rows_of_lanes[index])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from html import escape
+from itertools import zip_longest
 from pathlib import Path
 
 import matplotlib as mpl
@@ -29,16 +30,22 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
             "seed": campaign.seed,
             "sampler": campaign.sampler,
             "flights": campaign.flights,
-            "disperse": [(each.name, str(each.distribution)) for each in campaign.dispersions],
         }
 
     ours, theirs = drawn(first), drawn(second)
+    sentence = f"The campaigns '{first.name}' and '{second.name}' do not have the same draws: "
     for key, value in ours.items():
         if theirs[key] != value:
-            raise ParameterError(
-                f"The campaigns '{first.name}' and '{second.name}' do not have the same draws: "
-                f"'{key}' is {value} and {theirs[key]}."
-            )
+            raise ParameterError(f"{sentence}'{key}' is {value} and {theirs[key]}.")
+    # One after the other: the third number of a draw is that of the third name.
+    for ours_is, theirs_is in zip_longest(first.dispersions, second.dispersions):
+        a, b = (
+            "nothing" if each is None else f"{each.name}: {each.distribution}"
+            for each in (ours_is, theirs_is)
+        )
+        same = a == b and ours_is.distribution == theirs_is.distribution
+        if not same:
+            raise ParameterError(f"{sentence}under 'disperse' is {a}, and {b}, in the same place.")
 
 
 def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
@@ -56,7 +63,14 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
     common = np.intersect1d(first.numbers, second.numbers)
     rows_a = np.searchsorted(first.numbers, common)
     rows_b = np.searchsorted(second.numbers, common)
-    names = [name for name in first.shown if name in second.shown]
+    if not common.size:
+        raise ParameterError(
+            f"'{first.campaign.name}' and '{second.campaign.name}' have no draw "
+            "that both have flown."
+        )
+    # What one of them requires is compared, too, where both have it.
+    names = list(dict.fromkeys([*first.shown, *second.shown]))
+    names = [name for name in names if name in first.columns and name in second.columns]
     found = []
     for name in names:
         difference = paired(name, first.columns[name][rows_a], second.columns[name][rows_b])

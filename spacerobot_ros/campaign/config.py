@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from spacerobot_ros.campaign.metrics import METRICS, is_metric
-from spacerobot_ros.campaign.targets import Target, targets_of
+from spacerobot_ros.campaign.metrics import METRICS, is_metric, joint_names, metric_names
+from spacerobot_ros.campaign.targets import DrawnFlight, Target, targets_of
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.parameter_files import CONFIGS
+from spacerobot_ros.flight.parameter_files import CONFIGS, number_in
 from spacerobot_ros.flight.scenario import Scenario, scenario_or_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import suggestion
@@ -52,18 +52,15 @@ class Distribution:
     arguments: Mapping[str, float] = field(default_factory=dict)
     choices: tuple[Any, ...] = ()
 
-    @property
-    def texts(self) -> bool:
-        """Whether texts are drawn."""
-        return any(isinstance(choice, str) for choice in self.choices)
-
     def at(self, shares: Array) -> list[Any]:
         """Return the values below which shares (N,), 0 to 1, of all lie."""
         if self.choices:
             last = len(self.choices) - 1
             return [self.choices[min(int(u * (last + 1)), last)] for u in shares.tolist()]
-        found: list[float] = np.asarray(_scipy(self.name).ppf(shares, **self.arguments)).tolist()
-        return found
+        # What is infinite or no number is refused by the flight that draws it.
+        with np.errstate(all="ignore"):
+            found = np.asarray(_scipy(self.name).ppf(shares, **self.arguments), dtype=float)
+        return list(found.tolist())
 
     def __str__(self) -> str:
         if self.choices:
@@ -144,6 +141,20 @@ class Campaign:
         return tuple(dispersion.name for dispersion in self.dispersions)
 
 
+class _EveryKeyOnce(yaml.SafeLoader):
+    """Refuses a key that a mapping has twice: of two dispersions one would be lost."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        known: set[str] = set()
+        for key, _ in node.value:
+            if key.value in known:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key '{key.value}' is there twice", key.start_mark
+                )
+            known.add(str(key.value))
+        return super().construct_mapping(node, deep)
+
+
 def load_campaign(path: Path, flights: int | None = None) -> Campaign:
     """Read the file of a campaign; ``flights`` replaces its number of flights.
 
@@ -153,7 +164,7 @@ def load_campaign(path: Path, flights: int | None = None) -> Campaign:
         It cannot be read, or something in it is refused; the sentence says what and where.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.load(path.read_text(encoding="utf-8"), _EveryKeyOnce)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         reason = " ".join(str(error).split())
         raise ParameterError(f"The campaign file {path} cannot be read: {reason}.") from error
@@ -255,7 +266,8 @@ def _scenario(section: Mapping[str, Any], folder: Path) -> Scenario:
 
 
 def _mapping(section: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    value = section.get(key) or {}
+    value = section.get(key)
+    value = {} if value is None else value
     if not isinstance(value, dict):
         raise ParameterError(f"'{key}' must have names with values under it.")
     return value
@@ -288,21 +300,31 @@ def _dispersions(section: Mapping[str, Any], scenario: Scenario) -> tuple[Disper
     found: dict[str, Dispersion] = {}
     for name, given in section.items():
         for target in targets_of(str(name), scenario):
-            distribution = _distribution(target.name, given)
-            if distribution.texts is not target.text:
-                what = "a text" if target.text else "a number"
-                raise ParameterError(f"'{target.name}' is {what}; {given} draws another thing.")
+            distribution = _distribution(target, given)
+            for choice in distribution.choices:
+                _require_taken(target, choice, scenario)
             if target.name in found:
                 raise ParameterError(f"'{target.name}' is dispersed twice.")
+            for other in found.values():
+                if other.target.sets & target.sets:
+                    raise ParameterError(
+                        f"'{other.name}' and '{target.name}' set the same numbers: leave one out."
+                    )
             found[target.name] = Dispersion(target, distribution)
-    for name, dispersion in found.items():
-        whole = dispersion.target.replaces
-        if whole in found and whole != name:
-            raise ParameterError(f"'{name}' and '{whole}' set the same numbers: leave one out.")
     return tuple(found.values())
 
 
-def _distribution(name: str, given: Any) -> Distribution:
+_KNOWN_AS = {"normal": "norm", "gauss": "norm", "gaussian": "norm", "exponential": "expon"}
+
+_WORDS = {
+    "norm": "loc is its mean and scale its standard deviation",
+    "uniform": "loc is its least value and scale its width",
+}
+"""What is often looked for under another name."""
+
+
+def _distribution(target: Target, given: Any) -> Distribution:
+    name = target.name
     if not isinstance(given, dict) or len(given) != 1:
         raise ParameterError(
             f"'{name}' must have one distribution, such as 'norm: {{loc: 1, scale: 0.05}}'."
@@ -311,7 +333,9 @@ def _distribution(name: str, given: Any) -> Distribution:
     if kind == "choice":
         if not isinstance(arguments, list) or not arguments:
             raise ParameterError(f"'{name}' must have a list of values to choose from.")
-        return Distribution("choice", {}, tuple(arguments))
+        return Distribution("choice", {}, tuple(_choice(target, each) for each in arguments))
+    if target.text:
+        raise ParameterError(f"'{name}' is a text: it must have a 'choice' of texts.")
     distribution = _scipy(str(kind))
     shapes = (distribution.shapes or "").replace(" ", "").split(",")
     words = [*filter(None, shapes), "loc", *(["scale"] if hasattr(distribution, "pdf") else [])]
@@ -326,19 +350,38 @@ def _distribution(name: str, given: Any) -> Distribution:
     for word in arguments:
         if word not in words:
             raise ParameterError(
-                f"'{name}': {kind} has no argument '{word}'; it takes {', '.join(words)}."
+                f"'{name}': {kind} has no argument '{word}'; it takes {', '.join(words)}"
+                f"{': ' + _WORDS[kind] if kind in _WORDS else ''}."
                 f"{suggestion(str(word), words)}"
             )
     missing = [word for word in filter(None, shapes) if word not in arguments]
     if missing:
         raise ParameterError(f"'{name}': {kind} needs its argument '{missing[0]}'.")
     values = {word: _real(f"{name}: {word}", value) for word, value in arguments.items()}
-    if not math.isfinite(float(distribution(**values).ppf(0.5))):
+    with np.errstate(all="ignore"):
+        middle = float(distribution.ppf(0.5, **values))
+    if not math.isfinite(middle):
         raise ParameterError(
             f"'{name}': {kind} takes no such arguments: "
             f"{', '.join(f'{word} {value:g}' for word, value in values.items())}."
         )
     return Distribution(str(kind), values)
+
+
+def _choice(target: Target, value: Any) -> Any:
+    """Return a value to choose from, a text or a finite number as its target takes it."""
+    if target.text:
+        if not isinstance(value, str):
+            raise ParameterError(f"'{target.name}' is a text; the choice has {value!r}.")
+        return value
+    return _real(f"{target.name}: choice", number_in(value) if isinstance(value, str) else value)
+
+
+def _require_taken(target: Target, value: Any, scenario: Scenario) -> None:
+    """Refuse a value that a node refuses, before it is flown thousands of times."""
+    flight = target.apply(DrawnFlight.of(scenario), value)
+    for node in ("plant", *scenario.commanders):
+        flight.scenario.config(node)
 
 
 def _scipy(name: str) -> Any:
@@ -353,7 +396,8 @@ def _scipy(name: str) -> Any:
             if isinstance(value, (stats.rv_continuous, stats.rv_discrete))
         ]
         raise ParameterError(
-            f"scipy.stats has no distribution '{name}'.{suggestion(name, [*known, 'choice'])}"
+            f"scipy.stats has no distribution '{name}'."
+            f"{suggestion(_KNOWN_AS.get(name.lower(), name), [*known, 'choice'])}"
         )
     return found
 
@@ -365,9 +409,10 @@ def _criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Criterion
     found = []
     for name, given in section.items():
         if not is_metric(str(name), scenario):
+            known = metric_names(joint_names(scenario))
             raise ParameterError(
-                f"there is no metric '{name}'; there are {', '.join(METRICS)}."
-                f"{suggestion(str(name), METRICS)}"
+                f"there is no metric '{name}'; there are {', '.join(METRICS)}, those of joints "
+                f"also for one.{suggestion(str(name), known)}"
             )
         if not isinstance(given, dict) or not given or set(given) - {"min", "max"}:
             raise ParameterError(f"the criterion of '{name}' must have 'min' or 'max', or both.")

@@ -78,6 +78,17 @@ def control_refusal(campaign: Campaign, *, asked: bool) -> str:
     return ""
 
 
+def require_lane(campaign: Campaign, flight: DrawnFlight) -> None:
+    """Refuse a draw that begins nowhere, as the plant and the controller refuse it.
+
+    Raises
+    ------
+    SpaceRobotError
+        A parameter, the start or a goal is refused.
+    """
+    _flights(campaign, [flight])
+
+
 def fly_controlled(
     campaign: Campaign, batch: Sequence[tuple[Draw, DrawnFlight]]
 ) -> list[tuple[Draw, FlightArrays | str]]:

@@ -66,41 +66,79 @@ class Dataset:
         Raises
         ------
         ParameterError
-            It holds another campaign.
+            It holds another campaign, another process flies into it, or a file in it is damaged.
+        RecordingError
+            It cannot be written.
         SpaceRobotError
             pyarrow is not installed.
         """
         self._schema = _schema(campaign)
-        about = self.folder / _ABOUT
-        fingerprint = _fingerprint(campaign)
-        if about.exists():
-            known = json.loads(about.read_text(encoding="utf-8"))
-            if known["fingerprint"] != fingerprint:
-                raise ParameterError(
-                    f"The folder {self.folder} holds another campaign, '{known['name']}': name "
-                    "another folder, or remove it."
-                )
-        elif self.folder.exists() and any(self.folder.iterdir()):
+        if (self.folder / _ABOUT).exists():
+            self._require_same(campaign)
+        else:
+            self._require_nothing_else()
+        try:
+            (self.folder / _FLIGHTS).mkdir(parents=True, exist_ok=True)
+            self._lock()
+            for left in (self.folder / _FLIGHTS).glob(".*"):
+                left.unlink()  # What was being written when an earlier process ended.
+            self._describe(campaign)
+            return self.done()
+        except OSError as error:
+            self.close()
+            raise RecordingError(f"The folder {self.folder} cannot be written: {error}.") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _require_same(self, campaign: Campaign) -> None:
+        """Refuse to go on with another campaign; the sentence says in what it differs."""
+        facts = self._facts()
+        if facts["fingerprint"] == _fingerprint(campaign):
+            return
+        known, wanted = _drawn_from(self.campaign()), _drawn_from(campaign)
+        differing = [key for key in {**known, **wanted} if known.get(key) != wanted.get(key)]
+        what = " and ".join(f"another '{key}'" for key in differing)
+        what = what or "another scenario, or other parameters of it"
+        raise ParameterError(
+            f"The folder {self.folder} holds another campaign: '{facts['name']}', with {what}. "
+            "Name another folder, or remove it."
+        )
+
+    def _require_nothing_else(self) -> None:
+        """Refuse a folder with other things; what an earlier process was about to begin is none."""
+        if not self.folder.exists():
+            return
+        if not self.folder.is_dir():
+            raise ParameterError(f"{self.folder} is a file: name a folder for the campaign.")
+        own = {_FLIGHTS, _CAMPAIGN, _SCENARIO}
+        others = [path for path in self.folder.iterdir() if path.name.lstrip(".") not in own]
+        if others or self._parts():
             raise ParameterError(
                 f"The folder {self.folder} is not empty and holds no campaign: name another one."
             )
-        (self.folder / _FLIGHTS).mkdir(parents=True, exist_ok=True)
-        self._lock()
-        for left in (self.folder / _FLIGHTS).glob(".*"):
-            left.unlink()  # What was being written when an earlier process ended.
+
+    def _describe(self, campaign: Campaign) -> None:
+        """Write what is flown; what makes the folder one of a campaign comes last."""
         section = {**campaign.section, "scenario": _SCENARIO, "flights": campaign.flights}
         for key in ("set", "method"):
             section.pop(key, None)
-        text = scenario_text(self_contained(campaign).scenario)
-        (self.folder / _SCENARIO).write_text(text, encoding="utf-8")
-        (self.folder / _CAMPAIGN).write_text(
-            yaml.safe_dump({"campaign": section}, sort_keys=False, allow_unicode=True),
-            encoding="utf-8",
-        )
-        facts = {"name": campaign.name, "fingerprint": fingerprint, "versions": VERSIONS}
-        facts["scenario"] = campaign.scenario.name
-        about.write_text(json.dumps(facts, indent=1), encoding="utf-8")
-        return self.done()
+        facts = {
+            "name": campaign.name,
+            "fingerprint": _fingerprint(campaign),
+            "versions": VERSIONS,
+            "scenario": campaign.scenario.name,
+        }
+        content = {"campaign": section}
+        self._write(_SCENARIO, scenario_text(self_contained(campaign).scenario))
+        self._write(_CAMPAIGN, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+        self._write(_ABOUT, json.dumps(facts, indent=1))
+
+    def _write(self, name: str, text: str) -> None:
+        """Replace a file as a whole or not at all: a full disk costs nothing that is there."""
+        path, new = self.folder / name, self.folder / f".{name}"
+        new.write_text(text, encoding="utf-8")
+        os.replace(new, path)
 
     def _lock(self) -> None:
         """Keep other processes from flying into this folder; the lock goes with this one.
@@ -137,22 +175,38 @@ class Dataset:
         ParameterError
             It holds none.
         """
+        facts = self._facts()
         try:
-            facts = json.loads((self.folder / _ABOUT).read_text(encoding="utf-8"))
             content = yaml.safe_load((self.folder / _CAMPAIGN).read_text(encoding="utf-8"))
-        except (OSError, ValueError, yaml.YAMLError) as error:
-            raise ParameterError(f"The folder {self.folder} holds no campaign: {error}.") from error
-        scenario = replace(load_scenario(str(self.folder / _SCENARIO)), name=facts["scenario"])
-        return parse_campaign(facts["name"], content["campaign"], self.folder, scenario)
+            section = dict(content["campaign"])
+            scenario = replace(load_scenario(str(self.folder / _SCENARIO)), name=facts["scenario"])
+            return parse_campaign(facts["name"], section, self.folder, scenario)
+        except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError) as error:
+            raise _damaged(self.folder / _CAMPAIGN, error) from error
+        except ParameterError as error:
+            raise ParameterError(f"The campaign in {self.folder} is refused: {error}") from error
+
+    def _facts(self) -> dict[str, str]:
+        """Return name, scenario and fingerprint of the campaign in the folder."""
+        path = self.folder / _ABOUT
+        try:
+            facts = json.loads(path.read_text(encoding="utf-8"))
+            return {key: str(facts[key]) for key in ("name", "scenario", "fingerprint")}
+        except OSError as error:
+            reason = error.strerror or error
+            raise ParameterError(
+                f"The folder {self.folder} holds no campaign: {path.name}: {reason}."
+            ) from error
+        except (ValueError, TypeError, KeyError) as error:
+            raise _damaged(path, error) from error
 
     # -- rows ---------------------------------------------------------------------------------
 
     def done(self) -> set[int]:
         """Return the numbers of the flights that are there."""
-        parquet = needed("pyarrow.parquet")
         found: set[int] = set()
         for part in self._parts():
-            found.update(parquet.read_table(part, columns=["flight"])["flight"].to_pylist())
+            found.update(_read(part, ["flight"])["flight"].to_pylist())
         return found
 
     def add(self, rows: Iterable[Row]) -> None:
@@ -183,7 +237,10 @@ class Dataset:
             parquet.write_table(table, folder / f".{path.name}")
             os.replace(folder / f".{path.name}", path)
         except OSError as error:
-            raise RecordingError(f"The flights cannot be written to {path}: {error}.") from error
+            raise RecordingError(
+                f"The last {len(self._rows)} flights cannot be written to {path}: {error}. The "
+                "same command goes on from those before them."
+            ) from error
         self._rows.clear()
 
     def table(self) -> Any:
@@ -194,8 +251,8 @@ class Dataset:
         ParameterError
             There are none.
         """
-        arrow, parquet = needed("pyarrow"), needed("pyarrow.parquet")
-        parts = [parquet.read_table(part) for part in self._parts()]
+        arrow = needed("pyarrow")
+        parts = [_read(part) for part in self._parts()]
         if not parts:
             raise ParameterError(f"The folder {self.folder} has no flights yet.")
         # Parts that an earlier version has written may lack columns.
@@ -203,6 +260,31 @@ class Dataset:
 
     def _parts(self) -> Sequence[Path]:
         return sorted((self.folder / _FLIGHTS).glob("part-*.parquet"))
+
+
+def _read(part: Path, columns: Sequence[str] | None = None) -> Any:
+    """Return a file of rows as a pyarrow table.
+
+    Raises
+    ------
+    ParameterError
+        It is damaged.
+    """
+    arrow, parquet = needed("pyarrow"), needed("pyarrow.parquet")
+    try:
+        return parquet.read_table(part, columns=columns)
+    except (OSError, arrow.ArrowException) as error:
+        reason = str(error).splitlines()[0].rstrip(".")
+        raise ParameterError(
+            f"The file {part} is damaged ({reason}): remove it, and the flights in it are flown "
+            "again."
+        ) from error
+
+
+def _damaged(path: Path, error: Exception) -> ParameterError:
+    return ParameterError(
+        f"The file {path} is damaged ({type(error).__name__}: {error}): the campaign cannot go on."
+    )
 
 
 def _schema(campaign: Campaign) -> Any:
@@ -237,14 +319,19 @@ def _record(row: Row) -> dict[str, Any]:
 
 def _fingerprint(campaign: Campaign) -> str:
     """Return what is the same for campaigns whose draws are the same flights."""
+    text = json.dumps(_drawn_from(campaign), sort_keys=True, default=str)
+    flown = scenario_text(self_contained(campaign).scenario)
+    return hashlib.sha256(f"{text}{flown}".encode()).hexdigest()
+
+
+def _drawn_from(campaign: Campaign) -> dict[str, Any]:
+    """Return what, beside the scenario, the rows of a campaign follow from, by its key."""
     own = {"flights", "engine", "description", "scenario", "set", "method"}
     section = {key: value for key, value in campaign.section.items() if key not in own}
     section |= {"seed": campaign.seed, "sampler": campaign.sampler, "longest": campaign.longest}
     if campaign.sampler in OF_ALL:
         section["flights"] = campaign.flights
-    text = json.dumps(section, sort_keys=True, default=str)
-    flown = scenario_text(self_contained(campaign).scenario)
-    return hashlib.sha256(f"{text}{flown}".encode()).hexdigest()
+    return section
 
 
 def self_contained(campaign: Campaign) -> Campaign:

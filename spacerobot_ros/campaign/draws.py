@@ -7,6 +7,7 @@ flights.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -156,7 +157,10 @@ def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = No
         flight, scenario=flight.scenario.with_overrides("plant", {"sensors.seed": draw.seed})
     )
     for dispersion in campaign.dispersions:
-        flight = dispersion.target.apply(flight, draw.values[dispersion.name])
+        value = draw.values[dispersion.name]
+        if not dispersion.target.text and not math.isfinite(value):
+            raise ParameterError(f"What was drawn of '{dispersion.name}' is {value}.")
+        flight = dispersion.target.apply(flight, value)
     inertial = flight.inertial
     if inertial is not None:
         inertial.require_physical([body.name for body in flight.nominal.bodies])

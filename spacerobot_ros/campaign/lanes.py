@@ -17,7 +17,11 @@ import numpy as np
 from spacerobot_ros.batch import Flights, FollowedSchedule, SensorErrors, Starts, fly_lanes
 from spacerobot_ros.batch.flights import BatchResult
 from spacerobot_ros.campaign.config import Campaign
-from spacerobot_ros.campaign.controlled_lanes import control_refusal, fly_controlled
+from spacerobot_ros.campaign.controlled_lanes import (
+    control_refusal,
+    fly_controlled,
+    require_lane,
+)
 from spacerobot_ros.campaign.draws import Draw, drawn_flight
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, node_robot, robots_of
 from spacerobot_ros.campaign.rows import LANES, Row
@@ -75,6 +79,14 @@ class _Planned:
         return None if plan is None else cls(draw, flight, *plan, time.perf_counter() - began)
 
 
+@dataclass(frozen=True)
+class _Left:
+    """A draw that lanes leave to the engine ``flights``, and why."""
+
+    draw: Draw
+    why: str
+
+
 class LanesEngine:
     """Many flights at once, on vector registers."""
 
@@ -107,23 +119,23 @@ class LanesEngine:
     def fly(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
     ) -> Iterator[Row]:
-        """Fly draws in batches."""
-        others: list[tuple[Draw, str]] = []
-        if "planner" in campaign.scenario.commanders:
-            yield from self._tracked(campaign, draws, stopped, others)
-        else:
-            yield from self._controlled(campaign, draws, stopped, others)
-        reasons = {draw.number: why for draw, why in others}
-        for row in self._flights.fly(campaign, [draw for draw, _ in others], stopped):
+        """Fly draws in batches, and after them what lanes leave to the engine ``flights``."""
+        plans = "planner" in campaign.scenario.commanders
+        in_lanes = self._tracked if plans else self._controlled
+        left: list[_Left] = []
+        for made in in_lanes(campaign, draws, stopped):
+            if isinstance(made, _Left):
+                left.append(made)
+            else:
+                yield made
+        reasons = {each.draw.number: each.why for each in left}
+        for row in self._flights.fly(campaign, [each.draw for each in left], stopped):
             yield replace(row, fallback=reasons[row.draw.number])
 
     def _controlled(
-        self,
-        campaign: Campaign,
-        draws: Sequence[Draw],
-        stopped: Callable[[], bool],
-        others: list[tuple[Draw, str]],
-    ) -> Iterator[Row]:
+        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
+    ) -> Iterator[Row | _Left]:
+        """Fly draws of coordinated control."""
         common = DrawnFlight.of(campaign.scenario)
         for first in range(0, len(draws), _MOST_CONTROLLED):
             if stopped():
@@ -131,29 +143,28 @@ class LanesEngine:
             batch = []
             for draw in draws[first : first + _MOST_CONTROLLED]:
                 try:
-                    batch.append((draw, drawn_flight(campaign, draw, common)))
+                    flight = drawn_flight(campaign, draw, common)
                 except SpaceRobotError as error:
                     yield Row.failed(draw, error, self.name)
+                    continue
+                try:
+                    require_lane(campaign, flight)
+                except SpaceRobotError as error:  # It alone: the others of its batch are flown.
+                    yield _Left(draw, str(error))
+                    continue
+                batch.append((draw, flight))
             if not batch:
                 continue
-            try:
-                flown = fly_controlled(campaign, batch)
-            except SpaceRobotError as error:  # Of one of them: they tell it each by itself.
-                others += [(draw, str(error)) for draw, _ in batch]
-                continue
-            for draw, flight in flown:
-                if isinstance(flight, str):
-                    others.append((draw, flight))
+            for draw, flown in fly_controlled(campaign, batch):
+                if isinstance(flown, str):
+                    yield _Left(draw, flown)
                 else:
-                    yield Row.of(campaign, draw, flight, self.name)
+                    yield Row.of(campaign, draw, flown, self.name)
 
     def _tracked(
-        self,
-        campaign: Campaign,
-        draws: Sequence[Draw],
-        stopped: Callable[[], bool],
-        others: list[tuple[Draw, str]],
-    ) -> Iterator[Row]:
+        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
+    ) -> Iterator[Row | _Left]:
+        """Fly draws that follow the plans of a planner."""
         common, batch, ticks = DrawnFlight.of(campaign.scenario), list[_Planned](), 0
         began = time.perf_counter()
         for draw in draws:
@@ -161,20 +172,20 @@ class LanesEngine:
                 return
             try:
                 planned = self._planned(draw, drawn_flight(campaign, draw, common))
-            except SpaceRobotError as error:
+            except Exception as error:  # It is a row, with its reason.
                 yield Row.failed(draw, error, self.name)
                 continue
             if planned is None:
-                others.append((draw, "No schedule begins at the first state."))
+                yield _Left(draw, "No schedule begins at the first state.")
                 continue
             batch.append(planned)
             ticks += planned.schedule.ticks
             late = time.perf_counter() - began > _LONGEST_BATCH
             if late or len(batch) >= _MOST or ticks > _MOST_TICKS:
-                yield from self._flown(campaign, batch, others)
+                yield from self._flown(campaign, batch)
                 batch, ticks, began = [], 0, time.perf_counter()
         if batch:
-            yield from self._flown(campaign, batch, others)
+            yield from self._flown(campaign, batch)
 
     def _planned(self, draw: Draw, flight: DrawnFlight) -> _Planned | None:
         """Have the executive plan a draw; None where it makes no plan for the first state."""
@@ -190,10 +201,8 @@ class LanesEngine:
             self._kept = key, _first_plan(flight)
         return _Planned.of(draw, flight, self._kept[1], began)
 
-    def _flown(
-        self, campaign: Campaign, batch: list[_Planned], others: list[tuple[Draw, str]]
-    ) -> Iterator[Row]:
-        """Fly a batch in lanes; what it cannot fly goes to ``others``."""
+    def _flown(self, campaign: Campaign, batch: list[_Planned]) -> Iterator[Row | _Left]:
+        """Fly a batch in lanes."""
         began = time.perf_counter()
         flights, ends = _flights(batch)
         result = fly_lanes(flights)
@@ -201,9 +210,9 @@ class LanesEngine:
         for row, planned in enumerate(batch):
             flight = _flight(result, row, planned, flights, ends[row])
             if isinstance(flight, str):
-                others.append((planned.draw, flight))
+                yield _Left(planned.draw, flight)
             elif flight.duration > campaign.longest:
-                others.append((planned.draw, "It is interrupted on the way."))
+                yield _Left(planned.draw, "It is interrupted on the way.")
             else:
                 made = Row.of(campaign, planned.draw, flight, self.name)
                 yield replace(made, wall_time=taken + planned.plan_time)

@@ -8,7 +8,7 @@ import tempfile
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -122,21 +122,33 @@ def nominal_robots(scenario: Scenario) -> Robots:
     return Robots.of(scenario, built)
 
 
-_METHODS: list[tuple[SpaceRobot, PlannerConfig, GaitMethod]] = []
-"""The method that was built last, if one was, for a robot and the configuration of its planner."""
+@dataclass(frozen=True)
+class _BuiltMethod:
+    """A gait method, and the robot and the configuration that it was built for."""
+
+    robot: SpaceRobot
+    config: PlannerConfig
+    method: GaitMethod
+
+    def serves(self, robot: SpaceRobot, config: PlannerConfig) -> bool:
+        """Whether it is the method of a planner."""
+        return self.robot is robot and (self.config is config or self.config == config)
+
+
+_last_method: _BuiltMethod | None = None
+"""What planned the last flight: its solvers serve all flights, and no plan depends on another."""
 
 
 def _method(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
-    """Return the method of a planner: its solvers serve all flights, and no plan heeds another."""
-    for known, before, method in _METHODS:
-        if known is robot and (before is config or before == config):
-            return method
-    made = build_method(
-        *(config.method, robot, config.control_period, config.integration_step),
-        config.method_options,
-    )
-    _METHODS[:] = [(robot, config, made)]
-    return made
+    """Return the method of a planner, that of the last flight where it planned alike."""
+    global _last_method
+    if _last_method is None or not _last_method.serves(robot, config):
+        method = build_method(
+            *(config.method, robot, config.control_period, config.integration_step),
+            config.method_options,
+        )
+        _last_method = _BuiltMethod(robot, config, method)
+    return _last_method.method
 
 
 def node_robot(node: str, flight: DrawnFlight) -> SpaceRobot:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -456,7 +457,7 @@ def _worst_table(results: Results) -> str:
     for row in results.worst():
         number = int(results.numbers[row])
         values = [f"{results.columns[name][row]:.4g}" for name in names]
-        command = f"spacerobot campaign rerun {results.folder} {number}"
+        command = f"spacerobot campaign rerun {shlex.quote(str(results.folder))} {number}"
         rows.append([str(number), command, results.columns["outcome"][row], *values])
     head = ["flight", "to fly it again, with a bag", "outcome", *map(named, names)]
     return table(head, rows, "worst")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections import Counter, deque
@@ -12,6 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from spacerobot_ros import __version__
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws
@@ -19,6 +21,7 @@ from spacerobot_ros.campaign.engines import chosen_engine, engine_called
 from spacerobot_ros.campaign.extras import needed
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.private_files import warn_once
 
 TASK_TIME = 2.0
 """Wall s that a task shall take: what a scheduler does for one is then small."""
@@ -33,6 +36,9 @@ _MOST_DEATHS = 2
 """Workers that a flight may take with it before it is reported and not tried again."""
 
 _LOOK_PERIOD = 0.2
+
+_ALONE = 5.0
+"""Wall s without a worker before a warning says so."""
 
 KILLED = "killed"
 """The outcome of a flight whose worker died with it, twice."""
@@ -148,6 +154,7 @@ def _rows(
     cluster: Cluster,
     stopped: Callable[[], bool],
 ) -> Iterator[list[Row]]:
+    """Yield the rows of draws as they are flown; none now and then, where others fly them."""
     if not numbers:
         return
     if not cluster.workers and not cluster.scheduler:
@@ -182,6 +189,7 @@ class _Specification:
     def __init__(self, campaign: Campaign) -> None:
         self.name, self.section = campaign.name, dict(campaign.section)
         self.scenario = campaign.scenario
+        self.version = __version__
         self.key = os.urandom(8).hex()
 
     def campaign(self) -> Campaign:
@@ -203,7 +211,18 @@ def _parsed(specification: _Specification) -> Campaign:
 
 
 def fly_task(specification: _Specification, draws: list[Draw], engine: str) -> list[Row]:
-    """Fly some draws in a worker: a task of the scheduler."""
+    """Fly some draws in a worker: a task of the scheduler.
+
+    Raises
+    ------
+    SpaceRobotError
+        The worker has another version of this package.
+    """
+    if specification.version != __version__:
+        raise SpaceRobotError(
+            f"A worker has spacerobot_ros {__version__}, and this process {specification.version}: "
+            "all need the same."
+        )
     campaign = specification.campaign()
     return list(engine_called(engine).fly(campaign, draws, lambda: False))
 
@@ -267,6 +286,12 @@ def _memory(workers: int) -> int:
     return max(512 * 2**20, total // (2 * max(1, workers)))
 
 
+def _lost() -> SpaceRobotError:
+    return SpaceRobotError(
+        "The scheduler is gone. What was flown is kept: the same command goes on from there."
+    )
+
+
 class _Distribution:
     """Deals draws out to workers.
 
@@ -290,6 +315,8 @@ class _Distribution:
         self._running: dict[Any, tuple[list[int], float]] = {}
         self._suspects: deque[int] = deque()
         self._deaths: Counter[int] = Counter()
+        self._alone_since = math.inf
+        """When it was seen that there is no worker, on the monotonic clock."""
         self._suspected: Any = None
         """The task of the suspect that is flown now."""
 
@@ -298,7 +325,10 @@ class _Distribution:
         waiting = deque(numbers)
         while (waiting or self._suspects or self._running) and not self._stopped():
             self._submit(waiting)
-            for future in self._ended():
+            ended = self._ended()
+            if not ended:
+                yield []
+            for future in ended:
                 yield self._taken(future)
         if self._running:
             self._client.cancel(list(self._running), force=True)
@@ -307,12 +337,34 @@ class _Distribution:
         """Keep the workers busy."""
         if self._suspects and self._suspected is None:
             self._suspected = self._task([self._suspects.popleft()])
-        workers = max(1, sum(self._client.nthreads().values()))
+        workers = self._workers()
         while waiting and len(self._running) < _AHEAD * workers:
             # The last tasks are smaller, so that no worker is alone at the end.
             size = min(self._size, max(self._least, len(waiting) / workers))
             count = min(len(waiting), max(1, round(size)))
             self._task([waiting.popleft() for _ in range(count)])
+
+    def _workers(self) -> int:
+        """Return how many workers there are, at least one: others may join later.
+
+        Raises
+        ------
+        SpaceRobotError
+            The scheduler is gone.
+        """
+        try:
+            if self._client.status != "running":
+                raise _lost()
+            workers = sum(self._client.nthreads().values())
+        except (OSError, AttributeError) as error:  # The client was about to notice it.
+            raise _lost() from error
+        if workers:
+            self._alone_since = math.inf
+        elif time.monotonic() - self._alone_since > _ALONE:
+            warn_once("The scheduler has no worker: the flights wait for one.")
+        elif self._alone_since == math.inf:
+            self._alone_since = time.monotonic()
+        return max(1, workers)
 
     def _task(self, numbers: list[int]) -> Any:
         draws = [self._draws[number] for number in numbers]
@@ -333,7 +385,13 @@ class _Distribution:
         return [future for future in self._running if future.done()]
 
     def _taken(self, future: Any) -> list[Row]:
-        """Return the rows of a task; none where its worker died."""
+        """Return the rows of a task; none where its worker died.
+
+        Raises
+        ------
+        SpaceRobotError
+            The scheduler is gone, or a worker cannot fly at all.
+        """
         from distributed.client import FutureCancelledError
         from distributed.scheduler import KilledWorker
 
@@ -343,8 +401,15 @@ class _Distribution:
             self._suspected = None
         try:
             rows: list[Row] = future.result()
-        except (KilledWorker, FutureCancelledError):
+        except KilledWorker:
             return self._mourned(numbers, alone)
+        except FutureCancelledError as error:
+            raise _lost() from error
+        except ImportError as error:
+            raise SpaceRobotError(
+                f"A worker or the scheduler cannot load what flies ({error}): all of them need "
+                f"spacerobot_ros[campaign] {__version__}."
+            ) from error
         if not alone and rows:
             took = sum(row.wall_time for row in rows if row.wall_time == row.wall_time)
             if took > 0:

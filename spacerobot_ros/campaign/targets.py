@@ -27,6 +27,11 @@ AXES = ("x", "y", "z")
 
 _INDEXED = re.compile(r"(.+)\[([^\]]+)\]")
 _FAULT = re.compile(r"faults\[(\d+)\]\.(at|until|value)")
+_OF_ALL_FLIGHTS = (
+    *("plant.robot", "plant.robot_description", "plant.time_mode", "plant.resume_bag"),
+    *("planner.resume_file", "coordinated_control.resume_file"),
+)
+"""Parameters that say what is flown, and how."""
 _POSES = ("goal", "end_effector_goal", "initial")
 
 KINDS_OF_TARGETS = (
@@ -57,15 +62,15 @@ class Target:
         For people.
     text
         Whether it is a text.
-    replaces
-        The name that would set the same number, or this one.
+    sets
+        What it sets, by names under which two targets that set the same number meet.
     """
 
     name: str
     apply: Callable[[DrawnFlight, Any], DrawnFlight]
-    unit: str = ""
-    text: bool = False
-    replaces: str = ""
+    unit: str
+    text: bool
+    sets: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -159,11 +164,11 @@ def targets_of(name: str, scenario: Scenario) -> list[Target]:
     ParameterError
         There is no such thing; the sentence asks for what may be meant.
     """
-    kind, _, rest = name.partition(".")
+    kind, dot, rest = name.partition(".")
     if kind in CONFIGS:
         return [_parameter(name, kind, rest, scenario)]
     if kind in ("mass", "inertia"):
-        return _weights(kind, rest, scenario)
+        return _weights(kind, dot, rest, scenario)
     if kind == "com":
         return _centers(rest, scenario)
     if kind in _POSES:
@@ -194,6 +199,8 @@ def _parameter(name: str, node: str, rest: str, scenario: Scenario) -> Target:
     value = values_of(scenario.config(node))[bare]
     if isinstance(value, bool) or declaration.texts:
         raise ParameterError(f"'{name}' is neither a number nor a text: it cannot be dispersed.")
+    if name in _OF_ALL_FLIGHTS:
+        raise ParameterError(f"'{name}' is the same in all flights of a campaign.")
     if isinstance(value, tuple) and bare.startswith("initial_orientation"):
         raise ParameterError(f"'{name}' is a quaternion: disperse initial.rotvec.x, y and z.")
     if isinstance(value, tuple) is not bool(index):
@@ -201,8 +208,8 @@ def _parameter(name: str, node: str, rest: str, scenario: Scenario) -> Target:
         raise ParameterError(f"'{name}': {how}.")
     if not index:
         return _plain(name, node, declaration, value)
-    nominal = value if isinstance(value, tuple) else ()
-    return _entry(name, node, declaration, _index(name, index, scenario), nominal)
+    assert isinstance(value, tuple)
+    return _entry(name, node, declaration, index, scenario)
 
 
 def _plain(name: str, node: str, declaration: Parameter, value: Any) -> Target:
@@ -213,35 +220,55 @@ def _plain(name: str, node: str, declaration: Parameter, value: Any) -> Target:
         scenario = flight.scenario.with_overrides(node, {declaration.name: given})
         return replace(flight, scenario=scenario)
 
-    return Target(name, apply, declaration.unit, isinstance(value, str), name)
+    return Target(name, apply, declaration.unit, isinstance(value, str), frozenset({name}))
 
 
-def _entry(
-    name: str, node: str, declaration: Parameter, index: int, nominal: tuple[Any, ...]
-) -> Target:
-    length = declaration.length or len(nominal)
+def _entry(name: str, node: str, declaration: Parameter, index: str, scenario: Scenario) -> Target:
+    """Return a number of a list, by its place or by the joint that it is of."""
+    values = _list(name, node, declaration, scenario)
+    of_joints = declaration.of_joints or (node == "plant" and declaration.length is None)
+    joints = list(description_of(scenario).joint_names) if of_joints else []
+    if index in joints:
+        place = joints.index(index)
+    elif index.isdecimal() and int(index) < len(values):
+        place = int(index)
+    else:
+        known = f", nor one of the joints {', '.join(joints)}" if joints else ""
+        raise ParameterError(
+            f"'{name}': '{index}' is none of the places 0 to {len(values) - 1} of the list{known}."
+            f"{suggestion(index, joints)}"
+        )
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
-        values = list(values_of(flight.scenario.config(node))[declaration.name])  # type: ignore[arg-type]
-        count = length or len(flight.nominal.joint_names)
-        values = values or [0.0] * count
-        values[index] = float(drawn)
+        values = _list(name, node, declaration, flight.scenario)
+        values[place] = float(drawn)
         scenario = flight.scenario.with_overrides(node, {declaration.name: values})
         return replace(flight, scenario=scenario)
 
-    return Target(name, apply, declaration.unit, replaces=f"{node}.{declaration.name}[{index}]")
+    one = frozenset({f"{node}.{declaration.name}[{place}]"})
+    return Target(name, apply, declaration.unit, False, one)
 
 
-def _index(name: str, text: str, scenario: Scenario) -> int:
-    joints = list(description_of(scenario).joint_names)
-    if text in joints:
-        return joints.index(text)
-    if text.isdigit() and int(text) < max(3, len(joints)):
-        return int(text)
+def _list(name: str, node: str, declaration: Parameter, scenario: Scenario) -> list[float]:
+    """Return a list of numbers as the scenario has it; one of joints that is empty is zero."""
+    values = values_of(scenario.config(node))[declaration.name]
+    assert isinstance(values, tuple)
+    if values:
+        return [float(x) for x in values]
+    if node == "plant" and declaration.length is None:
+        return _start(scenario) if "positions" in name else [0.0] * len(_start(scenario))
     raise ParameterError(
-        f"'{name}': '{text}' is no place in a list, nor one of the joints {', '.join(joints)}."
-        f"{suggestion(text, joints)}"
+        f"'{name}': the list is empty, which has a meaning of its own: give all of it under 'set'."
     )
+
+
+def _start(scenario: Scenario) -> list[float]:
+    """Return the joint positions at the start: where none are given, as near to zero as may be."""
+    given, robot = scenario.plant.initial_joint_positions, description_of(scenario)
+    if given:
+        return list(given)
+    zero = np.zeros(len(robot.joint_names))
+    return [float(x) for x in np.clip(zero, robot.limits("lower"), robot.limits("upper"))]
 
 
 def _bodies(name: str, scenario: Scenario) -> list[tuple[int, str]]:
@@ -256,18 +283,20 @@ def _bodies(name: str, scenario: Scenario) -> list[tuple[int, str]]:
     return [(names.index(name), name)]
 
 
-def _weights(kind: str, rest: str, scenario: Scenario) -> list[Target]:
-    def target(indices: Sequence[int], name: str) -> Target:
+def _weights(kind: str, dot: str, rest: str, scenario: Scenario) -> list[Target]:
+    def target(bodies: Sequence[tuple[int, str]], name: str) -> Target:
+        indices = [index for index, _ in bodies]
+
         def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
             factors = getattr(flight, kind).copy()
-            factors[list(indices)] *= float(drawn)
+            factors[indices] *= float(drawn)
             return replace(flight, **{kind: factors})
 
-        return Target(name, apply, "1", replaces=kind)
+        return Target(name, apply, "1", False, frozenset(f"{kind}.{body}" for _, body in bodies))
 
-    if not rest:
-        return [target(range(len(description_of(scenario).bodies)), kind)]
-    return [target([index], f"{kind}.{name}") for index, name in _bodies(rest, scenario)]
+    if not dot:
+        return [target(_bodies("*", scenario), kind)]
+    return [target([body], f"{kind}.{body[1]}") for body in _bodies(rest, scenario)]
 
 
 def _centers(rest: str, scenario: Scenario) -> list[Target]:
@@ -275,7 +304,10 @@ def _centers(rest: str, scenario: Scenario) -> list[Target]:
     if rest == "*":
         body, dot, axis = "*", ".", "*"
     if not dot or axis not in (*AXES, "*"):
-        raise ParameterError(f"'com.{rest}' must be com.BODY.x, y, z or *, or com.*.")
+        raise ParameterError(
+            f"'{f'com.{rest}'.rstrip('.')}' must be com.BODY.x, y, z or *, or com.*; the bodies "
+            f"are {', '.join(name for _, name in _bodies('*', scenario))}."
+        )
     found = []
     for index, name in _bodies(body, scenario):
         for column, letter in enumerate(AXES):
@@ -290,7 +322,7 @@ def _center(index: int, column: int, name: str) -> Target:
         com[index, column] += float(drawn)
         return replace(flight, com=com)
 
-    return Target(name, apply, "m", replaces=name)
+    return Target(name, apply, "m", False, frozenset({name}))
 
 
 def _pose(name: str, kind: str, rest: str, scenario: Scenario) -> Target:
@@ -299,6 +331,8 @@ def _pose(name: str, kind: str, rest: str, scenario: Scenario) -> Target:
         return _initial_joint(name, axis, scenario)
     if part not in ("position", "rotvec") or axis not in AXES:
         known = [f"{kind}.{p}.{a}" for p in ("position", "rotvec") for a in AXES]
+        if kind == "initial":
+            known += [f"initial.joints.{joint}" for joint in description_of(scenario).joint_names]
         raise ParameterError(f"'{name}' is none of {', '.join(known)}.{suggestion(name, known)}")
     if kind == "end_effector_goal" and scenario.end_effector_goal is None:
         raise ParameterError(f"'{name}': the scenario has no goal for the end-effector.")
@@ -322,7 +356,10 @@ def _pose(name: str, kind: str, rest: str, scenario: Scenario) -> Target:
             moved = scenario.with_poses(scenario.goal, goal)
         return replace(flight, scenario=moved)
 
-    return Target(name, apply, "m" if part == "position" else "rad", replaces=name)
+    sets = {name}
+    if kind == "initial" and part == "position":
+        sets = {f"plant.initial_{what}[{column}]" for what in ("position", "center_of_mass")}
+    return Target(name, apply, "m" if part == "position" else "rad", False, frozenset(sets))
 
 
 def _moved_start(scenario: Scenario, part: str, offset: Array) -> Scenario:
@@ -346,12 +383,13 @@ def _initial_joint(name: str, joint: str, scenario: Scenario) -> Target:
     index = joints.index(joint)
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
-        given = flight.scenario.plant.initial_joint_positions or (0.0,) * len(joints)
-        values = [q + float(drawn) * (i == index) for i, q in enumerate(given)]
+        values = _start(flight.scenario)
+        values[index] += float(drawn)
         scenario = flight.scenario.with_overrides("plant", {"initial_joint_positions": values})
         return replace(flight, scenario=scenario)
 
-    return Target(name, apply, "m or rad", replaces=f"plant.initial_joint_positions[{index}]")
+    one = frozenset({f"plant.initial_joint_positions[{index}]"})
+    return Target(name, apply, "m or rad", False, one)
 
 
 def _fault(name: str, index: int, part: str, scenario: Scenario) -> Target:
@@ -370,7 +408,7 @@ def _fault(name: str, index: int, part: str, scenario: Scenario) -> Target:
         scenario = flight.scenario.with_overrides("plant", {"faults": lines})
         return replace(flight, scenario=scenario)
 
-    return Target(name, apply, "" if part == "value" else "s", replaces=name)
+    return Target(name, apply, "" if part == "value" else "s", False, frozenset({name}))
 
 
 def _line(words: list[str], part: str, text: str) -> str:

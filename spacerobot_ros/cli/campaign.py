@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -139,14 +140,21 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
 
 
 def _flown(
-    file: Path, flights: int | None, engine: str, cluster: Cluster, out: Path | None
+    file: Path,
+    flights: int | None,
+    engine: str,
+    cluster: Cluster,
+    out: Path | None,
+    name: str = "",
 ) -> Path:
-    """Fly a campaign, say how far it has come, and return its folder."""
+    """Fly a campaign, say how far it has come, and return its folder; ``name`` replaces its own."""
     from spacerobot_ros.campaign.config import load_campaign
     from spacerobot_ros.campaign.running import run_campaign
     from spacerobot_ros.termination import ended_on_request
 
     campaign = load_campaign(file, flights)
+    if name:
+        campaign = replace(campaign, name=name)
     folder = out or Path("out") / campaign.name
     with ended_on_request() as stopped, _shown(campaign.name) as show:
         end = run_campaign(
@@ -206,10 +214,13 @@ def _compare(
     from spacerobot_ros.campaign.config import load_campaign
 
     require_same_draws(*(load_campaign(file, flights) for file in files))
-    base = out or Path("out") / "_".join(file.stem for file in files)
+    names = [file.stem for file in files]
+    if names[0] == names[1]:  # Of different folders.
+        names = [f"{name}_{letter}" for name, letter in zip(names, "AB", strict=True)]
+    base = out or Path("out") / "_".join(names)
     folders = []
-    for file in files:
-        folders.append(_flown(file, flights, engine, cluster, base / file.stem))
+    for file, name in zip(files, names, strict=True):
+        folders.append(_flown(file, flights, engine, cluster, base / name, name))
         end_if_requested()
     path = report or base / "report.html"
     for line in write_comparison((folders[0], folders[1]), path):

@@ -166,6 +166,8 @@ class InertialParameters:
                 f"The mass of '{names[int(body_index)]}' is {masses[row, body_index]:.6g} kg; it "
                 "must be positive."
             )
+        if not masses.sum(axis=1).all():
+            raise RobotDescriptionError("All bodies of the robot together weigh nothing.")
         tensors = self.inertias.reshape(-1, len(names), 3, 3)
         low, middle, high = np.moveaxis(np.linalg.eigvalsh(tensors), -1, 0)
         slack = _ROUNDING * np.maximum(1.0, high)

@@ -38,6 +38,39 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"mass": {"norm": [1, 2, 3]}}}, "norm takes loc, scale, not 3 numbers"),
     ({"disperse": {"mass": 1.0}}, "must have one distribution"),
     ({"disperse": {"mass": NORM, "mass.mass_1": NORM}}, "set the same numbers"),
+    ({"disperse": {"mass.mass_1": NORM, "mass": NORM}}, "'mass.mass_1' and 'mass' set the same"),
+    ({"disperse": {"mass.": NORM}}, "the robot has no body ''"),
+    ({"disperse": 0}, "'disperse' must have names"),
+    ({"criteria": []}, "'criteria' must have names"),
+    ({"disperse": {"mass": {"gaussian": {}}}}, "Did you mean 'norm'"),
+    ({"disperse": {"mass": {"norm": {"mean": 1}}}}, "loc is its mean and scale its standard"),
+    ({"disperse": {"mass": {"uniform": {"max": 1}}}}, "loc is its least value and scale its width"),
+    ({"disperse": {"mass": {"norm": {"loc": 1, "scale": 0}}}}, "norm takes no such arguments"),
+    ({"disperse": {"mass": {"choice": [1, None]}}}, "'mass: choice' is None"),
+    ({"disperse": {"mass": {"choice": [True, 1]}}}, "'mass: choice' is True"),
+    ({"disperse": {"mass": {"choice": [[1], 2]}}}, r"'mass: choice' is \[1\]"),
+    ({"disperse": {"mass": {"choice": [float("inf")]}}}, "it must be a finite number"),
+    ({"disperse": {"planner.method": {"choice": ["optimal", 3]}}}, "is a text; the choice has 3"),
+    ({"disperse": {"planner.method": {"choice": ["optimall"]}}}, "must be one of lie_bracket"),
+    ({"disperse": {"plant.sensors.position_noise": {"choice": [-1]}}}, "must be a number from 0"),
+    ({"disperse": {"plant.sensors.position_bias[3]": NORM}}, "none of the places 0 to 2"),
+    ({"disperse": {"plant.sensors.position_bias[slider_1]": NORM}}, "none of the places 0 to 2"),
+    ({"disperse": {"plant.sensors.joint_bias[3]": NORM}}, "nor one of the joints slider_1"),
+    ({"disperse": {"planner.optimal.max_velocity[0]": NORM}}, "the list is empty, which has"),
+    ({"disperse": {"plant.robot": {"choice": ["dual_arm"]}}}, "the same in all flights"),
+    ({"disperse": {"plant.time_mode": {"choice": ["realtime"]}}}, "the same in all flights"),
+    ({"disperse": {"initial.joint.slider_1": NORM}}, "Did you mean 'initial.joints.slider_1'"),
+    ({"disperse": {"com.x": NORM}}, "'com.x' must be com.BODY.x.*the bodies are base_link"),
+    ({"disperse": {"initial.position.x": NORM, "plant.initial_position[0]": NORM}}, "same numbers"),
+    (
+        {
+            "disperse": {
+                "initial.joints.slider_1": NORM,
+                "plant.initial_joint_positions[slider_1]": NORM,
+            }
+        },
+        "set the same numbers",
+    ),
     ({"disperse": {"plant.sensors.noise": NORM}}, "no parameter 'sensors.noise'.*Did you mean"),
     ({"disperse": {"coordinated_control.time_limit": NORM}}, "a node that does not fly"),
     ({"disperse": {"plant.linear_momentum": NORM}}, "say which number of the list"),
@@ -47,10 +80,10 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"goal.position.u": NORM}}, "none of goal.position.x"),
     ({"disperse": {"end_effector_goal.position.x": NORM}}, "no goal for the end-effector"),
     ({"disperse": {"faults[0].at": NORM}}, r"plant.faults has 0 fault\(s\)"),
-    ({"disperse": {"planner.method": NORM}}, "is a text"),
-    ({"disperse": {"mass": {"choice": ["a"]}}}, "is a number"),
+    ({"disperse": {"planner.method": NORM}}, "is a text: it must have a 'choice' of texts"),
+    ({"disperse": {"mass": {"choice": ["a"]}}}, "'mass: choice' is 'a'"),
     ({"criteria": {"position_eror_m": {"max": 1}}}, "no metric.*Did you mean 'position_error_m'"),
-    ({"criteria": {"peak_rate.slider_9": {"max": 1}}}, "no metric 'peak_rate.slider_9'"),
+    ({"criteria": {"peak_rate.slider_9": {"max": 1}}}, "Did you mean 'peak_rate.slider_[123]'"),
     ({"criteria": {"duration_s": {"most": 1}}}, "must have 'min' or 'max'"),
     ({"criteria": {"duration_s": {"min": 2, "max": 1}}}, "is met by nothing"),
     ({"sampler": "saltelli"}, "needs something that is dispersed"),
@@ -61,6 +94,31 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 def test_what_is_wrong_is_said(given: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=f"(?s){sentence}"):
         campaign(**given)
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_is_wrong_is_said_in_one_sentence_without_a_warning() -> None:
+    for given in ({"norm": {"scale": 0}}, {"triang": {"c": 3}}):
+        with pytest.raises(ParameterError, match="takes no such arguments"):
+            campaign(disperse={"mass": given})
+    made = campaign(disperse={"mass": {"pareto": {"b": 0.001}}}, flights=9)
+    assert any(np.isinf(draw.values["mass"]) for draw in Draws(made))
+
+
+def test_numbers_without_a_dot_may_be_chosen() -> None:
+    """YAML reads 9e-1 as a text."""
+    made = campaign(disperse={"mass": {"choice": ["9e-1", 1]}})
+    assert made.dispersions[0].distribution.choices == (0.9, 1.0)
+
+
+def test_a_key_that_is_there_twice_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "twice.yaml"
+    text = yaml.safe_dump({"campaign": section(disperse={"mass": NORM})})
+    file.write_text(text)
+    assert load_campaign(file).names == ("mass",)
+    file.write_text(text.replace("disperse:\n", "disperse:\n    mass: {norm: {}}\n"))
+    with pytest.raises(ParameterError, match=r"the key 'mass' is there twice.*line 4"):
+        load_campaign(file)
 
 
 def test_a_file_names_its_scenario_beside_it(tmp_path: Path) -> None:

@@ -127,6 +127,37 @@ def test_flights_in_lanes_are_interrupted_or_left_to_the_controller() -> None:
     assert {lanes[number].fallback for number in lost} == {"Control is lost."}
 
 
+def test_a_draw_that_is_refused_leaves_the_others_of_its_batch_in_lanes() -> None:
+    """Each has its own reason: a start beyond the joint limits, noise below zero."""
+    refused: dict[str, Any] = {
+        "initial.joints.elbow": {"choice": [0.0, 9.0]},
+        "plant.sensors.joint_noise": {"uniform": {"loc": -0.0001, "scale": 0.0003}},
+    }
+    made = controlled(flights=12, disperse=refused, longest=0.2)
+    lanes, _ = assert_same_flights(made)
+    reasons = {number: row.reason for number, row in lanes.items() if row.outcome == "error"}
+    for part in ("is outside its limits", "must be a number from 0"):
+        assert any(part in reason for reason in reasons.values()), (part, reasons)
+    assert 3 <= len(reasons) < 12
+    flown_in_lanes = {number for number, row in lanes.items() if row.engine == "lanes"}
+    assert set(lanes) - set(reasons) <= flown_in_lanes
+    assert all(row.fallback == row.reason for row in lanes.values() if row.fallback)
+
+
+def test_draws_that_are_no_robot_and_no_number_end_no_other_flight() -> None:
+    nothing = {"mass": {"choice": [0.0, 1.0]}}
+    lanes, _ = assert_same_flights(controlled(flights=6, disperse=nothing, longest=0.2))
+    infinite = {"plant.sensors.seed": {"pareto": {"b": 0.001}}}
+    lanes_of_none, _ = assert_same_flights(controlled(flights=4, disperse=infinite))
+    sentence = "What was drawn of 'plant.sensors.seed' is inf."
+    assert sentence in {row.reason for row in lanes_of_none.values()}
+    assert {row.outcome for row in lanes_of_none.values()} == {"error"}
+    weightless = [row.reason for row in lanes.values() if not row.draw.values["mass"]]
+    assert 0 < len(weightless) < 6
+    assert set(weightless) == {"All bodies of the robot together weigh nothing."}
+    assert {row.engine for row in lanes.values()} == {"lanes"}
+
+
 def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
     made = campaign(disperse=DISPERSED)
     assert chosen_engine(made, "auto").name == "lanes"

@@ -36,13 +36,13 @@ def ishigami(draw: Draw) -> float:
     return math.sin(x) + 7.0 * math.sin(y) ** 2 + 0.1 * z**4 * math.sin(x)
 
 
-def filled(folder: Path, made: Campaign, error: Callable[[Draw], float]) -> Path:
+def filled(folder: Path, made: Campaign, error: Callable[[Draw], float], **others: float) -> Path:
     """Write a dataset whose flights have such position errors, and nothing else."""
     dataset = Dataset(folder)
     dataset.begin(made)
     rows = []
     for draw in Draws(made):
-        metrics = {"position_error_m": error(draw), "manoeuvre_time_s": 4.0}
+        metrics = {"position_error_m": error(draw), "manoeuvre_time_s": 4.0, **others}
         outcome = "reached" if metrics["position_error_m"] < 0.05 else "failed"
         ok = passed(made.criteria, outcome, metrics)
         left = "It is corrected." if draw.number % 50 == 0 else ""
@@ -107,7 +107,8 @@ def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
         return bowl(draw) - 0.002 + 0.001 * math.sin(draw.number)
 
     one, two = filled(tmp_path / "one", made, bowl), filled(tmp_path / "two", made, better)
-    lines = write_comparison((one, two), tmp_path / "report.html")
+    page = tmp_path / "report.html"
+    lines = write_comparison((one, two), page)
     draws = list(Draws(made))
     a, b = np.array([bowl(draw) for draw in draws]), np.array([better(draw) for draw in draws])
     interval = stats.ttest_rel(b, a).confidence_interval(0.95)
@@ -123,16 +124,31 @@ def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
     again = write_comparison((two, one), tmp_path / "again.html")
     (line,) = [line for line in again if line.startswith("position_error_m")]
     assert f"{(a - b).mean():.4g}" in line
+    # What one of them requires is compared, too.
+    more = {**CRITERIA, "duration_s": {"max": 5.0}}
+    three = filled(
+        tmp_path / "three",
+        campaign(disperse=MASSES, flights=120, seed=8, criteria=more),
+        better,
+        duration_s=4.5,
+    )
+    again = write_comparison((filled(tmp_path / "a", made, bowl, duration_s=4.0), three), page)
+    assert "duration_s: short minus short is 0.5 (0.5 to 0.5)" in again
+    reordered = campaign(
+        disperse=dict(reversed(MASSES.items())), flights=120, seed=8, criteria=CRITERIA
+    )
+    with pytest.raises(ParameterError, match=r"'disperse' is mass.mass_1: .* mass.mass_3"):
+        write_comparison((one, filled(tmp_path / "b", reordered, bowl)), page)
     other = campaign(disperse=MASSES, flights=120, seed=9, criteria=CRITERIA)
-    three = filled(tmp_path / "three", other, bowl)
+    four = filled(tmp_path / "four", other, bowl)
     with pytest.raises(ParameterError, match="do not have the same draws: 'seed' is 8 and 9"):
-        write_comparison((one, three), tmp_path / "no.html")
+        write_comparison((one, four), tmp_path / "no.html")
 
 
 @pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with")
 def test_the_pages_open_without_a_complaint_and_need_nothing_else(tmp_path: Path) -> None:
     made = campaign(disperse=MASSES, flights=120, seed=8, criteria=CRITERIA)
-    one = filled(tmp_path / "one", made, bowl)
+    one = filled(tmp_path / "one of two", made, bowl)
     two = filled(tmp_path / "two", made, lambda draw: bowl(draw) - 0.001)
     page, comparison = one / "report.html", tmp_path / "comparison.html"
     lines = write_campaign_report(one, page)
@@ -157,4 +173,4 @@ def test_the_pages_open_without_a_complaint_and_need_nothing_else(tmp_path: Path
     assert f"{share} of 120" in words
     assert "Left to another engine: It is corrected (3)" in words
     worst = max(Draws(made), key=bowl).number
-    assert f"spacerobot campaign rerun {one} {worst}" in words
+    assert f"spacerobot campaign rerun '{one}' {worst}" in words

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +14,14 @@ from support.campaigns import campaign
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
+from spacerobot_ros.campaign.extras import needed
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
+from spacerobot_ros.campaign.report import Results
 from spacerobot_ros.campaign.rerunning import TOLERANCE, largest_deviation, rerun_flight
 from spacerobot_ros.campaign.rows import ERROR, Row
 from spacerobot_ros.campaign.running import Progress, run_campaign
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, RecordingError
 
 MASSES: dict[str, Any] = {
     "mass.*": {"norm": {"loc": 1.0, "scale": 0.03}},
@@ -78,6 +82,13 @@ def test_the_folder_of_another_campaign_is_refused(tmp_path: Path) -> None:
     for other in (small(flights=1, seed=3), small(flights=1, set={"planner.averaging": 3})):
         with pytest.raises(ParameterError, match="holds another campaign"):
             run_campaign(other, tmp_path / "one")
+    with pytest.raises(ParameterError, match=r"'short', with another 'seed'. Name another"):
+        run_campaign(small(flights=1, seed=3), tmp_path / "one")
+    with pytest.raises(ParameterError, match="with another scenario, or other parameters of it"):
+        run_campaign(small(flights=1, method="optimal"), tmp_path / "one")
+    (tmp_path / "file").touch()
+    with pytest.raises(ParameterError, match="is a file: name a folder"):
+        run_campaign(small(), tmp_path / "file")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("1")
     with pytest.raises(ParameterError, match="is not empty and holds no campaign"):
@@ -113,6 +124,64 @@ def test_what_is_half_written_is_not_there(tmp_path: Path) -> None:
     run_campaign(small(flights=2), tmp_path)
     assert [row["flight"] for row in rows(tmp_path)] == [0, 1]
     assert not list((tmp_path / "flights").glob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("about.json", b"{"),
+        ("about.json", b"{}"),
+        ("campaign.yaml", b""),
+        ("campaign.yaml", b"\xff"),
+        ("flights/part-000000.parquet", b""),
+        ("flights/part-000000.parquet", b"PAR1 and no more"),
+    ],
+)
+def test_a_damaged_file_is_named(tmp_path: Path, name: str, content: bytes) -> None:
+    """No report of it, and no flights into it, but where the other files say enough."""
+    run_campaign(small(flights=1), tmp_path)
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ParameterError, match=f"The file {tmp_path / name} is damaged"):
+        Results.of(tmp_path)
+    if name == "campaign.yaml":
+        assert run_campaign(small(flights=1), tmp_path).done == 1
+        assert len(Results.of(tmp_path)) == 1
+        return
+    with pytest.raises(ParameterError, match=f"The file {tmp_path / name} is damaged"):
+        run_campaign(small(flights=2), tmp_path)
+    if name.startswith("flights"):
+        (tmp_path / name).unlink()
+        assert run_campaign(small(flights=2), tmp_path).done == 2
+        assert [row["flight"] for row in rows(tmp_path)] == [0, 1]
+
+
+def test_a_disk_that_is_full_costs_nothing_that_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whichever file cannot be written, the campaign goes on later."""
+    run_campaign(small(flights=2), tmp_path)
+    before = rows(tmp_path)
+
+    def full(*given: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", full)
+        with pytest.raises(RecordingError, match=r"cannot be written: .*No space left"):
+            run_campaign(small(flights=3), tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(needed("pyarrow.parquet"), "write_table", full)
+        with pytest.raises(RecordingError, match=r"The last 1 flights cannot be .*goes on from"):
+            run_campaign(small(flights=3), tmp_path)
+    assert str(rows(tmp_path)) == str(before)
+    assert run_campaign(small(flights=3), tmp_path).done == 3
+
+
+def test_a_campaign_that_was_killed_while_it_began_begins_again(tmp_path: Path) -> None:
+    (tmp_path / "flights").mkdir()
+    (tmp_path / ".scenario.yaml").write_text("half")
+    (tmp_path / "scenario.yaml").write_text("whole")
+    assert run_campaign(small(flights=1), tmp_path).done == 1
 
 
 @pytest.fixture
