@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 from pathlib import Path
 from typing import Any
 
@@ -165,8 +164,12 @@ def test_a_disk_that_is_full_costs_nothing_that_is_there(
     def full(*given: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
+    def emptied(path: Path, *given: object, **options: object) -> None:
+        path.write_bytes(b"")  # What opens a file to write it does so first.
+        full()
+
     with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", full)
+        patch.setattr(Path, "write_text", emptied)
         with pytest.raises(RecordingError, match=r"cannot be written: .*No space left"):
             run_campaign(small(flights=3), tmp_path)
     with monkeypatch.context() as patch:
