@@ -76,9 +76,7 @@ def viewing(
                 stderr=errors,
                 start_new_session=True,
             )
-        with suppress(OSError):
-            # Everything that flies goes first.
-            os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
+        yield_to_flight(process.pid)
         try:
             show(_announcement(process, log))
             for line in log.read_text("utf-8", errors="replace").splitlines():
@@ -86,6 +84,15 @@ def viewing(
             yield
         finally:
             _end(process)
+
+
+def yield_to_flight(pid: int) -> None:
+    """Have the processes of a session give way to everything that flies."""
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, pid, _NICENESS)
+    # Linux may share the processor among sessions first; niceness counts within each alone.
+    with suppress(OSError):
+        Path(f"/proc/{pid}/autogroup").write_text(str(_NICENESS), "ascii")
 
 
 def _announcement(process: subprocess.Popen[bytes], log: Path) -> str:
