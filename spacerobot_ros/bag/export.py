@@ -152,15 +152,17 @@ def export(
 
 
 def _require_suffix(target: Path, format: ExportFormat) -> None:
-    """Refuse names that say something else than what is made."""
+    """Refuse names that belong to another format."""
     suffix = target.suffix.lower()
     if format is ExportFormat.MAT:
         if suffix not in ("", ".mat"):
-            raise RecordingError(f"A file in MAT is called .mat, and not '{target.name}'.")
+            raise RecordingError(
+                f"The name of a file for MATLAB ends in .mat; '{target.name}' does not."
+            )
     elif suffix in {f".{each.value}" for each in ExportFormat}:
         raise RecordingError(
-            f"Tables in {format.value} are a folder with a file for each topic, which is not "
-            f"called '{target.name}'."
+            f"Tables in {format.value} are a folder with a file for each topic; '{target.name}' is "
+            "the name of one file."
         )
 
 

@@ -60,6 +60,17 @@ class Checkout:
             raise ParameterError(f"{declaration} declares no command 'spacerobot'.")
         return cls(folder.resolve(), entry[1])
 
+    @classmethod
+    def pair(cls, other: Path | None) -> tuple[Checkout, Checkout | None]:
+        """Return ours, and the one in another folder if there is one to compare with.
+
+        Raises
+        ------
+        ParameterError
+            There is none in the folder.
+        """
+        return cls.ours(), None if other is None else cls.at(other)
+
     def measure(self, words: Sequence[str]) -> Figures:
         """Return the numbers that ``spacerobot bench`` with these words writes as JSON.
 

@@ -1,6 +1,7 @@
-"""The first plan of a robot that this machine has not seen, and the first of the next process.
+"""CPU time of the first plan of a robot: with an empty cache, and in the next process.
 
-This file is also run by itself, with the package of another checkout: it uses only what both have.
+This file is also run by itself, with the package of another checkout. So it uses only what both
+checkouts have.
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from spacerobot_ros.benchmarks.against import Checkout
 
 ROBOTS = ("seven_joint_arm", "quadruped", "dual_arm")
 """Of 7, 12 and 14 joints."""
@@ -22,27 +26,27 @@ ROBOTS = ("seven_joint_arm", "quadruped", "dual_arm")
 _PERIOD = 0.05
 _TURN = (0.1, -0.15, 0.2)
 _NEXT = 3
-"""Processes that plan with the cache of the first one; the medians count."""
+"""Number of processes that plan with the cache of the first one, of which medians are taken."""
 
 
 def run_first_plan_benchmark(other: Path | None, show: Callable[[str], None]) -> dict[str, Any]:
-    """Plan one goal of robots of many joints with an empty cache, then in another process.
+    """Plan one goal of robots with many joints, first with an empty cache, then in other processes.
 
-    CPU time is measured, with that of the compiler; manoeuvres are planned cold, so of the cache
-    only the compiled equations count.
+    CPU time is measured, with that of the compiler. The cache of plans is off: the other processes
+    find only compiled equations.
 
     Parameters
     ----------
     other
-        Folder of a checkout that does the same; None: of none.
+        Folder of a checkout to compare with; None: there is none.
     show
         Called with lines for people.
 
     Returns
     -------
-    By the name of the robot: its ``joints``; CPU times, s, of the process that has found an empty
-    cache, ``first_cpu_s``, of the next one, ``next_cpu_s``, and what that is more than the same
-    plan where all is loaded, ``more_cpu_s``; ``there`` those of the other checkout.
+    By the name of the robot: its ``joints``; the CPU time in s of the process with an empty cache,
+    ``first_cpu_s``; that of a next process, ``next_cpu_s``; how much of that is not the plan
+    itself, ``more_cpu_s``; ``there``: the same of the other checkout.
 
     Raises
     ------
@@ -51,8 +55,7 @@ def run_first_plan_benchmark(other: Path | None, show: Callable[[str], None]) ->
     """
     from spacerobot_ros.benchmarks.against import Checkout
 
-    ours = Checkout.ours()
-    theirs = None if other is None else Checkout.at(other)
+    ours, theirs = Checkout.pair(other)
     figures: dict[str, Any] = {}
     for name in ROBOTS:
         found = figures[name] = _measured(ours, name)
@@ -63,7 +66,7 @@ def run_first_plan_benchmark(other: Path | None, show: Callable[[str], None]) ->
     return figures
 
 
-def _measured(checkout: Any, name: str) -> dict[str, Any]:
+def _measured(checkout: Checkout, name: str) -> dict[str, Any]:
     """Return the figures of a robot by a checkout."""
     from spacerobot_ros.resources import robot_file
 
@@ -87,7 +90,11 @@ def _sentence(figures: dict[str, Any]) -> str:
 
 
 def first_plan(urdf: Path) -> dict[str, float]:
-    """Return joints, CPU time of this process and of its compilers to a plan, and the plan's, s."""
+    """Return figures of the first plan in this process.
+
+    They are the number of ``joints``, the CPU time of this process and of its compilers until the
+    plan is there, ``cpu_s``, and that of the same plan when all is loaded, ``plan_cpu_s``.
+    """
     import numpy as np
 
     from spacerobot_ros.model import SpaceRobot

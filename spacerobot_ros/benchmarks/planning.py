@@ -52,8 +52,7 @@ def run_planning_benchmark(
     SpaceRobotError
         There is no such checkout, or a benchmark fails.
     """
-    ours = Checkout.ours()
-    theirs = None if other is None else Checkout.at(other)
+    ours, theirs = Checkout.pair(other)
     figures: dict[str, Any] = {}
     for name in planning_goals.CASES:
         plans = _plans(ours, name, goals, {})

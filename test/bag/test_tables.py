@@ -262,10 +262,10 @@ def test_what_cannot_be_exported_leaves_nothing_behind(tmp_path: Path, bag: Bag)
         export([], bag.path / "below", ExportFormat.CSV)
 
     for name, kind, mention in (
-        ("flight.csv", ExportFormat.MAT, "A file in MAT is called .mat, and not 'flight.csv'."),
-        ("flight.xlsx", ExportFormat.MAT, "A file in MAT"),
-        ("flight.CSV", ExportFormat.CSV, "csv are a folder"),
-        ("flight.mat", ExportFormat.PARQUET, "parquet are a folder"),
+        ("flight.csv", ExportFormat.MAT, "ends in .mat; 'flight.csv' does not."),
+        ("flight.xlsx", ExportFormat.MAT, "ends in .mat"),
+        ("flight.CSV", ExportFormat.CSV, "in csv are a folder"),
+        ("flight.mat", ExportFormat.PARQUET, "in parquet are a folder"),
     ):
         with pytest.raises(RecordingError) as refusal:
             export([], tmp_path / name, kind)
