@@ -41,14 +41,13 @@ def _figure(problem: Problem, trial: Trial) -> Figure:
     figure, rows = sheet([[1], [1], [1, 1]], [1.9, 1.9, 1.9], right=room_for(names) + 0.35)
     joints, speeds, (place, attitude) = rows[0][0], rows[1][0], rows[2]
     kinds = {joint.kind is JointKind.PRISMATIC for joint in robot.description.movable_joints}
-    unit = "m, rad" if len(kinds) == 2 else "m" if kinds == {True} else "rad"
-    title = f"{trial.method}, {trial.duration:.6g} s: joints ({unit})"
+    units = [unit for unit, prismatic in (("m", True), ("rad", False)) if prismatic in kinds]
+    title = f"{trial.method}, {trial.duration:.6g} s: joints ({', '.join(units)})"
     _panel(joints, title, ticks, positions, names)
     # Held over a tick: steps.
     held = np.repeat(rates, 2, axis=0)
-    _panel(
-        speeds, f"held joint velocities ({unit} a second)", np.repeat(ticks, 2)[1:-1], held, names
-    )
+    title = f"held joint velocities ({', '.join(f'{unit}/s' for unit in units)})"
+    _panel(speeds, title, np.repeat(ticks, 2)[1:-1], held, names)
     for axes, what, values, wanted in (
         (place, "base position (m) and goal", path.position, goal.position),
         (
