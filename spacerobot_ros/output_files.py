@@ -9,17 +9,20 @@ from pathlib import Path
 
 from spacerobot_ros.errors import SpaceRobotError
 
+_MCAP = b"\x89MCAP"
+"""What bags begin with."""
+
 
 def write_output(path: Path, content: bytes | str) -> None:
     """Write a file, and the folders that it is in, as a whole or not at all.
 
-    An older file is replaced once the new one is complete. Devices and pipes are written to. A text
-    is written as UTF-8.
+    An older file is replaced once the new one is complete, but for a bag, which may be the only
+    record of a flight. Devices and pipes are written to. A text is written as UTF-8.
 
     Raises
     ------
     SpaceRobotError
-        It cannot be written; what was there before stays.
+        It cannot be written, or is a bag; what was there before stays.
     """
     data = content.encode() if isinstance(content, str) else content
     try:
@@ -35,6 +38,8 @@ def write_output(path: Path, content: bytes | str) -> None:
 def _write(path: Path, data: bytes) -> None:
     before = path.stat() if path.exists() else None
     in_place = before is not None and not stat.S_ISREG(before.st_mode)
+    if before is not None and not in_place and _is_bag(path):
+        raise SpaceRobotError(f"The file {path} is a bag, which is not replaced: name another.")
     if in_place or not os.access(path.parent, os.W_OK):
         path.write_bytes(data)
         return
@@ -49,3 +54,8 @@ def _write(path: Path, data: bytes) -> None:
         with suppress(OSError):
             made.unlink()
         raise
+
+
+def _is_bag(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(_MCAP)) == _MCAP

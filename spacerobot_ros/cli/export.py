@@ -16,7 +16,7 @@ FORMATS = ("csv", "parquet", "mat")
 @click.option(
     "--format",
     "format_name",
-    type=click.Choice(FORMATS),
+    type=click.Choice(FORMATS, case_sensitive=False),
     default="csv",
     show_default=True,
     help="csv and parquet: a folder with a file for each topic; mat: one file for MATLAB.",

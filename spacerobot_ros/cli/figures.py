@@ -8,14 +8,14 @@ from pathlib import Path
 import click
 
 from spacerobot_ros.cli.errors import fail
-from spacerobot_ros.cli.options import PATH, bag_argument
+from spacerobot_ros.cli.options import PATH, bag_argument, beside
 
 FORMATS = ("pdf", "svg", "png")
 _MILLIMETRES = {"": 1.0, "mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72}
 
 
 def _millimetres(context: click.Context, option: click.Parameter, text: str) -> float:
-    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) *([a-z]*)", text.strip())
+    found = re.fullmatch(r"([0-9]*\.?[0-9]+) *([a-z]*)", text.strip().lower())
     if found is None or found[2] not in _MILLIMETRES:
         raise click.BadParameter(f"'{text}' is no length such as 88mm, 18cm, 3.5in or 246pt.")
     return float(found[1]) * _MILLIMETRES[found[2]]
@@ -29,7 +29,7 @@ def _millimetres(context: click.Context, option: click.Parameter, text: str) -> 
 @click.option(
     "--format",
     "format_name",
-    type=click.Choice(FORMATS),
+    type=click.Choice(FORMATS, case_sensitive=False),
     default="pdf",
     show_default=True,
     help="Format of the files; text in PDF and SVG can be searched and edited.",
@@ -45,7 +45,7 @@ def _millimetres(context: click.Context, option: click.Parameter, text: str) -> 
     "--style",
     type=PATH,
     metavar="FILE.mplstyle",
-    help="Style file of matplotlib: fonts, sizes, lines, colours.",
+    help="Style file of matplotlib, or name of one of its styles: fonts, sizes, lines, colours.",
 )
 @click.option("--events", is_flag=True, help="Show events below the time axes.")
 @click.option("--out", "-o", type=PATH, help="Folder of the figures [BAG_figures].")
@@ -61,13 +61,13 @@ def command(
     """Draw figures of a BAG for a paper, one file each.
 
     Files of the same names are replaced. Exit code 1: the bag lacks the data of a figure that
-    --only names.
+    --only names, or of all figures.
     """
     from spacerobot_ros.report import write_figures
     from spacerobot_ros.report.style import PictureFormat
 
-    names = [name.strip() for name in only.split(",") if name.strip()]
-    folder = out or bag.with_name(f"{bag.stem}_figures")
+    names = [name.strip().lower() for name in only.split(",") if name.strip()]
+    folder = out or beside(bag, "_figures")
     made = write_figures(
         bag,
         folder,
@@ -77,10 +77,11 @@ def command(
         style=style,
         events=events,
     )
-    for name, result in made.items():
-        if isinstance(result, Path):
-            click.echo(f"{name:<11} {result}")
-        elif names:
-            click.echo(f"{name:<11} none: {result}", err=True)
-    if names and not all(isinstance(result, Path) for result in made.values()):
+    drawn = {name: result for name, result in made.items() if isinstance(result, Path)}
+    for name, path in drawn.items():
+        click.echo(f"{name:<11} {path}")
+    for name in names or () if drawn else made:
+        if name not in drawn:
+            click.echo(f"{name:<11} none: {made[name]}", err=True)
+    if not drawn or not drawn.keys() >= set(names):
         fail()

@@ -164,6 +164,13 @@ def picture_option(help: str) -> Any:
     return click.option("--picture", type=PATH, callback=checked, help=help)
 
 
+def beside(bag: Path, ending: str) -> Path:
+    """Return the file or folder beside a bag, or a folder with one, that is called as it is."""
+    # The folder in which the command runs has no name of its own.
+    named = bag if bag.name not in ("", "..") else bag.resolve()
+    return named.with_name(f"{named.name if bag.is_dir() else named.stem}{ending}")
+
+
 def write_json(path: Path, content: Any, indent: int | None = 2) -> None:
     """Write a JSON file and the folders that it is in."""
     write_output(path, json.dumps(content, indent=indent) + "\n")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from spacerobot_ros.cli.options import PATH, bag_argument, picture_option
+from spacerobot_ros.cli.options import PATH, bag_argument, beside, picture_option
 
 
 @click.command("report")
@@ -15,17 +15,18 @@ from spacerobot_ros.cli.options import PATH, bag_argument, picture_option
 @picture_option("Also draw an overview (.png, .svg, .pdf).")
 @click.option(
     "--beside",
+    "others",
     multiple=True,
     type=PATH,
     metavar="BAG",
     help="Bag of another flight to compare with. May be repeated.",
 )
-def command(bag: Path, output: Path | None, picture: Path | None, beside: tuple[Path, ...]) -> None:
+def command(bag: Path, output: Path | None, picture: Path | None, others: tuple[Path, ...]) -> None:
     """Write an HTML report of a BAG, with pictures and a 3D view."""
     from spacerobot_ros.report import write_picture, write_report
 
-    target = output or bag.with_suffix(".html")
-    write_report(bag, target, beside)
+    target = output or beside(bag, ".html")
+    write_report(bag, target, others)
     click.echo(f"report      {target}")
     if picture is not None:
         write_picture(bag, picture)

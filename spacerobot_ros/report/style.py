@@ -11,12 +11,14 @@ from contextvars import ContextVar
 from enum import Enum
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
@@ -54,6 +56,19 @@ _DECIMALS = re.compile(rb"(\.\d\d)\d+")
 _FONT_SIZE = 8.5
 """Points, for which the distances of these modules are meant."""
 
+_FONT_SIZES = (3.0, 30.0)
+"""Least and largest letters of a style file, points."""
+
+_KEPT: Any = {
+    # Names of joints are shown as they are, dollars included.
+    "text.parse_math": False,
+    # A figure is as wide as was asked for, and its panels are placed by these modules.
+    "savefig.bbox": None,
+    "figure.autolayout": False,
+    "figure.constrained_layout.use": False,
+}
+"""Settings that no style file changes."""
+
 
 _width = ContextVar("_width", default=WIDTH)
 _scale = ContextVar("_scale", default=1.0)
@@ -71,19 +86,21 @@ def drawing(width: float = WIDTH, style: str = "report", own: Path | None = None
     style
         A style file of this package: ``report`` for pages, ``paper`` for papers.
     own
-        A style file of matplotlib's, whose settings come after.
+        A style file of matplotlib's, or the name of one of its own styles, whose settings come
+        after.
 
     Raises
     ------
     SpaceRobotError
-        The style file cannot be read.
+        The style file cannot be read, or nothing can be drawn with it.
     """
     shipped = Path(str(files("spacerobot_ros.report").joinpath(f"{style}.mplstyle")))
     with mpl.rc_context():
-        for path in (shipped, own) if own is not None else (shipped,):
-            _use(path)
-        # Names of joints are shown as they are, dollars included.
-        mpl.rcParams["text.parse_math"] = False
+        _use(shipped)
+        if own is not None:
+            _use(own)
+            _require_fonts(own)
+        mpl.rcParams.update(_KEPT)
         across = _width.set(width)
         scale = _scale.set(float(mpl.rcParams["font.size"]) / _FONT_SIZE)
         try:
@@ -94,19 +111,74 @@ def drawing(width: float = WIDTH, style: str = "report", own: Path | None = None
 
 
 def _use(path: Path) -> None:
-    said = _Said()
-    logger = logging.getLogger("matplotlib")
-    logger.addFilter(said)
-    try:
-        settings = mpl.rc_params_from_file(path, use_default_template=False)
-    except (OSError, ValueError, KeyError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise SpaceRobotError(f"The style file {path} cannot be read: {why}.") from error
-    finally:
-        logger.removeFilter(said)
+    with _listening() as said:
+        try:
+            settings = _settings(path)
+        except (OSError, ValueError, KeyError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise SpaceRobotError(f"The style file {path} cannot be read: {why}.") from error
     if said.sentences:
         raise SpaceRobotError(f"The style file {path} is refused: {said.sentences[0]}.")
     mpl.rcParams.update(settings)
+
+
+def _settings(path: Path) -> mpl.RcParams:
+    if not path.exists():
+        # Reads all of its styles.
+        import matplotlib.style as styles
+
+        if str(path) in styles.library:
+            return styles.library[str(path)]
+        raise ValueError("there is no such file, and matplotlib has no style of that name")
+    if not path.is_file():
+        raise ValueError("it is no file")
+    return mpl.rc_params_from_file(path, use_default_template=False)
+
+
+def _require_fonts(path: Path) -> None:
+    """Refuse what nothing can be drawn with, or only in another font than the one asked for."""
+    size = float(mpl.rcParams["font.size"])
+    if not _FONT_SIZES[0] <= size <= _FONT_SIZES[1]:
+        raise SpaceRobotError(
+            f"The style file {path} is refused: font.size is {size:g}, and letters have "
+            f"{_FONT_SIZES[0]:g} to {_FONT_SIZES[1]:g} points."
+        )
+    if mpl.rcParams["text.usetex"]:
+        raise SpaceRobotError(
+            f"The style file {path} is refused: text.usetex makes TeX of the names of joints, and "
+            "leaves no text that can be edited."
+        )
+    families = mpl.rcParams["font.family"]
+    found = [family for family in families if _installed(family)]
+    if not found:
+        raise SpaceRobotError(
+            f"The style file {path} is refused: of the fonts that it names "
+            f"({', '.join(families)}) none is installed."
+        )
+    mpl.rcParams["font.family"] = found
+
+
+def _installed(family: str) -> bool:
+    with _listening():
+        try:
+            findfont(FontProperties(family=[family]), fallback_to_default=False)
+        except ValueError:
+            return False
+    return True
+
+
+@contextmanager
+def _listening() -> Iterator[_Said]:
+    """Keep what matplotlib would log."""
+    said = _Said()
+    loggers = [logging.getLogger(name) for name in ("matplotlib", "matplotlib.font_manager")]
+    for logger in loggers:
+        logger.addFilter(said)
+    try:
+        yield said
+    finally:
+        for logger in loggers:
+            logger.removeFilter(said)
 
 
 class _Said(logging.Filter):
@@ -169,6 +241,11 @@ def sheet(
     for widths, row_height in zip(rows, heights, strict=True):
         y -= row_height
         room = width() - left - right - between * (len(widths) - 1)
+        if room <= 0.0:
+            raise SpaceRobotError(
+                f"Letters of {mpl.rcParams['font.size']:g} points leave no room for panels in a "
+                f"figure {25.4 * width():.3g} mm wide."
+            )
         x, row = left, []
         for share in widths:
             across = room * share / sum(widths)

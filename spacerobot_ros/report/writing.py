@@ -51,6 +51,7 @@ from spacerobot_ros.report.style import (
     picture_of,
     room_for,
 )
+from spacerobot_ros.resources import suggestion
 
 _WIDTHS = (40.0, 400.0)
 """Least and largest width of a figure for a paper, mm."""
@@ -143,7 +144,8 @@ def write_figures(
     width
         Of a figure, mm.
     style
-        A style file of matplotlib's, for fonts, sizes and colours of lines and axes.
+        A style file of matplotlib's, for fonts, sizes and colours of lines and axes, or the name
+        of one of its own styles.
     events
         Whether what happened is shown below time axes.
 
@@ -158,23 +160,36 @@ def write_figures(
     """
     unknown = [name for name in only if name not in FIGURES]
     if unknown:
-        known = ", ".join(FIGURES)
-        raise SpaceRobotError(f"There is no figure '{unknown[0]}': there are {known}.")
+        known, meant = ", ".join(FIGURES), suggestion(unknown[0], FIGURES)
+        raise SpaceRobotError(f"There is no figure '{unknown[0]}': there are {known}.{meant}")
     if not _WIDTHS[0] <= width <= _WIDTHS[1]:
         least, most = _WIDTHS
         raise SpaceRobotError(f"A figure is {least:g} to {most:g} mm wide, and not {width:g} mm.")
+    if folder.suffix.lower() in {f".{each.value}" for each in PictureFormat}:
+        raise SpaceRobotError(
+            f"Figures are a folder with a file for each, which is not called '{folder.name}'."
+        )
     flight = read_flight(bag)
     if not events:
         flight = replace(flight, events=[])
     made: dict[str, Path | str] = {}
     with drawing(width / 25.4, "paper", style):
         for name in only or [name for name in FIGURES if name not in ("position", "attitude")]:
-            plate = FIGURES[name](flight)
+            try:
+                plate = FIGURES[name](flight)
+                picture = picture_of(plate.figure, format) if isinstance(plate, Plate) else b""
+            except (ValueError, ArithmeticError, RuntimeError, TypeError) as error:
+                if style is None:
+                    raise
+                # Of the settings in a style file matplotlib refuses some only when it draws.
+                raise SpaceRobotError(
+                    f"With the style file {style} nothing can be drawn: {error}."
+                ) from error
             if isinstance(plate, Plate):
                 made[name] = path = folder / f"{name}.{format.value}"
-                write_output(path, picture_of(plate.figure, format))
+                write_output(path, picture)
             else:
-                made[name] = plate or "The flight is of another kind."
+                made[name] = plate or "The bag holds nothing for it."
     return made
 
 

@@ -83,6 +83,10 @@ def test_all_figures_of_a_bag_by_the_command(bag: Path, tmp_path: Path) -> None:
         (("--width", "wide"), "'wide'"),
         (("--width", "2mm"), "2 mm"),
         (("--style", "nowhere.mplstyle"), "nowhere.mplstyle"),
+        (("--style", "."), "it is no file"),
+        (("--width", "nan"), "'nan'"),
+        (("--only", "joint"), "Did you mean 'joints'?"),
+        (("--out", "pose.pdf"), "'pose.pdf'"),
     ],
 )
 def test_what_is_refused_is_named(
@@ -94,14 +98,94 @@ def test_what_is_refused_is_named(
     assert not (tmp_path / "x").exists()
 
 
-@pytest.mark.parametrize("content", ["font.size large\n", "no.such.key: 1\n", "font.size: red\n"])
+@pytest.mark.parametrize(
+    ("content", "mention"),
+    [
+        ("font.size large\n", "is refused"),
+        ("no.such.key: 1\n", "is refused"),
+        ("font.size: red\n", "is refused"),
+        ("font.size: 0\n", "font.size is 0"),
+        ("font.size: nan\n", "font.size is nan"),
+        ("text.usetex: True\n", "text.usetex"),
+        ("font.family: Nowhere Sans\n", "(Nowhere Sans) none is installed"),
+        ("figure.subplot.left: 2\nlines.dashed_pattern: 0, 0\n", "nothing can be drawn"),
+    ],
+)
 def test_a_style_file_with_a_mistake_is_one_sentence(
-    content: str, bag: Path, tmp_path: Path
+    content: str, mention: str, bag: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     style = tmp_path / "own.mplstyle"
     style.write_text(content)
-    with pytest.raises(SpaceRobotError, match="style file"):
-        write_figures(bag, tmp_path, ["pose"], style=style)
+    with pytest.raises(SpaceRobotError, match="style file") as refused:
+        write_figures(bag, tmp_path / "x", ["pose"], style=style, width=40.0)
+    assert_one_sentence(str(refused.value), mention, str(style))
+    assert not (tmp_path / "x").exists()
+    assert not caplog.records
+
+
+def test_a_style_changes_neither_the_width_nor_who_places_the_panels(
+    bag: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    style = tmp_path / "own.mplstyle"
+    style.write_text(
+        "savefig.bbox: tight\nfigure.autolayout: True\nfigure.constrained_layout.use: True\n"
+        "font.family: Nowhere Sans, DejaVu Serif\ntext.parse_math: True\n"
+    )
+    write_figures(bag, tmp_path, ["pose"], width=100.0, style=style)
+    page = pypdf.PdfReader(tmp_path / "pose.pdf").pages[0]
+    assert float(page.mediabox.width) == pytest.approx(100.0 / 25.4 * 72, abs=0.01)
+    fonts: Any = page["/Resources"]["/Font"]  # type: ignore[index]
+    assert all("DejaVuSerif" in fonts[name]["/BaseFont"] for name in fonts)
+    # A font that is not there is passed over without a line for each letter.
+    assert not caplog.records
+
+
+def test_a_style_of_matplotlib_is_known_by_its_name(bag: Path, tmp_path: Path) -> None:
+    """ggplot has ticks and axes in white and grey on its own grey."""
+    write_figures(bag, tmp_path, ["pose"], format=PictureFormat.SVG, style=Path("ggplot"))
+    assert "#e5e5e5" in (tmp_path / "pose.svg").read_text("utf-8").lower()
+
+
+def test_a_bag_without_a_flight_has_no_figures_and_says_so(tmp_path: Path) -> None:
+    bag = tell(tmp_path / "bare.mcap", Story(np.zeros((2, 1)), topics=()))
+    result = CliRunner().invoke(main, ["figures", str(bag)])
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    lines = result.stderr.splitlines()
+    assert len(lines) > 10
+    assert all("none: " in line and line.endswith(".") for line in lines)
+    assert "pose        none: The bag holds no base poses (odom)" in result.stderr
+    assert list(tmp_path.iterdir()) == [bag]
+
+
+def test_letters_leave_room_for_panels(bag: Path, tmp_path: Path) -> None:
+    style = tmp_path / "own.mplstyle"
+    style.write_text("font.size: 29\n")
+    with pytest.raises(SpaceRobotError, match="no room for panels in a figure 40 mm wide"):
+        write_figures(bag, tmp_path, ["pose"], style=style, width=40.0)
+
+
+def test_what_is_made_stands_beside_a_bag_that_is_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As ``ros2 bag record`` makes it: a folder with a file, whose name may have dots."""
+    folder = tmp_path / "Flug 22.11"
+    folder.mkdir()
+    bag = tell(folder / "flight_0.mcap", Story(np.zeros((3, 1)), urdf=None, topics=("odom",)))
+    before = bag.read_bytes()
+    monkeypatch.chdir(folder)
+    words = ["figures", ".", "--only", " Pose ,", "--format", "SVG", "--width", "3.5IN"]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "Flug 22.11_figures" / "pose.svg").is_file()
+    result = CliRunner().invoke(main, ["report", "."])
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "Flug 22.11.html").is_file()
+    # The one record of a flight is not taken for an older report.
+    result = CliRunner().invoke(main, ["report", ".", "-o", "flight_0.mcap"])
+    assert result.exit_code == 2
+    assert_one_sentence(result.stderr, "flight_0.mcap", "is a bag")
+    assert bag.read_bytes() == before
 
 
 COMMANDS = {
