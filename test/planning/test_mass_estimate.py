@@ -119,3 +119,35 @@ def test_an_offset_of_all_poses_tells_nothing_of_masses() -> None:
     for derivative in sensitivity.along(schedule):
         masses.add(derivative, np.array([0.01, -0.02, 0.03, 0.02, 0.01, -0.01]))
     np.testing.assert_allclose(masses.errors, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "step"),
+    [
+        ("three_joint_arm", [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        ("servicer", [0.02, 0.0, 0.0, 0.0, 0.02, 0.0]),
+    ],
+)
+def test_a_jump_of_what_is_measured_tells_nothing_of_masses(name: str, step: list[float]) -> None:
+    robot = robot_of(name)
+    sensitivity = PathSensitivity(robot)
+    schedule = schedule_of(robot, shapes_of(robot, 120))
+    derivatives, masses = sensitivity.along(schedule), MassEstimate(sensitivity.count)
+    true = weighing(robot, np.random.default_rng(8).uniform(-0.1, 0.1, sensitivity.count))
+    path = flown(true, schedule.positions)
+
+    def follow(until: int, jump_at: int) -> PathDeviation:
+        deviation = PathDeviation(schedule.path, 3, derivatives, masses)
+        for k in range(until):
+            off = np.array(step) * (k >= jump_at)
+            attitude = Rotation.from_rotvec(off[3:]) * Rotation.from_quat(path.quaternion[k])
+            deviation.add(k, path.position[k] + off[:3], attitude.as_quat())
+        return deviation
+
+    jumped = follow(60, jump_at=30)
+    for found, plain in zip(jumped.expected_end(59), jumped.end(59), strict=True):
+        np.testing.assert_allclose(found, plain, atol=1e-12)
+    # The path of the jump is forgotten: what comes after it counts alone.
+    following = follow(60, jump_at=60)
+    end = Rotation.from_quat(following.expected_end(59)[1])
+    assert (Rotation.from_quat(path.quaternion[-1]).inv() * end).magnitude() < 1e-3

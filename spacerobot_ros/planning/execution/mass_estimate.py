@@ -31,6 +31,9 @@ _SPREAD = 0.1
 _NOISE = 1e-3
 """Standard deviation of each component of a measured pose, m or rad."""
 
+_LARGEST = 6 * _SPREAD
+"""Relative errors beyond this have another cause, such as a jump of what is measured."""
+
 
 class PathSensitivity:
     """Derivatives of a base path by P parameters: relative errors of masses and inertias.
@@ -121,7 +124,9 @@ class MassEstimate:
     """Estimate of the relative errors of masses and inertias (P,), from deviations of base paths.
 
     The first pose of each path is measured with an error. So each path has an unknown constant
-    offset, which is eliminated from the normal equations.
+    offset, which is eliminated from the normal equations. Deviations that only implausible errors
+    explain (a sensor that fails, say) do not count: the estimate is zero, and their path is
+    forgotten.
 
     Parameters
     ----------
@@ -141,10 +146,12 @@ class MassEstimate:
         self._poses = 0
         self._sum_J, self._sum_y = np.zeros((6, count)), np.zeros(6)
         self._squares, self._products = np.zeros((count, count)), np.zeros(count)
+        self._errors = None
 
     def next_path(self) -> None:
         """Begin with another path; the information of the earlier ones is kept."""
-        self._information, self._vector = self._normal_equations()
+        if self.errors.any():
+            self._information, self._vector = self._normal_equations()
         self._begin()
 
     def add(self, sensitivity: Array, deviation: Array) -> None:
@@ -160,7 +167,9 @@ class MassEstimate:
     def errors(self) -> Array:
         """The relative errors (P,) of masses, then of inertias."""
         if self._errors is None:
-            self._errors = np.asarray(np.linalg.solve(*self._normal_equations()))
+            errors = np.asarray(np.linalg.solve(*self._normal_equations()))
+            plausible = np.abs(errors).max(initial=0.0) <= _LARGEST
+            self._errors = errors if plausible else np.zeros_like(errors)
         return self._errors
 
     def _normal_equations(self) -> tuple[Array, Array]:
