@@ -1,7 +1,7 @@
-"""Files that are executed, flown or resumed: read only where nobody else could have written them.
+"""Files that are executed, flown or resumed: read only where no other user could have written them.
 
-A :class:`Cache` keeps what can be made again. What it returns is whole and was written by this
-user; everything else is as good as nothing, and is said once.
+A :class:`Cache` keeps what can be made again. What it returns is complete and was written by this
+user. It treats every other file as if it were not there, and warns once.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def read_private(path: Path, *, follow: bool = False) -> bytes:
     OSError
         It cannot be read, or is a symbolic link (ELOOP).
     UntrustedFileError
-        It is no regular file, belongs to somebody else, or others may write it.
+        It is no regular file, belongs to another user, or others may write it.
     """
     # A FIFO without a writer would hold up an open that waits.
     flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | (0 if follow else os.O_NOFOLLOW)
@@ -117,7 +117,7 @@ def trusted_folder(folder: Path) -> Path:
     OSError
         It is not there.
     UntrustedFileError
-        It belongs to somebody else, others may write it, or others may put another in its place.
+        It belongs to another user, others may write it, or others may put another in its place.
     """
     if folder.is_symlink():
         _require_own(folder, os.lstat(folder), link=True)
@@ -127,7 +127,7 @@ def trusted_folder(folder: Path) -> Path:
     _require_own(real, real.stat())
     for parent in real.parents:
         mode = parent.stat().st_mode
-        # In a folder with the sticky bit, as /tmp, nobody renames what belongs to somebody else.
+        # In a folder with the sticky bit, as /tmp, no user renames what belongs to another.
         if mode & _OTHERS_MAY_WRITE and not mode & stat.S_ISVTX:
             raise UntrustedFileError(_writable(parent, mode))
     return real
@@ -159,7 +159,8 @@ class Cache:
 
     A file ends with a line that holds the key that its content was made for, its length and its
     SHA-256; one that is altered, cut or of something else is deleted. Its folder and it itself
-    belong to this user and are writable by nobody else, or are not used, with a warning.
+    must belong to this user and be writable by no other; else they are not used, and a warning
+    says so.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """How a process ends: by a signal or with its parent, in seconds, and with what it has started.
 
 A process is guarded from its first import on (:func:`guarded`). SIGINT, SIGTERM and SIGHUP then
-raise :class:`Terminated` in the main thread, unless what runs has asked to be told instead
+raise :class:`Terminated` in the main thread, unless what runs has asked for a request instead
 (:func:`ended_on_request`) because it has something to complete: a flight, a bag. A thread watches
 over both. It ends the process when the main thread does not react, and at once by a second signal.
 
@@ -79,7 +79,7 @@ class Terminated(KeyboardInterrupt):
 
 
 class _Request:
-    """Who wants to be told of a signal: in the main thread, and at once in the guard's."""
+    """What is called on a signal: in the main thread, and at once in the guard's thread."""
 
     def __init__(self, main: Callable[[], None], at_once: Callable[[], None]) -> None:
         self.main, self.at_once = main, at_once

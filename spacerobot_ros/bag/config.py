@@ -30,7 +30,7 @@ class RecorderConfig(WatchdogConfig):
     )
     tf_period: float = parameter(
         0.1,
-        "bag time between transforms of all links, which are put into the bag where nobody "
+        "bag time between transforms of all links, which the recorder writes where no node "
         "publishes /tf; 0: none",
         unit="s",
         minimum=0.0,

@@ -165,8 +165,7 @@ class McapFile:
         Raises
         ------
         RecordingError
-            It was removed, replaced, moved or cut: whoever looks for it will not find what is
-            written.
+            It was removed, replaced, moved or cut, so the path no longer leads to what was written.
         """
         what = ""
         try:

@@ -167,7 +167,7 @@ def _flown(
 
 @contextmanager
 def _shown(label: str) -> Iterator[Callable[[Progress], None]]:
-    """Show how far a campaign is, with rate and time left, where somebody is looking."""
+    """Show progress, rate and time left of a campaign, if standard error is a terminal."""
     if not sys.stderr.isatty():
         yield lambda progress: None
         return

@@ -1,6 +1,4 @@
-"""What a command shows while it works, where somebody is looking: on standard error, if that is a
-terminal.
-"""
+"""What a command shows while it works: on standard error, if that is a terminal."""
 
 from __future__ import annotations
 
@@ -93,7 +91,7 @@ class Display:
 
 @contextmanager
 def display(label: str) -> Iterator[Display]:
-    """Have a display for the length of a block; nothing is imported where nobody looks."""
+    """Have a display for the length of a block; where it is not visible, nothing is imported."""
     shown = Display(label, visible=sys.stderr.isatty())
     try:
         if not sys.stderr.isatty():

@@ -163,7 +163,7 @@ def fly_scenario(
     robots
         The models; None: those that the scenario names.
     progress
-        Told how far the flight is; it may end it.
+        Called with the progress of the flight; it may end it.
     longest
         Simulated time after which the flight is interrupted, s.
 
@@ -372,7 +372,7 @@ class _LockstepFlight:
                         news.why, news.commanded_until_ns, news.rests_since_ns
                     )
                 case Change():
-                    raise AssertionError("nobody resets or rearms this plant")
+                    raise AssertionError("this plant is neither reset nor rearmed")
         if isinstance(owner, _Planner):
             owner.executive.plant_rests = listener.rests
             self._take_outputs(owner)

@@ -37,8 +37,8 @@ class CommanderConfig(WatchdogConfig, BelievedRobotConfig):
     )
     state_reliability: str = parameter(
         "auto",
-        "how odom and joint_states are subscribed: best_effort hears every publisher, reliable "
-        "loses nothing of one that is reliable; auto: reliable, until a publisher offers less",
+        "how odom and joint_states are subscribed: best_effort receives from every publisher, "
+        "reliable loses no message of a reliable publisher; auto: reliable, until one offers less",
         choices=("auto", "reliable", "best_effort"),
     )
     diagnostics_period: float = parameter(

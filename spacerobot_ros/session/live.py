@@ -108,12 +108,12 @@ def send_goal(
                 lambda: clocks["own"] or clocks["global"] or time.time_ns(),
                 namespace=namespace,
                 name=f"goal_{decider}",
-                # Joint positions that somebody has had an earlier goal end in are not this goal's.
+                # Joint positions that were sent for an earlier goal are not those of this one.
                 joint_names=tuple if decider == "planner" else None,
             )
             for decider in ("planner", "coordinated_control")
         ]
-        # In a namespace the clock is that of its stack, unless nobody has moved it there.
+        # In a namespace the clock is that of its stack, where a remap has moved it there.
         node = clients[0].node
         for topic, which in {"/clock": "global", node.resolve_topic_name("clock"): "own"}.items():
             node.create_subscription(Clock, topic, partial(on_clock, which=which), 10)

@@ -1,4 +1,4 @@
-"""A scenario of a robot that nobody has flown yet: what to mind, a goal to begin with, its file."""
+"""A first scenario of a robot: notes on its description, a goal, and the text of the file."""
 
 from __future__ import annotations
 

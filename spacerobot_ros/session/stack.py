@@ -93,7 +93,7 @@ class Stack(ABC):
             )
         self.scenario = scenario
         self.when_exists = scenario.parameters("recorder").get("when_exists", "refuse")
-        """Somebody who names a bag wants that one: by default it is refused where it is there."""
+        """What is done where a bag that the user names exists; by default it is refused."""
         self.bag = free_name(bag) if bag is not None and self.when_exists == "next" else bag
         recorder = () if bag is None else ("recorder",)
         self.names = ("plant", *scenario.commanders, *recorder)

@@ -371,7 +371,7 @@ class CommandValidator:
         for source in self.sources[1:]:
             source.required = source.commanders > 0
             if not source.required:
-                # Nobody is left who could turn the thrusters off.
+                # No commander is left that could turn the thrusters off.
                 source.rest()
                 source.arrived = False
 

@@ -1,12 +1,12 @@
-"""Who sends on a topic: publishers told apart where messages do not name them."""
+"""The publishers of a topic, distinguished where messages do not name them."""
 
 from __future__ import annotations
 
 _UNNUMBERED = 2**63
-"""Middleware that does not number messages says a larger number."""
+"""Middleware that does not number messages reports a larger number."""
 
 _MOST_PUBLISHERS = 100
-"""So many that have sent once are remembered."""
+"""Largest number of publishers that are remembered."""
 
 
 class Senders:

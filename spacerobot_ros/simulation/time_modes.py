@@ -36,11 +36,11 @@ class Lockstep:
         return self._commands.complete
 
     def looks(self, tick: int, *, pose_lost: bool) -> bool:
-        """Return whether a plant that looks round now and then is to step.
+        """Return whether a plant that checks now and then is to step.
 
-        To a state without a pose nobody need answer: a commander cannot know that none comes before
-        it sees another state. So the plant steps without a command if it was still waiting in the
-        same tick when it looked last.
+        A state without a pose may get no answer: a commander cannot know that no pose will come
+        before it receives another state. So the plant steps without a command if it was still
+        waiting in the same tick at its last check.
         """
         self.waits, self._looked_at = self._looked_at == tick, tick
         return (self.waits and pose_lost) or self.may_step

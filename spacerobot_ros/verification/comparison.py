@@ -286,7 +286,7 @@ def _resimulate(
                 refusal = commands.offer(source, now, by_tick[tick], now)
                 if refusal is not None:
                     done.refusals.setdefault(tick, (source.topic, refusal))
-            elif not state.sensors.dropout:  # To a lost pose nobody need answer.
+            elif not state.sensors.dropout:  # A state without a pose needs no answer.
                 source.rest()
         if commands.fault and done.latched is None:
             done.latched = tick

@@ -275,7 +275,7 @@ class FlightNode(LifecycleNode):
         return guarded
 
     def _fail(self, what: str, error: Exception) -> None:
-        """Stop working after an exception of a callback; whoever spins the node goes on."""
+        """Stop working after an exception of a callback; the executor goes on."""
         if self._destroyed or (isinstance(error, InvalidHandle) and not self._is_configured):
             return  # The executor had the callback in its queue when its entity was destroyed.
         self.get_logger().debug("".join(traceback.format_exception(error)))
@@ -339,7 +339,7 @@ class FlightNode(LifecycleNode):
         return bool(machine and machine.current_state[0] not in _WITHOUT_ENTITIES)
 
     def finalize(self) -> None:
-        """Take the transition to the end, unless somebody has had the node take it before."""
+        """Take the transition to the end, unless the node has taken it before."""
         machine = self._state_machine
         if machine and machine.current_state[0] in _CAN_SHUT_DOWN:
             self.trigger_shutdown()

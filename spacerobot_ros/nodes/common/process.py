@@ -49,7 +49,7 @@ def use_loopback_discovery() -> None:
 def _use_sockets_without_shared_memory() -> None:
     """Send messages through sockets where shared memory is missing or full, and say why.
 
-    The middleware does so by itself, after errors that nobody understands.
+    The middleware does so by itself, after error messages that do not name the cause.
     """
     if any(os.environ.get(name) for name in _TRANSPORT_CHOICES):
         return

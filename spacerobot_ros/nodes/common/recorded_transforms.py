@@ -1,4 +1,4 @@
-"""The transforms that a recorder puts into a bag where nobody publishes them."""
+"""The transforms that a recorder writes into a bag where no node publishes them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class RecordedTransforms:
     topics
         Names of /tf and /tf_static in the bag.
     is_published
-        Returns whether somebody publishes /tf: that is recorded, and nothing is written here.
+        Returns whether a node publishes /tf: its messages are recorded, and none are written here.
     """
 
     def __init__(

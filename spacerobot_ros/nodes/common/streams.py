@@ -46,7 +46,7 @@ class RawStream:
         self.take = take
 
     def unlisten(self) -> None:
-        """Show messages to nobody any more."""
+        """Call the listener no more."""
         self.take = self._take
 
 

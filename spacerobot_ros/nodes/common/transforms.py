@@ -171,9 +171,9 @@ class StateFrames:
 
 
 class KnownFrames:
-    """What a node knows of frames: from its robot's state, and from /tf where that can be heard.
+    """The frames that a node knows: those of its robot's state, and those of /tf where it is there.
 
-    Messages of /tf are kept as they come and are read when somebody asks.
+    Messages of /tf are kept as they are received, and read when a frame is asked for.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ class KnownFrames:
         return None
 
     def _heard(self) -> dict[str, tuple[str, Array]]:
-        heard: dict[str, tuple[str, Array]] = {}
+        received: dict[str, tuple[str, Array]] = {}
         for raw in (*self._static, *self._recent):
             try:
                 transforms: Sequence[TransformStamped] = deserialize_message(
@@ -232,8 +232,8 @@ class KnownFrames:
                 length = float(np.linalg.norm(pose[3:]))
                 if np.all(np.isfinite(pose)) and length > 0.5:
                     pose[3:] /= length
-                    heard[each.child_frame_id] = each.header.frame_id, pose
-        return heard
+                    received[each.child_frame_id] = each.header.frame_id, pose
+        return received
 
 
 def robot_frames(description: RobotDescription, state: StateFrames) -> dict[str, tuple[str, Array]]:

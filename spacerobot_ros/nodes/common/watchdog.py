@@ -97,10 +97,10 @@ class Watchdog:
     def __init__(self, timeout: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._timeout, self._clock = timeout, clock
         self._heard: dict[str, float] = {}
-        """When a node was heard last, or should have been."""
+        """When the last heartbeat of a node was received, or should have been."""
         self._busy: set[str] = set()
         self.silent: dict[str, float] = {}
-        """The nodes that are silent, and when each was heard last."""
+        """The nodes that are silent, and when the last heartbeat of each was received."""
         self._looked = clock()
 
     def hear(self, name: str, pulse: str) -> Silence | None:
@@ -252,7 +252,7 @@ class Liveness:
         status = diagnostic_status(
             diagnostic_name(node.get_fully_qualified_name(), "watchdog"),
             DiagnosticStatus.ERROR if silent else DiagnosticStatus.OK,
-            f"silent: {', '.join(silent)}" if silent else "all nodes are heard",
+            f"silent: {', '.join(silent)}" if silent else "all nodes send heartbeats",
             values,
             "" if self._role is None else self._role.value,
         )

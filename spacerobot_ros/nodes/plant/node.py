@@ -160,7 +160,7 @@ class PlantNode(FlightNode):
                 reader.message_type,
                 source.topic,
                 partial(self._on_command, reader),
-                # In lockstep the first command of a tick counts, whoever sends it.
+                # In lockstep the first command of a tick counts, of whichever publisher.
                 None if self._real_time is None else self._number_taker(source.senders),
             )
         self.create_subscription(String, "fault_injection", self._on_fault, STREAM)
@@ -226,7 +226,7 @@ class PlantNode(FlightNode):
         self._look_at_status()
 
     def drain(self, executor: EventsExecutor) -> None:
-        """Bring the joints to rest: the commanders end too, and nobody watches the robot."""
+        """Bring the joints to rest, because the commanders end as well."""
         if self._active is not PlantState.RUNNING or self._real_time is None:
             return
         for stream in self.raw_streams:
@@ -343,7 +343,7 @@ class PlantNode(FlightNode):
         return max(1, round(seconds * NANOSECONDS / self._period_ns)) if seconds else 0
 
     def _viewed_ticks(self, seconds: float, longest_wall: float) -> int:
-        """Return the ticks of a period; in real time somebody may look, whatever a file says."""
+        """Return the ticks of a period; in real time it is short enough for people to watch."""
         if self._real_time is not None and seconds:
             seconds = min(seconds, longest_wall * self.config.real_time_factor)
         return self._ticks(seconds)
@@ -363,7 +363,7 @@ class PlantNode(FlightNode):
             self._step()
 
     def _on_look_round(self) -> None:
-        """A lockstep plant waits for ever if nobody saw its last state: show it to newcomers."""
+        """Publish the last state again to new subscribers: a lockstep plant waits for an answer."""
         if self._active is not PlantState.RUNNING:
             if self._report_ticks:
                 self._report_by_wall()

@@ -89,7 +89,7 @@ class StatePublisher:
                 output.take(template.serialised(stamp))
 
     def has_new_readers(self) -> bool:
-        """Whether somebody subscribes to the state who did not at the last call.
+        """Whether the state has a subscriber that it did not have at the last call.
 
         Takes a millisecond. A subscription that is replaced by another leaves their number; one
         that is known of may be matched later.

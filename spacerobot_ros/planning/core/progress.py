@@ -1,7 +1,7 @@
-"""How far a search has come, and what else takes long, for whoever wants to know.
+"""Progress of searches, and announcements of other long work.
 
-Searches log it, as they log everything, in a record that :func:`reported` finds. So it passes
-through methods that know nothing of it, and out of the threads that plans are made in.
+A search writes its progress into the log, in a record that :func:`reported` finds. So progress
+passes through methods that do not know of it, and out of the threads in which plans are made.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def reported(
     handler, logger = _Handler(show, announce), logging.getLogger(_PACKAGE)
     before = logger.level
     logger.addHandler(handler)
-    # What others than this handler are to be told of stays as it is: they have levels of their own.
+    # Other handlers report what they did before: they have levels of their own.
     logger.setLevel(logging.INFO if before == logging.NOTSET else min(before, logging.INFO))
     try:
         yield
