@@ -181,7 +181,7 @@ def declared(config: type[Any] | Any, prefix: str = "") -> tuple[Parameter, ...]
 
 
 def _registered(config: Any) -> tuple[tuple[str, type[Any]], ...]:
-    """Return the names and the options of what is registered now: users add their own."""
+    """Return names and option classes of the present registries, to which users add their own."""
     return tuple(
         (entry, type(options))
         for each in fields(config)
@@ -194,7 +194,7 @@ def _registered(config: Any) -> tuple[tuple[str, type[Any]], ...]:
 def _declared(
     config: type[Any], prefix: str, registered: tuple[tuple[str, type[Any]], ...]
 ) -> tuple[Parameter, ...]:
-    """Return the parameters of a class, while what is registered stays the same."""
+    """Return the parameters of a class; the registries are part of the cache's key."""
     return tuple(parameter for parameter, _ in _leaves(config, prefix))
 
 

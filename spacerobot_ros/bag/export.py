@@ -167,7 +167,7 @@ def _require_suffix(target: Path, format: ExportFormat) -> None:
 
 
 def _place(made: Path, target: Path) -> None:
-    """Give what was made its name, unless something else has got it in the meantime."""
+    """Rename the finished file or folder, unless its name has been taken meanwhile."""
     if made.is_dir():
         # Takes the place of an empty folder at most.
         made.rename(target)

@@ -46,7 +46,7 @@ RECORD_HEADER = struct.Struct("<BQ")
 _LENGTH = struct.Struct("<Q")
 
 _CHUNK = struct.Struct("<QQQI")
-"""What a chunk begins with: times, size and checksum of what it holds."""
+"""The head of a chunk: times, size and checksum of its content."""
 
 DAMAGE = (
     McapError,

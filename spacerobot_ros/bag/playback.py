@@ -21,7 +21,7 @@ _MOST_TOPICS = 1000
 
 @dataclass(frozen=True)
 class ReplayTopic:
-    """A topic to publish on: its name and type in the bag, and what its publisher offered."""
+    """A topic to publish: its name, type and quality of service in the bag."""
 
     name: str
     type_name: str

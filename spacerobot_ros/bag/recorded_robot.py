@@ -1,4 +1,4 @@
-"""The topics of one robot in a bag: what was measured of it, and the state to go on from."""
+"""The topics of one robot in a bag: its measurements, and the last state to resume from."""
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ class Recording:
         self.messages += 1
 
     def flush(self, clock_is_published: bool) -> None:
-        """Hand to the operating system what is in memory; decide on wall time if it is time."""
+        """Hand the data in memory to the operating system if the period of wall time is over."""
         if self._early and not clock_is_published:
             waited_ns = self._wall_time() - self._early[0].arrival_ns
             if waited_ns > self._clock_wait_ns:

@@ -25,7 +25,7 @@ _TIMES = ("time", "time_ns", "stamp", "stamp_ns")
 """Columns of every table; a field of these names is below ``message``."""
 
 _MOST_ENTRIES = 1000
-"""Of an array that becomes columns: more make no table, such as the bytes of an image."""
+"""Longest array that becomes columns; longer ones, such as the bytes of an image, do not."""
 
 _JOINT_UNITS = {
     "position": ("m", "rad"),

@@ -235,7 +235,7 @@ class RobotDescription:
         return link or (DEFAULT_END_EFFECTOR if DEFAULT_END_EFFECTOR in names else "")
 
     def with_links(self, links: tuple[Link, ...]) -> RobotDescription:
-        """Return the robot with other links of the same names; ``urdf`` stays what it was."""
+        """Return the robot with other links of the same names and the same ``urdf``."""
         return self._rebuilt(links, self.joints)
 
     def with_locked(self, positions: Mapping[str, float]) -> RobotDescription:

@@ -277,7 +277,7 @@ class ModelFunctions:
 
 
 _MOST_BUILDS = 8
-"""So many builds of robots are kept; the one that was used longest ago goes first."""
+"""Builds of robots that are kept; the one used longest ago is dropped first."""
 
 
 @dataclass(frozen=True)

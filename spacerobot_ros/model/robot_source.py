@@ -1,4 +1,4 @@
-"""Where a robot comes from: a URDF text, a file, or a robot of this package by name."""
+"""Sources of a robot: a URDF text, a file, or the name of a robot of this package."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ _GEOMETRIES = ("box", "cylinder", "sphere", "mesh")
 
 @dataclass(frozen=True)
 class _Attribute:
-    """An attribute of so many numbers (0: a text), which may be needed; and what it is."""
+    """An attribute: its count of numbers (0: a text), its meaning, whether it is required."""
 
     name: str
     count: int

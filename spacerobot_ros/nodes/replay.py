@@ -139,7 +139,7 @@ class ReplayNode(FlightNode):
         return f"Replays {len(self._outputs)} topic(s) of {config.bag} at {config.rate:g} times."
 
     def deactivate(self) -> None:
-        """Stand still; what was sent stays sent."""
+        """Pause; the replay continues from the same message when it is activated again."""
         if self._timers:
             self._playback.pause(self._now())
         for timer in self._timers:
@@ -225,7 +225,7 @@ class ReplayNode(FlightNode):
         self._timer.reset()
 
     def _play(self) -> None:
-        """Send what is due, and come back for the next."""
+        """Send the messages that are due, and set the timer for the next one."""
         try:
             for message in self._playback.due(self._now(), _BURST):
                 self._send(message)

@@ -1,4 +1,4 @@
-"""Re-simulates the plant of a bag under the commands in it, and compares what it published."""
+"""Re-simulates the plant of a bag under its commands, and compares the published states."""
 
 from __future__ import annotations
 
@@ -357,7 +357,7 @@ class _Comparison:
         )
 
     def _deviation(self, p: _Published) -> tuple[Floats, Floats]:
-        """Return what is expected, and how far from it the bag is, both shaped as its values."""
+        """Return the expected values and the deviations, both in the shape of the bag's values."""
         rows = np.minimum(p.ticks, self._done.end) - self._done.first
         expected = p.expected(self._done.states, rows)
         deviation = np.abs(p.values - expected) / np.maximum(1.0, np.abs(expected))
@@ -392,7 +392,7 @@ class _Comparison:
         )
 
     def _remark(self, tick: int) -> str:
-        """Say what is known of the commands that led to a tick, beside their numbers."""
+        """Return a clause on why the commands of a tick had no effect; empty where they had."""
         done, before = self._done, tick - 1
         if tick > done.end:
             return f" (its plant had stopped: {done.stopped.rstrip('.')})"

@@ -334,7 +334,7 @@ class TemplateReader(Generic[M]):
         self.changes += 1
 
     def _take_whole(self, message: M) -> None:
-        """Offer a message without a layout: nothing but what it is can be read of it."""
+        """Offer the message itself: without a layout no numbers are read in place."""
         header = bytes(serialize_message(message.header))  # type: ignore[attr-defined]
         self.prototype, self._raw, self._stamp = message, header, _ENCAPSULATION
         self._size, self._fixed, self._stretches, self._reads = -1, [], [], {}
@@ -372,7 +372,7 @@ class JointReader:
         self._changes = 0
         self._problem = ""
         self._required: bytes | None = None
-        """The last message that was not refused: it may come again at once."""
+        """The last message that was accepted: the same bytes are often received again."""
         self._order: npt.NDArray[np.intp] | None = None
         self._copies: list[tuple[memoryview, slice]] = []
         self.values = {name: np.zeros(len(joint_names)) for name in quantities}

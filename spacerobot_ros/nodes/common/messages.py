@@ -55,7 +55,7 @@ def diagnostic_name(node: str, part: str) -> str:
 def diagnostic_status(
     name: str, level: bytes, sentence: str, values: Mapping[str, object], hardware_id: str = ""
 ) -> DiagnosticStatus:
-    """Return the message about what goes by ``name``; values as texts."""
+    """Return the status of the component ``name``, with values as texts."""
     return DiagnosticStatus(
         level=level,
         name=name,

@@ -363,7 +363,7 @@ class FlightNode(LifecycleNode):
         """Begin to work."""
 
     def start_sentence(self) -> str:
-        """Return what is to be known of the node when it begins to work."""
+        """Return the sentence that the node logs when it becomes active."""
         return f"Node '{self.get_name()}' is active."
 
     def deactivate(self) -> None:
@@ -402,7 +402,7 @@ class FlightNode(LifecycleNode):
             self._liveness.beat()
 
     def drain(self, executor: EventsExecutor) -> None:
-        """Complete what is under way before the node ends: about a second is left."""
+        """Complete pending work before the node ends; about a second is left."""
 
     def parameters_changed(self) -> None:
         """React to a change of live parameters; ``self.config`` has the new values."""
@@ -410,7 +410,7 @@ class FlightNode(LifecycleNode):
     # -- life cycle ---------------------------------------------------------------------------
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run the hook; what it has created goes again where it fails."""
+        """Run the hook; where it fails, the entities that it has created are destroyed."""
         if self._liveness is not None:
             self._liveness.configure(float(getattr(self.config, "watchdog_timeout", 0.0)))
         result = self._run(self.configure)
@@ -575,7 +575,7 @@ class FlightNode(LifecycleNode):
 
 
 def described_robot(robot: SpaceRobot | None) -> str:
-    """Return what is to be known of a robot, for one line."""
+    """Return name, joints and mass of a robot, for one line."""
     if robot is None:
         return "the robot that robot_description will bring"
     mass = robot.description.total_mass

@@ -22,7 +22,7 @@ from spacerobot_ros.termination import Terminated, ended_on_request, guarded
 _LOG = logging.getLogger(__name__)
 
 _LONGEST_DELIVERY = 1.0
-"""Wall s after a signal in which readers may still confirm what they were sent."""
+"""Wall time after a signal in which readers may still confirm messages, s."""
 
 _DISCOVERY_CHOICES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
 
@@ -136,7 +136,7 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
 
 
 def _deliver(node: FlightNode) -> None:
-    """Wait until readers have what was published: it would go with the process."""
+    """Wait until readers have received all messages, which are lost when the process ends."""
     end = time.monotonic() + _LONGEST_DELIVERY
     for publisher in node.publishers:
         left = end - time.monotonic()

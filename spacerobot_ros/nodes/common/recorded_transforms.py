@@ -21,7 +21,7 @@ _STREAM = QosProfile(depth=100)
 
 
 class RecordedTransforms:
-    """Writes the frames of one robot from what is recorded of it.
+    """Writes the frames of one robot by its recorded topics.
 
     A state is taken when its odom and its joint_states are there, whichever comes first; so the
     transforms have the stamps of states.
@@ -55,7 +55,7 @@ class RecordedTransforms:
         self._channel = -1
 
     def listeners(self, odom: str, joint_states: str, description: str) -> dict[str, Take]:
-        """Return what is to be called with every message of these topics."""
+        """Return the callback of every message of these topics."""
         return {
             odom: self._on_odom,
             joint_states: self._on_joint_states,
@@ -81,7 +81,7 @@ class RecordedTransforms:
         self._state = StateFrames(description)
 
     def _take_state(self, time_ns: int) -> None:
-        """Write the transforms if it is time; a time that has gone back begins anew."""
+        """Write the transforms if the period is over, or time has gone back."""
         state = self._state
         if self._last_ns <= time_ns < self._next_ns or state is None:
             return

@@ -69,7 +69,7 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
 
 
 def _given(node: Node, name: str) -> Any:
-    """Return what was given for a parameter, whatever its type; None without."""
+    """Return the value that was given for a parameter, of any type; None without."""
     overrides = getattr(node, "_parameter_overrides", None)
     if isinstance(overrides, dict):
         return overrides[name].value if name in overrides else None

@@ -186,7 +186,7 @@ class StateTimes:
         return (odom if same else b""), doubtful.joint_states
 
     def _ignore(self) -> None:
-        """Count what was set aside: the old time goes on."""
+        """Count the states that were set aside as ignored, because the old time continues."""
         parts = [
             (name, raw)
             for name, raw in (

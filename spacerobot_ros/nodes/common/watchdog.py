@@ -119,7 +119,7 @@ class Watchdog:
         return back
 
     def look(self) -> list[Silence]:
-        """Return which nodes have become silent since the last look."""
+        """Return the nodes that have become silent since the last call."""
         now = self._clock()
         if now - self._looked > _STANDSTILL:
             for name in self._heard:
@@ -200,7 +200,7 @@ class Liveness:
                 self._publish(Pulse.INACTIVE)
 
     def forget_configured(self) -> None:
-        """Take note that what was created since the construction is destroyed."""
+        """Note that the entities created since the construction are destroyed."""
         self._diagnostics = None
 
     def beat(self, pulse: Pulse = Pulse.ACTIVE) -> None:
@@ -239,7 +239,7 @@ class Liveness:
             self._report(lost)
 
     def _report(self, news: list[Silence]) -> None:
-        """Have the node react to what is new, and publish who is silent."""
+        """Have the node react to changes, and publish the nodes that are silent."""
         for silence in news:
             self._on_silence(silence)
         watchdog, node = self._watchdog, self._node

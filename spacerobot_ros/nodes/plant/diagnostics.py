@@ -207,7 +207,7 @@ class PlantReport:
         )
 
     def _thruster_status(self, thrusters: ThrusterPlant) -> DiagnosticStatus:
-        """Return what thrusters used and what they could not do; a warning where that is new."""
+        """Return propellant, pulses and unmet wrenches; a warning where new ones are unmet."""
         unmet = thrusters.unmet_ticks > self._unmet_reported
         self._unmet_reported = thrusters.unmet_ticks
         sentences = [f"they cannot give {thrusters.missing}"] if thrusters.missing else []

@@ -194,7 +194,7 @@ class PlantNode(FlightNode):
         self._publish()
 
     def deactivate(self) -> None:
-        """Stop time; nothing is commanded when it goes on."""
+        """Stop time; no command is in force when it continues."""
         self._stop_timers()
         if self._active in (PlantState.INACTIVE, PlantState.FAILED):
             return

@@ -1,4 +1,4 @@
-"""Where the joints can put the centre of mass in the base: a bound that proves what is out of it.
+"""A bound on where the joints can put the centre of mass in the base: a proof for goals beyond.
 
 Without thrust the centre of mass rests in the world, so a pose of the base says where it is in the
 base. Sliders whose directions are fixed in the base move it along straight slots, exactly. What

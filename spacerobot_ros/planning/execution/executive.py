@@ -377,7 +377,7 @@ class Executive(ScheduleExecution):
             self._request(ticket, state)
 
     def _request(self, ticket: Ticket, state: RobotState) -> None:
-        """Have a plan made from a measured state; unless it takes over, what is tracked brakes."""
+        """Request a plan from a measured state; unless it is to take over, the joints brake."""
         pursuit, braking = None if ticket.reason.for_new_goal else self._pursuit, None
         if pursuit is not None and pursuit.stuck_at is None:
             names = self._robot.joint_names

@@ -119,7 +119,7 @@ class InMotion:
         return Remainder(take_over, replace(state, q=take_over.shapes[0].copy()), aim)
 
     def _able(self, config: PlannerConfig, pursuit: Pursuit) -> bool:
-        """Whether a plan may take over in motion from what is tracked."""
+        """Whether a plan may take over in motion from the schedule that is tracked."""
         return (
             config.takeover_time > 0
             and not self._tracker.stuck

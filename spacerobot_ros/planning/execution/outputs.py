@@ -45,7 +45,7 @@ Output = PlannerStatus | ScheduleStart | Notice | Transition | FlightEvent
 
 @dataclass
 class Pursuit:
-    """A goal that was accepted, and what was done for it so far."""
+    """A goal that was accepted, and its plans and corrections so far."""
 
     identified: IdentifiedGoal
     schedule: GaitSchedule
@@ -97,7 +97,7 @@ class OutputQueue:
         remaining: PoseError | None = None,
         schedule: GaitSchedule | None = None,
     ) -> None:
-        """Add a status of a goal: with what its pursuit has taken, its error, and its schedule."""
+        """Add a status of a goal, with corrections, durations, remaining error and schedule."""
         self.waiting.append(
             PlannerStatus(
                 state,

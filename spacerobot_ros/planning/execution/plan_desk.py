@@ -1,4 +1,4 @@
-"""The plan that an executive has made: what for and why, from what, and what has come of it."""
+"""The plan that an executive requests: its goal, its reason, its start, and its result."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ class PlanDesk:
         return True
 
     def drop(self) -> IdentifiedGoal | None:
-        """Cancel what is planned; return the new goal that it was for, if it was for one."""
+        """Cancel the plan that is being made; return its goal, if that is a new one."""
         self._worker.cancel()
         ticket, self.ticket, self.ready = self.current, None, None
         return ticket.identified if ticket is not None and ticket.reason.for_new_goal else None

@@ -62,7 +62,7 @@ class ScheduleExecution:
         self._in_motion = InMotion(self._tracker, self._worker)
         self._commands = 0
         self._commanded_from_ns = 0
-        """Stamp of the first state that is answered for what is executed or planned now."""
+        """Stamp of the first state that the present schedule or plan answers, ns."""
         self.plant_rests = False
         """Whether the plant reports that no command is in force, for the owner to set."""
         self._longest_gap = round(max(_GAP, _GAP_PERIODS * config.control_period) * 1e9)
@@ -103,7 +103,7 @@ class ScheduleExecution:
         self._out.happened(EventKind.CORRECTION, sentence, pursuit.identified, 1, **about)
 
     def _go_on_for(self, identified: IdentifiedGoal, pursuit: Pursuit) -> None:
-        """Pursue another goal with the same pose and shape by what is tracked already."""
+        """Pursue another goal with the same pose and shape by the present schedule."""
         self._proposed = None
         self._pursuit = replace(
             pursuit,
@@ -137,13 +137,13 @@ class ScheduleExecution:
         self._proposed = self._proposed or dropped
 
     def _phase_without_plan(self) -> Phase:
-        """Return what is done where there is no plan."""
+        """Return the next phase where there is no plan."""
         if self._tracker.active:
             return Phase.BRAKING if self._tracker.braking else Phase.EXECUTING
         return self._phase_at_rest()
 
     def _phase_at_rest(self) -> Phase:
-        """Return what is done when the joints have come to rest."""
+        """Return the next phase when the joints have come to rest."""
         if self._proposed is not None:
             return Phase.MEASURING
         return Phase.IDLE if self._pursuit is None else Phase.EVALUATING
@@ -207,7 +207,7 @@ class ScheduleExecution:
             pursuit.ends_at = stamp_ns / 1e9
 
     def _on_end(self, stamp_ns: int) -> None:
-        """End what was tracked; its result is evaluated unless its goal was given up."""
+        """End the schedule; its result is evaluated unless its goal was cancelled."""
         ready = self._desk.ready
         if ready is not None:
             # No state was measured since the tick at which it takes over.
@@ -221,7 +221,7 @@ class ScheduleExecution:
         self._go(Event.AT_REST if at_rest else Event.SCHEDULE_ENDED, self._phase_at_rest())
 
     def _on_time_jump(self, stamp_ns: int) -> None:
-        """Plan the remaining motion where what is tracked has no shape for the time now."""
+        """Plan the remaining motion where the schedule does not cover the present time."""
         if self._tracker.covers(stamp_ns):
             return
         self._plan_again_for(self._desk.drop())
@@ -272,7 +272,7 @@ class ScheduleExecution:
         self._go(event, self._phase_at_rest())
 
     def _go(self, event: Event, target: Phase) -> None:
-        """Change the phase; every change comes through here."""
+        """Change the phase; no other method does."""
         self.outputs.append(self._machine.go(event, target))
 
     def _goal_id(self) -> str:

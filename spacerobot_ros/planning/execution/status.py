@@ -167,7 +167,7 @@ def goal_values(goal: Goal) -> tuple[float, ...]:
 
 
 def remaining_error(error: PoseError, controls: frozenset[Controlled]) -> str:
-    """Return a clause that says how far from the goal the robot is, in what is controlled."""
+    """Return a clause with the remaining error in the parts of the goal that are controlled."""
     parts: dict[Controlled, str] = {
         "position": f"{error.distance:.3g} m",
         "attitude": f"{error.angle:.3g} rad",

@@ -335,7 +335,7 @@ class TrajectoryTracker:
         return take_over
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether what is tracked has a shape for a time."""
+        """Whether the schedule or braking covers a time."""
         return self._follower is not None and self._follower.covers(stamp_ns)
 
     def ended(self, stamp_ns: int, q: Array) -> bool:

@@ -166,7 +166,7 @@ class PlanningWorker:
             job.cancellation.cancel()
 
     def close(self) -> None:
-        """Cancel, and wait until nothing goes on in the background."""
+        """Cancel, and wait until the thread in the background has ended."""
         self.cancel()
         if self._job is not None and self._job.is_alive():
             # It would crash a process that ends, in the middle of CasADi.
@@ -216,7 +216,7 @@ class PlanningWorker:
         method: GaitMethod,
         cancellation: Cancellation,
     ) -> GaitSchedule:
-        """Return one schedule: braking to rest, then what is planned from there.
+        """Return one schedule: braking to rest, then the gait that is planned from there.
 
         No joint velocity jumps. Where the base will be at rest is predicted.
         """
@@ -250,7 +250,7 @@ class PlanningWorker:
 
 
 class _Job(Thread):
-    """One plan in the making, and what has come of it."""
+    """One plan that is being made, and its result."""
 
     def __init__(self, worker: PlanningWorker, task: PlanningTask) -> None:
         super().__init__(daemon=True)

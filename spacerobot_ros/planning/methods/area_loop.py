@@ -85,7 +85,7 @@ class AreaLoopOptions:
 
 @dataclass(frozen=True)
 class AreaLoopProgress:
-    """What the next schedule for the same goal goes on with.
+    """Progress that the next schedule for the same goal continues from.
 
     ``nominal`` is the nominal shape that was chosen, ``cycles`` how many are flown when the
     schedule has ended.

@@ -189,7 +189,7 @@ class _Result:
         return cls(schedule, schedule.controls & asked, reaches)
 
     def rank(self, others: Collection[_Result]) -> tuple[bool, bool, float]:
-        """Return what is smaller for the better of two results among ``others``."""
+        """Return the key to sort by: the better one of two results has the smaller key."""
         less = any(self.parts < other.parts and other.reaches for other in others)
         return not self.reaches, less, self.schedule.expected_duration
 
@@ -208,7 +208,7 @@ def _noted(
     results: Mapping[str, _Result],
     refusals: Mapping[str, SpaceRobotError],
 ) -> GaitSchedule:
-    """Return a schedule whose notes say what it was compared with."""
+    """Return a schedule with notes on the manoeuvres that it was compared with."""
     compared = [f"{name}: {result.sentence}." for name, result in results.items()]
     compared += [f"{name}: {refusal}" for name, refusal in refusals.items()]
     notes = {"chosen": chosen, "because": because, "compared": " ".join(compared)}

@@ -154,7 +154,7 @@ class InitialGuesses:
         return Trajectory(step, shapes, velocities, self._attitudes(shapes, step * velocities))
 
     def moving(self, guess: Trajectory, velocity: Array, limits: MotionLimits) -> Trajectory:
-        """Return a guess from rest as one that begins with a velocity (n,) and comes back to it."""
+        """Return a guess from rest, changed so that it begins with a velocity (n,)."""
         brakes = float((np.abs(velocity) / limits.acceleration).max(initial=0.0))
         back = min(guess.duration, _COMES_BACK * brakes)
         if back == 0:

@@ -294,7 +294,7 @@ class OptimalGait(GaitMethod):
         return self._schedule_of(goal, positions, path, notes)
 
     def _limited_by(self, positions: Array, velocity: Array | float) -> str:
-        """Return which limits of which joints held commands come near to."""
+        """Return the limits that held commands come near to, with their joints."""
         if len(positions) < 2:
             return "nothing"
         speed, change = self._limits.shares(positions, self.control_period, velocity)
@@ -334,7 +334,7 @@ class OptimalGait(GaitMethod):
         boundary: BoundaryConditions,
         limits: MotionLimits,
     ) -> GaitSchedule | None:
-        """Return the plan that was kept under a key, if it still does what it was made for."""
+        """Return the cached plan of a key, if it still reaches its goal within the limits."""
         kept = cache.load(_file(key), key)
         if kept is None:
             return None
@@ -398,7 +398,7 @@ def _file(key: str) -> str:
 
 @dataclass(frozen=True)
 class _KeptPlan:
-    """What a schedule is made from again: shapes (N + 1, n) at the ticks, and what was noted."""
+    """A cached schedule: shapes (N + 1, n) at the ticks, and the notes."""
 
     positions: Array
     notes: Notes

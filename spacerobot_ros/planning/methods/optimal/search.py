@@ -56,7 +56,7 @@ _GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
 left, and haste would leave more."""
 
 _LAST_CALL = 5.0
-"""Without anything found, a search goes on for this many times its time budget."""
+"""Factor of the time budget after which a search without any solution ends."""
 
 _UNHURRIED = 4.0
 """A gentle manoeuvre is the path of least effort in this many times the time of its guess, then as
@@ -217,7 +217,7 @@ class _Progress:
         return 0 < agreeing <= same
 
     def cost(self, trajectory: Trajectory) -> float:
-        """Return what is to be least: the duration, or in a given one the effort."""
+        """Return the cost: the duration, or the effort where the duration is given."""
         if self.budget.duration == 0:
             return trajectory.duration
         scale = np.where(np.isfinite(self.limits.velocity), self.limits.velocity, 1.0)

@@ -504,7 +504,7 @@ def _places(sparsity: ca.Sparsity) -> tuple[Indices, Indices]:
 def _scattered(
     shape: tuple[int, int], rows: Indices, columns: Indices, nonzeros: Sequence[ca.MX]
 ) -> ca.MX:
-    """Return the sparse matrix with these nonzeros; what is for one place is added up."""
+    """Return the sparse matrix with these nonzeros; those of the same place are added."""
     places, number = np.unique(columns * shape[0] + rows, return_inverse=True)
     at_row, at_column = (each.tolist() for each in (places % shape[0], places // shape[0]))
     sparsity = ca.Sparsity.triplet(*shape, at_row, at_column)
