@@ -17,8 +17,10 @@ from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.flight.parameter_files import CONFIGS
 from spacerobot_ros.flight.scenario import (
     Scenario,
+    goal_from_rotvec,
     load_scenario,
     scenario_names,
+    scenario_of,
     scenario_or_robot,
 )
 from spacerobot_ros.model import SpaceRobot
@@ -29,7 +31,7 @@ from spacerobot_ros.simulation.trials import state_of
 
 
 def fly(
-    what: Scenario | str | Path,
+    what: SpaceRobot | Scenario | str | Path,
     goal: Goal | npt.ArrayLike | None = None,
     *,
     rotvec: npt.ArrayLike | None = None,
@@ -46,12 +48,12 @@ def fly(
     ----------
     what
         A scenario: its name, its file, or :func:`~spacerobot_ros.flight.scenario.load_scenario`'s;
-        or a robot: its name or its URDF file. A name that is both is the scenario.
+        or a robot: its name, its URDF file, or its model. A name that is both is the scenario.
     goal
         Where the base is to be; or its position (3,), m, or position and quaternion (7,). None: the
         goal of the scenario.
     rotvec
-        Its attitude (3,), rad, as exponential coordinates.
+        Its attitude (3,), rad, as exponential coordinates, in the place of the goal's.
     method
         A gait method or a control law; None: that of the scenario.
     seed
@@ -66,8 +68,13 @@ def fly(
     GoalError
         The goal is none.
     """
-    scenario = _scenario(what, goal, rotvec, parameters or {})
-    scenario.require_goal()
+    scenario = _aimed(_scenario(what), goal, None, rotvec)
+    if not scenario.has_goal:
+        raise ParameterError(
+            f"'{scenario.name}' is a robot, and no scenario with a goal: give one, for instance "
+            "rotvec=(0, 0, 0.1)."
+        )
+    scenario = _with_parameters(scenario, {} if parameters is None else parameters)
     if method is not None:
         scenario = scenario.with_method(method)
     if seed is not None:
@@ -77,7 +84,7 @@ def fly(
 
 def plan(
     what: SpaceRobot | Scenario | str | Path,
-    goal: Goal | None = None,
+    goal: Goal | npt.ArrayLike | None = None,
     *,
     position: npt.ArrayLike | None = None,
     rotvec: npt.ArrayLike | None = None,
@@ -97,9 +104,11 @@ def plan(
     what
         The model, a URDF file or the name of a robot; or a scenario, its file, or its name. A name
         that is both is the scenario where no goal is given, and else the robot.
-    goal, position, rotvec
-        Where the base is to be: a goal, or a position (3,), m, and exponential coordinates (3,),
-        rad.
+    goal
+        Where the base is to be; or its position (3,), m, or position and quaternion (7,).
+    position, rotvec
+        Its position (3,), m, and attitude (3,), rad, as exponential coordinates, in the place of
+        the goal's.
     method
         Name of a gait method; None: that of the scenario, or ``optimal``.
     options
@@ -113,12 +122,21 @@ def plan(
     ParameterError
         There is no such scenario, robot, method or option, or one is refused.
     """
-    scenario = None if isinstance(what, SpaceRobot) else _planned(what, goal, position, rotvec)
-    if scenario is None:
+    aimed = any(each is not None for each in (goal, position, rotvec))
+    if not _is_scenario(what, aimed=aimed):
         assert not isinstance(what, Scenario)
+        if goal is not None:
+            start = Goal.checked([0, 0, 0], [0, 0, 0, 1])
+            goal, position, rotvec = _goal(start, goal, position, rotvec), None, None
+            if (shape := options.pop("joint_positions", None)) is not None:
+                goal = Goal.checked(goal.position, goal.quaternion, shape)
+        position = None if position is None else _numbers(position, "position")
+        rotvec = None if rotvec is None else _numbers(rotvec, "rotvec")
         given = {"position": position, "rotvec": rotvec, "method": method}
         chosen = {name: value for name, value in given.items() if value is not None}
         return planning.plan(what, goal, **{**chosen, **options})
+    scenario = what if isinstance(what, Scenario) else load_scenario(str(what))
+    scenario = _aimed(scenario, goal, position, rotvec)
     settings: dict[str, Any] = {} if method is None else {"method": method}
     name = method or scenario.planner.method
     method_options(name, options)  # Refused here, by the names that were given.
@@ -129,53 +147,75 @@ def plan(
     return problem.method(name).plan(request)
 
 
-def _planned(
-    what: Scenario | str | Path, goal: Goal | None, position: Any, rotvec: Any
-) -> Scenario | None:
-    """Return the scenario that is meant, with the goal; None where it is a robot."""
-    given = [each for each in (goal, position, rotvec) if each is not None]
-    if not isinstance(what, Scenario):
-        name = str(what)
-        file = name.endswith((".yaml", ".yml"))
-        if not file and (name not in scenario_names() or (given and _is_robot(name))):
-            return None
-        what = load_scenario(name)
-    scenario = what if goal is None else replace(what, goal=goal, has_goal=True)
-    if position is None and rotvec is None:
+def _is_scenario(what: SpaceRobot | Scenario | str | Path, *, aimed: bool) -> bool:
+    """Whether a scenario is planned for: a name that is also a robot's is one without a goal."""
+    if isinstance(what, SpaceRobot | Scenario):
+        return isinstance(what, Scenario)
+    name = str(what)
+    if name.endswith((".yaml", ".yml")):
+        return True
+    return name in scenario_names() and not (aimed and name in resource_names("urdf", ".urdf"))
+
+
+def _scenario(what: SpaceRobot | Scenario | str | Path) -> Scenario:
+    """Return what is flown; a robot alone is a scenario without a goal."""
+    match what:
+        case Scenario():
+            return what
+        case SpaceRobot():
+            return scenario_of(what.description)
+        case _:
+            return scenario_or_robot(str(what))
+
+
+def _aimed(scenario: Scenario, *given: Any) -> Scenario:
+    """Return a scenario with another goal, whose figures are not the published ones."""
+    if all(each is None for each in given):
         return scenario
-    pose = None if position is None else [*_floats(position), *scenario.goal.quaternion.tolist()]
-    return scenario.with_goal(pose, None if rotvec is None else _floats(rotvec))
+    return replace(scenario, goal=_goal(scenario.goal, *given), published=(), has_goal=True)
 
 
-def _floats(values: npt.ArrayLike) -> list[float]:
-    return [float(x) for x in np.asarray(values, dtype=float).reshape(-1)]
-
-
-def _is_robot(name: str) -> bool:
-    return name in resource_names("urdf", ".urdf")
-
-
-def _scenario(
-    what: Scenario | str | Path,
+def _goal(
+    before: Goal,
     goal: Goal | npt.ArrayLike | None,
+    position: npt.ArrayLike | None,
     rotvec: npt.ArrayLike | None,
-    settings: Mapping[str, Any],
-) -> Scenario:
-    """Return what is flown, with another goal and other parameters."""
-    scenario = what if isinstance(what, Scenario) else scenario_or_robot(str(what))
+) -> Goal:
+    """Return a goal, or the one before, with another position or attitude."""
+    made = before
     if isinstance(goal, Goal):
-        scenario = replace(scenario, goal=goal, has_goal=True)
+        made = goal
     elif goal is not None:
-        pose = _floats(goal)
-        if len(pose) == 3:
-            pose += scenario.goal.quaternion.tolist()
-        if len(pose) != 7:
+        pose = _numbers(goal, "goal")
+        if len(pose) not in (3, 7):
             raise GoalError(f"A goal is 3 or 7 numbers, not {len(pose)}: position, quaternion.")
-        scenario = scenario.with_goal(pose)
+        given = Goal.checked(pose[:3], pose[3:] or before.quaternion)
+        made = replace(before, position=given.position, quaternion=given.quaternion)
+    if position is not None:
+        given = Goal.checked(_numbers(position, "position"), made.quaternion)
+        made = replace(made, position=given.position)
     if rotvec is not None:
-        scenario = scenario.with_goal(rotvec=_floats(rotvec))
+        given = goal_from_rotvec(made.position.tolist(), _numbers(rotvec, "rotvec"))
+        made = replace(made, quaternion=given.quaternion)
+    return made
+
+
+def _numbers(values: npt.ArrayLike, what: str) -> list[float]:
+    try:
+        return [float(x) for x in np.asarray(values, dtype=float).reshape(-1)]
+    except (TypeError, ValueError, OverflowError):
+        raise GoalError(f"The {what} {values!r} is no list of numbers.") from None
+
+
+def _with_parameters(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
+    """Return the scenario with other parameters, by ``node.parameter``."""
+    if not isinstance(settings, Mapping):
+        raise ParameterError(
+            "Parameters are given by name, as {'plant.sensors.position_noise': 0.001}, and not as "
+            f"{settings!r}."
+        )
     for key, value in settings.items():
-        node, dot, name = key.partition(".")
+        node, dot, name = str(key).partition(".")
         if not dot or node not in CONFIGS:
             raise ParameterError(
                 f"'{key}' is no parameter: it is called node.parameter with one of the nodes "

@@ -54,7 +54,12 @@ class Flight(FlightArrays):
     def animate(self, *, seconds: float = 8.0, frames: int = 80) -> Any:
         """Return the robot in motion as an HTML animation for a notebook.
 
-        ``seconds`` is how long it takes to watch, ``frames`` of how many pictures.
+        ``seconds`` is how long it takes to watch, ``frames`` of how many pictures: at most 1000.
+
+        Raises
+        ------
+        ParameterError
+            One of them is none.
         """
         from spacerobot_ros.flight.views import animation
 

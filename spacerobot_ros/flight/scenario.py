@@ -22,7 +22,7 @@ from spacerobot_ros.flight.parameter_files import (
     read_content,
     sections_of,
 )
-from spacerobot_ros.model import SpaceRobot, load_robot
+from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
 from spacerobot_ros.model.rotations import (
     matrix_from_rpy,
     quaternion_from_matrix,
@@ -478,8 +478,17 @@ def scenario_or_robot(name: str) -> Scenario:
     path = path if path.is_file() else robot_file(name)
     load_robot(path)  # What is no robot is refused before a goal is asked for.
     robot = {"robot": str(path.resolve()) if path == Path(name) else name}
+    return _of_robot(path.name.split(".")[0], path, robot)
+
+
+def scenario_of(robot: RobotDescription) -> Scenario:
+    """Return a scenario without a goal of a robot alone, as :func:`scenario_or_robot` does."""
+    return _of_robot(robot.name, Path(), {"robot_description": robot.urdf})
+
+
+def _of_robot(name: str, path: Path, robot: dict[str, str]) -> Scenario:
     return Scenario(
-        name=path.name.split(".")[0],
+        name=name,
         path=path,
         description="",
         goal=Goal.checked([0, 0, 0], [0, 0, 0, 1]),

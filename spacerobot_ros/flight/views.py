@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import re
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
@@ -25,7 +26,11 @@ if TYPE_CHECKING:
     from spacerobot_ros.flight.arrays import FlightArrays
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+_DASHES = ("-", "--", "-.", ":")
+"""Of the joints beyond those that have a colour of their own."""
+
 _INK, _GOAL = "#1f2328", "#CC79A7"
+_MOST_FRAMES = 1000
 
 _NAMES = {
     "pose": ("x", "y", "z", "qx", "qy", "qz", "qw"),
@@ -152,8 +157,8 @@ def _lines(
     axes: Any, time: Array, values: Array, names: Any, label: str, goal: Array | None = None
 ) -> None:
     for i, name in enumerate(names):
-        colour = _COLOURS[i % len(_COLOURS)]
-        axes.plot(time, values[:, i], color=colour, label=name, linewidth=1.3)
+        colour, dashes = _COLOURS[i % len(_COLOURS)], _DASHES[i // len(_COLOURS) % len(_DASHES)]
+        axes.plot(time, values[:, i], color=colour, label=name, linewidth=1.3, linestyle=dashes)
         if goal is not None:
             axes.axhline(goal[i], color=colour, linestyle=":", linewidth=1.0)
     axes.set_ylabel(label, fontsize=9)
@@ -166,6 +171,10 @@ def animation(flight: FlightArrays, seconds: float, frames: int) -> Animation:
     """Draw the robot in motion: its joints as points, the links between them as lines."""
     from matplotlib.animation import FuncAnimation
 
+    if not isinstance(frames, int) or not 1 <= frames <= _MOST_FRAMES:
+        raise ParameterError(f"An animation has 1 to {_MOST_FRAMES} frames, and not {frames!r}.")
+    if not (isinstance(seconds, int | float) and 0 < seconds < math.inf):
+        raise ParameterError(f"An animation lasts more than 0 s, and not {seconds!r}.")
     rows = np.unique(np.linspace(0, len(flight.time) - 1, frames).round().astype(int))
     skeleton = _Skeleton(flight.robot)
     shapes = np.array([skeleton.points(flight.pose[i], flight.q[i]) for i in rows])

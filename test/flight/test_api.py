@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from support.sentences import assert_one_sentence
 
 import spacerobot_ros
-from spacerobot_ros import fly, load_scenario, plan
-from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros import fly, load_scenario, plan, read_bag
+from spacerobot_ros.errors import GoalError, ParameterError, RecordingError
+from spacerobot_ros.model import SpaceRobot, load_robot
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.resources import robot_file
 
 QUICK = {"planner.lie_bracket.t1": 2.0, "planner.lie_bracket.cycle_period": 1.0}
 
@@ -72,6 +80,69 @@ def test_goals_are_given_in_many_ways() -> None:
         fly("sliding_masses", parameters={"position_noise": 1.0})
 
 
+def test_goals_of_a_plan_are_given_as_those_of_a_flight_are() -> None:
+    """A robot by its name, by its file and by its model; a pose, or parts of one."""
+    name, at, turn = "sliding_masses", (0.01, 0.02, -0.01), (0.01, -0.02, 0.015)
+    model = SpaceRobot.from_file(robot_file(name))
+    quaternion = Rotation.from_rotvec(turn).as_quat()
+    plans = [
+        plan(name, position=at, rotvec=turn, method="lie_bracket"),
+        plan(model, [*at, *quaternion], method="lie_bracket"),
+        plan(robot_file(name), at, rotvec=turn, method="lie_bracket"),
+        plan(model, Goal.checked(at, [0, 0, 0, 1]), rotvec=turn, method="lie_bracket"),
+    ]
+    for each in plans:
+        np.testing.assert_allclose(each.positions, plans[0].positions, atol=1e-9)
+        np.testing.assert_allclose(each.goal.quaternion, quaternion, atol=1e-15)
+        np.testing.assert_array_equal(each.goal.position, at)
+    shape = [0.1, 0.2, 0.3]
+    shaped = plan(model, at, joint_positions=shape, method="lie_bracket")
+    np.testing.assert_array_equal(shaped.goal.joint_positions, shape)
+    flight = fly(model, at, rotvec=turn, method="lie_bracket", parameters=QUICK)
+    assert flight.succeeded
+    assert flight.goal.position.tolist() == list(at)
+    np.testing.assert_allclose(flight.goal.quaternion, quaternion, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "given", ["x", "1 2 3", {"x": 1}, (1.0, 2.0), 5, [[1, 2], [3]], (np.nan, 0, 0), object()]
+)
+def test_what_is_no_goal_is_refused_in_one_sentence(given: Any) -> None:
+    scenario = load_scenario("faults/stuck_slider")
+    for action in (
+        lambda: fly(scenario, given),
+        lambda: fly(scenario, rotvec=given),
+        lambda: plan(scenario, given),
+        lambda: plan(scenario, position=given),
+        lambda: plan("planar_chain", given),
+        lambda: plan("planar_chain", rotvec=given),
+    ):
+        with pytest.raises(GoalError) as refused:
+            action()
+        assert_one_sentence(str(refused.value))
+
+
+def test_a_robot_alone_asks_for_a_goal_in_the_words_of_python() -> None:
+    with pytest.raises(ParameterError, match=r"'dual_arm' is a robot.*rotvec=\(0, 0, 0\.1\)"):
+        fly("dual_arm")
+
+
+@pytest.mark.parametrize("parameters", ["planner.method", 3, ["planner.method"], {3: 1}])
+def test_parameters_are_given_by_name(parameters: Any) -> None:
+    with pytest.raises(ParameterError) as refused:
+        fly("faults/stuck_slider", parameters=parameters)
+    assert_one_sentence(str(refused.value))
+
+
+def test_a_schedule_says_what_it_is_in_one_line() -> None:
+    schedule = plan("faults/stuck_slider", method="lie_bracket")
+    count, duration = len(schedule.positions) - 1, schedule.duration
+    assert repr(schedule).startswith(
+        f"<GaitSchedule by lie_bracket: {duration:g} s in {count} ticks of 0.05 s for 3 joint(s)"
+    )
+    assert "\n" not in repr(schedule)
+
+
 def test_seeds_repeat_a_flight_and_change_it() -> None:
     noise: dict[str, object] = {"plant.sensors.position_noise": 1e-3, "plant.faults": [], **QUICK}
     flights = [fly("faults/stuck_slider", seed=k, parameters=noise) for k in (1, 1, 2)]
@@ -89,7 +160,7 @@ def test_arrays_are_copies() -> None:
     assert flight.summary()["final_joint_positions"] == flight.q[-1].tolist()
 
 
-def test_an_animation_shows_every_frame() -> None:
+def test_an_animation_shows_every_frame(tmp_path: Path) -> None:
     flight = fly("faults/stuck_slider", parameters=QUICK)
     shown = flight.animate(seconds=1.0, frames=3)
     assert shown._repr_html_().count("data:image/png") == 3
@@ -97,6 +168,35 @@ def test_an_animation_shows_every_frame() -> None:
     # Nothing is asked of a server, and every button has a sign.
     assert "http" not in shown._repr_html_().replace("http://www.w3.org", "")
     assert "fa-" not in shown._repr_html_()
+    shown.save(tmp_path / "new" / "motion.html")
+    assert shown.html in (tmp_path / "new" / "motion.html").read_text("utf-8")
+    for wrong in ({"frames": 0}, {"frames": 2.5}, {"seconds": 0.0}, {"seconds": np.nan}):
+        with pytest.raises(ParameterError, match="An animation"):
+            flight.animate(**wrong)
+
+
+def test_every_joint_of_a_plot_is_told_from_the_others() -> None:
+    flight = fly("faults/stuck_slider", parameters=QUICK)
+    robot = load_robot(robot_file("quadruped"))
+    joints = np.zeros((len(flight.time), 12))
+    panels = replace(flight, robot=robot, q=joints, qdot=joints, effort=joints).plot().axes
+    for panel in panels[2:]:
+        looks = [(line.get_color(), line.get_linestyle()) for line in panel.get_lines()]
+        assert len(set(looks)) == len(looks) == 12
+
+
+def test_a_flight_is_saved_once_unless_it_may_replace_what_is_there(tmp_path: Path) -> None:
+    flight = fly("faults/stuck_slider", parameters=QUICK)
+    file = tmp_path / "Bäge mit Lücken" / "ein Flug.mcap"
+    flight.save(file)
+    before = file.read_bytes()
+    with pytest.raises(RecordingError, match="File exists"):
+        flight.save(str(file))
+    assert file.read_bytes() == before
+    flight.save(file, overwrite=True)
+    np.testing.assert_array_equal(
+        read_bag(file)["joint_states"].field("position"), flight.q, strict=True
+    )
 
 
 def test_the_package_names_what_it_offers() -> None:

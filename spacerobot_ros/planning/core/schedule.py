@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal
+from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, PoseError
 
 Notes = dict[str, list[float] | float | str]
 """Named results of a method, for reports."""
@@ -23,7 +23,7 @@ class BasePath:
     quaternion: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GaitSchedule:
     """A gait as held commands: the shape at each tick, joint velocities constant in between.
 
@@ -66,6 +66,14 @@ class GaitSchedule:
     remaining: float = 0.0
     controls: frozenset[Controlled] = POSE
     progress: object = None
+
+    def __repr__(self) -> str:
+        error = PoseError.between(self.path.position[-1], self.path.quaternion[-1], self.goal)
+        return (
+            f"<GaitSchedule by {self.method}: {self.duration:.6g} s in {self.ticks} ticks of "
+            f"{self.control_period:g} s for {len(self.joint_names)} joint(s), ends "
+            f"{error.distance:.3g} m and {error.angle:.3g} rad from the goal>"
+        )
 
     @property
     def ticks(self) -> int:
