@@ -27,13 +27,13 @@ COLUMNS = "_columns.csv"
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
 _LONGEST_NAME = 63
-"""Of a variable in MATLAB, characters."""
+"""Longest name of a variable in MATLAB, characters."""
 
 _KEYWORD = re.compile(
     "break|case|catch|classdef|continue|else|elseif|end|for|function|global|if|otherwise|parfor|"
     "persistent|return|spmd|switch|try|while"
 )
-"""Of MATLAB: no variable is called so."""
+"""Keywords of MATLAB, which no variable may be named by."""
 
 _QUOTED = re.compile(r'[,"\r\n]')
 """What a text in CSV is in quotes for."""

@@ -32,7 +32,7 @@ _JOINT_UNITS = {
     "velocity": ("m/s", "rad/s"),
     "effort": ("N", "N m"),
 }
-"""Of a sliding joint and of a turning one."""
+"""Units of a sliding joint and of a turning one."""
 
 _THRUSTER_UNITS = {"position": "s", "velocity": "1", "effort": "N"}
 _MOMENTUM_UNITS = {"linear": "kg m/s", "angular": "kg m^2/s", "kinetic": "J"}

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from spacerobot_ros.benchmarks.against import Checkout
 
 ROBOTS = ("seven_joint_arm", "quadruped", "dual_arm")
-"""Of 7, 12 and 14 joints."""
+"""Robots of 7, 12 and 14 joints."""
 
 _PERIOD = 0.05
 _TURN = (0.1, -0.15, 0.2)

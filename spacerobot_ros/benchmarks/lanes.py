@@ -38,7 +38,7 @@ _SPREAD = 0.05
 """Masses and inertias are drawn within this share."""
 
 _AGREED = 50
-"""So many flights are flown by the plant too, and compared."""
+"""Number of flights that the plant flies, too, for comparison."""
 
 
 @dataclass(frozen=True)

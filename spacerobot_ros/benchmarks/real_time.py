@@ -35,7 +35,7 @@ _WARM_UP = 0.25
 """Part of the time after which memory is to grow no more."""
 
 _PRIORITIES = {"plant": 30, "planner": 20, "coordinated_control": 20, "recorder": 10}
-"""Of the kernel's real-time scheduling, where it is allowed; `chrt -f` gives the same."""
+"""Priorities of the kernel's real-time scheduling, where it is allowed; `chrt -f` sets the same."""
 
 _GOAL = Goal.checked([0.2, -0.15, 0.05], quaternion_from_rotvec([0.1, -0.05, 0.02]))
 _FEWEST_CYCLES = 170

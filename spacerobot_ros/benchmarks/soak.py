@@ -35,7 +35,7 @@ _MOST_SAMPLES = 400
 
 _SEED = 13
 _FARTHEST, _WIDEST = 0.05, 0.0001
-"""Of goals in each coordinate, m and rad."""
+"""Largest coordinate of goals, m and rad."""
 
 _MIB = 1024.0
 """KiB."""

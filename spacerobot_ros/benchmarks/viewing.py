@@ -271,7 +271,7 @@ def _deadlines(bag: Bag) -> Array:
 
 
 def _between(table: Array, start: float, end: float) -> Phase:
-    """Return what a table of counts from the beginning has between two times, s."""
+    """Return the counts between two times, s, by a table of counts from the beginning."""
     time_s, deadlines, missed = table.T
     at = np.clip(np.searchsorted(time_s, (start, end)), 0, len(time_s) - 1)
     return Phase(int(np.ptp(deadlines[at])), int(np.ptp(missed[at])))

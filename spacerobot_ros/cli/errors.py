@@ -47,7 +47,7 @@ def end(ending: Terminated) -> NoReturn:
 
 
 def end_if_requested() -> None:
-    """End a command whose work a signal has cut short, once it has said what there is to say."""
+    """End a command whose work a signal has cut short, after its output is written."""
     ending = termination()
     if ending is not None:
         end(ending)

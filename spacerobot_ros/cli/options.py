@@ -132,7 +132,7 @@ view_option = click.option(
 
 @contextmanager
 def viewing_if(view: bool, parameters: Mapping[str, Any], namespace: str = "") -> Iterator[None]:
-    """Have the viewer run beside a command, if that is wanted; it says on stderr where it is."""
+    """Run the viewer beside a command, if wanted; its address is written to standard error."""
     if not view:
         yield
         return

@@ -200,7 +200,7 @@ def table(found: Mapping[str, Trial | SpaceRobotError]) -> Iterator[str]:
 def _try_random(
     problem: Problem, methods: list[str], count: int, within: tuple[float, float]
 ) -> None:
-    """Print what becomes of random goals; the exit code says whether all flown ones are reached."""
+    """Plan and print random goals; exit code 0: all that were simulated were reached."""
     from spacerobot_ros.simulation.trials import random_goals, try_goals
 
     goals = random_goals(problem, count, within[0], math.radians(within[1]))

@@ -147,7 +147,7 @@ def _propellant_line(summary: dict[str, Any]) -> list[str]:
 
 
 def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
-    """Return what a publication prints beside what was measured."""
+    """Return lines with the published figures beside the measured ones."""
     lines = []
     for row in scenario.comparable if summary["state"] in ("reached", "failed") else ():
         measured = summary.get(row.quantity, summary["gait"].get(row.quantity))

@@ -450,10 +450,10 @@ class ControlExecutive:
 
 
 LOST_RATE = 1.5
-"""How many times its largest rate a joint is no more mastered at."""
+"""Ratio of a joint's rate to its largest rate beyond which control of it is lost."""
 
 LOST_STATES = 3
-"""States one after the other that say so: one bad measurement does not."""
+"""Consecutive states beyond a bound after which control is lost: one may be a bad measurement."""
 
 _GAP, _GAP_PERIODS = 1.0, 10
 """Longest time between two states beyond which time has jumped: s, or control periods."""

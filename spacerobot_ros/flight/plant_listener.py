@@ -99,7 +99,7 @@ class PlantListener:
 
 
 def _rested(status: PlantStatus) -> Stopped | None:
-    """Return that a plant rests, or has rested meanwhile; None if it says nonsense of the time."""
+    """Return that a plant rests, or has rested meanwhile; None if its times are nonsense."""
     last, since = status.last_command_s, status.time_s
     last = since if last is None else last
     why = status.sentence

@@ -405,7 +405,7 @@ class _StreamTaps:
         self._tapped: dict[str, list[RawStream]] = {}
 
     def tap(self, topic: str, listener: Take, publishers: int) -> bool:
-        """Listen to a topic with so many publishers; return whether nothing can escape."""
+        """Listen to the streams of a topic; return whether they carry those of all publishers."""
         streams = self._streams(topic, publishers)
         if streams:
             self._tapped[topic] = streams

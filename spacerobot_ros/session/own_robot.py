@@ -21,7 +21,7 @@ from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.trials import Problem, Trial
 
 _FIRST_TURN = math.radians(5.0)
-"""How far the base turns at most in the first scenario of a robot, rad."""
+"""Largest turn of the base in the first scenario of a robot, rad."""
 
 _MOST_TURNS = 4 * math.pi
 """Limits of joints beyond that may be meant in degrees, rad."""

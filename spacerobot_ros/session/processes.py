@@ -172,7 +172,7 @@ class MultiProcessStack(Stack):
             )
 
     def _environment(self) -> dict[str, str]:
-        """Return the environment of a node; what the user has chosen stays."""
+        """Return the environment of a node; variables that the user has set stay."""
         environment = {**_WITHOUT_SHARED_MEMORY, **os.environ}
         if not any(name in environment for name in _PROFILES):
             file = Path(self._folder.name, "fastdds.xml")
@@ -181,7 +181,7 @@ class MultiProcessStack(Stack):
         return environment
 
     def _log_of(self, name: str) -> Path:
-        """Return the file of what a node writes to its standard output and error."""
+        """Return the file that receives standard output and error of a node."""
         return Path(self._folder.name, f"{name}.txt")
 
     def _last_line(self, name: str) -> str:

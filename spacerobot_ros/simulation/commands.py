@@ -35,7 +35,7 @@ NEVER = -math.inf
 _SECOND = 10**9
 
 _START = 1.0
-"""How long a stamp of zero is that of the first state where commands never grow old, s."""
+"""Time for which a stamp of zero is that of the first state where commands never grow old, s."""
 
 _STAMP_ROUNDING = 1_000
 """By how much a stamp may be off its state where a commander keeps time in floating point, ns."""

@@ -379,7 +379,7 @@ class FaultyPlant(WrappedPlant):
         return limited
 
     def _realised(self, joints: Array, *wrench: Array) -> list[Array]:
-        """Return what the actuators make of the commands, which stay as they are."""
+        """Return the commands as the faulty actuators realise them, in new arrays."""
         disturbed = joints + self._bias
         if self._noise.any():
             disturbed += self._noise * self._rng.standard_normal(self.robot.n)

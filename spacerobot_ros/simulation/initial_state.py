@@ -1,4 +1,4 @@
-"""Where a run starts."""
+"""The initial state of a plant."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ _BISECTIONS = 40
 """They leave 1e-12 of an integration step of the time of arrival."""
 
 _BEYOND = 1e-12
-"""How far beyond its end a joint counts as outside: relative, and in m or rad below one."""
+"""Distance beyond its end at which a joint counts as outside: relative, in m or rad below one."""
 
 
 class JointStops:

@@ -67,7 +67,7 @@ class Plant(Protocol):
 
 
 class WrappedPlant:
-    """Reports what the plant within reports, in the same arrays; what steps it is to be added."""
+    """Reports the state of the plant within, in the same arrays; subclasses add its step."""
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant

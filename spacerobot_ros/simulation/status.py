@@ -123,7 +123,7 @@ class PlantStatus:
 
 
 class PlantMonitor:
-    """Follows what a plant does, and says what has changed.
+    """Follows the state of a plant, and reports its changes.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ _MET = 1e-9
 """A wrench is met if what is missing is less than this part of it."""
 
 _PREFERENCE = 1e4
-"""How much more a larger part of the wrench counts than its cost."""
+"""Weight of the part of the wrench that is given, relative to its cost."""
 
 _ROUNDING = 1e-9
 """Shorter parts of a time count as zero."""

@@ -27,7 +27,7 @@ IN_URDF = "urdf"
 """Source of a table that is in no file of its own."""
 
 _LARGEST = 1e12
-"""Of the numbers of a table, in SI units."""
+"""Largest number that a table may have, in SI units."""
 
 _AXES = ("force along x", "force along y", "force along z", *(f"torque about {x}" for x in "xyz"))
 _KEYS = {"name", "link", "position", "rpy", "direction", "force", "min_on_time", "isp"}

@@ -134,7 +134,7 @@ class CommanderNode(FlightNode):
 
     @abstractmethod
     def _plant_changed(self, change: Change) -> None:
-        """Do what the change asks for."""
+        """React to a change of the plant."""
 
     @abstractmethod
     def _plant_reported(self) -> None:
@@ -299,7 +299,7 @@ class CommanderNode(FlightNode):
                 self._on_plant_status(taken[0])
 
     def _publish_diagnostics(self, times: StateTimes, *, ignored: bool = False) -> None:
-        """Publish what the status says, how many states were ignored, and why the last one was."""
+        """Publish the status, the number of ignored states, and why the last one was ignored."""
         full, robot = self.get_fully_qualified_name(), self._robot
         hardware = robot.description.name if robot is not None else ""
         level = DiagnosticStatus.WARN if ignored else DiagnosticStatus.OK

@@ -125,7 +125,7 @@ class PlantReport:
         return self._real_time.ticks_lost if self._real_time is not None else 0
 
     def _counters(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Return what the levels of commands and actuators follow from."""
+        """Return the counts from which the levels of commands and actuators follow."""
         limits = self._plant.limit_counts.values()
         return (
             (self._commands.counts.total(), self._command_timeouts, self._ticks_lost),

@@ -61,7 +61,7 @@ class StatePublisher:
         self.rebuild()
 
     def rebuild(self) -> None:
-        """Publish from now on what the state reports now."""
+        """Publish from now on the quantities that the state has now."""
         clock = TOPICS["/clock"]
         streams = [
             (topic, self._output(topic), self._template(topic))

@@ -207,7 +207,7 @@ class Executive(ScheduleExecution):
         return tracker.setpoint
 
     def _act(self, phase: Phase, measured: MeasuredState) -> None:
-        """Do what the phase demands beside tracking."""
+        """Do the work of a phase beside tracking."""
         match phase:
             case Phase.MEASURING | Phase.EVALUATING:
                 self._measure_at_rest(measured)
@@ -399,7 +399,7 @@ class Executive(ScheduleExecution):
             self._conclude_plan(*taken)
 
     def _conclude_plan(self, ticket: Ticket, result: Planned | Refused) -> None:
-        """Execute a plan, or say why there is none: it depends on why it was requested."""
+        """Execute a plan, or report why there is none, depending on the reason of the request."""
         pursuit = self._pursuit
         match ticket.reason, result:
             case PlanReason.IN_MOTION | PlanReason.SHRINKING_HORIZON, Planned(schedule=schedule):

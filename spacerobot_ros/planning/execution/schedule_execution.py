@@ -200,7 +200,7 @@ class ScheduleExecution:
 
     @staticmethod
     def _cut_off(pursuit: Pursuit, stamp_ns: int) -> None:
-        """Count what the present schedule would have yet to do as not done."""
+        """Subtract the rest of the present schedule from the duration of the manoeuvre."""
         remainder = pursuit.ends_at - stamp_ns / 1e9
         if remainder > 0:
             pursuit.manoeuvre_time -= min(remainder, pursuit.schedule.duration)

@@ -8,16 +8,17 @@ import numpy.typing as npt
 from spacerobot_ros.model.description import Array
 
 _STUCK_SHARE = 0.05
-"""A joint that goes less than this part of what it is commanded to go is stuck."""
+"""A joint that moves over less than this share of its commanded range is stuck."""
 
 _FOLLOWS_SHARE = 0.5
-"""... and one that goes more than this follows. In between it is slow, or noise hides it."""
+"""A joint that moves over more than this share follows. In between it is slow, or noise hides
+its motion."""
 
 _PATIENCE = 8
-"""Windows that are waited for commands to arrive when no joint moves."""
+"""Windows to wait for commands to arrive when no joint moves."""
 
 _LOOK_EVERY = 16
-"""Ticks between two looks at joints that have all followed so far: a look takes time."""
+"""Ticks between two checks of joints that have all followed so far: a check takes time."""
 
 _LEAST_BAND = 1e-6
 """Errors below this are rounding, m or rad."""

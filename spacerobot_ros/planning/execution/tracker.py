@@ -21,7 +21,7 @@ _AT_END = 1e-6
 """A schedule has ended when every joint is this near its last position, m or rad."""
 
 _LONGEST_SETTLING = 5.0
-"""... or this long after its last tick, s."""
+"""A schedule has also ended this long after its last tick, s."""
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ _EQUAL = 1e-4
 """Peaks of the curvature that differ by less than this share are equally good, ..."""
 
 _EQUALLY_NEAR = 1e-2
-"""... and equally near where their distances differ by less than this, rad."""
+"""Distances that differ by less than this count as equal, rad."""
 
 _AROUND = np.array([[x, y] for x in (0.0, -1.0, 1.0) for y in (0.0, -1.0, 1.0)])
 """A point and its eight neighbours; the point itself comes first and wins a tie."""

@@ -52,7 +52,8 @@ _COARSER, _FEWEST_INTERVALS = 4, 10
 intervals."""
 
 _REFINED = 3
-"""Of the solutions, so many are made into commands, the fastest first, until one keeps all."""
+"""Largest number of solutions that are made into commands, fastest first, until one keeps all
+limits."""
 
 _SAME, _AGREED = 1e-3, 3
 """Solutions of the same duration, relative, that end the search."""

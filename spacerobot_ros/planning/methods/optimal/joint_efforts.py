@@ -102,14 +102,14 @@ class JointEfforts:
         return math.sqrt(float(np.abs(self.shares(positions, velocity)).max(initial=0.0)))
 
     def peak(self, trajectory: Trajectory) -> float:
-        """Return the largest effort on a trajectory over what a solution may use."""
+        """Return the largest ratio of efforts on a trajectory to those that solutions may use."""
         q, v = trajectory.shapes, trajectory.velocities
         a = np.diff(v, axis=0) / trajectory.step
         ends = np.vstack([self._shares(q[:-1], v[:-1], a), self._shares(q[1:], v[1:], a)])
         return float(np.abs(ends).max()) / _ROOM
 
     def slowed(self, trajectory: Trajectory) -> Trajectory:
-        """Return the same path, in so much more time that its efforts keep the limits."""
+        """Return the same path, slowed until its efforts keep the limits."""
         peak = self.peak(trajectory)
         return trajectory if peak <= 1 else trajectory.retimed(math.sqrt(peak))
 

@@ -63,23 +63,23 @@ _UNHURRIED = 4.0
 fast as the limits allow."""
 
 _COARSER = 5
-"""The coarse grid has so many times fewer intervals than the full one ..."""
+"""Ratio of the intervals of the full grid to those of the coarse grid."""
 
 _COARSE_TOLERANCE = 1e-4
-"""The error of the coarse grid is larger than what a smaller tolerance would improve."""
+"""Tolerance of the solver on the coarse grid, whose own error is larger."""
 
 _FEWEST_INTERVALS = 8
-"""... and at least so many; otherwise there is no coarse grid."""
+"""Fewest intervals of a coarse grid; where it would have fewer, there is none."""
 
 _REFINED = 2
-"""Manoeuvres that are made of coarse solutions at most."""
+"""Largest number of coarse solutions that are refined."""
 
 _FAR_BEHIND = 1.1
-"""A coarse solution that costs so many times more than the best is not refined beside it: a coarse
-grid overrates some solutions by more than others."""
+"""Largest ratio of the cost of a coarse solution to the best one at which it is refined, too: the
+coarse grid underestimates some costs by more than others."""
 
 _SAME = 1e-3
-"""Solutions whose costs are this near, relative, are taken for one."""
+"""Relative difference of costs below which two solutions count as the same."""
 
 _AGREEING = 3e-3
 """Solutions whose costs are this near, relative, agree: the coarse grid and the tolerance of the
