@@ -282,6 +282,15 @@ def test_a_reset_is_planned_for_from_where_the_robot_is_then(
     np.testing.assert_array_equal(stub_of(loop).requests[-1].state.q, np.zeros(3))
 
 
+def test_a_reset_at_the_end_of_a_schedule_is_no_miss(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = evaluating(max_corrections=0)
+    requested = reasons(loop, monkeypatch)
+    reset_plant(loop)
+    status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
+    assert (status.state, status.corrections) == (PlannerState.REACHED, 0)
+    assert requested == [PlanReason.REPLAN]
+
+
 def test_momenta_of_before_a_reset_are_not_planned_for() -> None:
     loop = resting()
     spin = InitialState(angular_momentum=np.array([0.0, 0.0, 0.25]))

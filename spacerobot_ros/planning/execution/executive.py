@@ -156,12 +156,12 @@ class Executive(ScheduleExecution):
         self._average.forget()
         # The shape that is held is one of before, like the schedule.
         self._tracker.stop()
+        if self._pursuit is not None:
+            self._pursuit.next_plan = PlanReason.REPLAN
         if self.phase in (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING):
             return
         # What is planned begins at a state that is gone.
         self._plan_again_for(self._desk.drop())
-        if self._pursuit is not None:
-            self._pursuit.next_plan = PlanReason.REPLAN
         self._go(Event.PLANT_RESET, self._phase_at_rest())
         self._out.notice(Severity.WARNING, "The plant was reset: the motion is planned again.")
 
