@@ -309,7 +309,8 @@ class Playback:
         """Be at ``bag_ns`` in the bag, or at its nearer end, running or not as before.
 
         Returns what a subscriber would have by then: of each topic the last message, if that is
-        latched or no older than a second.
+        latched or no older than a second. Where time stands still at the beginning it is what is
+        there, as nothing is before it; that comes again when time goes on.
 
         Raises
         ------
@@ -319,7 +320,8 @@ class Playback:
         at = min(max(bag_ns, self._start_ns), self._last_ns)
         recent = max(at - _RECENT_NS, self._start_ns)
         last = {message.topic: message for message in self._latched_before(at)}
-        for message in self._between(set(self._names), recent, at - 1):
+        begins = at == self._start_ns and not self._timeline.running
+        for message in self._between(set(self._names), recent, at if begins else at - 1):
             last[message.topic] = message
         self._turn.close()
         self._turn = self._between(set(self._names), at, self._end_ns)

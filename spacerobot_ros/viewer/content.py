@@ -85,11 +85,11 @@ def goal_of(
 
 def silence(state: StackState) -> str:
     """Return a sentence where no state comes, else an empty text."""
+    if state.replay is not None and (state.replay.paused or state.replay.ended):
+        return ""
     if state.age_s == math.inf:
         return "No state has come yet: no plant is running in this ROS domain and namespace."
-    if state.age_s < SILENT_AFTER or (
-        state.replay is not None and (state.replay.paused or state.replay.ended)
-    ):
+    if state.age_s < SILENT_AFTER:
         return ""
     if state.plant is not None and state.plant.state is PlantState.PAUSED:
         return ""
@@ -100,6 +100,8 @@ def time_to_go(state: StackState) -> float | None:
     """Return how long the planned manoeuvre still takes, s; None where none is flown."""
     planner, measured = state.planner, state.measured
     if planner is None or measured is None or planner.state is not PlannerState.EXECUTING:
+        return None
+    if "planner" in state.absent:
         return None
     return max(0.0, planner.ends_at_s - measured.time_s) if planner.ends_at_s else None
 
@@ -133,16 +135,18 @@ def head(state: StackState, *, described: bool = True) -> str:
         text = f"Replay {word}: {replay.position_s:.2f} s of {replay.duration_s:.2f} s"
         lines.append(_line(text, 0))
     if state.plant is not None:
-        lines.append(_status("Plant", state.plant.state.value, state.plant.sentence,
-                             state.plant.level))  # fmt: skip
+        plant = state.plant
+        text = _status("Plant", plant.state.value, plant.sentence, plant.level)
+        lines.append(_faint(text, faint="plant" in state.absent))
         lines.extend(_line(f"Fault: {each}", 1) for each in state.plant.faults)
     if state.planner is not None:
         status = state.planner
-        lines.append(_status("Planner", status.state.value, status.sentence, status.state.level))
+        text = _status("Planner", status.state.value, status.sentence, status.state.level)
+        lines.append(_faint(text, faint="planner" in state.absent))
     if state.controller is not None:
         control = state.controller
-        level = control.state.level
-        lines.append(_status("Controller", control.state.value, control.sentence, level))
+        text = _status("Controller", control.state.value, control.sentence, control.state.level)
+        lines.append(_faint(text, faint="controller" in state.absent))
     return padded("".join(lines))
 
 
@@ -157,6 +161,11 @@ def _status(name: str, word: str, sentence: str, level: int) -> str:
         f'<span style="color:{_LEVELS[level]};font-weight:600">{escape(word)}</span> '
         f"{escape(sentence)}</div>"
     )
+
+
+def _faint(html: str, *, faint: bool) -> str:
+    """Return HTML so that what is no longer so is hardly seen."""
+    return f'<div style="opacity:.45">{html}</div>' if faint else html
 
 
 def _line(text: str, level: int | None) -> str:
@@ -261,16 +270,12 @@ def base_error(state: StackState) -> tuple[float, float] | None:
 
 
 def tool_error(state: StackState) -> tuple[float, float] | None:
-    """Return how far the end-effector is from its goal as the controller has it, m and rad."""
-    command = None if state.controller is None else state.controller.command
-    if command is None:
+    """Return how far the end-effector is from its goal, m and rad; None where there is no goal."""
+    goal, pose = state.goals.get("end_effector"), state.tool
+    if goal is None or pose is None:
         return None
-    tool = {k: v for k, v in command.errors.items() if k.startswith("end_effector.")}
-    if not tool:
-        return None
-    places = [v for k, v in tool.items() if not k.removeprefix("end_effector.").startswith("r")]
-    turns = [v for k, v in tool.items() if k.removeprefix("end_effector.").startswith("r")]
-    return math.hypot(*places), math.hypot(*turns)
+    error = PoseError.between(pose[:3], pose[3:], goal)
+    return error.distance, error.angle
 
 
 def momentum_drift(momenta: Momenta, first: Array) -> tuple[float, float]:

@@ -33,10 +33,11 @@ _ROBOT = "/robot"
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
 """Wall s from one drawing of the slower parts to the next."""
 
-CAMERA = np.array([1.1, -1.4, 0.8])
-"""From the robot to where a page looks at it from when it is opened, in lengths of the robot."""
+CAMERA = np.array([1.1, 1.4, 0.8])
+"""From the robot to where a page looks at it from when it is opened, in lengths of the robot.
 
-_LIGHT, _DARK = "light", "dark"
+What is ahead of the base, such as its arm, is then on the left: the panel is on the right.
+"""
 
 
 class Page:

@@ -89,6 +89,9 @@ class StackState:
         Nodes whose heartbeats have ended, by name, and for how many wall s.
     inactive
         Nodes that were deactivated or have ended in order, by name.
+    absent
+        Which of ``plant``, ``planner``, ``controller``, ``replay`` are of such nodes: what they
+        reported is no longer so.
     """
 
     measured: Measured | None = None
@@ -104,6 +107,7 @@ class StackState:
     goals: Mapping[Part, Goal] = field(default_factory=dict)
     silent: Mapping[str, float] = field(default_factory=dict)
     inactive: tuple[str, ...] = ()
+    absent: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)

@@ -172,6 +172,21 @@ def test_a_jump_brings_what_a_subscriber_would_have(path: Path) -> None:
     assert not playback.ended
 
 
+def test_a_jump_to_the_beginning_while_time_stands_still_shows_what_is_there(path: Path) -> None:
+    everything = played(Playback(read_bag(path)), 1.0)
+    for start in (0.0, 0.25):
+        playback = Playback(read_bag(path), start=start)
+        playback.seek(BEGAN + round(0.62 * S), CLOCK)
+        shown = texts_of(playback.seek(BEGAN, CLOCK))
+        there = {text.split()[0]: text for time, text in everything if time == start}
+        assert there
+        assert set(there.values()) <= set(shown)
+        # Everything comes when it goes on.
+        playback.run(CLOCK)
+        rest = texts_of(playback.due(CLOCK + 2 * S, 1000))
+        assert rest == [text for time, text in everything if time >= start]
+
+
 def test_a_jump_stays_in_the_part_that_is_played(path: Path) -> None:
     playback = Playback(read_bag(path), start=0.2, duration=0.5)
     assert (playback.start_ns, playback.duration_s) == (BEGAN + S // 5, 0.5)

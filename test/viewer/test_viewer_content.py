@@ -68,6 +68,7 @@ def test_silence_is_said() -> None:
     assert content.silence(replace(STATE, age_s=5.9, plant=paused)) == ""
     held = ReplayStatus(1.0, 2.0, paused=True, ended=False, rate=1.0)
     assert content.silence(replace(STATE, age_s=5.9, replay=held)) == ""
+    assert content.silence(StackState(replay=held)) == "", "it has not begun"
     plays = replace(held, paused=False)
     assert content.silence(replace(STATE, age_s=5.9, replay=plays)) == "No state for 5 s."
     head = content.head(replace(STATE, silent={"/planner": 3.2}))
@@ -89,6 +90,10 @@ def test_time_to_go_is_of_the_schedule_that_is_flown() -> None:
     assert content.share_flown(STATE) == 0.0
     reached = replace(STATE, planner=replace(executing, state=PlannerState.REACHED))
     assert content.time_to_go(reached) is None
+    lost = replace(flying, absent=frozenset({"planner"}))
+    assert content.time_to_go(lost) is None, "nobody flies it any more"
+    assert "opacity" in content.head(lost)
+    assert "opacity" not in content.head(replace(flying, absent=frozenset({"controller"})))
     late = replace(STATE, planner=replace(executing, ends_at_s=3.0))
     assert content.time_to_go(late) == 0.0
     assert content.share_flown(late) == 1.0
@@ -144,11 +149,15 @@ def test_errors_are_to_the_goal() -> None:
     turned = content.quaternion_from_rpy((0.0, 0.0, 0.5))
     goal = Goal(np.array([1.0, 2.0, 5.0]), turned)
     assert content.base_error(replace(STATE, goals={"base": goal})) == pytest.approx((2.0, 0.5))
-    errors = {"base.x": 9.0, "end_effector.x": 3.0, "end_effector.y": 4.0, "end_effector.rz": 0.2}
+    # That of the end-effector too, whatever the reference is that the controller follows to it.
+    errors = {"end_effector.x": 9.0, "end_effector.rz": 0.9}
     report = CommandReport("model_based", False, 1.0, 0.0, 0.0, 0.0, 0.0, errors)
     controlled = ControllerStatus(ControllerState.TRACKING, command=report)
-    assert content.tool_error(replace(STATE, controller=controlled)) == pytest.approx((5.0, 0.2))
-    assert content.tool_error(STATE) is None
+    tool = Goal(np.array([4.0, 6.0, 3.0]), content.quaternion_from_rpy((0.0, 0.2, 0.0)))
+    flying = replace(STATE, controller=controlled, tool=HERE, goals={"end_effector": tool})
+    assert content.tool_error(flying) == pytest.approx((5.0, 0.2))
+    assert content.tool_error(replace(flying, goals={})) is None
+    assert content.tool_error(replace(flying, tool=None)) is None
 
 
 def test_momenta_are_compared_with_what_they_should_be() -> None:

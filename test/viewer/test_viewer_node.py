@@ -25,13 +25,16 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.nodes import ViewerNode
 from spacerobot_ros.nodes.common.watchdog import Pulse, Role
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
-from spacerobot_ros.viewer.port import StackState
+from spacerobot_ros.viewer.port import Measured, StackState
 from spacerobot_ros.viewer.reachability import Check, Verdict
 
 URDF = load_robot(robot_file("sliding_masses")).urdf
+GOAL = Goal.checked([1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+HERE = Measured(0.0, np.eye(7)[6], *np.zeros((3, 3)))
 ARM = load_robot(robot_file("three_joint_arm"))
 
 
@@ -370,6 +373,8 @@ def test_nodes_that_are_gone_are_shown_no_longer(harness: Harness) -> None:
     replay = create(DiagnosticStatus, "/replay/status", LATCHED)
     heart = create(DiagnosticStatus, "/heartbeat", 20)
     harness.connect()
+    stack.describe()
+    stack.until(lambda: stack.viewer._robot is not None, "a robot")
 
     def beat(name: str, pulse: Pulse, role: Role | None) -> None:
         hardware = "" if role is None else role.value
@@ -393,14 +398,20 @@ def test_nodes_that_are_gone_are_shown_no_longer(harness: Harness) -> None:
     assert look().inactive == (), "viewers come and go"
     pass_time(10.0)
     assert look().silent["/planner"] >= 10.0
+    assert look().absent == {"planner"}
+    question, why_not = stack.viewer._question(replace(look(), measured=HERE), {"base": GOAL})
+    assert question is None
+    assert why_not == "The planner is not there now."
     assert look().planner == idle, "it may come back"
     pass_time(60.0)
     assert look().planner is None
     assert "/planner" not in look().silent
     beat("/planner", Pulse.ACTIVE, Role.COMMANDER)
     assert look().planner == idle, "it had only stood still"
+    assert look().absent == frozenset()
     beat("/planner", Pulse.INACTIVE, Role.COMMANDER)
     assert look().inactive == ("/planner",)
+    assert look().absent == {"planner"}
     beat("/planner", Pulse.BUSY, Role.COMMANDER)
     pass_time(1000.0)
     assert look().planner == idle, "it plans"
@@ -414,7 +425,6 @@ def test_nodes_that_are_gone_are_shown_no_longer(harness: Harness) -> None:
     status = ReplayStatus(1.0, 2.0, paused=True, ended=False, rate=1.0)
     values = [KeyValue(key=k, value=v) for k, v in status.to_values().items()]
     replay.publish(DiagnosticStatus(name="/replay", values=values))
-    stack.describe()
     stack.until(lambda: listener.state().replay is not None, "a replay")
     beat("/replay", Pulse.ACTIVE, Role.REPLAY)
     beat("/live_plant", Pulse.ACTIVE, Role.PLANT)

@@ -160,6 +160,12 @@ class Listener:
         self._take_streams(now)
         self._look_for_nodes_that_are_gone(now)
         beats = self._beats.items()
+        silent = {
+            name: now - beat.at
+            for name, beat in beats
+            if beat.pulse is Pulse.ACTIVE and now - beat.at > _SILENT_AFTER
+        }
+        inactive = tuple(name for name, beat in beats if beat.pulse is Pulse.INACTIVE and beat.role)
         statuses = {
             key: status
             for key, status in self._statuses.items()
@@ -177,13 +183,10 @@ class Listener:
             replay=statuses.get("replay"),
             planned_path=None if self._reporters.get("planner") in self._gone else self._planned,
             goals=dict(self._goals),
-            silent={
-                name: now - beat.at
-                for name, beat in beats
-                if beat.pulse is Pulse.ACTIVE and now - beat.at > _SILENT_AFTER
-            },
-            inactive=tuple(
-                name for name, beat in beats if beat.pulse is Pulse.INACTIVE and beat.role
+            silent=silent,
+            inactive=inactive,
+            absent=frozenset(
+                key for key in statuses if self._reporters[key] in (*silent, *inactive)
             ),
         )
 

@@ -205,10 +205,12 @@ class ViewerNode(FlightNode):
         self._look_for_parameters()
         for action in self._page.update(state, now):
             self._carry_out(action, state)
-        if state.planner is not None and state.planner.state is not self._planner_state:
-            self._planner_state = state.planner.state
-            if self._planner_state not in (PlannerState.PLANNING, PlannerState.EXECUTING):
-                self._page.touch_goal(now)  # The robot is elsewhere.
+        planner = None if "planner" in state.absent else state.planner
+        planner_state = None if planner is None else planner.state
+        if planner_state is not self._planner_state:
+            self._planner_state = planner_state
+            if planner_state not in (PlannerState.PLANNING, PlannerState.EXECUTING):
+                self._page.touch_goal(now)  # The robot is elsewhere, or nobody plans.
         self._send_goals(state, now)
         self._check_goal(state, now)
 
@@ -238,6 +240,8 @@ class ViewerNode(FlightNode):
             return None, "No state has come yet."
         if state.planner is None:
             return self._question_of_arm(measured, goals)
+        if "planner" in state.absent:
+            return None, "The planner is not there now."
         if state.planner.state is PlannerState.PLANNING:
             return None, "The planner plans."
         parameters = self._remote_values.get("planner")
