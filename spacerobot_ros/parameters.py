@@ -96,6 +96,8 @@ class Parameter:
             raise self._refusal(value, "a finite number")
         if whole and value != int(value):
             raise self._refusal(value, "a whole number")
+        if whole and not -(2**63) <= value < 2**63:  # What a ROS parameter holds.
+            raise self._refusal(float(value), "a whole number of 64 bits")
         if not self.minimum <= value <= self.maximum:
             raise self._refusal(value, f"a number{self._range()}")
         return int(value) if whole else float(value)
