@@ -177,6 +177,7 @@ def test_a_disk_that_is_full_costs_nothing_that_is_there(
         with pytest.raises(RecordingError, match=r"The last 1 flights cannot be .*goes on from"):
             run_campaign(small(flights=3), tmp_path)
     assert str(rows(tmp_path)) == str(before)
+    assert len(Results.of(tmp_path)) == 2
     assert run_campaign(small(flights=3), tmp_path).done == 3
 
 
