@@ -405,10 +405,14 @@ class _Distribution:
             return self._mourned(numbers, alone)
         except FutureCancelledError as error:
             raise _lost() from error
-        except ImportError as error:
+        except (ImportError, RuntimeError) as error:
+            # So dask.distributed calls what the scheduler cannot load.
+            if isinstance(error, RuntimeError) and "deserialization" not in str(error):
+                raise
             raise SpaceRobotError(
-                f"A worker or the scheduler cannot load what flies ({error}): all of them need "
-                f"spacerobot_ros[campaign] {__version__}."
+                "The scheduler or a worker cannot load what flies "
+                f"({str(error).splitlines()[0]}): all of them need spacerobot_ros[campaign] "
+                f"{__version__}."
             ) from error
         if not alone and rows:
             took = sum(row.wall_time for row in rows if row.wall_time == row.wall_time)
