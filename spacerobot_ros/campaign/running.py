@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +37,8 @@ _AHEAD = 2
 
 _MOST_DEATHS = 2
 """Workers that a flight may take with it before it is reported and not tried again."""
+
+_PACKAGE = "spacerobot_ros"
 
 _LOOK_PERIOD = 0.2
 
@@ -248,9 +253,15 @@ def _client(cluster: Cluster, flights: int) -> Iterator[Any]:
         "distributed.scheduler.worker-saturation": 1.0,
         "distributed.worker.daemon": True,
         "distributed.admin.tick.limit": "1h",
+        # Ctrl-C reaches the workers of a terminal, too: this process ends them.
+        "distributed.worker.preload": [
+            "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        ],
     }
     with dask.config.set(settings):
         if cluster.scheduler:
+            # A sentence says what its tracebacks would.
+            logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
             try:
                 client = Client(cluster.scheduler, timeout="20s")
             except (OSError, TimeoutError, ValueError) as error:
@@ -315,6 +326,8 @@ class _Distribution:
         self._running: dict[Any, tuple[list[int], float]] = {}
         self._suspects: deque[int] = deque()
         self._deaths: Counter[int] = Counter()
+        self._fit: set[str] = set()
+        """Addresses of workers that have this package."""
         self._alone_since = math.inf
         """When it was seen that there is no worker, on the monotonic clock."""
         self._suspected: Any = None
@@ -355,9 +368,11 @@ class _Distribution:
         try:
             if self._client.status != "running":
                 raise _lost()
-            workers = sum(self._client.nthreads().values())
+            threads = self._client.nthreads()
+            self._require_package(threads)
         except (OSError, AttributeError) as error:  # The client was about to notice it.
             raise _lost() from error
+        workers = sum(threads.values())
         if workers:
             self._alone_since = math.inf
         elif time.monotonic() - self._alone_since > _ALONE:
@@ -365,6 +380,27 @@ class _Distribution:
         elif self._alone_since == math.inf:
             self._alone_since = time.monotonic()
         return max(1, workers)
+
+    def _require_package(self, workers: Iterable[str]) -> None:
+        """Refuse workers without this package, which a task would end again and again.
+
+        Raises
+        ------
+        SpaceRobotError
+            One that has joined has not got it.
+        """
+        joined = [address for address in workers if address not in self._fit]
+        if not joined:
+            return
+        # A function of the standard library, which every worker can load.
+        found = self._client.run(find_spec, _PACKAGE, workers=joined, on_error="return")
+        for address, spec in found.items():
+            if spec is None:
+                raise SpaceRobotError(
+                    f"The worker at {address} has no {_PACKAGE}: install it there."
+                )
+            if not isinstance(spec, Exception):  # It may be gone again.
+                self._fit.add(address)
 
     def _task(self, numbers: list[int]) -> Any:
         draws = [self._draws[number] for number in numbers]
@@ -382,6 +418,8 @@ class _Distribution:
             wait(list(self._running), timeout=_LOOK_PERIOD, return_when="FIRST_COMPLETED")
         except TimeoutError:
             return []
+        except CancelledError as error:
+            raise _lost() from error
         return [future for future in self._running if future.done()]
 
     def _taken(self, future: Any) -> list[Row]:
@@ -392,7 +430,6 @@ class _Distribution:
         SpaceRobotError
             The scheduler is gone, or a worker cannot fly at all.
         """
-        from distributed.client import FutureCancelledError
         from distributed.scheduler import KilledWorker
 
         numbers, _ = self._running.pop(future)
@@ -403,7 +440,7 @@ class _Distribution:
             rows: list[Row] = future.result()
         except KilledWorker:
             return self._mourned(numbers, alone)
-        except FutureCancelledError as error:
+        except CancelledError as error:
             raise _lost() from error
         except (ImportError, RuntimeError) as error:
             # So dask.distributed calls what the scheduler cannot load.
@@ -411,7 +448,7 @@ class _Distribution:
                 raise
             raise SpaceRobotError(
                 "The scheduler or a worker cannot load what flies "
-                f"({str(error).splitlines()[0]}): all of them need spacerobot_ros[campaign] "
+                f"({str(error).splitlines()[0]}): all of them need {_PACKAGE}[campaign] "
                 f"{__version__}."
             ) from error
         if not alone and rows:

@@ -51,20 +51,27 @@ class Started:
         assert found is not None
         return found[0]
 
-    def kill(self, number: signal.Signals = signal.SIGKILL) -> int:
-        """Send a signal, wait for the end, and return its code."""
-        os.kill(self.process.pid, number)
+    def kill(self, number: signal.Signals = signal.SIGKILL, *, all_of_it: bool = False) -> int:
+        """Send a signal, wait for the end, and return its code.
+
+        ``all_of_it``: to what it has started, too, as a terminal does.
+        """
+        (os.killpg if all_of_it else os.kill)(self.process.pid, number)
         return self.process.wait(timeout=_LONGEST)
 
 
 @contextmanager
-def started(folder: Path, *command: str) -> Iterator[Started]:
-    """Run a process of this Python while the block lasts."""
+def started(folder: Path, *command: str, path: Path | None = None) -> Iterator[Started]:
+    """Run a process of this Python while the block lasts; ``path`` is a folder of modules."""
+    environment = dict(os.environ)
+    if path is not None:
+        environment["PYTHONPATH"] = f"{path}:{environment.get('PYTHONPATH', '')}"
     log = folder / f"{command[0]}-{len(list(folder.glob('*.log')))}.log"
     with log.open("wb") as output:
         process = subprocess.Popen(
-            [sys.executable, "-m", *command], stdout=output, stderr=subprocess.STDOUT
-        )
+            [sys.executable, "-m", *command], stdout=output, stderr=subprocess.STDOUT,
+            env=environment, start_new_session=True,
+        )  # fmt: skip
         try:
             yield Started(process, log)
         finally:
@@ -87,16 +94,61 @@ def rows(folder: Path) -> list[dict[str, Any]]:
     return [{k: v for k, v in row.items() if not k.startswith(("wall_", "plan_"))} for row in found]
 
 
+SCHEDULER = ("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0",
+             "--no-dashboard", "--no-jupyter")  # fmt: skip
+ADDRESS = r"tcp://127\.0\.0\.1:\d+"
+
+
+def worker_of(address: str) -> tuple[str, ...]:
+    return ("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny",
+            "--no-dashboard", "--host", "127.0.0.1")  # fmt: skip
+
+
+def test_a_scheduler_that_goes_away_is_said_and_takes_no_flight_with_it(tmp_path: Path) -> None:
+    """No flight is taken for one that kills its worker."""
+    file, out = tmp_path / "many.yaml", tmp_path / "out"
+    file.write_text(yaml.safe_dump({"campaign": section(**GIVEN)}))
+    command = ("spacerobot_ros", "campaign", str(file), "--out", str(out), "--scheduler")
+    with started(tmp_path, *SCHEDULER) as scheduler:
+        address = scheduler.awaited(ADDRESS)
+        with started(tmp_path, *worker_of(address)) as worker:
+            worker.awaited("Registered to")
+            with started(tmp_path, *command, address) as run:
+                until(out, 10, run)
+                scheduler.kill()
+                assert run.process.wait(timeout=_LONGEST) == 2
+                assert run.log.read_text() == (
+                    "The scheduler is gone. What was flown is kept: the same command goes on from "
+                    "there.\n"
+                )
+    found = rows(out)
+    assert {row["outcome"] for row in found} == {"reached"}
+    numbers = [row["flight"] for row in found]
+    assert len(numbers) == len(set(numbers)) >= 10
+
+
+def test_a_worker_that_has_no_package_is_refused(tmp_path: Path) -> None:
+    file, out = tmp_path / "many.yaml", tmp_path / "out"
+    file.write_text(yaml.safe_dump({"campaign": section(**GIVEN)}))
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['spacerobot_ros'] = None\n")
+    command = ("spacerobot_ros", "campaign", str(file), "--out", str(out), "--scheduler")
+    with started(tmp_path, *SCHEDULER) as scheduler:
+        address = scheduler.awaited(ADDRESS)
+        with started(tmp_path, *worker_of(address), path=tmp_path) as worker:
+            worker.awaited("Registered to")
+            with started(tmp_path, *command, address) as run:
+                assert run.process.wait(timeout=_LONGEST) == 2
+                expected = rf"The worker at {ADDRESS} has no spacerobot_ros: install it there\.\n"
+                assert re.fullmatch(expected, run.log.read_text())
+
+
 def test_workers_and_campaigns_that_are_killed(tmp_path: Path) -> None:
     file = tmp_path / "many.yaml"
     file.write_text(yaml.safe_dump({"campaign": section(**GIVEN)}))
     out = tmp_path / "out"
-    scheduler = ("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0",
-                 "--no-dashboard", "--no-jupyter")  # fmt: skip
-    with started(tmp_path, *scheduler) as process:
-        address = process.awaited(r"tcp://127\.0\.0\.1:\d+")
-        worker = ("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny",
-                  "--no-dashboard", "--host", "127.0.0.1")  # fmt: skip
+    with started(tmp_path, *SCHEDULER) as process:
+        address = process.awaited(ADDRESS)
+        worker = worker_of(address)
         command = ("spacerobot_ros", "campaign", str(file), "--out", str(out), "--scheduler")
         with started(tmp_path, *worker) as first, started(tmp_path, *worker) as second:
             for each in (first, second):
@@ -163,7 +215,8 @@ def test_what_was_flown_is_kept_after_ctrl_c(tmp_path: Path) -> None:
     command = ("spacerobot_ros", "campaign", str(file), "--out", str(out), "--workers", "2")
     with started(tmp_path, *command) as run:
         until(out, 8, run)
-        assert run.kill(signal.SIGINT) == 130, run.log.read_text()
+        assert run.kill(signal.SIGINT, all_of_it=True) == 130, run.log.read_text()
+        assert "Traceback" not in run.log.read_text()
     numbers = [row["flight"] for row in rows(out)]
     assert len(numbers) >= 8
     assert len(numbers) == len(set(numbers))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.campaigns import campaign
 
+from spacerobot_ros.campaign import running
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
@@ -20,7 +21,7 @@ from spacerobot_ros.campaign.report import Results
 from spacerobot_ros.campaign.rerunning import TOLERANCE, largest_deviation, rerun_flight
 from spacerobot_ros.campaign.rows import ERROR, Row
 from spacerobot_ros.campaign.running import Progress, run_campaign
-from spacerobot_ros.errors import ParameterError, RecordingError
+from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 
 MASSES: dict[str, Any] = {
     "mass.*": {"norm": {"loc": 1.0, "scale": 0.03}},
@@ -186,6 +187,15 @@ def test_a_campaign_that_was_killed_while_it_began_begins_again(tmp_path: Path) 
     (tmp_path / ".scenario.yaml").write_text("half")
     (tmp_path / "scenario.yaml").write_text("whole")
     assert run_campaign(small(flights=1), tmp_path).done == 1
+
+
+def test_a_worker_of_another_version_flies_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = small(flights=1)
+    specification = running._Specification(made)
+    assert len(running.fly_task(specification, [_draw(made, 0)], "flights")) == 1
+    monkeypatch.setattr(running, "__version__", "9.9")
+    with pytest.raises(SpaceRobotError, match=r"A worker has spacerobot_ros 9\.9, and this"):
+        running.fly_task(specification, [_draw(made, 0)], "flights")
 
 
 @pytest.fixture
