@@ -50,8 +50,9 @@ _STATES = {
 def control_refusal(campaign: Campaign, *, asked: bool) -> str:
     """Return why lanes cannot fly a campaign of coordinated control, as a clause; empty if they do.
 
-    Thrusters that are on or off multiply rounding: of 1e-15 m at the start they make 1e-3 s at the
-    end. Flights in lanes are then not the very same, and are flown where they are ``asked`` for.
+    On/off thrusters amplify rounding: 1e-15 m at the start become 1e-4 m and 0.1 s at the end. So a
+    draw in lanes is another flight than that of the engine ``flights``, and is flown only where
+    lanes are ``asked`` for.
     """
     scenario = campaign.scenario
     plant = scenario.plant
