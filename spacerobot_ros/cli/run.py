@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from spacerobot_ros.cli.options import (
     write_json,
 )
 from spacerobot_ros.cli.progress import display
+from spacerobot_ros.termination import termination
 
 if TYPE_CHECKING:
     from spacerobot_ros.flight.scenario import Scenario
@@ -83,6 +85,9 @@ def command(
         write_json(json_file, result.summary)
     for line in (*_summary_lines(result.summary), *_published_lines(chosen, result.summary)):
         click.echo(line)
+    if report is not None and termination() is not None:
+        words = shlex.join(["spacerobot", "report", str(path), "--output", str(report)])
+        click.echo(f"report      none of what was interrupted: `{words}` makes one")
     end_if_requested()
     if report is not None:
         from spacerobot_ros.report import write_report

@@ -16,7 +16,7 @@ from spacerobot_ros.events import Event
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
-from spacerobot_ros.planning.execution.status import PlannerStatus, time_to_end
+from spacerobot_ros.planning.execution.status import PlannerStatus, manoeuvre_time
 from spacerobot_ros.simulation.commands import Refusal
 
 if TYPE_CHECKING:
@@ -135,12 +135,11 @@ class FlightArrays:
 
     @property
     def manoeuvre_time(self) -> float:
-        """Duration of the schedules for the goal that were flown, s; where the planner has not
-        counted them, because they were aborted, the time to their end; without any, from the first
-        state that a controller tracked to the end that it named.
+        """Duration of the schedules for the goal that were flown, s, as
+        :func:`~spacerobot_ros.planning.execution.status.manoeuvre_time` has it; without any, from
+        the first state that a controller tracked to the end that it named.
         """
-        planned = self.status.manoeuvre_time_s if isinstance(self.status, PlannerStatus) else 0.0
-        aborted = time_to_end(
+        planned = manoeuvre_time(
             (
                 (stamp_ns / 1e9, status)
                 for stamp_ns, status in self.statuses
@@ -153,7 +152,7 @@ class FlightArrays:
             for stamp_ns, status in self.statuses
             if isinstance(status, ControllerStatus)
         )
-        return planned or aborted or tracked or self.duration
+        return planned or tracked or self.duration
 
     @property
     def corrections(self) -> int:

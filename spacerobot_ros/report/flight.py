@@ -19,7 +19,12 @@ from spacerobot_ros.model.description import Array, Joint, Pose
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
 from spacerobot_ros.planning import METHODS, Goal, PoseError
-from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
+from spacerobot_ros.planning.execution.status import (
+    PlannerState,
+    PlannerStatus,
+    manoeuvre_time,
+    time_to_end,
+)
 from spacerobot_ros.report.events import FlightEvent
 from spacerobot_ros.report.signals import Cycles, Signal, find_cycles, nearest_rotvec
 from spacerobot_ros.report.solids import SolidRobot
@@ -316,9 +321,9 @@ class Flight:
 
     @property
     def manoeuvre_time(self) -> float | None:
-        """Duration of the schedules for the last goal that were flown, s, as the planner counts it,
-        or else :attr:`time_to_end`; of a controller, from the first state that it flew to the end
-        that it named.
+        """Duration of the schedules for the last goal that were flown, s, as
+        :func:`~spacerobot_ros.planning.execution.status.manoeuvre_time` has it; of a controller,
+        from the first state that it flew to the end that it named.
         """
         if not self.executing:
             return tracking_time(
@@ -326,18 +331,19 @@ class Flight:
                 for status in self.statuses
                 if isinstance(status.report, ControllerStatus)
             )
-        last = [status.report for status in self.statuses if status.state in _FOLLOWED][-1]
-        counted = last.manoeuvre_time_s if isinstance(last, PlannerStatus) else 0.0
-        return counted or self.time_to_end
+        return manoeuvre_time(self._planner_reports, self.end)
 
     @property
     def time_to_end(self) -> float | None:
         """Time from the first schedule for the last goal to its end, s, with what was waited in
         between; None where no schedule was flown.
         """
+        return time_to_end(self._planner_reports, self.end)
+
+    @property
+    def _planner_reports(self) -> list[tuple[float, PlannerStatus]]:
         reports = ((s.time, s.report) for s in self.statuses)
-        planned = ((time, report) for time, report in reports if isinstance(report, PlannerStatus))
-        return time_to_end(planned, self.end)
+        return [(time, report) for time, report in reports if isinstance(report, PlannerStatus)]
 
     @cached_property
     def drawn(self) -> SolidRobot | None:

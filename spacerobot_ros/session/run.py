@@ -24,7 +24,7 @@ from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.nodes.common.process import use_loopback_discovery, use_private_discovery
 from spacerobot_ros.nodes.plant.diagnostics import PROPELLANT
 from spacerobot_ros.planning import PoseError
-from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, manoeuvre_time
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.stack import InProcessStack, Stack
 from spacerobot_ros.termination import ended_on_request
@@ -156,8 +156,8 @@ def _summary(stack: Stack, wall_time: float) -> dict[str, Any]:
         "attitude_error_rad": error.angle,
         "sim_time_s": sim_time,
         "manoeuvre_time_s": (
-            planner.manoeuvre_time_s
-            or _time_to_end(robots, float(time[-1]))
+            _manoeuvre_time(robots, float(time[-1]))
+            or planner.manoeuvre_time_s
             or _tracking_time(robots)
             or sim_time
         ),
@@ -209,10 +209,10 @@ def _files(path: Path) -> list[Bag]:
     return [read_bag(part) for part in ([path] if path.exists() or not parts else parts)]
 
 
-def _time_to_end(robots: Sequence[RecordedRobot], end_s: float) -> float | None:
-    """Return how long the schedules for the last goal took with what was waited in between."""
+def _manoeuvre_time(robots: Sequence[RecordedRobot], end_s: float) -> float | None:
+    """Return how long the schedules for the last goal were flown, None where none was."""
     statuses = _statuses(robots, "planner/status", PlannerStatus.from_values)
-    return time_to_end(statuses, max(end_s, statuses[-1][0]) if statuses else end_s)
+    return manoeuvre_time(statuses, max(end_s, statuses[-1][0]) if statuses else end_s)
 
 
 def _tracking_time(robots: Sequence[RecordedRobot]) -> float | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -115,6 +116,19 @@ def test_a_flight_that_misses_its_goal_is_exit_1_and_the_sentence(
     result = run(monkeypatch, SUMMARY | missed, *GOAL)
     assert result.exit_code == 1
     assert result.stderr == "The goal is not reached.\n"
+
+
+def test_an_interrupted_flight_says_how_its_report_is_made(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from spacerobot_ros.cli import run as command
+
+    monkeypatch.setattr(command, "termination", lambda: object())
+    report = tmp_path / "ein Flug.html"
+    result = run(monkeypatch, SUMMARY, *GOAL, "--report", str(report))
+    line = result.stdout.removeprefix(LINES)
+    words = shlex.split(line.partition("`")[2].partition("`")[0])
+    assert words == ["spacerobot", "report", "out/a.mcap", "--output", str(report)]
 
 
 @pytest.mark.parametrize("state", ["reached", "failed"])

@@ -154,6 +154,9 @@ def test_a_flight_that_is_longer_than_allowed_is_interrupted() -> None:
     assert flight.outcome is Outcome.INTERRUPTED
     assert flight.duration == 2.0
     assert flight.sentence == "Interrupted after 2 s of simulated time."
+    ((began, schedule),) = flight.schedules
+    assert schedule.duration > 2.0
+    assert flight.manoeuvre_time == pytest.approx(2.0 - began / 1e9, abs=1e-9)
 
 
 def test_a_plant_that_latches_ends_the_flight(tmp_path: Path) -> None:

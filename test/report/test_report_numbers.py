@@ -299,6 +299,28 @@ def test_the_time_is_what_the_planner_counts_and_the_time_to_the_end_is_beside_i
     assert rows_of(found)["First schedule to the end"] == "1.5 s"
 
 
+def test_a_flight_that_was_cut_off_has_not_flown_the_rest_of_its_schedule(tmp_path: Path) -> None:
+    """Ctrl-C 0.5 s after the second of two schedules began, of which 39 s were left."""
+    first: dict[str, Any] = {"method": "a", "duration_s": 0.5, "manoeuvre_time_s": 0.5}
+    first["ends_at_s"] = 5.5
+    second = {**first, "duration_s": 39.5, "manoeuvre_time_s": 40.0, "ends_at_s": 45.5}
+    statuses = [
+        planner(PlannerState.EXECUTING, 5.0, **first),
+        planner(PlannerState.PLANNING, 5.5, manoeuvre_time_s=0.5, ends_at_s=5.5),
+        planner(PlannerState.EXECUTING, 6.0, **second),
+    ]
+    found = flight(tmp_path, statuses)
+    assert found.end == 1.5
+    assert found.manoeuvre_time == 1.0
+    # In the middle of planning nothing is left of the first.
+    found = flight(tmp_path, statuses[:2], name="planning.mcap")
+    assert found.manoeuvre_time == 0.5
+    # And what was flown to its end counts in full.
+    reached = planner(PlannerState.REACHED, 6.5, manoeuvre_time_s=40.0, ends_at_s=45.5)
+    found = flight(tmp_path, [*statuses, reached], name="reached.mcap")
+    assert found.manoeuvre_time == 40.0
+
+
 def test_a_goal_that_is_refused_in_flight_is_not_the_one_flown_to(tmp_path: Path) -> None:
     other = (9.0, 9.0, 9.0, *GOAL[3:])
     statuses = [

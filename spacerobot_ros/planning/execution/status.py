@@ -191,6 +191,38 @@ def _note(text: str) -> list[float] | float | str:
     return numbers[0] if len(numbers) == 1 else numbers
 
 
+def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
+    """Return the duration of the schedules for the last goal that were flown, s.
+
+    It is as the planner counts it, without what a flight that was cut off left of the last
+    schedule; where the planner has not counted it, as when it was aborted, :func:`time_to_end`.
+
+    Parameters
+    ----------
+    statuses, end_s
+        As of :func:`time_to_end`.
+
+    Returns
+    -------
+    float | None
+        None where no schedule was flown.
+    """
+    given = list(statuses)
+    flown = [
+        (time, status)
+        for time, status in given
+        if status.state is PlannerState.EXECUTING
+        or (status.state.decided and status.state is not PlannerState.REFUSED)
+    ]
+    if all(status.state is not PlannerState.EXECUTING for _, status in flown):
+        return None
+    began, last = flown[-1]
+    counted = last.manoeuvre_time_s
+    if last.state is PlannerState.EXECUTING:
+        counted -= max(0.0, last.duration_s - (end_s - began))
+    return counted if counted > 0.0 else time_to_end(given, end_s)
+
+
 def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
     """Return the time, s, from the beginning of the first schedule for the last goal to the end.
 
