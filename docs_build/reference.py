@@ -162,42 +162,32 @@ def command_line() -> str:
     for name in main.list_commands(context):
         command = main.get_command(context, name)
         assert command is not None
-        inner = click.Context(command, info_name=name, parent=context)
-        usage = " ".join(command.collect_usage_pieces(inner))
-        rows = [
-            (f"`{record[0]}`", record[1])
-            for parameter in command.get_params(inner)
-            if (record := parameter.get_help_record(inner)) is not None
-        ]
-        parts = [
-            f"## {name}",
-            inspect.cleandoc(command.help or "").replace("\f", ""),
-            f"```text\nspacerobot {name} {usage}\n```",
-            table(("option", "meaning"), rows),
-        ]
-        sections.append("\n\n".join(part for part in parts if part))
+        sections.append(_command("##", name, command, context))
         if isinstance(command, click.Group):
-            sections += _subcommands(command, inner)
+            inner = click.Context(command, info_name=name, parent=context)
+            sections += [
+                _command("###", f"{name} {below}", each, inner)
+                for below, each in command.commands.items()
+            ]
     return "\n\n".join(sections)
 
 
-def _subcommands(group: click.Group, context: click.Context) -> list[str]:
-    """Return a section for every command of a group."""
-    sections = []
-    for name, command in group.commands.items():
-        inner = click.Context(command, info_name=name, parent=context)
-        rows = [
-            (f"`{record[0]}`", record[1])
-            for parameter in command.get_params(inner)
-            if (record := parameter.get_help_record(inner)) is not None
-        ]
-        usage = " ".join(command.collect_usage_pieces(inner))
-        whole = f"{context.info_name} {name}"
-        sections.append(
-            f"### {whole}\n\n{inspect.cleandoc(command.help or '')}\n\n"
-            f"```text\nspacerobot {whole} {usage}\n```\n\n{table(('option', 'meaning'), rows)}"
-        )
-    return sections
+def _command(level: str, words: str, command: click.Command, parent: click.Context) -> str:
+    """Return the section of a command that is called by ``words``."""
+    context = click.Context(command, info_name=words.split()[-1], parent=parent)
+    usage = " ".join(command.collect_usage_pieces(context))
+    rows = [
+        (f"`{record[0]}`", record[1])
+        for parameter in command.get_params(context)
+        if (record := parameter.get_help_record(context)) is not None
+    ]
+    parts = [
+        f"{level} {words}",
+        inspect.cleandoc(command.help or "").replace("\f", ""),
+        f"```text\nspacerobot {words} {usage}\n```",
+        table(("option", "meaning"), rows),
+    ]
+    return "\n\n".join(part for part in parts if part)
 
 
 def python_api(package: str) -> str:

@@ -207,7 +207,9 @@ def test_meaningless_bytes_at_the_end_do_no_harm(tmp_path: Path) -> None:
         channel = writer.add_topic("/a", "sensor_msgs/msg/JointState")
         writer.write(channel, data + b"\xff" * 8, 1, 1)
         writer.write(channel, data, 2, 2)
-    for _, decoded in read_bag(tmp_path / "a.mcap").messages("/a"):
+    read = list(read_bag(tmp_path / "a.mcap").messages("/a"))
+    assert len(read) == 2
+    for _, decoded in read:
         assert decoded.position.tolist() == [1.0, 2.0]
         assert decoded.effort.tolist() == []
 

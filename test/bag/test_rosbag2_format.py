@@ -290,10 +290,12 @@ def test_any_file_name_survives_yaml(tmp_path: Path, name: str) -> None:
     with BagWriter(tmp_path / name):
         pass
     with (tmp_path / name).open("rb") as file:
-        for record in make_reader(file).iter_metadata():
-            metadata = yaml.safe_load(record.metadata["serialized_metadata"])
-            assert metadata["relative_file_paths"] == [name]
-            assert metadata["files"][0]["path"] == name
+        records = list(make_reader(file).iter_metadata())
+    assert records
+    for record in records:
+        metadata = yaml.safe_load(record.metadata["serialized_metadata"])
+        assert metadata["relative_file_paths"] == [name]
+        assert metadata["files"][0]["path"] == name
 
 
 def _record_at(file: Any, offset: int) -> Any:

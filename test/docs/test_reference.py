@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 
+import click
 import pytest
 
 from docs_build import reference
 from docs_build.hooks import prepared
-from spacerobot_ros.cli.main import main
+from spacerobot_ros.cli.main import COMMANDS, main
 from spacerobot_ros.nodes import (
     CoordinatedControlNode,
     FlightNode,
@@ -63,12 +64,20 @@ def test_parameters_are_documented_with_their_defaults(
 
 
 def test_every_command_and_option_is_documented() -> None:
-    page = reference.command_line()
-    for name, command in main.commands.items():
-        section = page.split(f"## {name}\n")[1].split("\n## ")[0]
+    headings = r"^#{2,3} (.+?)\n(.*?)(?=^#{2,3} |\Z)"
+    sections = dict(re.findall(headings, reference.command_line(), re.MULTILINE | re.DOTALL))
+    commands: dict[str, click.Command] = {}
+    for name in COMMANDS:
+        command = main.get_command(click.Context(main), name)
+        assert command is not None
+        commands[name] = command
+        if isinstance(command, click.Group):
+            commands |= {f"{name} {below}": each for below, each in command.commands.items()}
+    assert list(sections) == list(commands)
+    for words, command in commands.items():
         for parameter in command.params:
             for option in (*parameter.opts, *parameter.secondary_opts):
-                assert option in section or parameter.human_readable_name in section
+                assert option in sections[words] or parameter.human_readable_name in sections[words]
 
 
 def test_every_topic_is_documented() -> None:

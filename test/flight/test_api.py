@@ -180,6 +180,7 @@ def test_every_joint_of_a_plot_is_told_from_the_others() -> None:
     robot = load_robot(robot_file("quadruped"))
     joints = np.zeros((len(flight.time), 12))
     panels = replace(flight, robot=robot, q=joints, qdot=joints, effort=joints).plot().axes
+    assert len(panels) > 2
     for panel in panels[2:]:
         looks = [(line.get_color(), line.get_linestyle()) for line in panel.get_lines()]
         assert len(set(looks)) == len(looks) == 12

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from lifecycle_msgs.msg import State
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.ros_harness import Harness
@@ -66,6 +67,7 @@ def test_a_node_that_was_shut_down_ends_without_another_transition(
     plant.drain(harness.executor)
     plant.finalize()
     plant.finalize()
+    assert plant._is_in(State.PRIMARY_STATE_FINALIZED)
 
 
 def test_a_plant_in_real_time_rests_before_its_process_ends(harness: Harness) -> None:

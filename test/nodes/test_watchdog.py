@@ -145,6 +145,7 @@ def test_a_look_that_is_due_when_the_node_is_stopped_is_no_failure(harness: Harn
     liveness.configure(1.0)
     liveness.begin()
     liveness.end()
+    assert due
     for act in due:  # The executor had taken them up before they were destroyed.
         act()
 

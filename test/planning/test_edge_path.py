@@ -71,7 +71,9 @@ def test_scaled_by_its_excess_a_path_fits(areas: Array, longest: Array) -> None:
 
 @given(areas=areas_of_either_sign, longest=st.tuples(*[st.floats(0.1, 2.0)] * 3).map(np.array))
 def test_every_loop_lies_round_the_origin_and_closes(areas: Array, longest: Array) -> None:
-    for loop in edge_path(areas, longest).loops:
+    loops = edge_path(areas, longest).loops
+    assert len(loops)
+    for loop in loops:
         np.testing.assert_allclose(loop[0], loop[-1], atol=1e-15)
         np.testing.assert_allclose(loop.max(axis=0), -loop.min(axis=0), atol=1e-12)
 
