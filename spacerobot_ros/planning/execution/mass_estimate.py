@@ -95,7 +95,7 @@ class PathSensitivity:
         knots = len(path.time)
         ticks = (path.time / schedule.control_period).round().astype(int)
         shapes = schedule.positions[ticks]
-        R = np.array([matrix_from_quaternion(each) for each in path.quaternion])
+        R_WB = np.array([matrix_from_quaternion(each) for each in path.quaternion])
         # The model changes little from shape to shape: it is evaluated for some of them, and
         # interpolated in between.
         instants: Array = np.arange(knots, dtype=float)
@@ -103,11 +103,12 @@ class PathSensitivity:
         turns, centers = self._derivatives(shapes[called])
         by_joint = _interpolated(instants[:-1] + 0.5, called, turns)
         in_base = np.einsum("kjap,kj->kap", by_joint, np.diff(shapes, axis=0))
-        steps = (R[:-1] + R[1:]) / 2 @ in_base
+        steps = (R_WB[:-1] + R_WB[1:]) / 2 @ in_base
         turned = np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
-        # The centre of mass of the system stays where it is: r = r_cm - R c.
-        arms = [hat(A @ self._robot.center_of_mass(q)) for A, q in zip(R, shapes, strict=True)]
-        moved = np.array(arms) @ turned - R @ _interpolated(instants, called, centers)
+        # The centre of mass C of the system stays where it is: r_WB = r_WC - R_WB r_BC_B.
+        r_BC_W = [R @ self._robot.center_of_mass(q) for R, q in zip(R_WB, shapes, strict=True)]
+        arms = np.array([hat(each) for each in r_BC_W])
+        moved = arms @ turned - R_WB @ _interpolated(instants, called, centers)
         return np.concatenate([moved - moved[0], turned], axis=1)
 
 
