@@ -1,7 +1,8 @@
 """How large the package is, here and in other checkouts: ``make structure AGAINST=PATH``.
 
 Counted are lines, lines of code (without comments, docstrings and blank lines), modules (without
-the ``__init__`` of folders), and modules that exactly one other module imports.
+the ``__init__`` of folders), modules that exactly one other module imports, and the lines of what
+draws a robot.
 """
 
 from __future__ import annotations
@@ -11,10 +12,18 @@ import io
 import sys
 import tokenize
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 PACKAGE = "spacerobot_ros"
 ROOT = Path(__file__).resolve().parents[1]
+
+DRAWING = {
+    "robot in pictures": ("report/solids.py",),
+    "robot in pages": ("report/scene.py", "report/meshcat.py"),
+    "robot, shared by both": ("model/visuals.py",),
+}
+"""The modules that draw a robot; viewers take the shared one, too."""
 
 _NO_CODE = {
     *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE),
@@ -61,7 +70,14 @@ def structure(checkout: Path) -> dict[str, int]:
         "lines of code": sum(map(lines_of_code, texts.values())),
         "modules": len(modules),
         "modules imported once": sum(importers[module] == 1 for module in modules),
+        **{what: lines_of(names, checkout) for what, names in DRAWING.items()},
     }
+
+
+def lines_of(names: Sequence[str], checkout: Path = ROOT) -> int:
+    """Return how many lines those of some files of the package that are there have together."""
+    files = [checkout / PACKAGE / name for name in names]
+    return sum(len(file.read_text("utf-8").splitlines()) for file in files if file.exists())
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import json
 import keyword
 import os
 import re
+import shlex
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -239,3 +240,12 @@ def test_the_command_names_what_it_leaves_out_and_a_topic_once(tmp_path: Path) -
     result = CliRunner().invoke(main, [*words, "--topic", "said", "--topic", "/said"])
     assert result.exit_code == 0, result.output
     assert {each.name for each in (tmp_path / "one").iterdir()} == {"_columns.csv", "said.csv"}
+
+
+def test_the_command_that_a_cut_bag_asks_for_can_be_pasted(tmp_path: Path) -> None:
+    bag = written(tmp_path / "ein Flug's Ende.mcap", [("/t", 1, Bool(data=True))])
+    bag.path.write_bytes(bag.path.read_bytes()[:-40])
+    result = CliRunner().invoke(main, ["export", str(bag.path)])
+    assert result.exit_code == 2
+    command = result.stderr.partition("'spacerobot")[2].rpartition("' makes")[0]
+    assert shlex.split(f"spacerobot{command}") == ["spacerobot", "salvage", str(bag.path)]

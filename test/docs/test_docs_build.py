@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import pytest
 
+from docs_build import notebook
 from docs_build.blocks import blocks, replace_blocks
 from docs_build.diagrams import diagram
 from docs_build.equations import characters, with_equations
 from docs_build.hooks import prepared
+
+ROOT = Path(__file__).resolve().parents[2]
 
 PAGE = """Text.
 
@@ -98,3 +102,19 @@ def test_a_diagram_is_one_line_of_svg_that_asks_nobody() -> None:
     assert "\n" not in figure
     assert "new goal" in figure
     assert "<script" not in figure
+
+
+@pytest.mark.slow
+def test_the_notebook_shows_what_its_cells_make(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = notebook.executed(ROOT / "docs" / "notebooks" / "first_flight.py")
+    plan, flight = (each.partition("\n```")[0] for each in page.split("```text\n")[1:3])
+    # The paper's goal, in the least time that the limits of the scenario allow.
+    assert plan == "optimal: 39.45 s in 789 ticks"
+    assert flight.startswith("<Flight of sliding_masses by optimal: reached after 39.45 s")
+    assert page.count('<img alt="Output of the cell"') == 1
+    assert "<th>39.45</th>" in page
+    assert page.count("data:image/png;base64") == 1 + 12
+    assert (tmp_path / "out" / "first_flight.mcap").is_file()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from docs_build.structure import structure
+from docs_build.hooks import prepared
+from docs_build.structure import DRAWING, PACKAGE, ROOT, structure
 
 
 def test_lines_and_imports_are_counted(tmp_path: Path) -> None:
@@ -22,4 +23,19 @@ def test_lines_and_imports_are_counted(tmp_path: Path) -> None:
         "lines of code": 5,
         "modules": 3,
         "modules imported once": 1,
+        **dict.fromkeys(DRAWING, 0),
     }
+
+
+def test_what_draws_a_robot_is_counted_in_modules_that_are_there(tmp_path: Path) -> None:
+    files = [ROOT / PACKAGE / name for names in DRAWING.values() for name in names]
+    assert all(file.is_file() for file in files)
+    for file in files:
+        copy = tmp_path / PACKAGE / file.relative_to(ROOT / PACKAGE)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_text("x = 1\n" * 3)
+    counts = structure(tmp_path)
+    assert [counts[what] for what in DRAWING] == [3, 6, 3]
+    assert prepared("{{ lines report/solids.py model/visuals.py }}") == str(
+        sum(file.read_bytes().count(b"\n") for file in (files[0], files[-1]))
+    )
