@@ -28,6 +28,9 @@ SILENT_AFTER = 1.0
 _NEAR_LIMIT = 0.05
 """Share of its range that a joint is from its end when it counts as near."""
 
+_LONGEST_NAME = 21
+"""Characters of the name of a joint that are shown."""
+
 COLORS: Mapping[Verdict, Color] = {
     Verdict.UNCHECKED: (150, 150, 160),
     Verdict.PLANNING: (235, 190, 40),
@@ -204,7 +207,8 @@ def joints(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -> str
         if share is not None and not _NEAR_LIMIT <= share <= 1 - _NEAR_LIMIT:
             level = 2 if not 0.0 <= share <= 1.0 else 1
         bar = "no limits" if share is None else _bar(share, level)
-        cells = [escape(joint.name), f"{_fixed(q[i], 3)} {joint.unit}", bar]
+        name = f'<span title="{escape(joint.name)}">{escape(shortened(joint.name))}</span>'
+        cells = [name, f"{_fixed(q[i], 3)} {joint.unit}", bar]
         cells += [_of(qdot[i], fastest[i]), _of(effort[i], strongest[i])]
         rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
     titles = ("joint", "at", "in range", "rate", "effort")
@@ -214,6 +218,12 @@ def joints(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -> str
     style = "border-spacing:4px 2px;text-align:left;white-space:nowrap;font-size:.9em"
     table = f'<table style="{style}"><tr>{heads}</tr>{"".join(rows)}</table>'
     return padded(f'<div style="overflow-x:auto">{table}</div>')
+
+
+def shortened(name: str) -> str:
+    """Return a name as long as there is room for: a longer one loses its middle."""
+    half = (_LONGEST_NAME - 1) // 2
+    return name if len(name) <= _LONGEST_NAME else f"{name[:half]}…{name[-half:]}"
 
 
 def _share(value: float, lower: float, upper: float) -> float | None:

@@ -23,6 +23,7 @@ from spacerobot_ros.viewer.content import (
     quaternion_from_rpy,
     quiet,
     rpy_from_quaternion,
+    shortened,
     verdict,
 )
 from spacerobot_ros.viewer.port import Part
@@ -347,15 +348,16 @@ class _FinalShape:
 
     def _field(self, joint: Joint) -> Any:
         """Return a slider between the limits of a joint, or a number where it has none."""
-        label, low, high = f"{joint.name} ({joint.unit})", joint.limits.lower, joint.limits.upper
+        label, name = f"{shortened(joint.name)} ({joint.unit})", joint.name
+        low, high = joint.limits.lower, joint.limits.upper
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            return self._gui.add_number(label, 0.0, step=0.01)
+            return self._gui.add_number(label, 0.0, step=0.01, hint=name)
         step = 10.0 ** math.floor(math.log10((high - low) / 100))
         low, high = (
             round(whole(end / step) * step, 9)
             for whole, end in ((math.ceil, low), (math.floor, high))
         )
-        return self._gui.add_slider(label, low, high, step, min(max(0.0, low), high))
+        return self._gui.add_slider(label, low, high, step, min(max(0.0, low), high), hint=name)
 
     def robot_is_at(self, q: Array) -> None:
         """Take note of the positions (n,) of the robot."""

@@ -282,7 +282,7 @@ class _Plot:
         series: list[Any] = [{"label": "t (s)"}]
         for i, name in enumerate(names):
             turn, color = divmod(i, len(_COLORS))
-            look = {"label": name, "stroke": _COLORS[color], "width": 1.5}
+            look = {"label": content.shortened(name), "stroke": _COLORS[color], "width": 1.5}
             # Colors come again with dashes, which are shorter every time.
             series.append(look | ({"dash": (max(12 // turn, 2), 4)} if turn else {}))
         faint = {"stroke": f"{_AXIS}33"}

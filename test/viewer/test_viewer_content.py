@@ -16,6 +16,7 @@ from spacerobot_ros.control.status import CommandReport, ControllerState, Contro
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.rotations import matrix_from_quaternion, matrix_from_rpy
+from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
@@ -120,8 +121,6 @@ def test_what_nodes_say_is_no_html() -> None:
     assert "&lt;img" in texts[0]
     assert f"Fault: {escape(evil)}" in texts[0]
     assert all("<img" not in text for text in texts)
-    from spacerobot_ros.model.urdf import parse_robot
-
     zeros = np.zeros(3)
     table = content.joints(parse_robot(urdf), zeros, zeros, zeros)
     assert "a&lt;b&gt;c" in table
@@ -227,3 +226,15 @@ def test_a_goal_that_is_carried_along_stays_where_it_is_beside_the_base() -> Non
     moved = carried(tool, before, after)
     np.testing.assert_allclose(moved[:3], [5.0, 7.0, 5.5], atol=1e-12)
     np.testing.assert_allclose(moved[3:], quarter, atol=1e-12)
+
+
+def test_long_names_of_joints_have_room() -> None:
+    assert content.shortened("shoulder_yaw") == "shoulder_yaw"
+    long = [f"the_very_long_name_of_the_shoulder_joint_{number}" for number in range(12)]
+    short = [content.shortened(name) for name in long]
+    assert max(map(len, short)) == 21
+    assert len(set(short)) == 12, "they are told apart by their ends"
+    robot = load_robot(robot_file("three_joint_arm"))
+    urdf = robot.urdf.replace(f'"{robot.joint_names[0]}"', f'"{long[0]}"')
+    table = content.joints(parse_robot(urdf), *np.zeros((3, 3)))
+    assert f'title="{long[0]}">{short[0]}<' in table

@@ -14,6 +14,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log as RosoutLog
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, String
@@ -436,3 +437,21 @@ def test_nodes_that_are_gone_are_shown_no_longer(harness: Harness) -> None:
     assert look().planner == idle
     beat("/replay", Pulse.ACTIVE, Role.REPLAY)
     assert look().replay == status
+
+
+def test_the_log_has_the_warnings_of_its_own_stack(harness: Harness) -> None:
+    viewers = [
+        harness.add(
+            ViewerNode(
+                context=harness.context,
+                namespace=namespace,
+                parameter_overrides=[Parameter("port", value=0)],
+            )
+        )
+        for namespace in ("/a/b", "")
+    ]
+    for viewer in viewers:
+        for name in ("a.b.planner", "a.bc.planner", "other.planner"):
+            viewer._on_log(RosoutLog(level=30, name=name, msg=f"{name} warns."))
+    logs = [[notice.source for notice in each._page._log._notices] for each in viewers]
+    assert logs == [["a.b.planner"], ["other.planner", "a.bc.planner", "a.b.planner"]]

@@ -313,6 +313,10 @@ class ViewerNode(FlightNode):
                     self._ask(key)
 
     def _on_log(self, message: RosoutLog) -> None:
+        # The topic is the same in all namespaces, and loggers have dots for slashes.
+        own = self.get_namespace().strip("/").replace("/", ".")
+        if own and not message.name.startswith(f"{own}."):
+            return  # Of another stack.
         if message.level >= _WARNING and message.name != self.get_logger().name:
             level = 1 if message.level == _WARNING else 2
             self._note(message.msg, level, message.name)
