@@ -40,7 +40,7 @@ def viewing(
 ) -> Iterator[None]:
     """Have a viewer run while something else does; ``show`` is given the line with its address.
 
-    A viewer that ends by itself ends nothing else.
+    A viewer that ends by itself ends nothing else; that it did is shown in the end.
 
     Parameters
     ----------
@@ -79,9 +79,11 @@ def viewing(
         yield_to_flight(process.pid)
         try:
             show(_announcement(process, log))
-            for line in log.read_text("utf-8", errors="replace").splitlines():
+            for line in _lines(log):
                 show(line)  # Of an address that others reach.
             yield
+            if process.poll() is not None:
+                show(f"The viewer had ended before: {(_lines(log) or ['it was killed.'])[-1]}")
         finally:
             _end(process)
 
@@ -95,6 +97,11 @@ def yield_to_flight(pid: int) -> None:
         Path(f"/proc/{pid}/autogroup").write_text(str(_NICENESS), "ascii")
 
 
+def _lines(log: Path) -> list[str]:
+    """Return what the viewer has written to standard error."""
+    return log.read_text("utf-8", errors="replace").strip().splitlines()
+
+
 def _announcement(process: subprocess.Popen[bytes], log: Path) -> str:
     """Return the line that the viewer writes once its page is there."""
     assert process.stdout is not None
@@ -104,7 +111,7 @@ def _announcement(process: subprocess.Popen[bytes], log: Path) -> str:
         if ready:
             more = os.read(process.stdout.fileno(), 4096)
             if not more:
-                lines = log.read_text("utf-8", errors="replace").strip().splitlines()
+                lines = _lines(log)
                 raise SpaceRobotError(lines[-1] if lines else "The viewer has ended at its start.")
             text += more
         elif time.monotonic() > deadline:

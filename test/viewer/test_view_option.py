@@ -17,6 +17,7 @@ from support.chromium import browser, chromium
 from support.viewer_page import ROOT, Page
 
 from spacerobot_ros.cli.main import main
+from spacerobot_ros.session import viewing
 from spacerobot_ros.session.viewing import yield_to_flight
 
 COMMAND = (sys.executable, "-m", "spacerobot_ros.cli.main")
@@ -40,6 +41,28 @@ def test_the_viewer_gives_way_to_what_flies_within_its_session_and_among_session
                 assert int(text.split()[-1]) > 0
         finally:
             process.kill()
+
+
+def test_a_viewer_that_has_ended_by_itself_is_mentioned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "short_viewer.py").write_text(
+        "import os, sys\n"
+        "print('viewer      http://127.0.0.1:1/', os.getpid(), flush=True)\n"
+        "while not os.path.exists('end'): pass\n"
+        "sys.exit('It has lost its way.')\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(viewing, "_CHILD", "short_viewer")
+    said: list[str] = []
+    with viewing.viewing({}, said.append):
+        Path("end").touch()
+        stat = Path("/proc", said[0].split()[-1], "stat")
+        end = time.monotonic() + 20.0
+        while stat.read_text().split()[2] != "Z":
+            assert time.monotonic() < end
+    assert said[1:] == ["The viewer had ended before: It has lost its way."]
 
 
 @contextmanager
