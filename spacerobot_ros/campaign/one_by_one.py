@@ -26,6 +26,7 @@ from spacerobot_ros.model.robot_source import BelievedRobotConfig, RobotConfig, 
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.registry import build_method
+from spacerobot_ros.termination import child_options
 
 
 class _OneByOneEngine(ABC):
@@ -190,15 +191,22 @@ class RosEngine(_OneByOneEngine):
         began = time.perf_counter()
         with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
             bag = Path(folder, "flight.mcap")
-            self._run(flight.finished().scenario, Path(folder, "draw.yaml"), bag)
+            scenario = flight.finished().scenario
+            self._run(scenario, Path(folder, "draw.yaml"), bag, campaign.longest)
             flown = recorded_flight(bag)
+        if flown.duration > campaign.longest:  # The stack looks five times a second of wall time.
+            sentence = f"Interrupted after {flown.duration:.6g} s of simulated time."
+            flown = replace(flown, outcome=Outcome.INTERRUPTED, sentence=sentence)
         return replace(flown, wall_time=time.perf_counter() - began)
 
-    def _run(self, scenario: Scenario, file: Path, bag: Path) -> None:
+    def _run(self, scenario: Scenario, file: Path, bag: Path, longest: float) -> None:
         """Fly a scenario in another process: signals and the contexts of ROS are a process's."""
         file.write_text(scenario_text(scenario), encoding="utf-8")
         command = [sys.executable, "-m", "spacerobot_ros", "run", str(file), "--bag", str(bag)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        command += ["--longest", repr(longest)]
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, **child_options()
+        )
         if not bag.exists():
             lines = (done.stderr or done.stdout).strip().splitlines() or ["it left no bag"]
             raise SpaceRobotError(f"spacerobot run ended with {done.returncode}: {lines[-1]}")

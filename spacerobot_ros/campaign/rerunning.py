@@ -12,6 +12,7 @@ from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.rows import LANES, Row
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.recorded import recorded_flight
 
 TOLERANCE = 1e-9
@@ -34,9 +35,8 @@ class Rerun:
         What the dataset says became of the goal; empty where it does not have the flight.
     bag
         Where its bag is.
-    comparable
-        Whether the flight is to be that of the dataset: thrusters that are on or off multiply the
-        rounding by which lanes differ from the stack.
+    note
+        Why it need not be the flight in the dataset, number for number; empty: it is to be.
     """
 
     row: Row
@@ -44,12 +44,12 @@ class Rerun:
     at: str
     outcome: str
     bag: Path
-    comparable: bool = True
+    note: str = ""
 
     @property
     def same(self) -> bool:
         """Whether it is the flight in the dataset, not known there, or not comparable."""
-        if self.deviation is None or not self.comparable:
+        if self.deviation is None or self.note:
             return True
         return self.outcome == self.row.outcome and self.deviation <= TOLERANCE
 
@@ -70,8 +70,10 @@ class Rerun:
             where = f" ({self.at})" if self.at else ""
             deviation = f"largest deviation {self.deviation:.2g}{where}"
             lines.append(f"dataset     {self.outcome}; {deviation}")
-        if not self.comparable:
-            lines.append("It was flown in lanes: thrusters that are on or off multiply rounding.")
+        else:
+            lines.append("dataset     has no such flight yet")
+        if self.note:
+            lines.append(self.note)
         return lines
 
 
@@ -96,15 +98,20 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
             f"flight {number}."
         )
     draw = draws[number]
-    run_scenario(drawn_flight(campaign, draw).finished().scenario, bag)
+    scenario = drawn_flight(campaign, draw).finished().scenario
+    run_scenario(scenario, bag, longest=campaign.longest)
     row = Row.of(campaign, draw, recorded_flight(bag), "ros")
     known = known_flight(dataset, campaign, number)
     if known is None:
         return Rerun(row, None, "", "", bag)
     outcome, engine, metrics = known
     deviation, at = largest_deviation(metrics, row.metrics)
-    comparable = engine != LANES or not campaign.scenario.plant.thrusters
-    return Rerun(row, deviation, at, outcome, bag, comparable)
+    note = ""
+    if engine == LANES and campaign.scenario.plant.thrusters:
+        note = "It was flown in lanes: thrusters that are on or off multiply rounding."
+    elif outcome == Outcome.INTERRUPTED.value:
+        note = "It was interrupted: the stack flies on for up to a fifth of a second of wall time."
+    return Rerun(row, deviation, at, outcome, bag, note)
 
 
 def known_flight(

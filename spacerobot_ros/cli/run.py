@@ -49,6 +49,13 @@ if TYPE_CHECKING:
     metavar="[FACTOR]",
     help="Run on the wall clock, FACTOR times as fast (1 without a number).",
 )
+@click.option(
+    "--longest",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=math.inf,
+    metavar="SECONDS",
+    help="Simulated time after which the flight is interrupted.",
+)
 @click.option("--processes", is_flag=True, help="Give each node a process of its own.")
 @view_option
 def command(
@@ -60,6 +67,7 @@ def command(
     json_file: Path | None,
     report: Path | None,
     realtime: float | None,
+    longest: float,
     processes: bool,
     view: bool,
 ) -> None:
@@ -79,7 +87,7 @@ def command(
         raise click.UsageError("--view needs --realtime: what is flown in lockstep is over soon.")
     path = bag or free_name(Path("out") / f"{chosen.name}.mcap")
     with viewing_if(view, chosen.parameters("viewer")), display(chosen.name) as shown:
-        result = run_scenario(chosen, path, shown.fly, processes=processes)
+        result = run_scenario(chosen, path, shown.fly, processes=processes, longest=longest)
     path = Path(result.summary["bag"])
     if json_file is not None:
         write_json(json_file, result.summary)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -79,11 +80,17 @@ def make_stack(
 
 
 def run_scenario(
-    scenario: Scenario, bag: Path, progress: Progress | None = None, *, processes: bool = False
+    scenario: Scenario,
+    bag: Path,
+    progress: Progress | None = None,
+    *,
+    processes: bool = False,
+    longest: float = math.inf,
 ) -> RunResult:
     """Fly a scenario from its initial state to its goal, in this process.
 
-    ``processes`` gives each node a process of its own instead.
+    ``processes`` gives each node a process of its own instead. A flight of ``longest`` s of
+    simulated time and more is interrupted at one of the looks at it, five a second of wall time.
 
     SIGINT, SIGTERM and SIGHUP end the flight early; the flight until then is recorded and summed
     up. Before it has begun they raise what they would without it.
@@ -108,7 +115,7 @@ def run_scenario(
                     if progress is not None:
                         with suppress(OSError):  # A closed terminal ends no flight.
                             progress(stack.time_ns / 1e9, stack.client.ends_at or time_limit)
-                    return stopped()
+                    return stopped() or stack.time_ns / 1e9 >= longest
 
                 stack.spin(look)
                 wall_time = time.perf_counter() - began

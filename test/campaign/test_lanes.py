@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 from support.campaigns import campaign
 
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
+from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.engines import chosen_engine
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.rerunning import TOLERANCE, largest_deviation
 from spacerobot_ros.campaign.rows import Row
+from spacerobot_ros.campaign.running import run_campaign
 from spacerobot_ros.errors import SpaceRobotError
 
 DISPERSED: dict[str, Any] = {
@@ -158,6 +161,13 @@ def test_draws_that_are_no_robot_and_no_number_end_no_other_flight() -> None:
     assert 0 < len(weightless) < 6
     assert set(weightless) == {"All bodies of the robot together weigh nothing."}
     assert {row.engine for row in lanes.values()} == {"lanes"}
+
+
+def test_control_in_lanes_is_flown_in_this_process_too(tmp_path: Path) -> None:
+    """Where no workers take the draws apart, lanes do."""
+    end = run_campaign(controlled(flights=3, longest=0.2), tmp_path)
+    assert end.done == 3
+    assert Dataset(tmp_path).table()["engine"].to_pylist() == ["lanes"] * 3
 
 
 def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:

@@ -216,6 +216,37 @@ def test_rows_flown_again_through_ros_are_the_same(tmp_path: Path, count: int) -
         assert again.deviation is not None
         assert again.deviation < TOLERANCE
         assert again.row.draw.values["mass.mass_1"] != 1.0
+    if count == 1:
+        few = tmp_path / "few"
+        run_campaign(made, few, stopped=lambda: True)
+        again = rerun_flight(few, 0, tmp_path / "again.mcap")
+        assert again.lines[-1] == "dataset     has no such flight yet"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("own_domain")
+def test_the_stack_ends_flights_that_are_too_long(tmp_path: Path) -> None:
+    """Its controller would try for an hour; 4 s are over before the stack looks once."""
+    section = {
+        "scenario": "coordinated_control",
+        "longest": 4.0,
+        "flights": 1,
+        "set": {
+            "coordinated_control.time_limit": 3600.0,
+            "coordinated_control.settle_time": 3000.0,
+        },
+    }
+    made = parse_campaign("endless", section)
+    run_campaign(made, tmp_path)
+    (row,) = rows(tmp_path)
+    assert (row["outcome"], row["duration_s"]) == ("interrupted", 4.0)
+    again = rerun_flight(tmp_path, 0, tmp_path / "0.mcap")
+    assert again.same
+    assert again.lines[-1].startswith("It was interrupted")
+    assert 4.0 <= again.row.metrics["duration_s"] < 1000.0
+    (there,) = RosEngine().fly(made, [_draw(made, 0)], lambda: False)
+    assert there.outcome == "interrupted"
+    assert not there.passed
 
 
 @pytest.mark.slow
