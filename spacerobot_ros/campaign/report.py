@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import ScalarFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from spacerobot_ros import __version__
 from spacerobot_ros.campaign.config import Campaign, Criterion, meets
@@ -40,12 +40,18 @@ from spacerobot_ros.output_files import write_output
 from spacerobot_ros.report.style import FAINT, INK, PALETTE
 
 _WORST = 10
+_FAR = 100.0
+"""Standard deviations beyond which distances from a bound make no difference."""
+
 _SHOWN = 6
 """Metrics with figures of their own."""
 
 Flags = npt.NDArray[np.bool_]
 
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
+_SHARES = (0.01, 0.5, 0.99)
+"""Shares of all draws below the values that tell what a distribution is."""
 
 _TEXTS = ("outcome", "reason", "engine", "fallback", "versions")
 
@@ -165,13 +171,18 @@ class Results:
         return sorted(found, key=lambda each: -each.strength)
 
     def worst(self) -> list[int]:
-        """Return the rows of the worst flights: those that were not flown or did not pass first."""
-        badness = np.zeros(len(self))
+        """Return the rows of the worst flights: those that were not flown or did not pass first.
+
+        Flights that pass are as bad as they are near a bound, in standard deviations.
+        """
+        badness = np.full(len(self), -_FAR)
         for criterion in self.campaign.criteria:
             x = self.columns[criterion.metric]
-            spread = np.nanstd(x) or 1.0
+            spread = x[np.isfinite(x)].std() if np.isfinite(x).any() else 1.0
+            spread = spread or 1.0
             over = np.maximum(x - criterion.maximum, criterion.minimum - x) / spread
-            badness = np.fmax(badness, np.where(np.isfinite(over), over, -np.inf))
+            # A metric that is missing is beyond its bounds.
+            badness = np.maximum(badness, np.clip(np.nan_to_num(over, nan=_FAR), -_FAR, _FAR))
         if not self.campaign.criteria:
             badness = np.nan_to_num(self.columns["position_error_m"])
         badness += 1e6 * (np.array(self.columns["outcome"]) != "reached")
@@ -375,6 +386,8 @@ def _outcomes(results: Results) -> str:
 
 
 def _percentiles(results: Results) -> str:
+    if not results.shown:
+        return '<p class="missing">No flight has any metric.</p>'
     rows = []
     for name, values in results.metrics().items():
         there = values[np.isfinite(values)]
@@ -480,18 +493,26 @@ def _convergence(results: Results) -> str:
         line = [percentiles(values[:k])[PERCENTILES.index(95.0)] / final for k in at]
         axes[1].plot(at, line, color=PALETTE[i], label=name)
     axes[1].set_ylabel("95 percentile over its last value")
-    axes[1].legend(fontsize=7, frameon=False)
+    if results.shown:
+        axes[1].legend(fontsize=7, frameon=False)
     for panel in axes:
         panel.set_xlabel("flights")
         panel.set_xscale("log")
-        panel.xaxis.set_major_formatter(ScalarFormatter())
+        panel.set_xlim(0.9 * at[0], 1.1 * at[-1])
+        panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        panel.xaxis.set_minor_formatter(NullFormatter())
     return picture(figure, "convergence", "How the numbers settle with the number of flights.")
 
 
 def _dispersed(campaign: Campaign) -> str:
-    rows = [
-        [each.name, str(each.distribution), each.target.unit or ""] for each in campaign.dispersions
-    ]
+    rows = []
+    for each in campaign.dispersions:
+        numbers = [""] * len(_SHARES)
+        if not each.distribution.choices:
+            numbers = [f"{value:.4g}" for value in each.distribution.at(np.array(_SHARES))]
+        rows.append([each.name, str(each.distribution), each.target.unit or "", *numbers])
     if not rows:
         return '<p class="missing">Nothing but the noise: every flight has another seed.</p>'
-    return table(["what", "distribution", "unit"], rows, "dispersed")
+    head = ["what", "distribution", "unit", *(f"{100 * share:g} %" for share in _SHARES)]
+    return table(head, rows, "dispersed")

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from html import unescape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy import stats
 from support.campaigns import campaign
 from support.chromium import browser, chromium
 
+from spacerobot_ros.campaign import report
 from spacerobot_ros.campaign.comparing import write_comparison
 from spacerobot_ros.campaign.config import Campaign, passed
 from spacerobot_ros.campaign.dataset import Dataset
@@ -99,6 +102,25 @@ def test_what_grows_to_both_sides_is_found(tmp_path: Path) -> None:
     assert [errors[row] for row in worst] == sorted(errors, reverse=True)[:10]
 
 
+def test_the_worst_flights_that_pass_are_those_next_to_their_bounds(tmp_path: Path) -> None:
+    """Flights that did not pass are before them, and those that were not flown before all."""
+    loose = {"position_error_m": {"max": 0.048}, "manoeuvre_time_s": {"min": 1.0}}
+    made = campaign(disperse=MASSES, flights=40, seed=8, criteria=loose)
+    results = Results.of(filled(tmp_path, made, lambda draw: 0.8 * bowl(draw)))
+    assert results.passed.all()
+    errors = results.columns["position_error_m"]
+    assert [errors[row] for row in results.worst()] == sorted(errors, reverse=True)[:10]
+    mixed = campaign(disperse=MASSES, flights=43, seed=8, criteria=loose)
+    dataset = Dataset(tmp_path)
+    dataset.begin(mixed)
+    draws = Draws(mixed)
+    bad = {"position_error_m": 0.5, "manoeuvre_time_s": 4.0}
+    dataset.add([Row(draws[40], "error", "."), Row(draws[41], "reached", ".", bad)])
+    dataset.add([Row(draws[42], "failed", ".", {**bad, "position_error_m": 0.06})])
+    dataset.close()
+    assert Results.of(tmp_path).worst()[:3] == [40, 42, 41]
+
+
 def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
     """The second one is 2 mm better on the average, and much alike from draw to draw."""
     made = campaign(disperse=MASSES, flights=120, seed=8, criteria=CRITERIA)
@@ -143,6 +165,53 @@ def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
     four = filled(tmp_path / "four", other, bowl)
     with pytest.raises(ParameterError, match="do not have the same draws: 'seed' is 8 and 9"):
         write_comparison((one, four), tmp_path / "no.html")
+
+
+@pytest.mark.parametrize("count", [1, 24, 10_000])
+def test_counts_below_the_convergence_are_plain_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
+    """As figures do not read formulas, a label such as 2 times a power of ten would be one."""
+    labels: list[str] = []
+
+    def seen(figure: Figure, name: str, caption: str) -> str:
+        figure.draw_without_rendering()
+        for axes in figure.axes:
+            texts = [*axes.get_xticklabels(), *axes.get_xticklabels(minor=True)]
+            low, high = axes.get_xlim()
+            labels.extend(
+                text.get_text() for text in texts if low <= text.get_position()[0] <= high
+            )
+        return ""
+
+    few = campaign(disperse=MASSES, flights=min(count, 24), seed=8, criteria=CRITERIA)
+    results = Results.of(filled(tmp_path, few, bowl))
+    many = np.resize(np.arange(len(results)), count)
+    columns = {
+        name: values[many] if isinstance(values, np.ndarray) else values
+        for name, values in results.columns.items()
+    }
+    monkeypatch.setattr(report, "picture", seen)
+    report._convergence(replace(results, columns=columns, numbers=many))
+    assert any(labels)
+    assert all(re.fullmatch(r"\d*", label) for label in labels), labels
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_flights_that_all_failed_have_a_report(tmp_path: Path, count: int) -> None:
+    """And so has a single one, without a warning."""
+    negative = {"mass": {"norm": {"loc": -1.0, "scale": 0.01}}}
+    made = campaign(disperse=negative, flights=count, criteria=CRITERIA)
+    dataset = Dataset(tmp_path)
+    dataset.begin(made)
+    dataset.add([Row(draw, "error", "The mass is negative.") for draw in Draws(made)])
+    dataset.close()
+    lines = write_campaign_report(tmp_path, tmp_path / "report.html")
+    assert lines[0].startswith(f"success     0 % (0 of {count};")
+    text = (tmp_path / "report.html").read_text()
+    assert "No flight has any metric." in text
+    assert "The mass is negative." in text
 
 
 @pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with")

@@ -163,21 +163,33 @@ def test_what_the_command_line_changes_reaches_the_flight(
 
     taken: list[Any] = []
 
-    def fly(scenario: Any, bag: Path, progress: Any, *, processes: bool) -> RunResult:
-        taken[:] = [scenario, bag, processes]
+    def fly(
+        scenario: Any, bag: Path, progress: Any, *, processes: bool, longest: float
+    ) -> RunResult:
+        taken[:] = [scenario, bag, processes, longest]
         return RunResult(SUMMARY)
 
     monkeypatch.setattr(flights, "run_scenario", fly)
     monkeypatch.chdir(tmp_path)
     runner = CliRunner()
     runner.invoke(main, ["run", "sliding_masses"])
-    scenario, bag, processes = taken
+    scenario, bag, processes, longest = taken
     assert (str(bag), processes, scenario.lockstep) == ("out/sliding_masses.mcap", False, True)
+    assert longest == float("inf")
     words = ["--goal", *"0120001", "--goal-rotvec", "0", "0", "1", "--realtime", "--processes"]
-    words += ["--bag", "b.mcap", "--set", "plant.tick_rate=50", "--method", "lie_bracket"]
+    words += [
+        "--longest",
+        "7.5",
+        "--bag",
+        "b.mcap",
+        "--set",
+        "plant.tick_rate=50",
+        "--method",
+        "lie_bracket",
+    ]
     runner.invoke(main, ["run", "sliding_masses", *words])
-    scenario, bag, processes = taken
-    assert (str(bag), processes) == ("b.mcap", True)
+    scenario, bag, processes, longest = taken
+    assert (str(bag), processes, longest) == ("b.mcap", True, 7.5)
     assert scenario.plant.time_mode == "realtime"
     assert scenario.plant.real_time_factor == 1.0
     assert scenario.plant.tick_rate == 50.0
