@@ -79,7 +79,7 @@ def robot_file(name: str, beside: Path | None = None) -> Path:
             return folder / name
     if any((folder / name).is_dir() for folder in folders):
         raise ParameterError(f"'{name}' is a folder; name the URDF file in it.")
-    nearby = [path.name for path in Path(name).parent.glob("*") if is_path(path.name)]
+    nearby = sorted(path.name for path in Path(name).parent.glob("*") if is_path(path.name))
     nearby += resource_names("urdf", ".urdf")
     raise ParameterError(
         f"There is no robot '{name}': there is no such URDF file."
