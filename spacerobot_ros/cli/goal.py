@@ -40,15 +40,14 @@ def command(
         raise click.UsageError("A goal is X Y Z, or X Y Z QX QY QZ QW.")
     if rotvec and rpy_deg:
         raise click.UsageError("The attitude is given twice, in radians and in degrees.")
-    from spacerobot_ros.flight.scenario import goal_from_rotvec, goal_from_rpy
     from spacerobot_ros.planning import Goal
 
     wanted = Goal.checked(pose[:3], pose[3:] or (0.0, 0.0, 0.0, 1.0))
     if rotvec:
         note_large_angles(rotvec, "--rpy-deg")
-        wanted = goal_from_rotvec(pose[:3], rotvec)
+        wanted = Goal.from_rotvec(pose[:3], rotvec)
     if rpy_deg:
-        wanted = goal_from_rpy(pose[:3], rpy_deg)
+        wanted = Goal.from_rpy(pose[:3], rpy_deg)
     from spacerobot_ros.flight.arrays import Outcome
     from spacerobot_ros.session.live import send_goal
 

@@ -17,7 +17,6 @@ from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.flight.parameter_files import CONFIGS
 from spacerobot_ros.flight.scenario import (
     Scenario,
-    goal_from_rotvec,
     load_scenario,
     scenario_names,
     scenario_of,
@@ -195,7 +194,7 @@ def _goal(
         given = Goal.checked(_numbers(position, "position"), made.quaternion)
         made = replace(made, position=given.position)
     if rotvec is not None:
-        given = goal_from_rotvec(made.position.tolist(), _numbers(rotvec, "rotvec"))
+        given = Goal.from_rotvec(made.position.tolist(), _numbers(rotvec, "rotvec"))
         made = replace(made, quaternion=given.quaternion)
     return made
 

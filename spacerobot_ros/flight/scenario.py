@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from spacerobot_ros.control.config import ControllerConfig
@@ -23,11 +22,6 @@ from spacerobot_ros.flight.parameter_files import (
     sections_of,
 )
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
-from spacerobot_ros.model.rotations import (
-    matrix_from_rpy,
-    quaternion_from_matrix,
-    quaternion_from_rotvec,
-)
 from spacerobot_ros.parameters import Value, configured, declared, reconfigured, values_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -47,9 +41,6 @@ COMMANDERS = ("planner", "coordinated_control")
 
 _OF_EVERY_NODE = ("autostart", "use_sim_time")
 """Parameters that a file may give a node beside those that its configuration declares."""
-
-_LARGEST_ANGLE = 2e6 * np.pi
-"""A million turns: beyond them the digits of an angle are not its attitude's any more, rad."""
 
 _GOALS = ("goal", "end_effector_goal")
 _KEYS = (
@@ -353,10 +344,10 @@ class Scenario:
         if rotvec is not None and rpy_deg is not None:
             raise GoalError("The attitude of the goal is given twice, in radians and in degrees.")
         if rotvec is not None:
-            given = goal_from_rotvec(goal.position.tolist(), rotvec)
+            given = Goal.from_rotvec(goal.position.tolist(), rotvec)
             goal = replace(goal, quaternion=given.quaternion)
         if rpy_deg is not None:
-            given = goal_from_rpy(goal.position.tolist(), rpy_deg)
+            given = Goal.from_rpy(goal.position.tolist(), rpy_deg)
             goal = replace(goal, quaternion=given.quaternion)
         if goal is self.goal:
             return self
@@ -511,40 +502,6 @@ def scenario_names() -> list[str]:
     return [*resource_names("config", ".yaml"), *(f"faults/{name}" for name in faults)]
 
 
-def goal_from_rotvec(position: Sequence[float], rotvec: Sequence[float]) -> Goal:
-    """Return the goal at a position (m) with the attitude ``exp(hat(rotvec))`` (rad).
-
-    Raises
-    ------
-    GoalError
-        It is no goal, or the rotation vector is not three numbers of at most a million turns.
-    """
-    try:
-        vector = np.asarray(rotvec, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        vector = np.full(3, np.nan)
-    if vector.shape != (3,) or not np.all(np.abs(vector) <= _LARGEST_ANGLE):
-        raise GoalError(
-            f"The rotation vector {rotvec} is not three finite numbers of at most "
-            f"{_LARGEST_ANGLE:.2g} rad."
-        )
-    return Goal.checked(position, quaternion_from_rotvec(vector))
-
-
-def goal_from_rpy(position: Sequence[float], rpy_deg: Sequence[float]) -> Goal:
-    """Return the goal at a position (m) after roll, pitch and yaw about fixed axes (deg).
-
-    Raises
-    ------
-    GoalError
-        It is no goal, or the angles are not finite.
-    """
-    angles = np.asarray(rpy_deg, dtype=float)
-    if angles.shape != (3,) or not np.all(np.abs(angles) <= np.degrees(_LARGEST_ANGLE)):
-        raise GoalError(f"The angles {rpy_deg} are not three finite numbers of degrees.")
-    return Goal.checked(position, quaternion_from_matrix(matrix_from_rpy(np.radians(angles))))
-
-
 def parse_kills(lines: object, where: str) -> tuple[Kill, ...]:
     """Read ``NODE at SECONDS [until SECONDS]``, a list of such lines, by time.
 
@@ -601,7 +558,7 @@ def _goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
         position = values.get(f"{name}_position", [0.0, 0.0, 0.0])
         orientation = values.get(f"{name}_orientation", [0.0, 0.0, 0.0, 1.0])
         if f"{name}_rotvec" in values:
-            orientation = goal_from_rotvec(position, values[f"{name}_rotvec"]).quaternion
+            orientation = Goal.from_rotvec(position, values[f"{name}_rotvec"]).quaternion
         return Goal.checked(position, orientation, values.get(f"{name}_joint_positions"))
     except (GoalError, ValueError, TypeError) as error:
         raise ParameterError(f"The goal of the scenario file {path} is refused: {error}") from error

@@ -21,7 +21,7 @@ from spacerobot_ros.errors import (
     RobotDescriptionError,
     SpaceRobotError,
 )
-from spacerobot_ros.flight.scenario import goal_from_rotvec, load_scenario
+from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.cdr import TemplateReader, UnreadableError
 from spacerobot_ros.parameters import Parameter
@@ -70,7 +70,7 @@ def test_a_position_that_is_no_place_is_refused(position: Any) -> None:
 
 def test_a_rotation_vector_of_absurd_length_is_refused() -> None:
     with pytest.raises(PlanningError, match="rotation vector"):
-        goal_from_rotvec(ORIGIN, [1e200, 0.0, 0.0])
+        Goal.from_rotvec(ORIGIN, [1e200, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("value", [10**400, [10**400]])

@@ -12,7 +12,6 @@ from sensor_msgs.msg import JointState
 from support.fuzzing import NUMBERS, TEXTS, VALUES, attempt, fuzz
 from support.planners import planner_of
 
-from spacerobot_ros.flight.scenario import goal_from_rotvec
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.messages import goal_of, shape_of
 from spacerobot_ros.planning import Goal, RobotState, Tolerance
@@ -66,7 +65,7 @@ def test_a_goal_of_anything(position: object, quaternion: object, shape: object)
 
 @fuzz("goal of a program", VECTORS, st.lists(NUMBERS, max_size=5), fast=60, long=400)
 def test_a_goal_of_a_rotation_vector(position: list[float], rotvec: list[float]) -> None:
-    assert_sound(attempt("goal of a program", goal_from_rotvec, position, rotvec))
+    assert_sound(attempt("goal of a program", Goal.from_rotvec, position, rotvec))
 
 
 @pytest.mark.parametrize("method", ROBOTS)

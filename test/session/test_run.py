@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.bag import iterate_raw, read_bag
 from spacerobot_ros.cli.options import write_json
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.scenario import Scenario, goal_from_rotvec, load_scenario
+from spacerobot_ros.flight.scenario import Scenario, load_scenario
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.session.run import RunResult, run_scenario
 
 SHORT = {
@@ -39,7 +40,7 @@ def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
 def short(**settings: Any) -> Scenario:
     """Return a flight of about ten seconds that moves and turns the base."""
     scenario = load_scenario("sliding_masses").with_overrides("planner", {**SHORT, **settings})
-    return replace(scenario, goal=goal_from_rotvec([0.02, -0.01, 0.01], [0.02, 0.01, -0.015]))
+    return replace(scenario, goal=Goal.from_rotvec([0.02, -0.01, 0.01], [0.02, 0.01, -0.015]))
 
 
 def papers_own() -> Scenario:
@@ -197,7 +198,7 @@ def test_corrections_follow_until_the_tolerance_is_met(tmp_path: Path) -> None:
 
 
 def test_unreachable_goal_is_summed_up_too(tmp_path: Path) -> None:
-    scenario = replace(short(), goal=goal_from_rotvec([9.0, 0.0, 0.0], [0.0, 0.0, 0.0]))
+    scenario = replace(short(), goal=Goal.from_rotvec([9.0, 0.0, 0.0], [0.0, 0.0, 0.0]))
     result = run_scenario(scenario, tmp_path / "run.mcap")
     assert not result.succeeded
     assert result.summary["state"] == "refused"

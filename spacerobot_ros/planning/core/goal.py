@@ -10,7 +10,13 @@ import numpy.typing as npt
 
 from spacerobot_ros.errors import GoalError
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import attitude_error, unit_quaternion
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    matrix_from_rpy,
+    quaternion_from_matrix,
+    quaternion_from_rotvec,
+    unit_quaternion,
+)
 
 Controlled = Literal["position", "attitude", "shape"]
 """A part of a goal: the position and the attitude of the base, and the joint positions."""
@@ -24,6 +30,9 @@ ALMOST = 0.5
 
 _FARTHEST = 1e12
 """Beyond it a float64 does not resolve a millimetre, m or rad."""
+
+_LARGEST_ANGLE = 2e6 * np.pi
+"""A million turns: beyond them the digits of an angle are not its attitude's any more, rad."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +93,37 @@ class Goal:
                 f"The goal orientation {q.tolist()} is a zero quaternion, not a rotation; "
                 "no rotation is (0, 0, 0, 1)."
             ) from None
+
+    @classmethod
+    def from_rotvec(cls, position: npt.ArrayLike, rotvec: npt.ArrayLike) -> Goal:
+        """Return the goal at a position (m) with the attitude ``exp(hat(rotvec))`` (rad).
+
+        Raises
+        ------
+        GoalError
+            It is no goal, or the rotation vector is not three numbers of at most a million turns.
+        """
+        vector = _numbers(rotvec, "rotation vector")
+        if vector.shape != (3,) or not np.all(np.abs(vector) <= _LARGEST_ANGLE):
+            raise GoalError(
+                f"The rotation vector {rotvec!r} is not three finite numbers of at most "
+                f"{_LARGEST_ANGLE:.2g} rad."
+            )
+        return cls.checked(position, quaternion_from_rotvec(vector))
+
+    @classmethod
+    def from_rpy(cls, position: npt.ArrayLike, rpy_deg: npt.ArrayLike) -> Goal:
+        """Return the goal at a position (m) after roll, pitch and yaw about fixed axes (deg).
+
+        Raises
+        ------
+        GoalError
+            It is no goal, or the angles are not three finite numbers.
+        """
+        angles = _numbers(rpy_deg, "roll, pitch and yaw")
+        if angles.shape != (3,) or not np.all(np.abs(angles) <= np.degrees(_LARGEST_ANGLE)):
+            raise GoalError(f"The angles {rpy_deg!r} are not three finite numbers of degrees.")
+        return cls.checked(position, quaternion_from_matrix(matrix_from_rpy(np.radians(angles))))
 
 
 def _numbers(given: npt.ArrayLike, what: str) -> Array:
