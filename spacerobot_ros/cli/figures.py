@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from spacerobot_ros.cli.errors import fail
-from spacerobot_ros.cli.options import PATH, bag_argument, beside
+from spacerobot_ros.cli.options import PATH, bag_argument, beside, namespace_option
 
 FORMATS = ("pdf", "svg", "png")
 _MILLIMETRES = {"": 1.0, "mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72}
@@ -49,6 +49,7 @@ def _millimetres(context: click.Context, option: click.Parameter, text: str) -> 
 )
 @click.option("--events", is_flag=True, help="Show events below the time axes.")
 @click.option("--out", "-o", type=PATH, help="Folder of the figures [BAG_figures].")
+@namespace_option
 def command(
     bag: Path,
     only: str,
@@ -57,6 +58,7 @@ def command(
     style: Path | None,
     events: bool,
     out: Path | None,
+    namespace: str | None,
 ) -> None:
     """Draw figures of a BAG for a paper, one file each.
 
@@ -76,6 +78,7 @@ def command(
         width=width,
         style=style,
         events=events,
+        namespace=namespace,
     )
     drawn = {name: result for name, result in made.items() if isinstance(result, Path)}
     for name, path in drawn.items():

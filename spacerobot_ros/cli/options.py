@@ -26,6 +26,9 @@ else:  # Generic in new versions only.
 PATH = click.Path(path_type=Path)
 
 bag_argument = click.argument("bag", type=PATH)
+namespace_option = click.option(
+    "--namespace", metavar="NAME", help="Robot of a bag that has several [the first]."
+)
 _pose_option = click.option(
     "--goal", nargs=7, type=float, metavar="X Y Z QX QY QZ QW", help="Goal pose (m, quaternion)."
 )

@@ -6,7 +6,13 @@ from pathlib import Path
 
 import click
 
-from spacerobot_ros.cli.options import PATH, bag_argument, beside, picture_option
+from spacerobot_ros.cli.options import (
+    PATH,
+    bag_argument,
+    beside,
+    namespace_option,
+    picture_option,
+)
 
 
 @click.command("report")
@@ -21,13 +27,20 @@ from spacerobot_ros.cli.options import PATH, bag_argument, beside, picture_optio
     metavar="BAG",
     help="Bag of another flight to compare with. May be repeated.",
 )
-def command(bag: Path, output: Path | None, picture: Path | None, others: tuple[Path, ...]) -> None:
+@namespace_option
+def command(
+    bag: Path,
+    output: Path | None,
+    picture: Path | None,
+    others: tuple[Path, ...],
+    namespace: str | None,
+) -> None:
     """Write an HTML report of a BAG, with pictures and a 3D view."""
     from spacerobot_ros.report import write_picture, write_report
 
     target = output or beside(bag, ".html")
-    write_report(bag, target, others)
+    write_report(bag, target, others, namespace=namespace)
     click.echo(f"report      {target}")
     if picture is not None:
-        write_picture(bag, picture)
+        write_picture(bag, picture, namespace=namespace)
         click.echo(f"picture     {picture}")

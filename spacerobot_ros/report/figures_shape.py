@@ -11,6 +11,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.report.figures_time import (
     DASHES,
+    NO_JOINTS,
     SHOWN_CYCLES,
     joint_unit,
     power_of_ten,
@@ -40,7 +41,7 @@ def loops_plate(flight: Flight) -> Plate | str:
     if len(names) < 2:
         return "A loop in shape space takes two joints or more."
     if not len(flight.shape):
-        return "The bag holds no joint positions."
+        return NO_JOINTS
     pairs = list(itertools.combinations(range(len(names)), 2))
     cycles = flight.cycles
     part = flight.shape

@@ -35,10 +35,8 @@ _INSTANTS = 6
 
 def configurations_plate(flight: Flight) -> Plate | str:
     """The robot at several instants from the first state to the last, and the goal."""
-    if flight.robot is None:
-        return "The bag holds no robot description, so there is no picture of the robot."
     if flight.drawn is None:
-        return "The bag does not hold base pose and joint positions for a picture of the robot."
+        return flight.not_drawn
     indices = _instants(flight)
     scenes = [flight.drawn.at(flight.joints[index], flight.base_at(index)) for index in indices]
     across = min(len(indices), 2 if narrow() else 3)

@@ -67,7 +67,7 @@ EVENTS = (
     "Below the time axis, what happened: goals and plans above, the robot and its faults below."
 )
 NO_STATES = "The bag holds no base poses (odom), so there is no picture of them."
-NO_JOINTS = "The robot has no joints in this bag."
+NO_JOINTS = "The bag holds no joint positions (joint_states)."
 
 
 def position_group(flight: Flight) -> Group:
@@ -185,14 +185,20 @@ def attitude_plate(flight: Flight) -> Plate | str:
 def shape_plate(flight: Flight) -> Plate | str:
     """Joint positions, with the limits of the URDF that are in range."""
     if not len(flight.shape) or not flight.joint_names:
-        return NO_JOINTS
+        return _no_joints(flight)
     return time_plate(flight, "shape", "Shape", "Joint positions", shape_groups(flight))
+
+
+def _no_joints(flight: Flight) -> str:
+    """Return why there is no picture of the joints."""
+    jointless = flight.robot is not None and not flight.robot.joint_names
+    return "The robot has no joints." if jointless else NO_JOINTS
 
 
 def rates_plate(flight: Flight) -> Plate | str:
     """Joint velocities, one panel a joint."""
     if not flight.joint_names:
-        return NO_JOINTS
+        return _no_joints(flight)
     if not len(flight.rates):
         return "The bag holds no joint velocities."
     names, cycles = flight.joint_names, flight.cycles

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -116,6 +117,14 @@ class Target:
     goal: Goal
 
 
+def parameters_of(
+    metadata: Mapping[str, dict[str, str]], namespace: str, node: str
+) -> dict[str, str]:
+    """Return the parameters of a robot's node as JSON texts; without its own, the common ones."""
+    own, common = f"parameters{namespace}/{node}", f"parameters/{node}"
+    return metadata.get(own) or metadata.get(common, {})
+
+
 @dataclass(frozen=True)
 class Flight:
     """What a bag holds of a flight, times in s since the first state; missing signals are empty.
@@ -153,6 +162,8 @@ class Flight:
     sensed_pose, sensed_shape
         Pose of the base link (M, 7) and joint positions (M, n) as measured while sensors err; empty
         where they do not.
+    namespace, other_robots
+        Of the robot's topics, such as ``/robot_1``; those of other robots in the bag.
     """
 
     file_name: str
@@ -181,6 +192,8 @@ class Flight:
     meshes: dict[str, TriangleMesh] = field(default_factory=dict)
     sensed_pose: Signal = field(default_factory=lambda: Signal.none(7))
     sensed_shape: Signal = field(default_factory=lambda: Signal.none(0))
+    namespace: str = ""
+    other_robots: Sequence[str] = ()
 
     # -- what it is called --------------------------------------------------------------------
 
@@ -213,7 +226,7 @@ class Flight:
     def parameter(self, node: str, name: str) -> Any:
         """Return a parameter of a node; None if the bag does not hold it."""
         try:
-            return json.loads(self.metadata.get(f"parameters/{node}", {})[name])
+            return json.loads(parameters_of(self.metadata, self.namespace, node)[name])
         except (KeyError, ValueError, RecursionError):
             return None
 
@@ -348,12 +361,26 @@ class Flight:
     @cached_property
     def drawn(self) -> SolidRobot | None:
         """The robot as something to draw; None if the bag lacks its description or its states."""
-        robot = self.robot
-        if robot is None or not len(self.position):
+        if self.robot is None or self.not_drawn:
             return None
-        if not set(robot.joint_names) <= set(self.joint_names):
-            return None
-        return None if robot.joint_names and not len(self.shape) else SolidRobot(robot, self.meshes)
+        return SolidRobot(self.robot, self.meshes)
+
+    @property
+    def not_drawn(self) -> str:
+        """A sentence on what the bag lacks for a picture of the robot; empty for nothing."""
+        lacking = []
+        if self.robot is None:
+            lacking.append("no robot description (robot_description)")
+        if not len(self.position):
+            lacking.append("no base poses (odom)")
+        named = self.robot.joint_names if self.robot is not None else ()
+        absent = named if not len(self.shape) else [x for x in named if x not in self.joint_names]
+        if absent:
+            more = f" and {len(absent) - 1} more" if len(absent) > 1 else ""
+            lacking.append(f"no positions of joint '{absent[0]}'{more} (joint_states)")
+        if not lacking:
+            return ""
+        return f"The bag holds {' and '.join(lacking)}: the robot is not drawn."
 
     @property
     def missing_meshes(self) -> str:

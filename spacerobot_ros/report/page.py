@@ -85,6 +85,10 @@ def _facts(flight: Flight) -> str:
         count = len(flight.robot.joint_names)
         joints = "1 joint" if count == 1 else f"{count} joints"
         facts.append(f"robot {flight.robot_name}: {joints}, {flight.robot.total_mass:.5g} kg")
+    if flight.namespace:
+        facts.append(f"namespace {flight.namespace}")
+    if flight.other_robots:
+        facts.append(f"the bag also has {', '.join(flight.other_robots)}")
     spans = "".join(f"<span>{escape(fact)}</span>" for fact in facts)
     return f'<p class="facts">{spans}</p>' if facts else ""
 

@@ -10,7 +10,12 @@ import numpy as np
 from spacerobot_ros.bag import Bag, RecordedRobot, TopicSeries, read_bag
 from spacerobot_ros.bag.recorded_robot import columns
 from spacerobot_ros.control.status import ControllerStatus
-from spacerobot_ros.errors import PlanningError, RobotDescriptionError, SpaceRobotError
+from spacerobot_ros.errors import (
+    PlanningError,
+    RecordingError,
+    RobotDescriptionError,
+    SpaceRobotError,
+)
 from spacerobot_ros.model import RobotDescription, parse_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.visuals import meshes_in
@@ -18,7 +23,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.report.events import FlightEvent, read_events
-from spacerobot_ros.report.flight import Flight, SentGoal, Status
+from spacerobot_ros.report.flight import Flight, SentGoal, Status, parameters_of
 from spacerobot_ros.report.signals import Signal, rotvecs
 from spacerobot_ros.topics import TOPICS
 
@@ -26,21 +31,37 @@ _SAME_CLOCK = 1.0
 """Stamps this near to the log times, in s, come from the same clock."""
 
 
-def read_flight(path: Path) -> Flight:
+def read_flight(path: Path, namespace: str | None = None) -> Flight:
     """Read a bag.
+
+    Parameters
+    ----------
+    path
+        The bag.
+    namespace
+        Of the robot's topics, with or without the slash before it; None: the first in the order of
+        the alphabet of those that the bag has an ``odom`` of.
 
     Raises
     ------
     RecordingError
-        There is no such bag, or it is damaged.
+        There is no such bag or robot, or it is damaged.
     """
     bag = read_bag(path)
-    prefixes = [
+    prefixes = sorted(
         topic.rpartition("/")[0]
         for topic, kind in bag.topics.items()
         if topic.endswith("/odom") and kind == TOPICS["odom"].type
-    ]
-    robot = _Recorded(bag, min(prefixes, default=""))
+    )
+    chosen = prefixes[0] if prefixes else ""
+    if namespace is not None:
+        chosen = f"/{namespace.strip('/')}".rstrip("/")
+        if chosen not in prefixes:
+            known = ", ".join(name or "/" for name in prefixes) or "no robot"
+            raise RecordingError(
+                f"The bag {bag.path} has no robot in the namespace '{namespace}': it has {known}."
+            )
+    robot = _Recorded(bag, chosen)
     names, nozzles = robot.joint_names, robot.names("thrusters")
     base = robot.true("odom", "pose.pose")
     shape = robot.true("joint_states", "position", len(names))
@@ -50,6 +71,8 @@ def read_flight(path: Path) -> Flight:
         file_name=bag.path.name,
         message_count=bag.message_count(),
         metadata=bag.metadata,
+        namespace=chosen,
+        other_robots=[name or "/" for name in prefixes if name != chosen],
         robot=description,
         joint_names=names,
         position=position,
@@ -168,7 +191,8 @@ def _description(robot: _Recorded) -> RobotDescription | None:
 def _efforts(robot: _Recorded, names: list[str]) -> Signal:
     """Return the commanded joint efforts (N, n), by the names of the states."""
     # Commands of velocities hold no efforts, and reading them takes a while.
-    actuation = robot.bag.metadata.get("parameters/plant", {}).get("actuation", "").strip('"')
+    plant = parameters_of(robot.bag.metadata, robot.namespace, "plant")
+    actuation = plant.get("actuation", "").strip('"')
     commands = robot.get("joint_commands") if actuation != "velocity" else None
     given = list(map(str, next(commands.messages())[1].name)) if commands is not None else []
     if commands is None or sorted(given) != sorted(names):

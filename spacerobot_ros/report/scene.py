@@ -102,7 +102,7 @@ def scene_of(flight: Flight) -> Scene | str:
     """Return the scene of a flight, or one sentence on why there is none."""
     drawn = flight.drawn
     if drawn is None:
-        return "The bag does not hold robot description, base pose and shape for an animation."
+        return flight.not_drawn
     center, radius = _extent(flight, drawn)
     frames = key_frames(_visible(flight, radius), flight.cycles)
     commands = _stage(center, radius, flight.flat)

@@ -98,19 +98,21 @@ _PLATES = (
 )
 
 
-def write_report(bag: Path, html: Path, beside: Sequence[Path] = ()) -> None:
+def write_report(
+    bag: Path, html: Path, beside: Sequence[Path] = (), *, namespace: str | None = None
+) -> None:
     """Write the report of a bag as one HTML file, which needs nothing besides itself.
 
     Any bag makes a page: what it does not hold is left out, with a sentence that says so. Bags
     ``beside`` it, of other methods to the same goal for one, get a row in a table and their paths
-    in the figure of paths.
+    in the figure of paths. Of several robots in the bag ``namespace`` chooses one.
 
     Raises
     ------
     SpaceRobotError
-        There is no such bag, one is damaged, or the file cannot be written.
+        There is no such bag or robot, one is damaged, or the file cannot be written.
     """
-    flight = read_flight(bag)
+    flight = read_flight(bag, namespace)
     others = [read_flight(other) for other in beside]
     with drawing():
         plates = [*(plate(flight) for plate in _PLATES), path_plate(flight, others)]
@@ -127,6 +129,7 @@ def write_figures(
     width: float = 88.0,
     style: Path | None = None,
     events: bool = False,
+    namespace: str | None = None,
 ) -> dict[str, Path | str]:
     """Write figures of a flight for a paper, each a file of its own.
 
@@ -148,6 +151,8 @@ def write_figures(
         of one of its own styles.
     events
         Whether what happened is shown below time axes.
+    namespace
+        Of the robot, where the bag has several.
 
     Returns
     -------
@@ -169,7 +174,7 @@ def write_figures(
         raise SpaceRobotError(
             f"Figures are a folder with a file for each, which is not called '{folder.name}'."
         )
-    flight = read_flight(bag)
+    flight = read_flight(bag, namespace)
     if not events:
         flight = replace(flight, events=[])
     made: dict[str, Path | str] = {}
@@ -193,7 +198,7 @@ def write_figures(
     return made
 
 
-def write_picture(bag: Path, picture: Path) -> None:
+def write_picture(bag: Path, picture: Path, *, namespace: str | None = None) -> None:
     """Write one picture of a flight: pose and shape over time, and the robot.
 
     It is a PNG 1000 pixels wide, or SVG or PDF, as the name of the file ends.
@@ -204,7 +209,7 @@ def write_picture(bag: Path, picture: Path) -> None:
         There is no such bag, it is damaged or holds no base poses, or the file cannot be written.
     """
     format = PictureFormat.of(picture)
-    flight = read_flight(bag)
+    flight = read_flight(bag, namespace)
     if not len(flight.position):
         raise SpaceRobotError(NO_STATES)
     with drawing():

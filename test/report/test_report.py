@@ -210,8 +210,42 @@ def test_dense_traces_become_bands_and_say_so(tmp_path: Path) -> None:
 def test_a_robot_without_joints(tmp_path: Path) -> None:
     page = report_of(tmp_path, Story(np.empty((50, 0)), goals=[(0.0, *GOAL)]))
     assert list(page.figures) == ["configurations", "position", "attitude", "momentum", "path"]
-    assert "The robot has no joints in this bag." in page.text
+    assert "The robot has no joints." in page.text
     assert "joints" not in page.tables
+
+
+@pytest.mark.parametrize(
+    ("story", "sentences"),
+    [
+        (
+            Story(still(), topics=("odom",)),
+            (
+                "The bag holds no positions of joint 'joint_0' and 2 more (joint_states): the "
+                "robot is not drawn.",
+                "The bag holds no joint positions (joint_states).",
+            ),
+        ),
+        (
+            Story(still(), topics=(), urdf=None),
+            (
+                "The bag holds no robot description (robot_description) and no base poses (odom): "
+                "the robot is not drawn.",
+            ),
+        ),
+        (
+            Story(still(), name="other_"),
+            ("The bag holds no positions of joint 'joint_0' and 2 more",),
+        ),
+    ],
+)
+@pytest.mark.usefixtures("blank")
+def test_what_is_missing_for_a_picture_of_the_robot_is_named(
+    story: Story, sentences: tuple[str, ...], tmp_path: Path
+) -> None:
+    page = report_of(tmp_path, story)
+    for sentence in sentences:
+        assert sentence in page.text
+    assert "has no joints" not in page.text
 
 
 @pytest.mark.parametrize("n", [1, 9])
