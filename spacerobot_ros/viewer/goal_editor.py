@@ -76,7 +76,11 @@ class GoalEditor:
         # Any: mypy takes viser's values for read-only.
         self._position: Any = gui.add_vector3("Goal (m)", (0.0, 0.0, 0.0), step=0.01)
         self._angles: Any = gui.add_vector3("Roll, pitch, yaw (deg)", (0.0, 0.0, 0.0), step=1.0)
-        self._tool_too = gui.add_checkbox("Goal for the end-effector", initial_value=True)
+        self._tool_too = gui.add_checkbox(
+            "Goal for the end-effector",
+            initial_value=True,
+            hint="Off: the end-effector keeps the goal that it has, if any.",
+        )
         self._tool_too.visible = False
         self._final = _FinalShape(gui, defer, self._change)
 

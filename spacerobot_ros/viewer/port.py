@@ -92,6 +92,8 @@ class StackState:
     absent
         Which of ``plant``, ``planner``, ``controller``, ``replay`` are of such nodes: what they
         reported is no longer so.
+    busy
+        Whether a commander plans or compiles, and answers when that is done.
     """
 
     measured: Measured | None = None
@@ -108,6 +110,7 @@ class StackState:
     silent: Mapping[str, float] = field(default_factory=dict)
     inactive: tuple[str, ...] = ()
     absent: frozenset[str] = frozenset()
+    busy: bool = False
 
 
 @dataclass(frozen=True)

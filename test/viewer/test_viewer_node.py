@@ -455,3 +455,23 @@ def test_the_log_has_the_warnings_of_its_own_stack(harness: Harness) -> None:
             viewer._on_log(RosoutLog(level=30, name=name, msg=f"{name} warns."))
     logs = [[notice.source for notice in each._page._log._notices] for each in viewers]
     assert logs == [["a.b.planner"], ["other.planner", "a.bc.planner", "a.b.planner"]]
+
+
+def test_a_commander_that_is_busy_is_waited_for(harness: Harness) -> None:
+    stack = Stack(harness)
+    viewer, state = stack.viewer, StackState()
+    viewer._unanswered = "7.000000001", 100.0
+    viewer._send_goals(replace(state, busy=True), 99.0)
+    viewer._send_goals(replace(state, busy=True), 130.0)
+    viewer._send_goals(state, 131.0)
+    assert "answered" not in stack.log(), "it may just have planned"
+    viewer._send_goals(state, 136.0)
+    assert "Nobody has answered the goal: send it again." in stack.log()
+    # Heartbeats of a plant that is busy are of no commander.
+    heart = stack.probe.create_publisher(DiagnosticStatus, "/heartbeat", 20)
+    harness.connect()
+    for role in (Role.PLANT, Role.COMMANDER):
+        beat = DiagnosticStatus(name="/x", message=Pulse.BUSY.value, hardware_id=role.value)
+        heart.publish(beat)
+        harness.settle(stack.probe)
+        assert viewer._listener.state().busy is (role is Role.COMMANDER)

@@ -188,6 +188,9 @@ class Listener:
             absent=frozenset(
                 key for key in statuses if self._reporters[key] in (*silent, *inactive)
             ),
+            busy=any(
+                beat.pulse is Pulse.BUSY and beat.role == Role.COMMANDER.value for _, beat in beats
+            ),
         )
 
     def time_ns(self) -> int:

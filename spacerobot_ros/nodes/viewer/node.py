@@ -412,6 +412,8 @@ class ViewerNode(FlightNode):
             statuses = (state.planner, state.controller)
             if any(status is not None and status.goal_id == goal_id for status in statuses):
                 self._unanswered = None
+            elif state.busy:
+                self._unanswered = goal_id, now + _LONGEST_ANSWER
             elif now >= until:
                 self._unanswered = None
                 self._note("Nobody has answered the goal: send it again.", 2, "page")
