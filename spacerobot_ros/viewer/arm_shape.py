@@ -22,13 +22,13 @@ _STARTS = 8
 """Shapes that the search begins in: the present one, and others."""
 
 _EVALUATIONS = 30
-"""Of each search at most."""
+"""How often each search looks at the error at most."""
 
 _NEAR = 1e-4
-"""Errors within which a shape is one, m and rad."""
+"""Errors within which a shape counts as one that reaches, m and rad."""
 
 _RADIAN = 0.5
-"""What an error of a radian counts, m."""
+"""The distance that an error of one radian counts as much as, m."""
 
 
 class Chain:
@@ -104,5 +104,5 @@ def arm_shape(
 
 
 def is_near(distance: float, angle: float) -> bool:
-    """Whether a shape is one that reaches."""
+    """Whether a shape that is so far off counts as one that reaches, m and rad."""
     return distance <= 2 * _NEAR and angle <= 4 * _NEAR

@@ -37,10 +37,10 @@ COLORS: Mapping[Verdict, Color] = {
     Verdict.REACHABLE: (40, 180, 90),
     Verdict.REFUSED: (220, 60, 60),
 }
-"""Of the ghost."""
+"""Of the ghost, by what is known of its goal."""
 
 _LEVELS = ("#2a9d5c", "#c98a00", "#d23c3c")
-"""Of texts about what is well, to be noticed, and wrong: readable on white and on black."""
+"""Of texts of level OK, WARN and ERROR: readable on white and on black."""
 
 _QUIET = "#8a8f98"
 

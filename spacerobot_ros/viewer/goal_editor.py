@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import viser
 
 Defer = Callable[[Callable[[], None]], None]
-"""Has something done in the thread that draws the page."""
+"""Has a function called in the thread that draws the page."""
 
 AT_REST_S = 0.3
 """Wall s without a change after which a goal is checked."""
@@ -251,13 +251,13 @@ class GoalEditor:
             self._defer(lambda: self._drag(name, pose))
 
     async def _on_field(self, event: Any) -> None:
-        if event.client is not None:  # What the page itself has written is no wish of a user.
+        if event.client is not None:  # Else the page itself has written it.
             position, angles = self._position.value, self._angles.value
             self._defer(lambda: self._type(position, angles))
 
     def _drag(self, name: str, pose: Array) -> None:
         if name not in self._gizmos or not np.all(np.isfinite(pose)):
-            return  # Of a robot that is gone, or of no browser.
+            return  # It is the gizmo of an earlier robot, or its pose has numbers that are none.
         self._set(name, pose)
         self._show_fields()
 
@@ -389,7 +389,7 @@ class _FinalShape:
         self._on_change()
 
     async def _on_field(self, event: Any) -> None:
-        if event.client is not None:  # What the page itself has written is no wish of a user.
+        if event.client is not None:  # Else the page itself has written it.
             self._defer(self._on_change)
 
 

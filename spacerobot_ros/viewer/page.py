@@ -130,7 +130,7 @@ class Page:
         self._drawing = scene.RobotDrawing(
             self._server.scene, _ROBOT, robot, on_note=lambda text: self.note(Notice(text, 1))
         )
-        self._drawing.base.visible = False  # Nobody knows where it is yet.
+        self._drawing.base.visible = False  # Until its first state comes.
 
     def show_thrusters(self, table: ThrusterTable | None) -> None:
         """Take the places of the thrusters, which are known later than the robot."""

@@ -1,4 +1,4 @@
-"""The parts of the page beside the scene: each shows one thing, and hands on what users want."""
+"""The panels of the page: each shows one part of the state, and passes on what users do there."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _HANDS_OFF_S = 1.5
 
 
 class Buttons:
-    """What is done with the stack at once."""
+    """Buttons that act on the stack at once."""
 
     def __init__(
         self, gui: viser.GuiApi, defer: Defer, want: Want, fly: Callable[[], None]
@@ -317,7 +317,7 @@ class Log:
     def add(self, notice: Notice) -> None:
         """Add a line."""
         if self._notices and self._notices[0] == notice:
-            return  # It is said again and again.
+            return  # Repeated at once: it is shown once.
         self._notices.appendleft(notice)
         self._changed = True
 

@@ -1,4 +1,4 @@
-"""What the page and the stack have to say to each other."""
+"""What the viewer node tells the page of the stack, and what the page tells the node to do."""
 
 from __future__ import annotations
 

@@ -349,8 +349,8 @@ def _of_arm(question: Mapping[str, Any]) -> dict[str, Any]:
     return {"verdict": Verdict.REFUSED.value, "sentence": sentence, **found}
 
 
-class _Desk:
-    """The last question, for the thread that plans; whoever brings one cancels the plan."""
+class _LastQuestion:
+    """The last question, for the thread that plans; a new one cancels the plan being made."""
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
@@ -380,11 +380,11 @@ def main() -> None:
         # What libraries print is not to be among the answers.
         answers = os.fdopen(os.dup(1), "w")
         os.dup2(2, 1)
-        desk = _Desk()
+        last = _LastQuestion()
 
         def read() -> None:
             for line in sys.stdin:
-                desk.put(json.loads(line))
+                last.put(json.loads(line))
             os._exit(0)
 
         def say(**words: Any) -> None:
@@ -395,7 +395,7 @@ def main() -> None:
         planner, number = Planner(), 0
         with reported(lambda progress: say(number=number, progress=progress.sentence)):
             while True:
-                question, cancellation = desk.take()
+                question, cancellation = last.take()
                 number = question["number"]
                 say(number=number)
                 if "urdf" in question:

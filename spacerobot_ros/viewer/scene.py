@@ -41,7 +41,7 @@ _MOST_TRIANGLES = 20_000
 """Of a mesh that is sent to browsers: a finer one is made coarser."""
 
 _SCALE = 0.05
-"""Of the radius of spheres at the joints of a robot without shapes, m."""
+"""Radius of the spheres that a robot without shapes has at its joints, m."""
 
 
 def wxyz(quaternion: Array) -> Array:
@@ -55,7 +55,7 @@ def xyzw(quaternion: Array) -> Array:
 
 
 class RobotDrawing:
-    """A robot, or its ghost.
+    """A drawing of a robot: the robot itself, or the ghost at its goal.
 
     Parameters
     ----------

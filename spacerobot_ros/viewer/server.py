@@ -1,7 +1,7 @@
 """The web server of the page: viser's, kept to this machine and to its own page.
 
 viser takes websockets from any page that a browser has open, and connects to a server of its
-makers when a client asks it to share the page. Neither is wanted of what steers a robot.
+makers when a client asks it to share the page. Both are prevented here: this page steers a robot.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ class Latest(Generic[M]):
         try:
             message: M = deserialize_message(taken[0], self._kind)
         except RuntimeError:
-            return None  # No message of that type; what it was, its readers have to say.
+            return None  # It is no message of that type.
         return message
 
 
@@ -251,7 +251,7 @@ class Listener:
                 values = {pair.key: pair.value for pair in message.values}
                 status = read(values, message.message)
             except SpaceRobotError:
-                return  # Somebody else's; theirs is shown nowhere.
+                return  # A status of some other node, which has other keys.
             self._statuses[key] = status
             self._reporters[key] = message.name
             self._gone.pop(message.name, None)
@@ -273,7 +273,7 @@ class Listener:
         try:
             self._goals[part] = goal_of(message, self._frame)
         except SpaceRobotError:
-            self._goals.pop(part, None)  # What becomes of it, its commander says.
+            self._goals.pop(part, None)  # Its commander reports why it is refused.
 
     def _on_heartbeat(self, message: DiagnosticStatus) -> None:
         with suppress(ValueError):  # Of no node of this package.

@@ -1,4 +1,4 @@
-"""The viewer node: the state of a stack onto a page, and what its users want to the stack."""
+"""The viewer node: it shows a stack on a page, and does to the stack what users of the page do."""
 
 from __future__ import annotations
 
@@ -330,7 +330,7 @@ class ViewerNode(FlightNode):
         """Ask a node for its parameters; once more where that is being done."""
         name, before = self._full_names[key], self._asking.get(key)
         if before is not None and before.name == name:
-            # Its answer is waited for: without a reader it would hold the node up.
+            # The question before is still open: an answer that nobody takes would block that node.
             self._to_ask_again.add(key)
             return
         if before is not None:
@@ -343,7 +343,7 @@ class ViewerNode(FlightNode):
                 continue
             del self._asking[key]
             if asking.values is None or key in self._to_ask_again:
-                # One without an answer reports a status: it is there, and busy.
+                # A node that does not answer, but has reported a status, is there and busy.
                 self._to_ask_again.discard(key)
                 self._ask(key)
             if asking.values is None:
@@ -466,8 +466,8 @@ class ViewerNode(FlightNode):
             if not client.service_is_ready():
                 continue
             called = True
-            wish = Trigger.Request() if data is None else SetBool.Request(data=data)
-            client.call_async(wish).add_done_callback(
+            call = Trigger.Request() if data is None else SetBool.Request(data=data)
+            client.call_async(call).add_done_callback(
                 lambda future, name=name: self._on_answer(name, future)
             )
         if not called:
