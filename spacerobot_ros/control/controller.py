@@ -245,11 +245,11 @@ class CoordinatedController:
         return dict(zip(self.law.outputs.labels, self.law.error.tolist(), strict=True))
 
     def error_bounds(self, margins: Errors) -> Array:
-        """Return errors (m,) of the outputs that a sound flight to the present goals stays within.
+        """Return bounds (m,) on the errors of the outputs in a sound flight to the present goals.
 
-        To be called after the first command towards them. An error may become twice what is to be
-        gone: the way of the reference, or the error that there is, with what the present speed
-        adds until it is damped; and a margin (m, rad) beyond.
+        Call it after the first command towards them. The bound is the same for all outputs of a
+        kind: twice the larger of the distance that the reference travels and the largest error now
+        (with the error that its rate adds until it is damped), and a margin (m, rad) beyond.
         """
         assert self._profile is not None
         law, far = self.law, self._profile.distances()
