@@ -72,7 +72,7 @@ _KINDS = (
 
 
 def require_regular(mode: int, path: Path, act: str = "read") -> None:
-    """Refuse what is no file: to open a pipe waits for ever, to write to a device does harm.
+    """Refuse paths that are no regular file: opening a pipe blocks, writing to a device does harm.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def open_file(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[BinaryIO]:
-    """Open a bag that is complete, and turn what is found wrong with it into one sentence.
+    """Open a complete bag; turn every defect of it into an error of one sentence.
 
     Raises
     ------

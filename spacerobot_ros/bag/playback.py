@@ -90,7 +90,7 @@ class ReplayMessage:
 
 
 class Timeline:
-    """The time of a bag against a clock that only goes on.
+    """The time of a bag as a function of a monotonic clock.
 
     Parameters
     ----------
@@ -278,7 +278,7 @@ class Playback:
         self._timeline.stop(clock_ns)
 
     def due(self, clock_ns: int, most: int) -> list[ReplayMessage]:
-        """Take what is due by now, at most so many messages.
+        """Return the messages that are due, at most so many.
 
         Raises
         ------

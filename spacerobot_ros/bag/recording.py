@@ -190,7 +190,7 @@ class Recording:
         self._guarded(lambda: self.writer.add_attachment(name, data, media_type, self.now_ns))
 
     def close(self) -> None:
-        """Write what is left, with the counts of messages, and complete the bag; once.
+        """Write the remaining data and the counts of messages, and complete the bag; once.
 
         Raises
         ------

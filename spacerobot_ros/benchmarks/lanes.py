@@ -86,7 +86,7 @@ class _Case:
         )
 
     def campaign(self, count: int, seed: int) -> Array:
-        """Draw, fly, and return the distances (count,) from where the flight was to end, m."""
+        """Draw, fly, and return the distances (count,) of the ends from the goal, m."""
         result = fly_lanes(self.flights(count, seed))
         return result.errors(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))[0][:, -1]
 

@@ -261,7 +261,7 @@ def _table(trends: Sequence[Trend], goals: Mapping[str, int], duration: float) -
 
 
 def _draw(file: Path, times: Floats, samples: Mapping[str, Mapping[str, Floats]]) -> None:
-    """Draw what was sampled, a panel a quantity."""
+    """Draw the samples, one panel for each quantity."""
     from matplotlib.figure import Figure  # It takes half a second to import.
 
     figure = Figure(figsize=(9, 9), layout="constrained")

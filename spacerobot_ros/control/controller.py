@@ -95,7 +95,7 @@ class CoordinatedController:
         """Whether the robot is brought to rest, wherever that is."""
 
     def reset(self) -> None:
-        """Drop goals and what was measured; the next state is the first."""
+        """Drop goals and measurements; the next state counts as the first."""
         self._profile, self._followed = None, Reference()
         self.coming_to_rest = False
         self._sent = self._estimator = self._brake = None
@@ -114,7 +114,7 @@ class CoordinatedController:
         end_effector: PoseReference | None = None,
         joints: Array | None = None,
     ) -> None:
-        """Start towards new goals; what is not given keeps its earlier goal.
+        """Start towards new goals; a part whose goal is not given keeps its earlier one.
 
         A robot that was brought to rest has none: it keeps what is not given where it is.
         """
@@ -133,7 +133,7 @@ class CoordinatedController:
         self._began = time
 
     def begin_anew(self, time: float, state: ControlState) -> None:
-        """Start towards the present goals from where the robot is, not from where it was to be."""
+        """Start towards the present goals from the measured pose, not from the reference."""
         goal, self._profile = self.goal, None
         joints = None if goal.joints is None else goal.joints.q
         self.set_goals(time, state, base=goal.base, end_effector=goal.end_effector, joints=joints)
@@ -190,7 +190,7 @@ class CoordinatedController:
         return result
 
     def limited(self, state: ControlState, commanded: Actuation, periods: int = 1) -> Saturated:
-        """Return what is realised of a command at a state that is held for so many periods."""
+        """Return the realised part of a command at a state, which is held for so many periods."""
         result = self._limits.apply(commanded)
         kept = self._rates.apply(state, result.realised, self._limits.effort, periods)
         return result if kept is result.realised else Saturated.of(commanded, kept)

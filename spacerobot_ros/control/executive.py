@@ -26,7 +26,7 @@ GOAL_KEYS = (BASE, END_EFFECTOR)
 
 
 class ControlExecutive:
-    """Decides what a :class:`CoordinatedController` pursues, and reports what becomes of it.
+    """Decides which goals a :class:`CoordinatedController` pursues, and reports their outcome.
 
     For every state the owner calls :meth:`command`, sends the result to the actuators, and then
     calls :meth:`evaluate`. The state of the goal is one of
@@ -83,7 +83,7 @@ class ControlExecutive:
         self._hold_here = False
         """Whether the robot is to hold where it is at the next measured state, without a goal."""
         self._begin_anew = False
-        """Whether the goal is to be begun anew at the next measured state."""
+        """Whether the goal is started again at the next measured state."""
         self.plant_blocked = False
         """Whether the plant obeys no command, for the owner to set: what answers a state from
         before it obeys again must not move the robot, so each answer holds it where it is."""
@@ -101,7 +101,7 @@ class ControlExecutive:
         self._error_bounds: Array | None = None
         """Errors (m,) of the outputs within which the flight to the goal is sound."""
         self._lost_rates = self._lost_errors = 0
-        """States one after the other in which a joint was too fast, or an error too large."""
+        """Consecutive states in which a joint was too fast, or an error too large."""
         self._guided = False
         """Whether the last command followed a reference from outside."""
         self._next_report = 0.0
@@ -274,7 +274,7 @@ class ControlExecutive:
         return self.controller.command(time, measured, q, qdot)
 
     def evaluate(self, time: float, result: Saturated) -> None:
-        """Evaluate the errors after the command ``result``, and report what is due."""
+        """Evaluate the errors after the command ``result``, and report a change of state."""
         if self.controller.mode is Mode.MEASURED and self._goal_state is ControllerState.TRACKING:
             self._watch_errors()
         if self.controller.mode is Mode.MEASURED and self._goal_state is ControllerState.TRACKING:
@@ -337,7 +337,7 @@ class ControlExecutive:
         self._decided(EventKind.GOAL_ABORTED, self._abort_sentence, ControllerState.ABORTED)
 
     def _shift_time(self, seconds: float) -> None:
-        """Go on with the goal as if time had not jumped: a jump is no progress of it."""
+        """Continue the goal as if time had not jumped: the jump does not count as time flown."""
         self.controller.shift_time(seconds)
         self._started += seconds
         self._next_report += seconds

@@ -1,4 +1,4 @@
-"""From where things are to where they are to be: references over time.
+"""References over time: profiles from the present poses and joints to the goals.
 
 The paper sets the goal at once (:class:`StepReference`): simple, with the largest demand on the
 actuators at the first instant. :class:`QuinticReference` moves the reference there smoothly.

@@ -157,7 +157,7 @@ def _is_scenario(what: SpaceRobot | Scenario | str | Path, *, aimed: bool) -> bo
 
 
 def _scenario(what: SpaceRobot | Scenario | str | Path) -> Scenario:
-    """Return what is flown; a robot alone is a scenario without a goal."""
+    """Return the scenario to fly; a robot alone is a scenario without a goal."""
     match what:
         case Scenario():
             return what

@@ -34,7 +34,7 @@ class Outcome(str, Enum):
     REFUSED = "refused"
     ABORTED = "aborted"
     INTERRUPTED = "interrupted"
-    """It was not followed to its end."""
+    """The flight ended before the goal was decided."""
 
 
 @dataclass(frozen=True)
@@ -115,12 +115,12 @@ class FlightArrays:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the goal was reached within tolerance, by what was measured."""
+        """Whether the goal was reached within tolerance, by the measured state."""
         return self.outcome is Outcome.REACHED
 
     @property
     def goal(self) -> Goal:
-        """Where the base was to be."""
+        """The goal of the base."""
         return self.scenario.goal
 
     @property

@@ -79,7 +79,7 @@ class Flight(FlightArrays):
 
 
 class FlightLog:
-    """Collects what becomes a :class:`Flight`.
+    """Collects the data of a :class:`Flight`.
 
     Parameters
     ----------

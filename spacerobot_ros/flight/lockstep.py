@@ -331,7 +331,7 @@ class _LockstepFlight:
                 self._log.refused_states.append((self._time, str(error)))
 
     def _send(self, effort: Array, wrench: Array) -> None:
-        """Offer the commands of the controller; what it decides from now on comes after them."""
+        """Offer the commands of the controller; its later decisions follow them."""
         now = self._tick * self._period_ns
         for source in reversed(self._commands.sources):  # The wrench is sent first.
             values = wrench if source.quantity == "wrench" else effort
@@ -353,7 +353,7 @@ class _LockstepFlight:
     # -- what the plant reports to its commanders ---------------------------------------------
 
     def _look_at_plant(self, activity: PlantState) -> None:
-        """Take up a change of the plant's status, and have the commanders learn of it."""
+        """Pass a change of the plant's status to the commanders."""
         self._faults_seen, self._moment = self._plant.active, _Moment.AFTER_COMMAND
         before = self._monitor.status
         self._events += self._monitor.update(activity, self._time)

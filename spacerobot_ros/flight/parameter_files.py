@@ -44,7 +44,7 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def read_content(path: Path) -> dict[Any, Any]:
-    """Return what is in a parameter file; a file that is no mapping has nothing.
+    """Return the content of a parameter file; empty where the file is no mapping.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a commander learns of its plant: whether it obeys, and what else has happened to it."""
+"""The plant's status as a commander needs it: whether it obeys, and events such as resets."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ def recorded_flight(path: str | os.PathLike[str]) -> Flight:
 
 
 def _quantities(robot: RecordedRobot, n: int) -> dict[str, Array]:
-    """Return what is there beside the state of base and joints, by the table of topics."""
+    """Return the recorded quantities beside base and joints, by the table of topics."""
     found: dict[str, Array] = {}
     for name in ("end_effector_pose", "momentum_expected", "base_wrench_realised", "thrusters"):
         series = robot.get(name)
@@ -187,7 +187,7 @@ def _quantities(robot: RecordedRobot, n: int) -> dict[str, Array]:
 
 
 def _commands(robot: RecordedRobot, config: PlantConfig, n: int) -> dict[str, Commands]:
-    """Return what was sent, by topic."""
+    """Return the commands by topic."""
     velocity = config.actuation == "velocity"
     found = {}
     wrench = [f"wrench.{part}.{axis}" for part in ("force", "torque") for axis in "xyz"]

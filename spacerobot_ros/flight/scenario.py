@@ -1,4 +1,4 @@
-"""Scenarios: ROS parameter files with a section that says what is to be reached."""
+"""Scenarios: ROS parameter files with a section that holds the goal."""
 
 from __future__ import annotations
 
@@ -221,7 +221,7 @@ class Scenario:
         return {"scenario": scenario, **parameters}
 
     def problem(self) -> Problem:
-        """Return what is to be planned to reach the goal of the base.
+        """Return the planning problem of the goal of the base.
 
         Raises
         ------

@@ -495,7 +495,7 @@ _SHARED_OBJECT = 3
 
 
 def _require_object(path: Path, compiler: str) -> None:
-    """Refuse what is not a complete ELF shared object of this machine.
+    """Refuse a file that is not a complete ELF shared object of this machine.
 
     Raises
     ------

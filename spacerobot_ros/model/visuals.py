@@ -70,7 +70,7 @@ class Visual:
 
     @cached_property
     def edges(self) -> Edges:
-        """Its sharp edges in the frame of the link; none of what is too thin to draw them."""
+        """Its sharp edges in the frame of the link; none where it is too thin to draw them."""
         none = np.empty((0, 2, 3))
         return Edges(none, none) if self.is_rod else sharp_edges(self.mesh)
 
@@ -82,7 +82,7 @@ class Visual:
 
     @property
     def outline(self) -> Array:
-        """Lines (K, 2, 3) in the frame of the link that show it without hiding what is behind."""
+        """Lines (K, 2, 3) in the frame of the link that show it without hiding things behind it."""
         shape = self.shape
         if self.is_rod:
             longest = int(np.argmax(shape.size))

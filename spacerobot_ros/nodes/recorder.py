@@ -73,7 +73,7 @@ _CHECK_PERIOD = 0.4
 """Wall s between two looks whether the file is still there: a failure is seen within a second."""
 
 _LONGEST_DRAIN = 1.2
-"""Wall s after a signal in which what is on its way is still recorded."""
+"""Wall time after a signal in which messages on their way are still recorded, s."""
 
 _LOSS_LOG_PERIOD = 5.0
 """Wall s between two log lines about lost messages."""
@@ -166,7 +166,7 @@ class RecorderNode(FlightNode):
                 self.report_event(Event(EventKind.RECORDING_PAUSED, "Recording is paused."))
 
     def drain(self, executor: EventsExecutor, quiet: float = 0.3) -> None:
-        """Record what is still on its way, until nothing has come for ``quiet`` wall s."""
+        """Record messages on their way, until none has come for ``quiet`` wall s."""
         began = last = time.monotonic()
         recording = self.recording
         while recording is not None and recording.running and last - began < _LONGEST_DRAIN:
@@ -254,7 +254,7 @@ class RecorderNode(FlightNode):
                     recording.describe(name, question.values)
 
     def flush(self) -> None:
-        """Hand what was recorded to the operating system, and report what was lost."""
+        """Hand the recorded data to the operating system, and report lost messages."""
         if self.recording is not None:
             clocks = self.count_publishers(self._clock)
             self.recording.flush(clock_is_published=clocks > 0)
@@ -342,7 +342,7 @@ class RecorderNode(FlightNode):
         self._publish_state()
 
     def _check(self) -> None:
-        """Look after the file; a failure is published again, for who subscribes to it late."""
+        """Check the file; a failure is published again for late subscribers."""
         recording = self.recording
         if recording is None or recording.state is RecordingState.CLOSED:
             return
@@ -460,7 +460,7 @@ class _Stamps:
 def _take(
     recording: Recording, stamps: _Stamps, topic: str, kind: Any, channel: int, clock: str = _CLOCK
 ) -> Take:
-    """Return what is done with a topic's messages: the clock sets the time of all others."""
+    """Return the callback of a topic's messages: the clock sets the time of all others."""
     record, time_of = recording.record, stamps.time_ns
     urdf_name = f"{topic.strip('/').replace('/', '.')}.urdf"
 

@@ -16,7 +16,7 @@ _THRIFT = 1e-5
 back afterwards; a much smaller weight would be lost in the rounding of the solver."""
 
 _MET = 1e-9
-"""A wrench is met if what is missing is less than this part of it."""
+"""Largest missing share of a wrench that counts as given."""
 
 _PREFERENCE = 1e4
 """Weight of the part of the wrench that is given, relative to its cost."""
@@ -219,7 +219,7 @@ class ThrusterModulator:
 
     @property
     def under_way(self) -> Array:
-        """Impulse (6,) of the shortest pulses that have begun and are to be ended, N s, N m s."""
+        """Impulse (6,) left in the shortest pulses that have begun, N s and N m s."""
         return self._wrenches @ self._left
 
     def fire(self, wrench: Array) -> Array:

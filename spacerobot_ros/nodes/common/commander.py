@@ -1,4 +1,4 @@
-"""What the nodes that command a plant share: they listen to its state and to its status."""
+"""Base class of the nodes that command a plant: they listen to its state and its status."""
 
 from __future__ import annotations
 

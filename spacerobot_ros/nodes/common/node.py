@@ -114,12 +114,12 @@ class FlightNode(LifecycleNode):
         self.on_end: Callable[[int], None] = lambda code: None
         """Called with an exit code by a node that has nothing left to do."""
         self.raw_streams: list[RawStream] = []
-        """What passes through the node as bytes, from its configuration to its cleanup."""
+        """The streams of bytes through the node, from its configuration to its cleanup."""
         self._failure, self._destroyed = "", False
         self._liveness: Liveness | None = None
         self._event_stream: RawOutput | None = None
         self.events_have_wall_time = True
-        """Off in a run that is to be repeatable to the last message."""
+        """False in a run that must be repeatable to the last message."""
         self._raising = False
         self._guard_transitions()
         try:
@@ -354,7 +354,7 @@ class FlightNode(LifecycleNode):
     # -- hooks --------------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Create what stays from the construction of the node to its end, such as its status."""
+        """Create the entities that exist as long as the node, such as its status."""
 
     def configure(self) -> None:
         """Create what the node needs: model, publishers, subscriptions."""

@@ -167,7 +167,7 @@ class Liveness:
         self._watchdog: Watchdog | None = None
 
     def configure(self, timeout: float) -> None:
-        """Prepare to watch, until what was created since the construction is destroyed.
+        """Prepare to watch, until the entities created since the construction are destroyed.
 
         ``timeout``: see :class:`Watchdog`; 0: nothing is watched.
         """
@@ -192,7 +192,7 @@ class Liveness:
         self.beat()
 
     def end(self) -> None:
-        """Say that no heartbeat is to be expected any more."""
+        """Announce that no more heartbeats follow."""
         if self._timers:
             self._end_timers()
             self._watchdog = None
