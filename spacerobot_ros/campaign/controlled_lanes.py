@@ -195,7 +195,8 @@ def _flight(
     force, torque = result.peak_wrench[row].tolist()
     linear, angular = result.momentum_drift[row].tolist()
     none = np.zeros(0, np.int64)
-    quantities = _end_effector(flights.robot, drawn, end)
+    pose = end[2 * n : 2 * n + 7]
+    quantities = end_effector_at(flights.robot, drawn, end[:n], pose)
     if flights.thrusters is not None:
         quantities["propellant"] = result.propellant[row].reshape(1, 1)
     return FlightArrays(
@@ -205,7 +206,7 @@ def _flight(
         sentence=sentence,
         control_period=flights.control_period,
         time=np.array([0.0, duration]),
-        pose=end[2 * n : 2 * n + 7][np.newaxis],
+        pose=pose[np.newaxis],
         twist=end[2 * n + 7 : 2 * n + 13][np.newaxis],
         # Rows with the extremes: metrics ask for no more.
         q=np.vstack([result.lowest[row], result.highest[row], end[:n]]),
@@ -227,13 +228,22 @@ def _flight(
     )
 
 
-def _end_effector(robot: SpaceRobot, drawn: DrawnFlight, end: Array) -> dict[str, Array]:
+def end_effector_at(
+    robot: SpaceRobot, drawn: DrawnFlight, q: Array, pose: Array
+) -> dict[str, Array]:
+    """Return what a flight has of its end-effector, in one state: its pose (1, 7) in W, or nothing.
+
+    Parameters
+    ----------
+    robot, drawn
+        What is flown.
+    q, pose
+        Joint positions (n,) and the pose (7,) of the base in W.
+    """
     link = robot.description.end_effector(drawn.scenario.plant.end_effector_frame)
     if not link:
         return {}
-    n = robot.n
-    R_BE, r_BE_B = robot.link_pose(link, end[:n])
-    pose = end[2 * n : 2 * n + 7]
+    R_BE, r_BE_B = robot.link_pose(link, q)
     R_WB = matrix_from_quaternion(pose[3:])
     placed = np.append(pose[:3] + R_WB @ r_BE_B, quaternion_from_matrix(R_WB @ R_BE))
     return {"end_effector_pose": placed[np.newaxis]}

@@ -82,8 +82,9 @@ class Dataset:
             self._lock()
             for left in (self.folder / _FLIGHTS).glob(".*"):
                 left.unlink()  # What was being written when an earlier process ended.
-            self._describe(campaign)
-            return self.done()
+            done = self.done()
+            self._describe(campaign, max([campaign.flights, *(number + 1 for number in done)]))
+            return done
         except OSError as error:
             self.close()
             raise RecordingError(f"The folder {self.folder} cannot be written: {error}.") from error
@@ -118,9 +119,12 @@ class Dataset:
                 f"The folder {self.folder} is not empty and holds no campaign: name another one."
             )
 
-    def _describe(self, campaign: Campaign) -> None:
-        """Write what is flown; what makes the folder one of a campaign comes last."""
-        section = {**campaign.section, "scenario": _SCENARIO, "flights": campaign.flights}
+    def _describe(self, campaign: Campaign, flights: int) -> None:
+        """Write what is flown; what makes the folder one of a campaign comes last.
+
+        ``flights``: how many there are to be, or were to be before.
+        """
+        section = {**campaign.section, "scenario": _SCENARIO, "flights": flights}
         for key in ("set", "method"):
             section.pop(key, None)
         facts = {

@@ -19,6 +19,7 @@ from spacerobot_ros.batch.flights import BatchResult
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.controlled_lanes import (
     control_refusal,
+    end_effector_at,
     fly_controlled,
     require_lane,
 )
@@ -231,7 +232,7 @@ def _tracking_refusal(campaign: Campaign) -> str:
     changing = (
         *("plant.tick_rate", "plant.integration_step", "planner.tick_rate"),
         *("planner.averaging", "planner.drift", "planner.replan", "planner.shape_"),
-        "planner.max_corrections",
+        *("planner.max_corrections", "planner.output", "plant.actuation"),
     )
     if any(name.startswith(changing) for name in dispersed):
         return "what lanes have in common is dispersed"
@@ -349,7 +350,9 @@ def _flight(
         qdot=result.peak_rate[row][np.newaxis],
         effort=np.zeros((1, n)),
         momentum=result.momentum[row, kept],
-        quantities={},
+        quantities=end_effector_at(
+            flights.robot, planned.flight, result.q[row, end], result.pose[row, end]
+        ),
         commands={"joint_commands": Commands(np.zeros(0, np.int64), np.zeros((0, n)))},
         statuses=(),
         schedules=(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from spacerobot_ros.campaign.rerunning import TOLERANCE, largest_deviation
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import run_campaign
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.planning import Goal
 
 DISPERSED: dict[str, Any] = {
     "mass.*": {"norm": {"loc": 1.0, "scale": 0.03}},
@@ -147,6 +149,21 @@ def test_a_draw_that_is_refused_leaves_the_others_of_its_batch_in_lanes() -> Non
     assert all(row.fallback == row.reason for row in lanes.values() if row.fallback)
 
 
+def test_lanes_measure_the_end_effector_that_a_planner_does_not_move() -> None:
+    """Its goal is one of the scenario: the criterion is of where it is, in every engine."""
+    made = campaign(
+        disperse={"mass.*": {"norm": {"loc": 1.0, "scale": 0.03}}},
+        flights=2,
+        set={"plant.end_effector_frame": "mass_2", "planner.max_corrections": 0},
+    )
+    goal = Goal.checked([0.4, 0.1, 0.2], [0.0, 0.0, 0.0, 1.0])
+    scenario = made.scenario.with_poses(made.scenario.goal, goal)
+    lanes, one_by_one = assert_same_flights(replace(made, scenario=scenario))
+    for row in (*lanes.values(), *one_by_one.values()):
+        assert 0.0 < row.metrics["end_effector_position_error_m"] < 5.0
+    assert {row.engine for row in lanes.values()} == {"lanes"}
+
+
 def test_draws_that_are_no_robot_and_no_number_end_no_other_flight() -> None:
     nothing = {"mass": {"choice": [0.0, 1.0]}}
     lanes, _ = assert_same_flights(controlled(flights=6, disperse=nothing, longest=0.2))
@@ -178,6 +195,10 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
     assert chosen_engine(stuck, "auto").name == "flights"
     with pytest.raises(SpaceRobotError, match="'lanes' cannot fly this campaign: it has faults"):
         chosen_engine(stuck, "lanes")
+    # What would be another kind of flight is not flown as the nominal one.
+    for name, values in (("plant.actuation", ["velocity", "effort"]), ("plant.tick_rate", [20])):
+        other = campaign(disperse={name: {"choice": values}})
+        assert chosen_engine(other, "auto").name == "flights"
     background = campaign(set={"planner.plan_in_background": True})
     assert chosen_engine(background, "auto").name == "ros"
     for given in ({"plant.sensors.joint_noise": 1e-3}, {"planner.averaging": 3}):

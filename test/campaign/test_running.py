@@ -56,6 +56,11 @@ def test_a_campaign_that_is_ended_goes_on_where_it_was(tmp_path: Path) -> None:
     # And more flights of the same campaign are only those that are missing.
     assert run_campaign(small(flights=6), tmp_path / "cut").done == 6
     assert str(rows(tmp_path / "cut")[:5]) == str(rows(tmp_path / "whole"))
+    # Fewer take none away.
+    fewer = run_campaign(small(flights=2), tmp_path / "cut")
+    assert (fewer.done, fewer.total) == (2, 2)
+    results = Results.of(tmp_path / "cut")
+    assert (len(results), results.total) == (6, 6)
 
 
 def test_the_numbers_of_a_row_are_those_of_its_flight(tmp_path: Path) -> None:
