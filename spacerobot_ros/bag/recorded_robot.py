@@ -98,6 +98,22 @@ class RecordedRobot:
         )
 
     @property
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Metadata records of the bag by name, those of this robot's nodes as ``parameters/NODE``.
+
+        A recorder in the namespace of the robot calls them so itself.
+        """
+        before = f"parameters{self.namespace}/"
+        return {
+            **self.bag.metadata,
+            **{
+                f"parameters/{name.removeprefix(before)}": values
+                for name, values in self.bag.metadata.items()
+                if self.namespace and name.startswith(before)
+            },
+        }
+
+    @property
     def joint_names(self) -> list[str]:
         """Names of the joints in the order of ``joint_states``; none where that is missing."""
         return self.names("joint_states")

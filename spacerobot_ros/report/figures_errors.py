@@ -11,13 +11,9 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     rotvecs_from_quaternions,
 )
-from spacerobot_ros.report.figures_time import (
-    JOINTS_A_PANEL,
-    axis_groups,
-    joint_groups,
-    time_plate,
-)
+from spacerobot_ros.report.figures_motion import JOINTS_A_PANEL, axis_groups, joint_groups
 from spacerobot_ros.report.flight import Flight, Target
+from spacerobot_ros.report.over_time import time_plate
 from spacerobot_ros.report.plates import Group, Plate
 from spacerobot_ros.report.signals import Indices, Signal
 from spacerobot_ros.report.style import PALETTE

@@ -9,14 +9,10 @@ from matplotlib.axes import Axes
 
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import PoseError
-from spacerobot_ros.report.figures_time import (
-    DASHES,
-    NO_JOINTS,
-    SHOWN_CYCLES,
-    joint_unit,
-    power_of_ten,
-)
-from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.figures_forces import power_of_ten
+from spacerobot_ros.report.figures_motion import NO_JOINTS
+from spacerobot_ros.report.flight import Flight, joint_unit
+from spacerobot_ros.report.over_time import DASHES, SHOWN_CYCLES
 from spacerobot_ros.report.plates import Plate
 from spacerobot_ros.report.signals import Indices, Signal
 from spacerobot_ros.report.style import (

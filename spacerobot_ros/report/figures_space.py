@@ -11,8 +11,9 @@ from matplotlib.lines import Line2D
 
 from spacerobot_ros.model.description import Array, Pose
 from spacerobot_ros.model.rotations import matrix_from_quaternion
-from spacerobot_ros.report.figures_time import DASHES, NO_STATES
+from spacerobot_ros.report.figures_motion import NO_STATES
 from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.over_time import DASHES
 from spacerobot_ros.report.plates import Plate
 from spacerobot_ros.report.signals import Indices
 from spacerobot_ros.report.solids import Canvas, Solids, View

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ from spacerobot_ros.control.thrusters.table import IN_URDF, find_thrusters
 from spacerobot_ros.errors import PlanningError, SpaceRobotError
 from spacerobot_ros.flight.scenario import Published
 from spacerobot_ros.model import RobotDescription
-from spacerobot_ros.model.description import Array, Joint, Pose
+from spacerobot_ros.model.description import Array, Joint, JointKind, Pose
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
 from spacerobot_ros.planning import METHODS, Goal, PoseError
@@ -115,14 +115,6 @@ class Target:
     start: float
     end: float
     goal: Goal
-
-
-def parameters_of(
-    metadata: Mapping[str, dict[str, str]], namespace: str, node: str
-) -> dict[str, str]:
-    """Return the parameters of a robot's node as JSON texts; without its own, the common ones."""
-    own, common = f"parameters{namespace}/{node}", f"parameters/{node}"
-    return metadata.get(own) or metadata.get(common, {})
 
 
 @dataclass(frozen=True)
@@ -226,7 +218,7 @@ class Flight:
     def parameter(self, node: str, name: str) -> Any:
         """Return a parameter of a node; None if the bag does not hold it."""
         try:
-            return json.loads(parameters_of(self.metadata, self.namespace, node)[name])
+            return json.loads(self.metadata.get(f"parameters/{node}", {})[name])
         except (KeyError, ValueError, RecursionError):
             return None
 
@@ -494,3 +486,11 @@ class Flight:
             if same and np.allclose(goal.quaternion, named.quaternion, rtol=0.0, atol=1e-7):
                 return goal
         return named
+
+
+def joint_unit(flight: Flight, name: str) -> str:
+    """Return m or rad; without a robot description, that it is one of them."""
+    joint = flight.joint(name)
+    if joint is None:
+        return "m or rad"
+    return "m" if joint.kind is JointKind.PRISMATIC else "rad"

@@ -23,7 +23,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.report.events import FlightEvent, read_events
-from spacerobot_ros.report.flight import Flight, SentGoal, Status, parameters_of
+from spacerobot_ros.report.flight import Flight, SentGoal, Status
 from spacerobot_ros.report.signals import Signal, rotvecs
 from spacerobot_ros.topics import TOPICS
 
@@ -70,7 +70,7 @@ def read_flight(path: Path, namespace: str | None = None) -> Flight:
     return Flight(
         file_name=bag.path.name,
         message_count=bag.message_count(),
-        metadata=bag.metadata,
+        metadata=robot.metadata,
         namespace=chosen,
         other_robots=[name or "/" for name in prefixes if name != chosen],
         robot=description,
@@ -191,8 +191,7 @@ def _description(robot: _Recorded) -> RobotDescription | None:
 def _efforts(robot: _Recorded, names: list[str]) -> Signal:
     """Return the commanded joint efforts (N, n), by the names of the states."""
     # Commands of velocities hold no efforts, and reading them takes a while.
-    plant = parameters_of(robot.bag.metadata, robot.namespace, "plant")
-    actuation = plant.get("actuation", "").strip('"')
+    actuation = robot.metadata.get("parameters/plant", {}).get("actuation", "").strip('"')
     commands = robot.get("joint_commands") if actuation != "velocity" else None
     given = list(map(str, next(commands.messages())[1].name)) if commands is not None else []
     if commands is None or sorted(given) != sorted(names):

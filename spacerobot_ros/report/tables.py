@@ -11,8 +11,7 @@ import numpy as np
 from spacerobot_ros.flight.scenario import Published
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning import PoseError
-from spacerobot_ros.report.figures_time import joint_unit
-from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.flight import Flight, joint_unit
 
 _ABSENT = "–"
 _TICKS = 1.5

@@ -11,6 +11,19 @@ from matplotlib.figure import Figure
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.output_files import write_output
 from spacerobot_ros.report.figures_errors import errors_plate, sensors_plate
+from spacerobot_ros.report.figures_forces import efforts_plate, momentum_plate, thrusters_plate
+from spacerobot_ros.report.figures_motion import (
+    NO_STATES,
+    attitude_group,
+    attitude_plate,
+    pose_plate,
+    position_group,
+    position_plate,
+    rates_plate,
+    shape_groups,
+    shape_plate,
+    twist_plate,
+)
 from spacerobot_ros.report.figures_shape import cycles_plate, loops_plate
 from spacerobot_ros.report.figures_space import (
     configurations_plate,
@@ -19,24 +32,9 @@ from spacerobot_ros.report.figures_space import (
     path_plate,
     view_of,
 )
-from spacerobot_ros.report.figures_time import (
-    NO_STATES,
-    attitude_group,
-    attitude_plate,
-    draw_whole,
-    efforts_plate,
-    momentum_plate,
-    pose_plate,
-    position_group,
-    position_plate,
-    rates_plate,
-    shape_groups,
-    shape_plate,
-    thrusters_plate,
-    twist_plate,
-)
 from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.report.meshcat import player_of
+from spacerobot_ros.report.over_time import draw_whole
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.plates import Plate
 from spacerobot_ros.report.reading import read_flight

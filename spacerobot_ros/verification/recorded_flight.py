@@ -109,7 +109,7 @@ def read_flight(bag: Bag) -> RecordedFlight:
         Its URDF is refused.
     """
     recorded = _recorded(bag)
-    config = _config(bag, recorded.namespace)
+    config = _config(recorded)
     urdf = recorded.urdf
     if urdf is None:
         raise RecordingError(f"The bag {bag.path} holds no description of its robot.")
@@ -148,8 +148,8 @@ def _recorded(bag: Bag) -> RecordedRobot:
     return found[0]
 
 
-def _config(bag: Bag, namespace: str) -> PlantConfig:
-    texts = bag.metadata.get(f"parameters{namespace}/plant") or bag.metadata.get("parameters/plant")
+def _config(recorded: RecordedRobot) -> PlantConfig:
+    bag, texts = recorded.bag, recorded.metadata.get("parameters/plant")
     if texts is None:
         raise RecordingError(
             f"The bag {bag.path} does not say what its plant was: bags of 'spacerobot run' hold "

@@ -16,7 +16,7 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.report import write_figures, write_picture
-from spacerobot_ros.report.figures_time import window_of
+from spacerobot_ros.report.figures_forces import window_of
 from spacerobot_ros.report.signals import Signal
 from spacerobot_ros.report.style import PictureFormat
 

@@ -34,7 +34,7 @@ from support.html_page import Page, leave_blank
 from spacerobot_ros.bag import RecordingError
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.report import figures_space, write_picture, write_report
-from spacerobot_ros.report.figures_time import shape_plate
+from spacerobot_ros.report.figures_motion import shape_plate
 from spacerobot_ros.report.plates import Plate
 from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.report.style import drawing

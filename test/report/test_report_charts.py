@@ -14,7 +14,7 @@ from support.html_page import leave_blank
 
 from spacerobot_ros.report import write_report
 from spacerobot_ros.report.charts import charts_of, thinned
-from spacerobot_ros.report.figures_time import shape_plate
+from spacerobot_ros.report.figures_motion import shape_plate
 from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.report.signals import Signal

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from support.flight_bags import GOAL, TICK, Story, goal_value, still, tell
 
 from spacerobot_ros.events import EventKind
-from spacerobot_ros.report import figures_time
+from spacerobot_ros.report import figures_forces, figures_motion
 from spacerobot_ros.report.events import _MARKS
 from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.report.reading import read_flight
@@ -72,11 +72,11 @@ def test_events_have_the_time_that_their_node_gave(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "plate",
     [
-        figures_time.position_plate,
-        figures_time.attitude_plate,
-        figures_time.shape_plate,
-        figures_time.rates_plate,
-        figures_time.momentum_plate,
+        figures_motion.position_plate,
+        figures_motion.attitude_plate,
+        figures_motion.shape_plate,
+        figures_motion.rates_plate,
+        figures_forces.momentum_plate,
     ],
 )
 def test_a_lane_below_every_time_axis_has_every_event(
@@ -100,7 +100,7 @@ def test_a_lane_below_every_time_axis_has_every_event(
 
 @pytest.mark.parametrize("events", [[], EVENTS[7:]])
 def test_a_bag_without_events_has_no_lane(tmp_path: Path, events: list[Any]) -> None:
-    made = figures_time.position_plate(read_flight(story(tmp_path, events)))
+    made = figures_motion.position_plate(read_flight(story(tmp_path, events)))
     assert not isinstance(made, str)
     assert "Below the time axis" not in made.caption
     assert not lanes(made.figure)

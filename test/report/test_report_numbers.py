@@ -24,15 +24,14 @@ from spacerobot_ros.bag import read_bag
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.figures_errors import pose_errors, sensors_plate
-from spacerobot_ros.report.figures_time import (
+from spacerobot_ros.report.figures_forces import thrusters_plate
+from spacerobot_ros.report.figures_motion import (
     attitude_group,
-    joint_unit,
     position_group,
     position_plate,
     shape_groups,
-    thrusters_plate,
 )
-from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.flight import Flight, joint_unit
 from spacerobot_ros.report.live import Live
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.plates import Plate
