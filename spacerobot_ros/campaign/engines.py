@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 
 from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.draws import Draw
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
-from spacerobot_ros.campaign.rows import Engine
+from spacerobot_ros.campaign.rows import FLIGHTS, Engine, Left, Row
 from spacerobot_ros.errors import SpaceRobotError
 
 ALL: Mapping[str, Callable[[], Engine]] = {
@@ -47,3 +49,19 @@ def chosen_engine(campaign: Campaign, wanted: str) -> Engine:
 def engine_called(name: str) -> Engine:
     """Return an engine by its name, the same one in each process: it keeps what it has built."""
     return ALL[name]()
+
+
+def fly_all(
+    engine: Engine, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
+) -> Iterator[Row]:
+    """Yield a row for each draw; what an engine leaves is flown after the others."""
+    left: list[Left] = []
+    for made in engine.fly(campaign, draws, stopped):
+        if isinstance(made, Left):
+            left.append(made)
+        else:
+            yield made
+    reasons = {each.draw.number: each.why for each in left}
+    for row in engine_called(FLIGHTS).fly(campaign, [each.draw for each in left], stopped):
+        assert isinstance(row, Row), "it leaves nothing"
+        yield replace(row, fallback=reasons[row.draw.number])

@@ -25,7 +25,7 @@ from spacerobot_ros.campaign.controlled_lanes import (
 )
 from spacerobot_ros.campaign.draws import Draw, drawn_flight
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, node_robot, robots_of
-from spacerobot_ros.campaign.rows import LANES, Row
+from spacerobot_ros.campaign.rows import LANES, Left, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.arrays import Commands, FlightArrays, Outcome
@@ -80,14 +80,6 @@ class _Planned:
         return None if plan is None else cls(draw, flight, *plan, time.perf_counter() - began)
 
 
-@dataclass(frozen=True)
-class _Left:
-    """A draw that lanes leave to the engine ``flights``, and why."""
-
-    draw: Draw
-    why: str
-
-
 class LanesEngine:
     """Many flights at once, on vector registers."""
 
@@ -119,23 +111,14 @@ class LanesEngine:
 
     def fly(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row]:
-        """Fly draws in batches, and after them what lanes leave to the engine ``flights``."""
+    ) -> Iterator[Row | Left]:
+        """Fly draws in batches; leave those that need a planner or controller on the way."""
         plans = "planner" in campaign.scenario.commanders
-        in_lanes = self._tracked if plans else self._controlled
-        left: list[_Left] = []
-        for made in in_lanes(campaign, draws, stopped):
-            if isinstance(made, _Left):
-                left.append(made)
-            else:
-                yield made
-        reasons = {each.draw.number: each.why for each in left}
-        for row in self._flights.fly(campaign, [each.draw for each in left], stopped):
-            yield replace(row, fallback=reasons[row.draw.number])
+        return (self._tracked if plans else self._controlled)(campaign, draws, stopped)
 
     def _controlled(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row | _Left]:
+    ) -> Iterator[Row | Left]:
         """Fly draws of coordinated control."""
         common = DrawnFlight.of(campaign.scenario)
         for first in range(0, len(draws), _MOST_CONTROLLED):
@@ -151,20 +134,20 @@ class LanesEngine:
                 try:
                     require_lane(campaign, flight)
                 except SpaceRobotError as error:  # It alone: the others of its batch are flown.
-                    yield _Left(draw, str(error))
+                    yield Left(draw, str(error))
                     continue
                 batch.append((draw, flight))
             if not batch:
                 continue
             for draw, flown in fly_controlled(campaign, batch):
                 if isinstance(flown, str):
-                    yield _Left(draw, flown)
+                    yield Left(draw, flown)
                 else:
                     yield Row.of(campaign, draw, flown, self.name)
 
     def _tracked(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row | _Left]:
+    ) -> Iterator[Row | Left]:
         """Fly draws that follow the plans of a planner."""
         common, batch, ticks = DrawnFlight.of(campaign.scenario), list[_Planned](), 0
         began = time.perf_counter()
@@ -177,7 +160,7 @@ class LanesEngine:
                 yield Row.failed(draw, error, self.name)
                 continue
             if planned is None:
-                yield _Left(draw, "No schedule begins at the first state.")
+                yield Left(draw, "No schedule begins at the first state.")
                 continue
             batch.append(planned)
             ticks += planned.schedule.ticks
@@ -202,7 +185,7 @@ class LanesEngine:
             self._kept = key, _first_plan(flight)
         return _Planned.of(draw, flight, self._kept[1], began)
 
-    def _flown(self, campaign: Campaign, batch: list[_Planned]) -> Iterator[Row | _Left]:
+    def _flown(self, campaign: Campaign, batch: list[_Planned]) -> Iterator[Row | Left]:
         """Fly a batch in lanes."""
         began = time.perf_counter()
         flights, ends = _flights(batch)
@@ -211,9 +194,9 @@ class LanesEngine:
         for row, planned in enumerate(batch):
             flight = _flight(result, row, planned, flights, ends[row])
             if isinstance(flight, str):
-                yield _Left(planned.draw, flight)
+                yield Left(planned.draw, flight)
             elif flight.duration > campaign.longest:
-                yield _Left(planned.draw, "It is interrupted on the way.")
+                yield Left(planned.draw, "It is interrupted on the way.")
             else:
                 made = Row.of(campaign, planned.draw, flight, self.name)
                 yield replace(made, wall_time=taken + planned.plan_time)

@@ -16,6 +16,9 @@ from spacerobot_ros.flight.arrays import FlightArrays
 LANES = "lanes"
 """The engine that flies many at once."""
 
+FLIGHTS = "flights"
+"""The engine that flies one by one, and what others leave to it."""
+
 ERROR = "error"
 """The outcome of a flight that could not be flown; the reason says why."""
 
@@ -76,6 +79,14 @@ class Row:
         return cls(draw, ERROR, reason, engine=engine)
 
 
+@dataclass(frozen=True)
+class Left:
+    """A draw that an engine leaves to the engine ``flights``, and why."""
+
+    draw: Draw
+    why: str
+
+
 class Engine(Protocol):
     """Flies draws.
 
@@ -94,5 +105,5 @@ class Engine(Protocol):
 
     def fly(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row]:
-        """Yield a row for each draw; fewer where it is stopped."""
+    ) -> Iterator[Row | Left]:
+        """Yield a row for each draw, or why it is left; fewer where it is stopped."""

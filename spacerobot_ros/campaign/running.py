@@ -10,8 +10,8 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,9 @@ from spacerobot_ros import __version__
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws
-from spacerobot_ros.campaign.engines import chosen_engine, engine_called
+from spacerobot_ros.campaign.engines import chosen_engine, engine_called, fly_all
 from spacerobot_ros.campaign.extras import needed
-from spacerobot_ros.campaign.rows import Row
+from spacerobot_ros.campaign.rows import FLIGHTS, Left, Row
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.private_files import warn_once
 
@@ -163,8 +163,7 @@ def _rows(
     if not numbers:
         return
     if not cluster.workers and not cluster.scheduler:
-        flying = engine_called(engine)
-        for row in flying.fly(campaign, _Chosen(draws, numbers), stopped):
+        for row in fly_all(engine_called(engine), campaign, _Chosen(draws, numbers), stopped):
             yield [row]
         return
     specification = _Specification(self_contained(campaign))
@@ -217,8 +216,17 @@ def _parsed(specification: _Specification) -> Campaign:
     )
 
 
-def fly_task(specification: _Specification, draws: list[Draw], engine: str) -> list[Row]:
+def fly_task(
+    specification: _Specification, draws: list[Draw], engine: str, *, all_of_them: bool = False
+) -> list[Row | Left]:
     """Fly some draws in a worker: a task of the scheduler.
+
+    Parameters
+    ----------
+    specification, draws, engine
+        What is flown by what.
+    all_of_them
+        What the engine leaves is flown here, too.
 
     Raises
     ------
@@ -230,8 +238,9 @@ def fly_task(specification: _Specification, draws: list[Draw], engine: str) -> l
             f"A worker has spacerobot_ros {__version__}, and this process {specification.version}: "
             "all need the same."
         )
-    campaign = specification.campaign()
-    return list(engine_called(engine).fly(campaign, draws, lambda: False))
+    flying, campaign = engine_called(engine), specification.campaign()
+    fly = partial(fly_all, flying) if all_of_them else flying.fly
+    return list(fly(campaign, draws, lambda: False))
 
 
 # -- the scheduler ----------------------------------------------------------------------------
@@ -305,8 +314,18 @@ def _lost() -> SpaceRobotError:
     )
 
 
+@dataclass(frozen=True)
+class _Task:
+    """Draws that a worker flies now, by number, and the engine that flies them."""
+
+    numbers: list[int]
+    engine: str
+
+
 class _Distribution:
     """Deals draws out to workers.
+
+    What an engine leaves to the engine ``flights`` is dealt out anew, in tasks of fewer flights.
 
     A worker that dies takes the tasks with it that it has, the one that killed it and others. Their
     flights are suspects: each is flown again in a task of its own, one suspect at a time. One that
@@ -323,9 +342,15 @@ class _Distribution:
     ) -> None:
         self._client, self._specification, self._draws = client, specification, draws
         self._engine, self._stopped = engine, stopped
-        self._least = engine_called(engine).least
-        self._size = float(max(_FIRST, self._least))
-        self._running: dict[Any, tuple[list[int], float]] = {}
+        self._sizes = {
+            name: float(max(_FIRST, engine_called(name).least)) for name in (engine, FLIGHTS)
+        }
+        """Flights of a task, by what flies it."""
+        self._left: deque[int] = deque()
+        """Draws that the engine has left to the engine ``flights``."""
+        self._reasons: dict[int, str] = {}
+        """Why it has left each of them."""
+        self._running: dict[Any, _Task] = {}
         self._suspects: deque[int] = deque()
         self._deaths: Counter[int] = Counter()
         self._fit: set[str] = set()
@@ -338,7 +363,7 @@ class _Distribution:
     def rows(self, numbers: list[int]) -> Iterator[list[Row]]:
         """Yield the rows of these draws as their tasks end."""
         waiting = deque(numbers)
-        while (waiting or self._suspects or self._running) and not self._stopped():
+        while (waiting or self._left or self._suspects or self._running) and not self._stopped():
             self._submit(waiting)
             ended = self._ended()
             if not ended:
@@ -351,13 +376,14 @@ class _Distribution:
     def _submit(self, waiting: deque[int]) -> None:
         """Keep the workers busy."""
         if self._suspects and self._suspected is None:
-            self._suspected = self._task([self._suspects.popleft()])
+            self._suspected = self._task([self._suspects.popleft()], self._engine, alone=True)
         workers = self._workers()
-        while waiting and len(self._running) < _AHEAD * workers:
+        while (self._left or waiting) and len(self._running) < _AHEAD * workers:
+            queue, engine = (self._left, FLIGHTS) if self._left else (waiting, self._engine)
             # The last tasks are smaller, so that no worker is alone at the end.
-            size = min(self._size, max(self._least, len(waiting) / workers))
-            count = min(len(waiting), max(1, round(size)))
-            self._task([waiting.popleft() for _ in range(count)])
+            share = max(engine_called(engine).least, len(queue) / workers)
+            count = min(len(queue), max(1, round(min(self._sizes[engine], share))))
+            self._task([queue.popleft() for _ in range(count)], engine)
 
     def _workers(self) -> int:
         """Return how many workers there are, at least one: others may join later.
@@ -404,12 +430,13 @@ class _Distribution:
             if not isinstance(spec, Exception):  # It may be gone again.
                 self._fit.add(address)
 
-    def _task(self, numbers: list[int]) -> Any:
+    def _task(self, numbers: list[int], engine: str, *, alone: bool = False) -> Any:
         draws = [self._draws[number] for number in numbers]
         future = self._client.submit(
-            fly_task, self._specification, draws, self._engine, pure=False, retries=0
+            *(fly_task, self._specification, draws, engine),
+            **{"all_of_them": alone, "pure": False, "retries": 0},
         )
-        self._running[future] = numbers, time.monotonic()
+        self._running[future] = _Task(numbers, engine)
         return future
 
     def _ended(self) -> list[Any]:
@@ -434,14 +461,14 @@ class _Distribution:
         """
         from distributed.scheduler import KilledWorker
 
-        numbers, _ = self._running.pop(future)
+        task = self._running.pop(future)
         alone = future is self._suspected
         if alone:
             self._suspected = None
         try:
-            rows: list[Row] = future.result()
+            made: list[Row | Left] = future.result()
         except KilledWorker:
-            return self._mourned(numbers, alone)
+            return self._mourned(task.numbers, alone)
         except CancelledError as error:
             raise _lost() from error
         except (ImportError, RuntimeError) as error:
@@ -453,12 +480,22 @@ class _Distribution:
                 f"({str(error).splitlines()[0]}): all of them need {_PACKAGE}[campaign] "
                 f"{__version__}."
             ) from error
+        rows = [each for each in made if isinstance(each, Row)]
+        left = [each for each in made if isinstance(each, Left)]
+        self._left += [each.draw.number for each in left]
+        self._reasons |= {each.draw.number: each.why for each in left}
         if not alone and rows:
             took = sum(row.wall_time for row in rows if row.wall_time == row.wall_time)
             if took > 0:
-                size = 0.5 * self._size + 0.5 * len(rows) * TASK_TIME / took
-                self._size = max(self._least, min(_MOST, size))
-        return rows
+                size = 0.5 * self._sizes[task.engine] + 0.5 * len(rows) * TASK_TIME / took
+                least = engine_called(task.engine).least
+                self._sizes[task.engine] = max(least, min(_MOST, size))
+        return [
+            replace(row, fallback=self._reasons[number])
+            if (number := row.draw.number) in self._reasons
+            else row
+            for row in rows
+        ]
 
     def _mourned(self, numbers: list[int], alone: bool) -> list[Row]:
         """Take the flights of a task whose worker died for suspects; report the guilty one."""

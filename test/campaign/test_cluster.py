@@ -19,6 +19,7 @@ import yaml
 from support.awaited import await_files
 from support.campaigns import campaign, section
 
+from spacerobot_ros.campaign import running
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.running import Cluster, _client, run_campaign
 
@@ -221,3 +222,34 @@ def test_what_was_flown_is_kept_after_ctrl_c(tmp_path: Path) -> None:
     assert len(numbers) >= 8
     assert len(numbers) == len(set(numbers))
     assert (out / "report.html").exists()
+
+
+def test_what_lanes_leave_is_flown_in_small_tasks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows of a slow campaign come while it flies, and are those of one process."""
+    corrected = {"planner.attitude_tolerance": 0.002, "planner.max_corrections": 3}
+    made = campaign(
+        disperse={"mass.*": {"norm": {"loc": 1.0, "scale": 0.03}}}, flights=70, set=corrected
+    )
+    tasks: list[tuple[int, str]] = []
+    deal = running._Distribution._task
+
+    def dealt(self: Any, numbers: list[int], engine: str, **options: Any) -> Any:
+        tasks.append((len(numbers), engine))
+        return deal(self, numbers, engine, **options)
+
+    monkeypatch.setattr(running._Distribution, "_task", dealt)
+    run_campaign(made, tmp_path / "here", engine="lanes")
+    run_campaign(made, tmp_path / "there", engine="lanes", cluster=Cluster(workers=2))
+    here, there = (
+        {row["flight"]: row for row in rows(tmp_path / name)} for name in ("here", "there")
+    )
+    assert here.keys() == there.keys() == set(range(70))
+    named = ("engine", "fallback", "outcome", "reason", "position_error_m", "duration_s")
+    assert all(here[n][name] == there[n][name] for n in here for name in named)
+    left = sum(row["fallback"] == "It is corrected." for row in there.values())
+    assert 5 < left < 70
+    assert sum(size for size, engine in tasks if engine == "flights") == left
+    assert max(size for size, engine in tasks if engine == "flights") < 64
+    assert sum(size for size, engine in tasks if engine == "lanes") == 70

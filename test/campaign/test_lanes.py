@@ -12,7 +12,7 @@ from support.campaigns import campaign
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
-from spacerobot_ros.campaign.engines import chosen_engine
+from spacerobot_ros.campaign.engines import chosen_engine, fly_all
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.rerunning import TOLERANCE, largest_deviation
@@ -33,7 +33,7 @@ DISPERSED: dict[str, Any] = {
 
 
 def flown(engine: LanesEngine | FlightsEngine, made: Campaign) -> dict[int, Row]:
-    rows = engine.fly(made, list(Draws(made)), lambda: False)
+    rows = fly_all(engine, made, list(Draws(made)), lambda: False)
     return {row.draw.number: row for row in rows}
 
 

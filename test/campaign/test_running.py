@@ -14,12 +14,13 @@ from spacerobot_ros.campaign import running
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
+from spacerobot_ros.campaign.engines import fly_all
 from spacerobot_ros.campaign.extras import needed
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
 from spacerobot_ros.campaign.report import Results
 from spacerobot_ros.campaign.rerunning import TOLERANCE, largest_deviation, rerun_flight
-from spacerobot_ros.campaign.rows import ERROR, Row
+from spacerobot_ros.campaign.rows import ERROR, Left, Row
 from spacerobot_ros.campaign.running import Progress, run_campaign
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 
@@ -203,6 +204,24 @@ def test_a_worker_of_another_version_flies_nothing(monkeypatch: pytest.MonkeyPat
         running.fly_task(specification, [_draw(made, 0)], "flights")
 
 
+def test_a_task_of_lanes_leaves_what_others_fly_unless_all_of_it_is_asked_for() -> None:
+    """What is flown at once is sent back before flights that take long."""
+    settings = {"planner.attitude_tolerance": 0.002, "planner.max_corrections": 3}
+    made = campaign(flights=8, set=settings, disperse={"mass.*": {"norm": [1.0, 0.03]}}, seed=8)
+    specification, draws = running._Specification(made), list(Draws(made))
+    part = running.fly_task(specification, draws, "lanes")
+    whole = running.fly_task(specification, draws, "lanes", all_of_them=True)
+    assert all(isinstance(each, Row) for each in whole)
+    left = {each.draw.number: each.why for each in part if isinstance(each, Left)}
+    assert 0 < len(left) < 8
+    assert left == {
+        each.draw.number: each.fallback
+        for each in whole
+        if isinstance(each, Row) and each.engine == "flights"
+    }
+    assert set(left.values()) == {"It is corrected."}
+
+
 @pytest.fixture
 def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
@@ -304,7 +323,7 @@ def test_the_servicer_is_the_same_in_lanes_one_by_one_and_in_the_stack(
     section = {"scenario": "servicer", "flights": 3, "seed": 5, "disperse": SERVICER}
     made = parse_campaign("servicer", {**section, "set": settings})
     draws = list(Draws(made))
-    lanes = list(LanesEngine().fly(made, draws, lambda: False))
+    lanes = list(fly_all(LanesEngine(), made, draws, lambda: False))
     one_by_one = list(FlightsEngine().fly(made, draws, lambda: False))
     stack = list(RosEngine().fly(made, draws[:2], lambda: False))
     assert [row.engine for row in lanes] == ["lanes"] * 3
