@@ -155,7 +155,8 @@ def _require_fonts(path: Path) -> None:
             f"The style file {path} is refused: of the fonts that it names "
             f"({', '.join(families)}) none is installed."
         )
-    mpl.rcParams["font.family"] = found
+    # Which comes with matplotlib, and has the signs that many fonts lack: 10⁻¹⁵, p₀.
+    mpl.rcParams["font.family"] = list(dict.fromkeys([*found, "DejaVu Sans"]))
 
 
 def _installed(family: str) -> bool:

@@ -140,6 +140,18 @@ def test_a_style_changes_neither_the_width_nor_who_places_the_panels(
     assert not caplog.records
 
 
+def test_signs_that_a_font_lacks_are_those_of_another(bag: Path, tmp_path: Path) -> None:
+    """STIXGeneral, which comes with matplotlib, has no superscript minus: 10⁻¹⁵."""
+    style = tmp_path / "own.mplstyle"
+    style.write_text("font.family: STIXGeneral\n")
+    write_figures(bag, tmp_path, ["momentum"], style=style)
+    page = pypdf.PdfReader(tmp_path / "momentum.pdf").pages[0]
+    found: Any = page["/Resources"]["/Font"]  # type: ignore[index]
+    fonts = {found[name]["/BaseFont"].partition("+")[2] for name in found}
+    assert {"STIXGeneral-Regular", "DejaVuSans"} == fonts, "no boxes in the place of signs"
+    assert re.search("10⁻¹[0-9⁰¹²³⁴⁵⁶⁷⁸⁹]", page.extract_text())
+
+
 def test_a_style_of_matplotlib_is_known_by_its_name(bag: Path, tmp_path: Path) -> None:
     """ggplot has ticks and axes in white and grey on its own grey."""
     write_figures(bag, tmp_path, ["pose"], format=PictureFormat.SVG, style=Path("ggplot"))
