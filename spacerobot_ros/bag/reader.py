@@ -8,7 +8,7 @@ from contextlib import suppress
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -34,6 +34,8 @@ from spacerobot_ros.resources import suggestion
 if TYPE_CHECKING:
     import pandas
     import xarray
+
+_Default = TypeVar("_Default")
 
 _TEXT = "std_msgs/msg/String"
 
@@ -137,6 +139,20 @@ class Bag:
         """
         return ((topic, self[topic]) for topic in self)
 
+    def values(self) -> Iterator[TopicSeries]:
+        """Go through the messages of all topics; raises as :meth:`items` does."""
+        return (self[topic] for topic in self)
+
+    @overload
+    def get(self, topic: str) -> TopicSeries | None: ...
+    @overload
+    def get(self, topic: str, default: _Default) -> TopicSeries | _Default: ...
+    def get(self, topic: str, default: Any = None) -> Any:
+        """Return the messages of a topic, or ``default`` where there is no such topic."""
+        if topic not in self:
+            return default
+        return self[topic]
+
     def __repr__(self) -> str:
         rows = self._overview()
         wide = max((len(row[0]) for row in rows), default=0)
@@ -165,6 +181,8 @@ class Bag:
 
     def _recorded_name(self, topic: str) -> str:
         """Return the name as recorded of a topic named with or without the slash before it."""
+        if not isinstance(topic, str):
+            raise TypeError(f"A topic is named by a text, such as 'odom', and not by {topic!r}.")
         other = topic[1:] if topic.startswith("/") else f"/{topic}"
         return other if topic not in self.topics and other in self.topics else topic
 

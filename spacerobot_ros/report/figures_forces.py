@@ -35,11 +35,12 @@ from spacerobot_ros.report.style import (
 _DECADES = 4
 
 _PEAKS = 0.02
-"""Part of the samples that may be beyond the axis."""
+"""Part of the samples that may be beyond the axis: the peaks."""
 
 _FAR = (3.0, 1e4)
-"""Where all values span so many times what the others do, the axis is for the others; where they
-span even more, the others are rest.
+"""Least and largest ratio of the span of all samples to that of all but the peaks, between which
+the axis leaves the peaks out. Below it they can be read together; above it all but the peaks is a
+robot at rest, and the peaks are what happens.
 """
 
 _SMALLEST = 1e-9
