@@ -227,11 +227,13 @@ class Plots:
         self._gui = gui
         self._tab_group = gui.add_tab_group()
         with self._tab_group.add_tab("Errors"):
-            self._error = _Plot(gui, "Base from its goal", ("m", "rad"))
-            self._tool = _Plot(gui, "End-effector from its goal", ("m", "rad"))
+            self._error = _Plot(gui, "Base from its goal", ("m", "rad"), 1e-4)
+            self._tool = _Plot(gui, "End-effector from its goal", ("m", "rad"), 1e-4)
             self._tool.handle.visible = False
         with self._tab_group.add_tab("Momentum"):
-            self._momentum = _Plot(gui, "Momenta from what they should be", ("kg m/s", "kg m²/s"))
+            self._momentum = _Plot(
+                gui, "Momenta from what they should be", ("kg m/s", "kg m²/s"), 1e-5
+            )
         self._joint_tab = self._tab_group.add_tab("Shape")
         self._shape: _Plot | None = None
         self._first: Array | None = None
@@ -246,7 +248,9 @@ class Plots:
             self._shape = None
         if robot is not None and robot.joint_names:
             with self._joint_tab:
-                self._shape = _Plot(self._gui, "Joints (m, rad)", robot.joint_names)
+                self._shape = _Plot(
+                    self._gui, "Joints (m, rad)", robot.joint_names, 1e-3, signed=True
+                )
 
     def add(self, state: StackState) -> None:
         """Take the last state into the curves."""
@@ -275,9 +279,29 @@ class Plots:
 
 
 class _Plot:
-    """One figure with its numbers; colors that are seen on white and on black."""
+    """One figure with its numbers; colors that are seen on white and on black.
 
-    def __init__(self, gui: viser.GuiApi, title: str, names: tuple[str, ...]) -> None:
+    Parameters
+    ----------
+    gui, title
+        Where it is added, and what is above it.
+    names
+        Of the curves.
+    least
+        Numbers up to which the axis goes at least: rounding is not to look like a peak.
+    signed
+        Whether the numbers may be negative.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        title: str,
+        names: tuple[str, ...],
+        least: float,
+        *,
+        signed: bool = False,
+    ) -> None:
         self.history = History(len(names))
         series: list[Any] = [{"label": "t (s)"}]
         for i, name in enumerate(names):
@@ -287,12 +311,15 @@ class _Plot:
             series.append(look | ({"dash": (max(12 // turn, 2), 4)} if turn else {}))
         faint = {"stroke": f"{_AXIS}33"}
         axis: dict[str, Any] = {"stroke": _AXIS, "grid": faint, "ticks": faint}
+        # Of uPlot's "soft limits", mode 1: those of the axis where all numbers are within.
+        end = {"pad": 0.1, "mode": 1}
+        ends = {"min": end | {"soft": -least if signed else 0.0}, "max": end | {"soft": least}}
         self.handle: Any = gui.add_uplot(
             self.history.columns(),
             tuple(series),
             title=title,
-            scales={"x": {"time": False}},
-            axes=(axis | {"size": 34}, axis | {"size": 62}),  # type: ignore[arg-type]
+            scales={"x": {"time": False}, "y": {"range": ends}},  # type: ignore[dict-item]
+            axes=(axis | {"size": 34}, axis | {"size": 66}),  # type: ignore[arg-type]
             height=_PLOT_HEIGHT,
         )
         self._width = len(names)

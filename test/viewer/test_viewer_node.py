@@ -463,9 +463,12 @@ def test_a_commander_that_is_busy_is_waited_for(harness: Harness) -> None:
     viewer._unanswered = "7.000000001", 100.0
     viewer._send_goals(replace(state, busy=True), 99.0)
     viewer._send_goals(replace(state, busy=True), 130.0)
-    viewer._send_goals(state, 131.0)
+    paused = PlantStatus(PlantState.PAUSED, "Time stands still.")
+    viewer._send_goals(replace(state, plant=paused), 131.0)
+    viewer._send_goals(replace(state, plant=paused), 136.5)
+    viewer._send_goals(state, 137.0)
     assert "answered" not in stack.log(), "it may just have planned"
-    viewer._send_goals(state, 136.0)
+    viewer._send_goals(state, 142.0)
     assert "Nobody has answered the goal: send it again." in stack.log()
     # Heartbeats of a plant that is busy are of no commander.
     heart = stack.probe.create_publisher(DiagnosticStatus, "/heartbeat", 20)

@@ -147,7 +147,7 @@ def test_a_robot_far_from_the_origin_is_looked_at_and_has_a_grid_below(server: A
 def test_curves_of_many_joints_differ(server: Any) -> None:
     names = tuple(f"joint_{number}" for number in range(30))
     server.gui.reset()
-    plot = _Plot(server.gui, "Joints", names)
+    plot = _Plot(server.gui, "Joints", names, 1e-3, signed=True)
     looks = {(each["stroke"], each.get("dash")) for each in plot.handle.series[1:]}
     assert len(looks) == 30
 

@@ -37,6 +37,7 @@ from spacerobot_ros.planning import Goal, RobotState
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import Targets
+from spacerobot_ros.simulation.status import PlantState
 from spacerobot_ros.viewer.config import ViewerConfig
 from spacerobot_ros.viewer.page import Page
 from spacerobot_ros.viewer.port import (
@@ -412,7 +413,10 @@ class ViewerNode(FlightNode):
             statuses = (state.planner, state.controller)
             if any(status is not None and status.goal_id == goal_id for status in statuses):
                 self._unanswered = None
-            elif state.busy:
+            elif state.busy or (
+                # Commanders answer with the next state.
+                state.plant is not None and state.plant.state is PlantState.PAUSED
+            ):
                 self._unanswered = goal_id, now + _LONGEST_ANSWER
             elif now >= until:
                 self._unanswered = None
