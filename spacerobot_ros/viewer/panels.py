@@ -8,6 +8,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.simulation.faults import KINDS, Targets
@@ -227,13 +229,13 @@ class Plots:
         self._gui = gui
         self._tab_group = gui.add_tab_group()
         with self._tab_group.add_tab("Errors"):
-            self._error = _Plot(gui, "Base from its goal", ("m", "rad"), 1e-4)
-            self._tool = _Plot(gui, "End-effector from its goal", ("m", "rad"), 1e-4)
+            self._error = _Plot(gui, "Base from its goal", ("m", "rad"), 0.01)
+            self._tool = _Plot(gui, "End-effector from its goal", ("m", "rad"), 0.01)
             self._tool.handle.visible = False
         with self._tab_group.add_tab("Momentum"):
-            self._momentum = _Plot(
-                gui, "Momenta from what they should be", ("kg m/s", "kg m²/s"), 1e-5
-            )
+            # In millionths: the figures of an axis have three digits behind the point.
+            units = ("1e-6 kg m/s", "1e-6 kg m²/s")
+            self._momentum = _Plot(gui, "Momenta from what they should be", units, 1.0)
         self._joint_tab = self._tab_group.add_tab("Shape")
         self._shape: _Plot | None = None
         self._first: Array | None = None
@@ -249,7 +251,7 @@ class Plots:
         if robot is not None and robot.joint_names:
             with self._joint_tab:
                 self._shape = _Plot(
-                    self._gui, "Joints (m, rad)", robot.joint_names, 1e-3, signed=True
+                    self._gui, "Joints (m, rad)", robot.joint_names, 0.01, signed=True
                 )
 
     def add(self, state: StackState) -> None:
@@ -267,7 +269,8 @@ class Plots:
         if state.momenta is not None:
             if self._first is None:
                 self._first = state.momenta.actual
-            self._momentum.history.add(time_s, content.momentum_drift(state.momenta, self._first))
+            drift = content.momentum_drift(state.momenta, self._first)
+            self._momentum.history.add(time_s, 1e6 * np.array(drift))
         if self._shape is not None:
             self._shape.history.add(time_s, measured.q)
 
@@ -318,7 +321,7 @@ class _Plot:
             self.history.columns(),
             tuple(series),
             title=title,
-            scales={"x": {"time": False}, "y": {"range": ends}},  # type: ignore[dict-item]
+            scales={"x": {"time": False}, "y": {"range": ends}},
             axes=(axis | {"size": 34}, axis | {"size": 66}),  # type: ignore[arg-type]
             height=_PLOT_HEIGHT,
         )

@@ -19,8 +19,8 @@ from spacerobot_ros.resources import robot_file
 from spacerobot_ros.viewer import scene
 from spacerobot_ros.viewer.config import ViewerConfig
 from spacerobot_ros.viewer.page import CAMERA, Page
-from spacerobot_ros.viewer.panels import _Plot
-from spacerobot_ros.viewer.port import Measured, StackState
+from spacerobot_ros.viewer.panels import Plots, _Plot
+from spacerobot_ros.viewer.port import Measured, Momenta, StackState
 from spacerobot_ros.viewer.server import start_server, stop_server
 
 
@@ -150,6 +150,28 @@ def test_curves_of_many_joints_differ(server: Any) -> None:
     plot = _Plot(server.gui, "Joints", names, 1e-3, signed=True)
     looks = {(each["stroke"], each.get("dash")) for each in plot.handle.series[1:]}
     assert len(looks) == 30
+
+
+def test_rounding_is_no_peak_and_numbers_of_a_flight_are_seen(server: Any) -> None:
+    server.gui.reset()
+    plots, zeros = Plots(server.gui), np.zeros(3)
+    plots.show_robot(load_robot(robot_file("sliding_masses")))
+    actual = np.array([1.0, 0.0, 0.0, 0.0, 2.0, 0.0])
+    off = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 2.0])
+    for time_s, size in ((0.0, 0.0), (1.0, 2e-16), (2.0, 3e-6)):
+        measured = Measured(time_s, np.eye(7)[6], zeros, zeros, zeros)
+        plots.add(StackState(measured, momenta=Momenta(actual + size * off, actual, 0.0)))
+    plots.draw()
+    handle = plots._momentum.handle
+    assert [series["label"] for series in handle.series[1:]] == ["1e-6 kg m/s", "1e-6 kg m²/s"]
+    np.testing.assert_allclose(handle.data[1], [0.0, 0.0, 3.0], atol=1e-8)
+    np.testing.assert_allclose(handle.data[2], [0.0, 0.0, 6.0], atol=1e-8)
+    # The axis goes to 1 where everything is less, and from below zero where numbers have signs.
+    ends = handle.scales["y"]["range"]
+    assert (ends["min"]["soft"], ends["max"]["soft"]) == (0.0, 1.0)
+    assert plots._shape is not None
+    ends = plots._shape.handle.scales["y"]["range"]
+    assert (ends["min"]["soft"], ends["max"]["soft"]) == (-0.01, 0.01)
 
 
 def test_plumes_point_against_the_thrust() -> None:
