@@ -1,4 +1,4 @@
-"""The file of a campaign: what is flown how often, what differs, and what is required."""
+"""The file of a campaign: scenario, number of flights, dispersions and criteria."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Distribution:
 
 @dataclass(frozen=True)
 class Dispersion:
-    """What differs from flight to flight, and how."""
+    """A quantity that differs from flight to flight, and its distribution."""
 
     target: Target
     distribution: Distribution
@@ -315,12 +315,13 @@ def _dispersions(section: Mapping[str, Any], scenario: Scenario) -> tuple[Disper
 
 
 _KNOWN_AS = {"normal": "norm", "gauss": "norm", "gaussian": "norm", "exponential": "expon"}
+"""Common names of distributions, with those of scipy.stats."""
 
 _WORDS = {
     "norm": "loc is its mean and scale its standard deviation",
     "uniform": "loc is its least value and scale its width",
 }
-"""What is often looked for under another name."""
+"""What loc and scale are, for those who look for the mean, or for bounds."""
 
 
 def _distribution(target: Target, given: Any) -> Distribution:

@@ -1,4 +1,4 @@
-"""The results of a campaign: a Parquet dataset that grows as flights end, and what it is of."""
+"""The results of a campaign: a Parquet dataset that grows as flights end, and its campaign."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DRAWN = "draw."
 _ABOUT, _CAMPAIGN, _SCENARIO, _FLIGHTS = "about.json", "campaign.yaml", "scenario.yaml", "flights"
 
 _FLUSH_PERIOD, _FLUSH_ROWS = 5.0, 2000
-"""Wall s, and rows, after which rows are written: a campaign that is killed loses no more."""
+"""Wall s, and number of rows, after which rows are written: a kill costs no more of them."""
 
 VERSIONS = json.dumps(
     {"spacerobot_ros": __version__, "numpy": np.__version__, "python": platform.python_version()}
@@ -41,12 +41,12 @@ VERSIONS = json.dumps(
 
 class Dataset:
     """The folder of a campaign: ``campaign.yaml`` and ``scenario.yaml`` say what is flown,
-    ``flights/*.parquet`` has a row a flight.
+    ``flights/*.parquet`` has a row for each flight.
 
     Parameters
     ----------
     folder
-        Where it is.
+        The path of the folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -163,7 +163,7 @@ class Dataset:
         self._descriptor = descriptor
 
     def close(self) -> None:
-        """Write what is left, and let others fly into the folder."""
+        """Write the rows that are not written yet, and unlock the folder for other processes."""
         try:
             self.flush()
         finally:
@@ -214,14 +214,14 @@ class Dataset:
         return found
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Take rows; they are written after some seconds, or with :meth:`flush`."""
+        """Add rows; they are written after some seconds, or with :meth:`flush`."""
         self._rows += rows
         late = time.monotonic() - self._written > _FLUSH_PERIOD
         if self._rows and (late or len(self._rows) >= _FLUSH_ROWS):
             self.flush()
 
     def flush(self) -> None:
-        """Write what was taken: a file of its own, there as a whole or not at all.
+        """Write the rows that were added into a new file, which is complete or does not exist.
 
         Raises
         ------
@@ -322,7 +322,7 @@ def _record(row: Row) -> dict[str, Any]:
 
 
 def _fingerprint(campaign: Campaign) -> str:
-    """Return what is the same for campaigns whose draws are the same flights."""
+    """Return a hash that two campaigns share whose draws of one number are the same flight."""
     text = json.dumps(_drawn_from(campaign), sort_keys=True, default=str)
     flown = scenario_text(self_contained(campaign).scenario)
     return hashlib.sha256(f"{text}{flown}".encode()).hexdigest()

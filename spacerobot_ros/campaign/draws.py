@@ -20,7 +20,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array
 
 _SMALLEST = 1e-12
-"""Shares are at least so far from 0 and 1, where many distributions are infinite."""
+"""Least distance of shares from 0 and 1, where many distributions are infinite."""
 
 
 _BLOCK = 256
@@ -29,16 +29,16 @@ _BLOCK = 256
 
 @dataclass(frozen=True)
 class Draw:
-    """What is drawn for one flight.
+    """The values that are drawn for one flight.
 
     Attributes
     ----------
     number
-        Which flight.
+        The number of the flight.
     seed
-        Of the noise of its sensors and actuators.
+        The seed of the noise of its sensors and actuators.
     values
-        By the names of what is dispersed.
+        The values by the names of the dispersions.
     """
 
     number: int
@@ -60,8 +60,8 @@ class Draws:
         self._block, self._made = -1, list[Draw]()
         """The block of draws that was made last."""
         self.shares = self._spread()
-        """(N, D) the shares of their distributions below the values; none is drawn that way where
-        each flight draws its own."""
+        """(N, D) the shares of the distributions below the values; None with the sampler
+        ``random``, with which each flight draws from a generator of its own."""
 
     def __len__(self) -> int:
         return self._campaign.flights if self.shares is None else len(self.shares)
@@ -121,7 +121,7 @@ class Draws:
         # The name before scipy 1.15, which later ones take, too.
         engine = kinds[campaign.sampler](d=size, seed=rng)
         if campaign.sampler == "sobol":
-            # Any number of them: balance is asked for by a power of two, and told in the docs.
+            # Any number of them: only a power of two is balanced.
             power = int(np.ceil(np.log2(max(1, campaign.flights))))
             return np.asarray(engine.random_base2(power))[: campaign.flights]
         return np.asarray(engine.random(campaign.flights))

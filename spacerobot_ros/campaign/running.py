@@ -1,4 +1,4 @@
-"""Flies the draws of a campaign, here or on a cluster, and writes what comes of them."""
+"""Flies the draws of a campaign, here or on a cluster, and writes a row for each."""
 
 from __future__ import annotations
 
@@ -27,26 +27,27 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.private_files import warn_once
 
 TASK_TIME = 2.0
-"""Wall s that a task shall take: what a scheduler does for one is then small."""
+"""Wall s that a task shall take: the work of the scheduler for one is then small beside it."""
 
 _FIRST, _MOST = 4, 2000
-"""Flights of the first tasks, and of the largest."""
+"""Numbers of flights in the first tasks, and in the largest."""
 
 _AHEAD = 2
-"""Tasks a worker that are submitted before others end."""
+"""Tasks for each worker that are submitted before its present one ends, that one included."""
 
 _MOST_DEATHS = 2
-"""Workers that a flight may take with it before it is reported and not tried again."""
+"""Workers that may die during a flight before it is reported and not flown again."""
 
 _PACKAGE = "spacerobot_ros"
 
 _LOOK_PERIOD = 0.2
+"""Longest wall s between two looks at tasks, signals and the dataset."""
 
 _ALONE = 5.0
 """Wall s without a worker before a warning says so."""
 
 KILLED = "killed"
-"""The outcome of a flight whose worker died with it, twice."""
+"""The outcome of a flight during which a worker died twice."""
 
 
 @dataclass(frozen=True)
@@ -104,22 +105,23 @@ def run_campaign(
     Parameters
     ----------
     campaign
-        What is flown.
+        The campaign.
     folder
-        Of its dataset.
+        The folder of its dataset.
     engine
-        What flies: a name, or ``auto``.
+        The name of an engine, or ``auto``.
     cluster
-        Where.
+        The workers that fly.
     show
-        Told how far it is.
+        Receives the progress after each task, and a few times a second.
     stopped
-        Asked a few times a second whether to end; what was flown until then is kept.
+        Returns whether to end; called a few times a second. Rows of flights that have ended are
+        kept.
 
     Returns
     -------
     Progress
-        How far it has come.
+        The progress at the end.
 
     Raises
     ------
@@ -172,7 +174,7 @@ def _rows(
 
 
 class _Chosen(Sequence[Draw]):
-    """Some of the draws, made when they are asked for."""
+    """Some draws by their place in a list of numbers, each made when it is used."""
 
     def __init__(self, draws: Draws, numbers: list[int]) -> None:
         self._draws, self._numbers = draws, numbers
@@ -327,9 +329,9 @@ class _Distribution:
 
     What an engine leaves to the engine ``flights`` is dealt out anew, in tasks of fewer flights.
 
-    A worker that dies takes the tasks with it that it has, the one that killed it and others. Their
-    flights are suspects: each is flown again in a task of its own, one suspect at a time. One that
-    dies with its worker then has killed it twice, and is reported.
+    When a worker dies, the scheduler reports all tasks that it had: the one that killed it, and
+    others. Their flights are suspects: each is flown again in a task of its own, one suspect at a
+    time. If a worker dies during such a task, its flight has killed two workers, and is reported.
     """
 
     def __init__(
@@ -498,7 +500,7 @@ class _Distribution:
         ]
 
     def _mourned(self, numbers: list[int], alone: bool) -> list[Row]:
-        """Take the flights of a task whose worker died for suspects; report the guilty one."""
+        """Make suspects of the flights of a task whose worker died; return rows of the guilty."""
         given_up = []
         for number in numbers:
             if alone or not self._deaths[number]:
