@@ -139,11 +139,16 @@ class LanesEngine:
                 batch.append((draw, flight))
             if not batch:
                 continue
-            for draw, flown in fly_controlled(campaign, batch):
-                if isinstance(flown, str):
-                    yield Left(draw, flown)
+            try:
+                flown = fly_controlled(campaign, batch)
+            except SpaceRobotError as error:  # Of one of them: each is flown by itself.
+                yield from (Left(draw, str(error)) for draw, _ in batch)
+                continue
+            for draw, flight_or_reason in flown:
+                if isinstance(flight_or_reason, str):
+                    yield Left(draw, flight_or_reason)
                 else:
-                    yield Row.of(campaign, draw, flown, self.name)
+                    yield Row.of(campaign, draw, flight_or_reason, self.name)
 
     def _tracked(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
