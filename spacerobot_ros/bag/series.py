@@ -176,6 +176,13 @@ class TopicSeries:
             return np.empty((0, 0), dtype)
         return np.array(values, dtype)
 
+    def constant(self, path: str) -> bool:
+        """Whether a list of texts is the same in all messages, as far as that is seen at once.
+
+        True is certain; false may mean that messages differ elsewhere.
+        """
+        return self._columns is not None and self._columns.constant(path)
+
     def table(self, fields: Sequence[str], width: int | None = None) -> NDArray[np.float64]:
         """Return numbers of all messages side by side, a row each.
 
@@ -305,14 +312,22 @@ class _Leaf:
 class Columns:
     """The fields that lie at a fixed place in all of some messages."""
 
-    def __init__(self, matrix: NDArray[np.uint8], leaves: dict[str, _Leaf]) -> None:
+    def __init__(
+        self, matrix: NDArray[np.uint8], leaves: dict[str, _Leaf], texts: dict[str, slice]
+    ) -> None:
         self._matrix = matrix
         self._leaves = leaves
+        self._texts = texts
 
     @property
     def paths(self) -> KeysView[str]:
         """The fields, such as ``pose.pose.position.x``."""
         return self._leaves.keys()
+
+    def constant(self, path: str) -> bool:
+        """Whether a list of texts has the same bytes in all messages."""
+        part = self._texts.get(path)
+        return part is not None and bool((self._matrix[:, part] == self._matrix[0, part]).all())
 
     def __getitem__(self, path: str) -> NDArray[Any] | list[str]:
         leaf = self._leaves[path]
@@ -341,7 +356,7 @@ def columns(messages: Sequence[bytes], type_name: str, fields: Fields) -> Column
     fixed = [slice(0, 2), *(slice(start, start + 4) for start in layout.lengths)]
     if any((matrix[:, part] != matrix[0, part]).any() for part in fixed):
         return None
-    return Columns(matrix, layout.leaves)
+    return Columns(matrix, layout.leaves, layout.texts)
 
 
 class _Layout:
@@ -351,6 +366,7 @@ class _Layout:
         self.position = _HEADER_SIZE
         self.lengths: list[int] = []
         self.leaves: dict[str, _Leaf] = {}
+        self.texts: dict[str, slice] = {}
         self._message = message
         self._fields = fields
 
@@ -373,11 +389,14 @@ class _Layout:
         if kind == Nodetype.BASE and detail[0] != "string":
             self._numbers(_DTYPES[detail[0]], path, (count,))
             return
+        begin = self.position
         for _ in range(count):
             if kind == Nodetype.NAME:
                 self.walk(detail, None)
             else:
                 self._value(detail[0], None)
+        if kind == Nodetype.BASE and path is not None:
+            self.texts[path] = slice(begin, self.position)
 
     def _value(self, base: str, path: str | None) -> None:
         if base != "string":

@@ -130,6 +130,8 @@ class _Recorded(RecordedRobot):
         if series is None:
             return Signal(np.empty(0), np.empty((0, len(fields) if width is None else width)))
         values = series.table(fields, width)
+        if width is not None and TOPICS[name].type == TOPICS["joint_states"].type:
+            values = _by_name(values, series, self.names(name))
         whole = np.isfinite(values).all(axis=1)
         time = (self._times(series) - self._began)[whole]
         order = np.argsort(time, kind="stable")
@@ -162,6 +164,17 @@ class _Recorded(RecordedRobot):
 
     def _times(self, series: TopicSeries) -> Array:
         return series.stamp if self._stamped else series.time
+
+
+def _by_name(values: Array, series: TopicSeries, names: list[str]) -> Array:
+    """Return numbers (N, n) of joints in the order of ``names``; nan of those that lack one."""
+    if series.constant("name"):
+        return values
+    made = np.full_like(values, np.nan)
+    for row, given in enumerate(series.field("name")):
+        if sorted(given) == sorted(names):
+            made[row] = values[row, [given.index(name) for name in names]]
+    return made
 
 
 _SAME_MESSAGE = {"base_wrench": "base_wrench_realised"}

@@ -79,3 +79,23 @@ def test_a_namespace_without_a_robot_is_refused(bag: Path, tmp_path: Path) -> No
         assert result.exit_code == 2
         assert_one_sentence(result.stderr, "'c'", "/fleet/a, /fleet/b")
     assert not (tmp_path / "none").exists()
+
+
+def test_joints_are_known_by_their_names_and_not_by_their_places(tmp_path: Path) -> None:
+    """As from publishers that have another order each, and one that has other joints."""
+    orders = [["a", "b", "c"], ["c", "a", "b"], ["x", "y", "z"], ["b", "c", "a"], ["a", "b"]]
+    numbers = {"a": 1.0, "b": 2.0, "c": 3.0, "x": 7.0, "y": 8.0, "z": 9.0}
+    path = tmp_path / "b.mcap"
+    with made_bag(path) as (_, say):
+        for k, names in enumerate(orders * 2):
+            time = 0.5 * k
+            position = [numbers[name] + time for name in names]
+            velocity = [10.0 * numbers[name] for name in names]
+            say("/joint_states", joint_states(time, names, position, velocity), time)
+    flight = read_flight(path)
+    assert flight.joint_names == ["a", "b", "c"]
+    times = [0.0, 0.5, 1.5, 2.5, 3.0, 4.0]
+    assert flight.shape.time.tolist() == times
+    expected = np.array([1.0, 2.0, 3.0]) + np.array(times)[:, np.newaxis]
+    np.testing.assert_array_equal(flight.shape.values, expected)
+    np.testing.assert_array_equal(flight.rates.values, np.tile([10.0, 20.0, 30.0], (6, 1)))
