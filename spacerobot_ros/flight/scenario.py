@@ -141,9 +141,7 @@ class Scenario:
         before, values = self._changes.get(node, (None, self._given(node)))
         for name, value in values.items():
             if name not in (*known, *_OF_EVERY_NODE):
-                raise ParameterError(
-                    f"Node '{node}' has no parameter '{name}'.{suggestion(name, list(known))}"
-                )
+                raise ParameterError(f"Node '{node}' has no parameter '{name}'.")
             if isinstance(value, str) and name in known:
                 is_number = isinstance(known[name].default, (int, float))
                 values[name] = number_in(value) if is_number else value

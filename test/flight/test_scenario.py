@@ -75,8 +75,6 @@ def test_overrides_go_before_the_file_and_have_the_declared_types() -> None:
     }
     with pytest.raises(ParameterError, match="Node 'plant' has no parameter 'tick_rte'"):
         scenario.with_settings(["plant.tick_rte=10"]).parameters("plant")
-    with pytest.raises(ParameterError, match=r"'optimal.strts'. Did you mean 'optimal.starts'\?"):
-        scenario.with_settings(["planner.optimal.strts=3"]).parameters("planner")
 
 
 def test_overrides_of_a_scenario_that_is_known_are_those_of_a_new_one() -> None:
