@@ -122,15 +122,16 @@ def report_command(folder: Path, report: Path | None) -> None:
 @command.command("rerun")
 @click.argument("folder", metavar="DIR", type=PATH)
 @click.argument("number", metavar="N", type=click.IntRange(min=0))
-@click.option("--bag", type=PATH, help="Bag to write [DIR/flight_N.mcap].")
+@click.option("--bag", type=PATH, help="Bag to write [DIR/flight_N.mcap, or the next free].")
 def rerun(folder: Path, number: int, bag: Path | None) -> None:
     """Fly flight N of DIR alone through ROS, and record a bag.
 
     Exit code 0: it is the flight of the dataset; 1: it is another one; 2: bad input.
     """
+    from spacerobot_ros.bag import free_name
     from spacerobot_ros.campaign.rerunning import rerun_flight
 
-    path = bag or folder / f"flight_{number}.mcap"
+    path = bag or free_name(folder / f"flight_{number}.mcap")
     result = rerun_flight(folder, number, path)
     for line in result.lines:
         click.echo(line)

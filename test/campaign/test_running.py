@@ -8,20 +8,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from support.campaigns import campaign
 
-from spacerobot_ros.campaign import running
+from spacerobot_ros.campaign import rerunning, running
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset
-from spacerobot_ros.campaign.draws import Draws
+from spacerobot_ros.campaign.draws import Draw, Draws
 from spacerobot_ros.campaign.engines import fly_all
 from spacerobot_ros.campaign.extras import needed
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
 from spacerobot_ros.campaign.report import Results
-from spacerobot_ros.campaign.rerunning import TOLERANCE, largest_deviation, rerun_flight
+from spacerobot_ros.campaign.rerunning import TOLERANCE, Rerun, largest_deviation, rerun_flight
 from spacerobot_ros.campaign.rows import ERROR, Left, Row
 from spacerobot_ros.campaign.running import Progress, run_campaign
+from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 
 MASSES: dict[str, Any] = {
@@ -193,6 +195,23 @@ def test_a_campaign_that_was_killed_while_it_began_begins_again(tmp_path: Path) 
     (tmp_path / ".scenario.yaml").write_text("half")
     (tmp_path / "scenario.yaml").write_text("whole")
     assert run_campaign(small(flights=1), tmp_path).done == 1
+
+
+def test_a_flight_is_flown_again_as_often_as_one_likes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each time into a bag of its own."""
+    bags: list[Path] = []
+
+    def fly(folder: Path, number: int, bag: Path) -> Rerun:
+        bags.append(bag)
+        bag.touch()
+        return Rerun(Row(Draw(number, 1, {}), "reached", "."), None, "", "", bag)
+
+    monkeypatch.setattr(rerunning, "rerun_flight", fly)
+    for _ in range(2):
+        assert CliRunner().invoke(main, ["campaign", "rerun", str(tmp_path), "3"]).exit_code == 0
+    assert [bag.name for bag in bags] == ["flight_3.mcap", "flight_3-1.mcap"]
 
 
 def test_a_worker_of_another_version_flies_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
