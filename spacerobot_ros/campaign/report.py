@@ -121,6 +121,22 @@ class Results:
         return len(self.numbers)
 
     @property
+    def bias(self) -> str:
+        """Why the numbers are not those of the whole campaign, as a sentence; empty if they are.
+
+        Draws that take long come late: among the flights of a campaign that is not complete there
+        may be too few of them.
+        """
+        missing = int(self.numbers.max()) + 1 - len(self) if len(self) else 0
+        if not missing:
+            return ""
+        draws = "1 draw is" if missing == 1 else f"{missing} draws are"
+        return (
+            f"{draws} not flown yet although later ones are, mostly because they take longer: "
+            "the shares and distributions may change."
+        )
+
+    @property
     def passed(self) -> Flags:
         """(N,) whether each flight has reached its goal and met every criterion."""
         return np.asarray(self.columns["passed"] > 0)
@@ -208,6 +224,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     results = Results.of(folder)
     write_page(path, f"Campaign {results.campaign.name}", _body(results))
     lines = [f"success     {results.success}"]
+    lines += [f"note        {results.bias}"] if results.bias else []
     lines += [f"required    {c}: {results.requirement(c)}" for c in results.campaign.criteria]
     for each in results.influences()[:3]:
         lines.append(f"driver      {each}")
@@ -326,7 +343,8 @@ def _facts(results: Results) -> str:
         "engine " + ", ".join(f"{name} ({count})" for name, count in engines.items()),
     ]
     spans = "".join(f"<span>{escape(fact)}</span>" for fact in facts)
-    return f'<p class="facts">{spans}</p>'
+    note = f'<p class="missing">{escape(results.bias)}</p>' if results.bias else ""
+    return f'<p class="facts">{spans}</p>{note}'
 
 
 def _headline(results: Results) -> str:

@@ -39,12 +39,18 @@ def ishigami(draw: Draw) -> float:
     return math.sin(x) + 7.0 * math.sin(y) ** 2 + 0.1 * z**4 * math.sin(x)
 
 
-def filled(folder: Path, made: Campaign, error: Callable[[Draw], float], **others: float) -> Path:
+def filled(
+    folder: Path,
+    made: Campaign,
+    error: Callable[[Draw], float],
+    flown: Callable[[int], bool] = lambda number: True,
+    **others: float,
+) -> Path:
     """Write a dataset whose flights have such position errors, and nothing else."""
     dataset = Dataset(folder)
     dataset.begin(made)
     rows = []
-    for draw in Draws(made):
+    for draw in (each for each in Draws(made) if flown(each.number)):
         metrics = {"position_error_m": error(draw), "manoeuvre_time_s": 4.0, **others}
         outcome = "reached" if metrics["position_error_m"] < 0.05 else "failed"
         ok = passed(made.criteria, outcome, metrics)
@@ -53,6 +59,22 @@ def filled(folder: Path, made: Campaign, error: Callable[[Draw], float], **other
     dataset.add(rows)
     dataset.close()
     return folder
+
+
+def test_a_report_of_flights_that_ended_early_says_that_late_ones_are_missing(
+    tmp_path: Path,
+) -> None:
+    made = campaign(disperse=TURNS, flights=60, seed=3)
+    first, quick = (
+        filled(tmp_path / name, made, ishigami, flown=flown)
+        for name, flown in (("first", lambda n: n < 40), ("quick", lambda n: n < 40 and n % 4))
+    )
+    assert not Results.of(first).bias
+    page = tmp_path / "page.html"
+    lines = write_campaign_report(quick, page)
+    sentence = "10 draws are not flown yet although later ones are"
+    assert sentence in "\n".join(lines)
+    assert sentence in unescape(page.read_text("utf-8"))
 
 
 def test_sobol_indices_are_those_of_a_function_that_is_known(tmp_path: Path) -> None:
