@@ -147,11 +147,13 @@ class _EveryKeyOnce(yaml.SafeLoader):
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         known: set[str] = set()
         for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue  # It is refused as a key, in a sentence of its own.
             if key.value in known:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"the key '{key.value}' is there twice", key.start_mark
                 )
-            known.add(str(key.value))
+            known.add(key.value)
         return super().construct_mapping(node, deep)
 
 

@@ -119,6 +119,15 @@ def test_a_key_that_is_there_twice_is_refused(tmp_path: Path) -> None:
     file.write_text(text.replace("disperse:\n", "disperse:\n    mass: {norm: {}}\n"))
     with pytest.raises(ParameterError, match=r"the key 'mass' is there twice.*line 4"):
         load_campaign(file)
+    file.write_text("campaign:\n  ? [1, 2]\n  : 3\n")
+    with pytest.raises(ParameterError, match=r"found unhashable key.*line 2"):
+        load_campaign(file)
+    # A value beside a merge replaces what it merges: that is no key twice.
+    shared = "shared: &shared {flights: 3, seed: 4}\n"
+    merged = text.replace("campaign:\n", "campaign:\n  <<: *shared\n  flights: 5\n")
+    file.write_text(shared + merged)
+    made = load_campaign(file)
+    assert (made.flights, made.seed) == (5, 4)
 
 
 def test_a_file_names_its_scenario_beside_it(tmp_path: Path) -> None:
