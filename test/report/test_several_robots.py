@@ -81,9 +81,12 @@ def test_a_namespace_without_a_robot_is_refused(bag: Path, tmp_path: Path) -> No
     assert not (tmp_path / "none").exists()
 
 
-def test_joints_are_known_by_their_names_and_not_by_their_places(tmp_path: Path) -> None:
-    """As from publishers that have another order each, and one that has other joints."""
-    orders = [["a", "b", "c"], ["c", "a", "b"], ["x", "y", "z"], ["b", "c", "a"], ["a", "b"]]
+@pytest.mark.parametrize("fewer", [["a", "b"], ["a", "b", "z"]])
+def test_joints_are_known_by_their_names_and_not_by_their_places(
+    fewer: list[str], tmp_path: Path
+) -> None:
+    """As from publishers that have another order each, and two that have other joints."""
+    orders = [["a", "b", "c"], ["c", "a", "b"], ["x", "y", "z"], ["b", "c", "a"], fewer]
     numbers = {"a": 1.0, "b": 2.0, "c": 3.0, "x": 7.0, "y": 8.0, "z": 9.0}
     path = tmp_path / "b.mcap"
     with made_bag(path) as (_, say):
