@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -478,3 +479,51 @@ def test_a_commander_that_is_busy_is_waited_for(harness: Harness) -> None:
         heart.publish(beat)
         harness.settle(stack.probe)
         assert viewer._listener.state().busy is (role is Role.COMMANDER)
+
+
+def test_momenta_are_compared_with_those_of_their_tick(harness: Harness) -> None:
+    stack = Stack(harness)
+    listener: Any = stack.viewer._listener
+    expected = stack.probe.create_publisher(Float64MultiArray, "/momentum_expected", 10)
+    harness.connect()
+    sent: dict[str, list[tuple[int, float]]] = {"momentum": [], "expected": []}
+
+    class Topic:
+        """Gives the messages that a test has put in, at the time that it says they were sent."""
+
+        def __init__(self, name: str) -> None:
+            self.name, self.sent_ns = name, 0
+
+        def take(self) -> Float64MultiArray | None:
+            if not sent[self.name]:
+                return None
+            self.sent_ns, value = sent[self.name].pop(0)
+            return Float64MultiArray(data=[value] * 7)
+
+    stack.momentum.publish(Float64MultiArray(data=[0.5] * 7))
+    expected.publish(Float64MultiArray(data=[0.5] * 6))
+    harness.settle(stack.probe)
+    before = time.time_ns()
+    listener.state()
+    assert 0 < before - listener._expected.sent_ns < 60 * 10**9, "when they were published"
+    assert listener._expected.sent_ns > listener._momentum.sent_ns
+    listener._momentum, listener._expected = Topic("momentum"), Topic("expected")
+
+    def pair() -> tuple[float, float | None]:
+        momenta = listener.state().momenta
+        assert momenta is not None
+        should_be = momenta.expected
+        return float(momenta.actual[0]), None if should_be is None else float(should_be[0])
+
+    sent |= {"momentum": [(1000, 1.0)], "expected": [(1001, 1.0)]}
+    assert pair() == (1.0, 1.0)
+    # The next tick is published while this one is taken: its second part comes in time, or not.
+    sent |= {"momentum": [(2000, 2.0)], "expected": [(1002, 1.0), (2001, 2.0)]}
+    assert pair() == (2.0, 2.0)
+    sent |= {"momentum": [(3000, 3.0)], "expected": []}
+    assert pair() == (2.0, 2.0)
+    sent |= {"momentum": [(4000, 4.0)], "expected": [(4001, 4.0)]}
+    assert pair() == (4.0, 4.0)
+    # Another plant has no thrusters: nothing is expected of its momenta.
+    sent |= {"momentum": [(10**10, 5.0)]}
+    assert pair() == (5.0, None)

@@ -47,6 +47,9 @@ _SILENT_AFTER = 1.5
 _FORGOTTEN_AFTER = 60.0
 """Wall s after which nothing more is said of it, nor of what it reported last."""
 
+_EXPECTED_NO_MORE_NS = 10**9
+"""Wall ns after which a plant no longer publishes what its momenta should be."""
+
 _MOST_POINTS = 1000
 """Of a planned path."""
 
@@ -66,6 +69,8 @@ class Latest(Generic[M]):
 
     def __init__(self, node: Node, kind: type[M], topic: str) -> None:
         self._kind = kind
+        self.sent_ns = 0
+        """When the last message that was taken was published, wall ns."""
         self._subscription = node.create_subscription(
             kind, topic, lambda raw: None, LATEST, raw=True
         )
@@ -81,6 +86,7 @@ class Latest(Generic[M]):
             message: M = deserialize_message(taken[0], self._kind)
         except RuntimeError:
             return None  # It is no message of that type.
+        self.sent_ns = taken[1]["source_timestamp"]
         return message
 
 
@@ -212,18 +218,38 @@ class Listener:
         if (odom is not None or joints is not None) and self._pose is not None and self._q:
             self._came_at = now
             self._measured = Measured(self._stamp_s, self._pose, *self._q)
-        tool, momentum, expected = self._tool.take(), self._momentum.take(), self._expected.take()
+        tool = self._tool.take()
         if tool is not None:
             self._tool_pose = _pose_of(tool.pose)
-        if expected is not None and len(expected.data) >= 6:
-            self._expected_now = np.array(expected.data[:6])
-        if momentum is not None and len(momentum.data) >= 7:
-            numbers = np.array(momentum.data)
-            if np.all(np.isfinite(numbers)):
-                self._momenta = Momenta(numbers[:6], self._expected_now, float(numbers[6]))
+        self._take_momenta()
         thrusters = self._thrusters.take()
         if thrusters is not None and len(thrusters.name) == len(thrusters.velocity):
             self._firing = Firing(tuple(thrusters.name), np.array(thrusters.velocity))
+
+    def _take_momenta(self) -> None:
+        """Take the momenta and what they should be, if both are of one tick.
+
+        They have no stamps. The plant publishes what they should be after them: so what was
+        published before the momenta, which are taken later, is of an earlier tick.
+        """
+        self._take_expected()
+        momentum = self._momentum.take()
+        if momentum is None or len(momentum.data) < 7 or not np.all(np.isfinite(momentum.data)):
+            return
+        if self._expected_now is not None and self._expected.sent_ns < self._momentum.sent_ns:
+            self._take_expected()
+            late = self._momentum.sent_ns - self._expected.sent_ns
+            if late > _EXPECTED_NO_MORE_NS:
+                self._expected_now = None
+            elif late > 0:
+                return  # The next look has a pair.
+        numbers = np.array(momentum.data)
+        self._momenta = Momenta(numbers[:6], self._expected_now, float(numbers[6]))
+
+    def _take_expected(self) -> None:
+        expected = self._expected.take()
+        if expected is not None and len(expected.data) >= 6:
+            self._expected_now = np.array(expected.data[:6])
 
     def _take_joints(self, message: JointState) -> None:
         places = {name: i for i, name in enumerate(message.name)}
