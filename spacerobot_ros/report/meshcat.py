@@ -218,12 +218,18 @@ def player_of(scene: Scene | str) -> Live:
 
 def _notices() -> tuple[tuple[str, str], ...]:
     """Return the licences of MeshCat and of what is in its viewer, three.js above all."""
-    found = []
+    own, others = "", []
     for file in distribution("meshcat").files or ():
         if file.name in ("LICENSE.txt", "LICENSE", "LICENCE"):
-            found.append(("MeshCat", file.read_text()))
+            own = file.read_text()
         elif file.name.endswith("THIRD_PARTY_LICENSES.json"):
-            for each in json.loads(file.read_text()):
-                text = each.get("licenseText") or each.get("license", "")
-                found.append((f"{each.get('name', '')} {each.get('version', '')}", text))
-    return tuple(sorted(found, key=lambda notice: notice[0] != "MeshCat"))
+            others += json.loads(file.read_text())
+    # One of them comes without the text of its licence; MeshCat's own has the words of MIT.
+    mit = own[own.find("Permission is hereby granted") :]
+    found = [("MeshCat", own)]
+    for each in others:
+        name, licence = f"{each.get('name', '')} {each.get('version', '')}", each.get("license", "")
+        holder = f"Copyright (c) {each.get('author', '')}"
+        words = f"{licence}\n\n{holder}\n\n{mit if licence == 'MIT' else ''}"
+        found.append((name, each.get("licenseText") or words))
+    return tuple(found)

@@ -227,6 +227,14 @@ def test_licences_of_the_programs_are_with_them(window: Browser) -> None:
     for name in ("MeshCat", "three", "dat.gui", "uPlot", "Leon Sorokin", "Robin Deits"):
         assert name in text
     assert text.count("Permission is hereby granted") >= 4
+    sections = "Array.from(document.querySelectorAll('#licences pre'), e => e.textContent)"
+    headings = "Array.from(document.querySelectorAll('#licences h3'), e => e.textContent)"
+    names = window.evaluate(headings)
+    assert len(names) == len(set(names)) >= 10
+    # The words of each licence, and not its name alone; who has the copyright.
+    for licence in window.evaluate(sections):
+        assert len(licence) > 600
+        assert "Copyright" in licence
 
 
 def test_fewer_samples_look_alike() -> None:
