@@ -47,6 +47,9 @@ _SILENT_AFTER = 1.5
 _FORGOTTEN_AFTER = 60.0
 """Wall s after which nothing more is said of it, nor of what it reported last."""
 
+_JITTER_NS = 200_000
+"""By how many wall ns more than at best two messages of one tick may be published apart."""
+
 _EXPECTED_NO_MORE_NS = 10**9
 """Wall ns after which a plant no longer publishes what its momenta should be."""
 
@@ -153,6 +156,7 @@ class Listener:
         self._tool_pose: Array | None = None
         self._momenta: Momenta | None = None
         self._expected_now: Array | None = None
+        self._least_apart_ns = _EXPECTED_NO_MORE_NS
         self._firing: Firing | None = None
 
     def use(self, robot: RobotDescription) -> None:
@@ -229,8 +233,9 @@ class Listener:
     def _take_momenta(self) -> None:
         """Take the momenta and what they should be, if both are of one tick.
 
-        They have no stamps. The plant publishes what they should be after them: so what was
-        published before the momenta, which are taken later, is of an earlier tick.
+        They have no stamps. The plant publishes what they should be right after them: what was
+        published before them is of an earlier tick, and what came much later than ever is of a
+        later one.
         """
         self._take_expected()
         momentum = self._momentum.take()
@@ -243,6 +248,11 @@ class Listener:
                 self._expected_now = None
             elif late > 0:
                 return  # The next look has a pair.
+        if self._expected_now is not None:
+            apart = self._expected.sent_ns - self._momentum.sent_ns
+            self._least_apart_ns = min(self._least_apart_ns, apart)
+            if apart > 3 * self._least_apart_ns + _JITTER_NS:
+                return
         numbers = np.array(momentum.data)
         self._momenta = Momenta(numbers[:6], self._expected_now, float(numbers[6]))
 
