@@ -112,14 +112,18 @@ class MissionClient:
         return self.status.ends_at_s if isinstance(self.status, PlannerStatus) else 0.0
 
     def is_connected(self, readers: int = 1) -> bool:
-        """Whether every goal has that many readers, and joint positions all that are known.
+        """Whether every goal has that many readers, and all topics all the readers that are known.
 
-        Planners of others need not take joint positions.
+        A commander may be known and not met yet, while a viewer or a recorder is. Planners of
+        others need not take joint positions.
         """
         return all(
             publisher.get_subscription_count()
-            >= (self.node.count_subscribers(publisher.topic_name) if shapes else readers)
-            for publisher, shapes in ((each, each is self._shape_topic) for each in self._sends)
+            >= max(
+                self.node.count_subscribers(publisher.topic_name),
+                0 if publisher is self._shape_topic else readers,
+            )
+            for publisher in self._sends
         )
 
     def has_decider(self) -> bool:

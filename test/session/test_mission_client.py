@@ -173,3 +173,15 @@ def test_joint_positions_of_an_earlier_goal_are_not_those_of_the_next(harness: H
     shapes = mission.commander.messages["goal_joint_states"]
     assert [list(each.name) for each in shapes] == [[], ["a", "b"], []], "those of each goal"
     assert list(shapes[1].position) == [0.5, -0.25]
+
+
+def test_a_goal_waits_for_a_commander_that_is_known_beside_a_viewer(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = Mission(harness, "planner").client
+    assert client.is_connected()
+    assert not client.is_connected(readers=2)
+    # Another reader of goals is known, and not met yet: it may be the commander.
+    known = client.node.count_subscribers("goal_pose") + 1
+    monkeypatch.setattr(client.node, "count_subscribers", lambda topic: known)
+    assert not client.is_connected()
