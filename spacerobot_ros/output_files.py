@@ -46,8 +46,10 @@ def _write(path: Path, data: bytes) -> None:
     # The umask applies, as it does to any new file; an old one keeps its mode.
     mode = 0o666 if before is None else stat.S_IMODE(before.st_mode)
     made = path.with_name(f".{path.name[:100]}.{os.getpid()}.new")
+    with suppress(FileNotFoundError):
+        made.unlink()  # Of a process that was killed.
     try:
-        with os.fdopen(os.open(made, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, mode), "wb") as file:
+        with os.fdopen(os.open(made, os.O_CREAT | os.O_WRONLY | os.O_EXCL, mode), "wb") as file:
             file.write(data)
         made.replace(path)
     except BaseException:
