@@ -11,6 +11,7 @@ MOST_CPU = {7: 8.0, 12: 20.0, 14: 40.0}
 """From an empty cache to the first plan, s, by the number of joints."""
 
 
+@pytest.mark.slow
 def test_a_first_plan_is_measured() -> None:
     found = first_plans.first_plan(robot_file("three_joint_arm"))
     assert found["joints"] == 3

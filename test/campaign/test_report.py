@@ -236,6 +236,7 @@ def test_flights_that_all_failed_have_a_report(tmp_path: Path, count: int) -> No
     assert "The mass is negative." in text
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with")
 def test_the_pages_open_without_a_complaint_and_need_nothing_else(tmp_path: Path) -> None:
     made = campaign(disperse=MASSES, flights=120, seed=8, criteria=CRITERIA)

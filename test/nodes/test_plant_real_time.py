@@ -172,7 +172,7 @@ def test_a_busy_machine_misses_deadlines_and_no_tick(harness: Harness) -> None:
     assert set(np.diff(stamps)) == {TICK_NS}
 
 
-@pytest.mark.parametrize("period", [20.0, 0.0])
+@pytest.mark.parametrize("period", [pytest.param(20.0, marks=pytest.mark.slow), 0.0])
 def test_diagnostics_come_once_a_second_whatever_simulated_time_says(
     harness: Harness, period: float
 ) -> None:

@@ -457,6 +457,7 @@ def test_the_command_loses_nothing_and_ends_with_the_bag(
     assert [message.data for message in probe.messages["/latched"]] == ["for ever"]
 
 
+@pytest.mark.slow
 def test_the_command_ends_cleanly_on_a_signal(harness: Harness, bag: Path, ros_domain: int) -> None:
     probe = harness.probe({"/stream": String})
     with command(bag, ros_domain, "--loop") as process:

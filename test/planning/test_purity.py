@@ -128,7 +128,12 @@ def content(schedule: GaitSchedule) -> dict[str, Any]:
     return values
 
 
-@pytest.mark.parametrize("name", CASES)
+_LONG = "area_loop of six joints"
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(each, marks=pytest.mark.slow) if each == _LONG else each for each in CASES]
+)
 def test_equal_requests_have_equal_schedules_in_any_order(name: str) -> None:
     case = CASES[name]
     robot, asked = robot_named(case.robot), requests(case)
