@@ -132,7 +132,7 @@ _LONG = "area_loop of six joints"
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(each, marks=pytest.mark.slow) if each == _LONG else each for each in CASES]
+    "name", [*(each for each in CASES if each != _LONG), pytest.param(_LONG, marks=pytest.mark.slow)]
 )
 def test_equal_requests_have_equal_schedules_in_any_order(name: str) -> None:
     case = CASES[name]
