@@ -129,11 +129,10 @@ def content(schedule: GaitSchedule) -> dict[str, Any]:
 
 
 _LONG = "area_loop of six joints"
+_NAMES = [pytest.param(each, marks=pytest.mark.slow if each == _LONG else ()) for each in CASES]
 
 
-@pytest.mark.parametrize(
-    "name", [*(each for each in CASES if each != _LONG), pytest.param(_LONG, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("name", _NAMES)
 def test_equal_requests_have_equal_schedules_in_any_order(name: str) -> None:
     case = CASES[name]
     robot, asked = robot_named(case.robot), requests(case)

@@ -30,6 +30,8 @@ FILE = ("--params-file", str(ROOT / "config" / "sliding_masses.yaml"))
 # A browser that draws without a graphics card leaves little of a processor to the planner.
 PLANT = ("time_mode:=realtime", "real_time_factor:=4.0", "command_timeout:=60.0")
 PLANNER = ("plan_in_background:=true",)
+_QUEUED = 20
+"""States: more than wait in a subscription."""
 POSITION, ANGLES = "Goal (m)", "Roll, pitch, yaw (deg)"
 
 
@@ -57,8 +59,13 @@ class Watched:
         self.probe: Probe = harness.probe(topics, latched=latched)
 
     def hear(self) -> None:
-        """Take what has come."""
-        self._harness.settle(self.probe)
+        """Take a state that was published after this call, and what came before it."""
+        enough = self.probe.count("odom") + _QUEUED
+        self._harness.spin_until(
+            lambda: self.probe.count("odom") >= enough and self.probe.count("planner/status"),
+            "states come",
+            timeout=60.0,
+        )
 
     @property
     def position(self) -> Array:
