@@ -6,12 +6,12 @@ import logging
 import os
 from typing import TYPE_CHECKING, Any
 
+from spacerobot_ros.version import __version__
+
 if TYPE_CHECKING:
     from spacerobot_ros.bag import read_bag
     from spacerobot_ros.flight.api import fly, plan
     from spacerobot_ros.flight.scenario import load_scenario
-
-__version__ = "0.2.0"
 
 __all__ = ["__version__", "fly", "load_scenario", "plan", "read_bag"]
 

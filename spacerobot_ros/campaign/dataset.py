@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from spacerobot_ros import __version__
 from spacerobot_ros.campaign.config import OF_ALL, Campaign, parse_campaign
 from spacerobot_ros.campaign.extras import needed
 from spacerobot_ros.campaign.metrics import joint_names, metric_names
@@ -25,6 +24,7 @@ from spacerobot_ros.errors import ParameterError, RecordingError
 from spacerobot_ros.flight.scenario import load_scenario, scenario_text
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.resources import is_path
+from spacerobot_ros.version import __version__
 
 DRAWN = "draw."
 """Before the names of columns that were drawn."""

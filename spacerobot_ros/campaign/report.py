@@ -21,7 +21,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from spacerobot_ros import __version__
 from spacerobot_ros.campaign.config import Campaign, Criterion, meets
 from spacerobot_ros.campaign.dataset import DRAWN, Dataset
 from spacerobot_ros.campaign.draws import Draws
@@ -38,6 +37,7 @@ from spacerobot_ros.campaign.statistics import (
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.output_files import write_output
 from spacerobot_ros.report.style import FAINT, INK, PALETTE
+from spacerobot_ros.version import __version__
 
 _WORST = 10
 _FAR = 100.0

@@ -16,7 +16,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from spacerobot_ros import __version__
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws
@@ -25,6 +24,7 @@ from spacerobot_ros.campaign.extras import needed
 from spacerobot_ros.campaign.rows import FLIGHTS, Left, Row
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.private_files import warn_once
+from spacerobot_ros.version import __version__
 
 TASK_TIME = 2.0
 """Wall s that a task shall take: the work of the scheduler for one is then small beside it."""

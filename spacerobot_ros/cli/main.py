@@ -7,9 +7,9 @@ from typing import Any
 
 import click
 
-from spacerobot_ros import __version__
 from spacerobot_ros.cli import start
 from spacerobot_ros.cli.errors import sentences
+from spacerobot_ros.version import __version__
 
 COMMANDS = (
     *("analyze", "bench", "campaign", "export", "figures", "goal", "library", "new", "plan"),

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spacerobot_ros import __version__
 from spacerobot_ros.bag import LATCHED, BagWriter
 from spacerobot_ros.bag.making import MessageMaker
 from spacerobot_ros.control.status import ControllerStatus
@@ -21,6 +20,7 @@ from spacerobot_ros.model.visuals import carried_meshes
 from spacerobot_ros.planning import GaitSchedule, Goal
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.topics import TOPICS, Topic, state_topics
+from spacerobot_ros.version import __version__
 
 _SECOND = 1_000_000_000
 

@@ -20,7 +20,6 @@ from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 
-from spacerobot_ros import __version__
 from spacerobot_ros.bag import BagWriter, QosProfile, Recording, RecordingState
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
@@ -40,6 +39,7 @@ from spacerobot_ros.nodes.common.transforms import (
 )
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.topics import NOT_RECORDED
+from spacerobot_ros.version import __version__
 
 _CLOCK = "/clock"
 """Where no remap moves it; as every absolute name that a stack uses."""

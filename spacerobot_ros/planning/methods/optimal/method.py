@@ -21,7 +21,6 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros import __version__
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cache_directory
@@ -57,6 +56,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch, SearchBudget
 from spacerobot_ros.private_files import Cache
+from spacerobot_ros.version import __version__
 
 _CORRECTION_INTERVALS = 40
 
