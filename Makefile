@@ -160,8 +160,12 @@ figures: $(STAMP)/docs ## compute the numbers of the documents again: docs/figur
 	$(BIN)/python3 -m docs_build.figures
 
 .PHONY: structure
-structure: ## count lines and modules of the package; AGAINST=PATH: of another checkout too
+structure: ## count lines, modules and unclear words of the package; AGAINST=PATH: of another checkout too
 	@$(PYTHON) -m docs_build.structure $(AGAINST)
+
+.PHONY: words
+words: ## draw names and texts of the package at random, to judge whether they are understood; SEED=1
+	@$(PYTHON) -m docs_build.structure --sample $(SEED)
 
 .PHONY: clean
 clean: ## remove .venv, caches, the site, and the demo's bag and report
