@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.status import ControllerStatus, tracking_time
 from spacerobot_ros.events import Event
 from spacerobot_ros.model.description import Array, RobotDescription
@@ -21,9 +22,6 @@ from spacerobot_ros.simulation.commands import Refusal
 
 if TYPE_CHECKING:
     from spacerobot_ros.flight.scenario import Scenario
-
-Status = PlannerStatus | ControllerStatus
-"""What a commander reports."""
 
 
 class Outcome(str, Enum):

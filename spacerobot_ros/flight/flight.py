@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.events import Event
-from spacerobot_ros.flight.arrays import Commands, FlightArrays, Outcome, Status
+from spacerobot_ros.flight.arrays import Commands, FlightArrays, Outcome
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.execution.status import PlannerStatus

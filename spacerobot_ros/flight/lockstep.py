@@ -26,6 +26,7 @@ from enum import Enum
 
 import numpy as np
 
+from spacerobot_ros.commanding.goal_follower import GoalFollower, Status, decision_event
 from spacerobot_ros.control import ControlState, NotFiniteError
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
@@ -34,8 +35,8 @@ from spacerobot_ros.control.reference import HeldVelocityReference
 from spacerobot_ros.control.state import Reference
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import CommandError, ParameterError, PlanningError, SpaceRobotError
-from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.flight.arrays import Outcome, Status
+from spacerobot_ros.events import Event
+from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.flight import Flight, FlightLog
 from spacerobot_ros.flight.plant_listener import Change, PlantListener, Stopped
 from spacerobot_ros.flight.scenario import Scenario
@@ -50,7 +51,7 @@ from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
 from spacerobot_ros.planning.execution.outputs import ScheduleStart
 from spacerobot_ros.planning.execution.state_average import BaseMeasurement
-from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.planning.execution.worker import PlanningWorker
 from spacerobot_ros.simulation.building import build_plant
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator
@@ -214,11 +215,10 @@ class _LockstepFlight:
         self._log = FlightLog(self._plant, self._reported, self._commands, self._period_ns)
         self._goal_id = GoalIds().of(0, 1)
         """Of the first goal that a mission client sends at time zero."""
-        self._decision: Status | None = None
+        self._follower = GoalFollower(self._goal_id)
         self._decided: _Moment | None = None
         self._moment = _Moment.BEFORE_COMMAND
         self._status: Status | None = None
-        self._gait: PlannerStatus | None = None
         self._events = self._log.events
         self._planner = self._controller = None
         commanders = scenario.commanders
@@ -411,10 +411,9 @@ class _LockstepFlight:
             match output:
                 case PlannerStatus():
                     self._on_status(output)
-                    kind = _DECISIONS.get(output.state)
-                    if kind is not None:
-                        sentence, level = output.sentence, output.state.level
-                        self._report_event(Event(kind, sentence, level, goal_id=output.goal_id))
+                    event = decision_event(output)
+                    if event is not None:
+                        self._report_event(event)
                 case ScheduleStart(schedule, stamp_ns):
                     self._log.schedules.append((stamp_ns, schedule))
                 case Event():
@@ -430,23 +429,15 @@ class _LockstepFlight:
         if self._decided is not None:
             return
         self._status = status
-        if status.goal_id != self._goal_id:
-            return
-        if (
-            isinstance(status, PlannerStatus)
-            and status.state is PlannerState.EXECUTING
-            and self._gait is None
-        ):
-            self._gait = status
-        if status.state.decided:
-            self._decided, self._decision = self._moment, status
+        if self._follower.take(status):
+            self._decided = self._moment
 
     def _report_event(self, event: Event) -> None:
         stamped = event if event.time_s is not None else replace(event, time_s=self._time)
         self._events.append(stamped)
 
     def _result(self, wall_time: float, interrupted: str) -> Flight:
-        decision = self._decision
+        decision = self._follower.decision
         outcome = Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value)
         sentence = interrupted
         if decision is not None:
@@ -462,19 +453,10 @@ class _LockstepFlight:
             outcome=outcome,
             sentence=sentence,
             status=self._status,
-            gait=self._gait,
+            gait=self._follower.gait,
             plan_time=plan_time,
             wall_time=wall_time,
         )
-
-
-_DECISIONS = {
-    PlannerState.REACHED: EventKind.GOAL_REACHED,
-    PlannerState.FAILED: EventKind.GOAL_FAILED,
-    PlannerState.REFUSED: EventKind.GOAL_REFUSED,
-    PlannerState.ABORTED: EventKind.GOAL_ABORTED,
-}
-"""The event of each status that decides a goal."""
 
 
 class _Planner:

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from spacerobot_ros.bag import Bag, RecordedRobot, TopicSeries, read_bag
 from spacerobot_ros.bag.recorded_robot import columns
-from spacerobot_ros.control.status import ControllerStatus
+from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower, Status
 from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.errors import RecordingError, SpaceRobotError
 from spacerobot_ros.events import Event
-from spacerobot_ros.flight.arrays import Commands, Outcome, Status
+from spacerobot_ros.flight.arrays import Commands, Outcome
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.parameter_files import CONFIGS
 from spacerobot_ros.flight.scenario import COMMANDERS, Scenario
@@ -23,17 +23,11 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
-from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.topics import TOPICS
 
 _SECOND = 1_000_000_000
-
-STATUS_TOPICS: Mapping[str, tuple[str, Callable[[Mapping[str, str], str], Status]]] = {
-    "planner": ("planner/status", PlannerStatus.from_values),
-    "coordinated_control": ("controller/status", ControllerStatus.from_values),
-}
-"""By commander: the topic of its status, and how it is read."""
 
 
 def recorded_scenario(bag: Bag) -> Scenario:
@@ -220,16 +214,11 @@ def _decision(
     if goals is None:
         raise RecordingError(f"The bag {robot.bag.path} holds no goal pose.")
     goal_id = GoalIds().of(*divmod(int(goals.stamp_ns[0]), _SECOND))
-    status, gait = None, None
+    follower, status = GoalFollower(goal_id, unnamed=True), None
     for _, status in statuses:
-        if status.goal_id not in (goal_id, ""):  # Earlier versions gave none.
-            continue
-        executing = isinstance(status, PlannerStatus) and status.state is PlannerState.EXECUTING
-        if executing and gait is None:
-            gait = status
-        if status.state.decided:
-            return status, status, gait if isinstance(gait, PlannerStatus) else None
-    return None, status, gait if isinstance(gait, PlannerStatus) else None
+        if follower.take(status):
+            break
+    return follower.decision, status, follower.gait
 
 
 def _events(robot: RecordedRobot) -> tuple[Event, ...]:

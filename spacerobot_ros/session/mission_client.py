@@ -17,14 +17,14 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
+from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower, Status
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.arrays import Outcome, Status
-from spacerobot_ros.flight.recorded import STATUS_TOPICS
+from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
-from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.planning.execution.status import PlannerStatus
 
 _LOOK_PERIOD = 0.2
 """Wall s from one look of a follower to the next."""
@@ -73,13 +73,11 @@ class MissionClient:
         self.node: Node = rclpy.create_node(name, namespace=namespace, context=context)
         self.status: Status | None = None
         """The last status of the commander that decides."""
-        self.gait: PlannerStatus | None = None
-        """The planner's status when its first schedule for the goal began."""
         self._done = rclpy.task.Future(executor=None)
         self._frame, self._now = world_frame, now
         self._joint_names, self._on_end = joint_names, on_end
         self._sent = 0
-        self._goal_id: str | None = None
+        self._follower = GoalFollower()
         self._goal_topic = self.node.create_publisher(PoseStamped, "goal_pose", STREAM)
         self._sends: list[Publisher] = [self._goal_topic]
         self._shape_topic: Publisher | None = None
@@ -95,6 +93,11 @@ class MissionClient:
         self._status_topic = self.node.create_subscription(
             DiagnosticStatus, topic, self._on_status, LATCHED
         )
+
+    @property
+    def gait(self) -> PlannerStatus | None:
+        """The planner's status when its first schedule for the goal began."""
+        return self._follower.gait
 
     @property
     def outcome(self) -> Outcome | None:
@@ -140,7 +143,7 @@ class MissionClient:
         self._sent += 1
         stamp = Time()
         stamp.sec, stamp.nanosec = divmod(self._now() + self._sent, _SECOND)
-        self._goal_id = GoalIds().of(stamp.sec, stamp.nanosec)
+        self._follower = GoalFollower(GoalIds().of(stamp.sec, stamp.nanosec))
         if self._shape_topic is not None and self._joint_names is not None:
             shape = goal.joint_positions
             self._shape_topic.publish(
@@ -205,14 +208,6 @@ class MissionClient:
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         values = {pair.key: pair.value for pair in message.values}
-        self.status = status = self._read(values, message.message)
-        if self._goal_id is None or status.goal_id != self._goal_id:
-            return  # Of an earlier goal, or of another client's.
-        if (
-            isinstance(status, PlannerStatus)
-            and status.state is PlannerState.EXECUTING
-            and self.gait is None
-        ):
-            self.gait = status
-        if status.state.decided:
-            self._end(Outcome(status.state.value))
+        self.status = self._read(values, message.message)
+        if self._follower.take(self.status):
+            self._end(Outcome(self.status.state.value))

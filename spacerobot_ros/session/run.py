@@ -16,9 +16,10 @@ from rclpy.signals import SignalHandlerOptions
 
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
 from spacerobot_ros.bag.recorded_robot import columns
+from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.status import ControllerStatus, tracking_time
 from spacerobot_ros.errors import RecordingError, SpaceRobotError
-from spacerobot_ros.flight.arrays import Outcome, Status
+from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvec_from_quaternion

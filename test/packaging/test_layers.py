@@ -26,6 +26,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("nodes",),
         ("flight",),  # above the bag and the plant, beside no ROS
         ("verification",),
+        ("commanding",),  # commanders without ROS: of flights, and of nodes
         ("batch",),
         ("viewer",),
         ("bag", "simulation"),

@@ -14,8 +14,9 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
+from spacerobot_ros.commanding.goal_follower import decision_event
 from spacerobot_ros.errors import CommandError, PlanningError
-from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.events import Event
 from spacerobot_ros.flight.plant_listener import Change, Stopped
 from spacerobot_ros.flight.state_synchroniser import CONTRADICTION, Pairing, StateSynchroniser
 from spacerobot_ros.model import SpaceRobot
@@ -48,15 +49,6 @@ from spacerobot_ros.planning.execution.worker import LONGEST_END, PlanningWorker
 
 # Python looks up the member of an enum as slowly as it calls a function; these are for every state.
 _WITHOUT_POSE, _LATE_POSE = Pairing.WITHOUT_POSE, Pairing.LATE_POSE
-
-
-_DECISIONS = {
-    PlannerState.REACHED: EventKind.GOAL_REACHED,
-    PlannerState.FAILED: EventKind.GOAL_FAILED,
-    PlannerState.REFUSED: EventKind.GOAL_REFUSED,
-    PlannerState.ABORTED: EventKind.GOAL_ABORTED,
-}
-"""The event of each status that decides a goal."""
 
 
 class PlannerNode(CommanderNode):
@@ -333,10 +325,9 @@ class PlannerNode(CommanderNode):
         """Publish a status, and an event where it decides a goal, and log its sentence."""
         self._said = status_message(status, self.get_fully_qualified_name())
         self._status_topic.publish(self._said)
-        kind = _DECISIONS.get(status.state)
-        if kind is not None:
-            level, goal_id = status.state.level, status.goal_id
-            self.report_event(Event(kind, status.sentence, level, goal_id=goal_id))
+        event = decision_event(status)
+        if event is not None:
+            self.report_event(event)
         if status.state.decided and self.config.stop_when_decided:
             self._running = False
         if status.state.level:

@@ -1,0 +1,62 @@
+"""The statuses of commanders: where each is published, and how those of one goal are followed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from spacerobot_ros.control.status import ControllerStatus
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+
+Status = PlannerStatus | ControllerStatus
+
+STATUS_TOPICS: Mapping[str, tuple[str, Callable[[Mapping[str, str], str], Status]]] = {
+    "planner": ("planner/status", PlannerStatus.from_values),
+    "coordinated_control": ("controller/status", ControllerStatus.from_values),
+}
+"""By commander: the topic of its status, and the function that reads its values and message."""
+
+
+class GoalFollower:
+    """Follows one goal through the statuses of the commander that decides about it.
+
+    Parameters
+    ----------
+    goal_id
+        Id of the goal; None: no goal was sent yet, and no status decides.
+    unnamed
+        Whether statuses without an id are about the goal too, as in bags of version 0.1.
+    """
+
+    def __init__(self, goal_id: str | None = None, *, unnamed: bool = False) -> None:
+        self.goal_id = goal_id
+        self._unnamed = unnamed
+        self.gait: PlannerStatus | None = None
+        """The planner's status when its first schedule for the goal began."""
+        self.decision: Status | None = None
+        """The status that decided the goal; None: it is still pursued."""
+
+    def concerns(self, status: Status) -> bool:
+        """Whether a status is about the goal."""
+        if self.goal_id is None:
+            return False
+        return status.goal_id == self.goal_id or (self._unnamed and not status.goal_id)
+
+    def take(self, status: Status) -> bool:
+        """Take the next status; return whether it is the one that decides the goal."""
+        if self.decision is not None or not self.concerns(status):
+            return False
+        if self.gait is None and status.state is PlannerState.EXECUTING:
+            assert isinstance(status, PlannerStatus)
+            self.gait = status
+        if status.state.decided:
+            self.decision = status
+        return status.state.decided
+
+
+def decision_event(status: Status) -> Event | None:
+    """Return the event of a status that decides a goal; None of one that decides nothing."""
+    if not status.state.decided:
+        return None
+    kind = EventKind(f"goal_{status.state.value}")
+    return Event(kind, status.sentence, status.state.level, goal_id=status.goal_id)
