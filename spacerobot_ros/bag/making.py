@@ -12,10 +12,10 @@ from rosbags.interfaces import Nodetype
 from spacerobot_ros.bag.definitions import MessageTypes
 from spacerobot_ros.bag.rosbag2 import message_definition
 from spacerobot_ros.bag.series import places
+from spacerobot_ros.times import SECOND
 
 _NUMBERS = ("float32", "float64", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32",
             "uint64")  # fmt: skip
-_SECOND = 1_000_000_000
 
 
 class MessageMaker:
@@ -57,7 +57,7 @@ class MessageMaker:
         prototype = self.serialised(message)
         at = places(prototype, message.__msgtype__, self._types.fields)
         table = np.tile(np.frombuffer(prototype, np.uint8), (len(stamps_ns), 1))
-        clock = np.stack([stamps_ns // _SECOND, stamps_ns % _SECOND], axis=1).astype("<u4")
+        clock = np.stack([stamps_ns // SECOND, stamps_ns % SECOND], axis=1).astype("<u4")
         for path in ("header.stamp.sec", "clock.sec"):
             if path in at:
                 table[:, at[path].start : at[path].start + 8] = clock.view(np.uint8)

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from spacerobot_ros.bag.reader import Bag
 from spacerobot_ros.bag.rosbag2 import QosProfile
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.times import SECOND
 
-_SECOND = 10**9
 _END_OF_TIME = 2**63 - 1
-_RECENT_NS = _SECOND
+_RECENT_NS = SECOND
 """How old a message may be that is shown again after a jump."""
 
 _MOST_TOPICS = 1000
@@ -235,8 +235,8 @@ class Playback:
             )
         self._bag = bag
         self._loop = loop
-        self._start_ns = min(bag.start_time_ns + round(start * _SECOND), _END_OF_TIME)
-        end_ns = self._start_ns + round(duration * _SECOND) if duration else _END_OF_TIME
+        self._start_ns = min(bag.start_time_ns + round(start * SECOND), _END_OF_TIME)
+        end_ns = self._start_ns + round(duration * SECOND) if duration else _END_OF_TIME
         self._end_ns = min(end_ns, _END_OF_TIME)
         self._last_ns = max(min(bag.end_time_ns, self._end_ns), self._start_ns)
         self.topics = [_topic(bag, name) for name in topics or bag.topics]
@@ -250,7 +250,7 @@ class Playback:
             raise RecordingError(
                 f"The bag {bag.path} has no message to replay from {start:g} s on"
                 + (f" for {duration:g} s" if duration else "")
-                + f": it lasts {(bag.end_time_ns - bag.start_time_ns) / _SECOND:g} s."
+                + f": it lasts {(bag.end_time_ns - bag.start_time_ns) / SECOND:g} s."
             )
 
     @property
@@ -339,7 +339,7 @@ class Playback:
     @property
     def duration_s(self) -> float:
         """From there to the last message, s."""
-        return (self._last_ns - self._start_ns) / _SECOND
+        return (self._last_ns - self._start_ns) / SECOND
 
     def close(self) -> None:
         """Close the bag; nothing is left to play."""

@@ -30,6 +30,7 @@ from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.bag.tables import TopicTable, table_of
 from spacerobot_ros.errors import RecordingError, RobotDescriptionError
 from spacerobot_ros.resources import suggestion
+from spacerobot_ros.times import SECOND
 
 if TYPE_CHECKING:
     import pandas
@@ -205,12 +206,12 @@ class Bag:
     @property
     def start_time(self) -> float:
         """Log time of the earliest message in seconds; nan without messages."""
-        return self._statistics.message_start_time / 1e9 if self.message_count() else float("nan")
+        return self.start_time_ns / SECOND if self.message_count() else float("nan")
 
     @property
     def end_time(self) -> float:
         """Log time of the latest message in seconds; nan without messages."""
-        return self._statistics.message_end_time / 1e9 if self.message_count() else float("nan")
+        return self.end_time_ns / SECOND if self.message_count() else float("nan")
 
     @property
     def start_time_ns(self) -> int:

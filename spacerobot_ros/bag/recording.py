@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 from spacerobot_ros.bag.writer import BagWriter
 from spacerobot_ros.errors import RecordingError, RobotDescriptionError
-
-_SECOND = 10**9
+from spacerobot_ros.times import SECOND
 
 
 class RecordingState(Enum):
@@ -94,7 +93,7 @@ class Recording:
         self.latched: dict[int, _Early | None] = {}
         """Channels of latched topics, and the last message that each has sent during a pause."""
         self.failure: RecordingError | None = None
-        self._clock_wait_ns = clock_wait * _SECOND
+        self._clock_wait_ns = clock_wait * SECOND
         self._on_failure = on_failure
         self._wall_time = wall_time
         self._early: list[_Early] = []

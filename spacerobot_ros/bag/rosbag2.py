@@ -17,6 +17,7 @@ import yaml
 from mcap.records import Metadata
 
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.times import SECOND
 
 # -- message definitions ----------------------------------------------------------------------
 
@@ -267,7 +268,7 @@ LATCHED = QosProfile(depth=1, durability="transient_local")
 
 
 def _duration(name: str, nanoseconds: int) -> tuple[str, str, str]:
-    seconds, rest = divmod(nanoseconds, 10**9)
+    seconds, rest = divmod(nanoseconds, SECOND)
     return f"  {name}:", f"    sec: {seconds}", f"    nsec: {rest}"
 
 
@@ -304,7 +305,7 @@ def _arguments(entry: dict[str, Any]) -> dict[str, Any]:
     arguments: dict[str, Any] = {}
     for name, value in entry.items():
         if name in _DURATIONS:
-            nanoseconds = int(value["sec"]) * 10**9 + int(value["nsec"])
+            nanoseconds = int(value["sec"]) * SECOND + int(value["nsec"])
             arguments[f"{name}_ns"] = min(nanoseconds, INFINITE_NS)
         elif name in _POLICIES:
             number = isinstance(value, int) and not isinstance(value, bool)

@@ -31,6 +31,7 @@ from spacerobot_ros.bag.mcap_records import (
 )
 from spacerobot_ros.bag.rosbag2 import METADATA_NAME, QosProfile, RecordedTopic, metadata_record
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.times import SECOND
 
 _CHUNK_SIZE = 65536
 _CHANNEL_AND_TIME = struct.Struct("<H4xQ")
@@ -101,7 +102,7 @@ def salvage_bag(
     return Salvaged(
         target,
         sum(file.message_counts.values()),
-        span / 1e9,
+        span / SECOND,
         found.lost_chunks,
         found.lost_bytes,
         found.reason,

@@ -22,6 +22,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.times import SECOND
 
 Fields: TypeAlias = dict[str, tuple[Any, list[tuple[str, Any]]]]
 """Type name -> constants and fields, as ``rosbags`` parses a definition."""
@@ -116,12 +117,12 @@ class TopicSeries:
     @property
     def time(self) -> NDArray[np.float64]:
         """Log times in seconds, shape (N,), a copy."""
-        return np.asarray(self.time_ns / 1e9)
+        return np.asarray(self.time_ns / SECOND)
 
     @property
     def stamp(self) -> NDArray[np.float64]:
         """Stamps of the headers in seconds (N,), a copy; the log times where messages have none."""
-        return np.asarray(self.stamp_ns / 1e9)
+        return np.asarray(self.stamp_ns / SECOND)
 
     @cached_property
     def stamp_ns(self) -> NDArray[np.int64]:
@@ -129,7 +130,7 @@ class TopicSeries:
         if not self.stamped:
             return self.time_ns
         seconds, nanoseconds = self.field("header.stamp.sec"), self.field("header.stamp.nanosec")
-        stamps = np.asarray(seconds, np.int64) * 10**9 + np.asarray(nanoseconds, np.int64)
+        stamps = np.asarray(seconds, np.int64) * SECOND + np.asarray(nanoseconds, np.int64)
         stamps.flags.writeable = False
         return np.asarray(stamps)
 

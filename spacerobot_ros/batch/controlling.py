@@ -27,6 +27,7 @@ from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.symbolic_rotations import quaternion_from_rotvec, quaternion_multiply
+from spacerobot_ros.times import SECOND
 
 ROUNDING = 1e-9
 """By how much sums of control periods may be off a time, s."""
@@ -63,7 +64,7 @@ class BatchController:
         self._program = Controlled(config)
         self._controller: CoordinatedController = build_controller(robot, config)
         self.law = self._controller.law
-        self._n, self.period_ns = robot.n, round(config.control_period * 1e9)
+        self._n, self.period_ns = robot.n, round(config.control_period * SECOND)
         selection = self.law.outputs.selection
         self._groups = (
             *(bool(selection.base), bool(selection.end_effector)),
@@ -121,7 +122,7 @@ class BatchController:
 
     def time(self, tick: int) -> float:
         """Return the time of a tick as controllers know it, s."""
-        return tick * self.period_ns / 1e9
+        return tick * self.period_ns / SECOND
 
     def command(self, tick: int, state: ControlState) -> list[Array]:
         """Return efforts and wrench for a state of the flight that was begun last."""

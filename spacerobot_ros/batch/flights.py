@@ -25,6 +25,7 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.simulation.building import PLANTS
 from spacerobot_ros.simulation.config import SensorConfig
 from spacerobot_ros.simulation.initial_state import InitialState
+from spacerobot_ros.times import SECOND
 
 Counts = npt.NDArray[np.int64]
 
@@ -373,7 +374,7 @@ class Flights:
             case Controlled(config=config, gains=gains):
                 if self.actuation != "effort":
                     raise ParameterError("A controller flies under effort actuation only.")
-                if round(config.control_period * 1e9) != round(self.control_period * 1e9):
+                if round(config.control_period * SECOND) != round(self.control_period * SECOND):
                     raise ParameterError("The controller commands at another rate than the plant.")
                 if gains and len(gains) != count:
                     raise ParameterError(f"Gains of {len(gains)} flights are not of {count}.")

@@ -42,6 +42,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.model_functions import ModelFunctions
 from spacerobot_ros.private_files import warn_once
 from spacerobot_ros.simulation.effort_plant import EffortPlant
+from spacerobot_ros.times import SECOND
 
 _BLOCK_BYTES = 32 * 2**20
 """Memory of a block of flights, noise and commands among it."""
@@ -301,7 +302,7 @@ class _Block:
             wrench_peak_row=rows.first("peak_wrench"),
             impulse_row=rows.first("impulse"),
             period=flights.control_period,
-            period_ns=round(flights.control_period * 1e9),
+            period_ns=round(flights.control_period * SECOND),
             program=_PROGRAMS[type(program)],
             command_row=rows.first("command"),
             command_count=table.shape[2] if each_table else table.shape[1],

@@ -30,6 +30,7 @@ from spacerobot_ros.simulation.faults import FaultyPlant
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import Sensors
 from spacerobot_ros.simulation.thrusters import ThrusterPlant
+from spacerobot_ros.times import SECOND
 
 
 def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> BatchResult:
@@ -116,7 +117,7 @@ class _Commands:
                     _schedule(flights, _of_row(program.positions, row)),
                     *(0, program.shape_gain, program.deadband),
                 )
-                self._period_ns = round(flights.control_period * 1e9)
+                self._period_ns = round(flights.control_period * SECOND)
             case HeldCommands():
                 self._held: list[Array] = [_of_row(program.joints, row)]
                 if program.wrench is not None:

@@ -42,6 +42,7 @@ from spacerobot_ros.session.run import ros
 from spacerobot_ros.session.stack import InProcessStack
 from spacerobot_ros.simulation import VelocityPlant
 from spacerobot_ros.simulation.trials import state_of
+from spacerobot_ros.times import SECOND
 
 _ROUNDS = 5
 _TOPICS: tuple[tuple[str, type[Any], int, int], ...] = (
@@ -267,7 +268,7 @@ def _replay_spacing(folder: Path) -> tuple[float, float]:
         channel = writer.add_topic(_REPLAYED, "sensor_msgs/msg/JointState")
         raw = serialize_message(JointState(name=["a", "b", "c"], position=[0.0] * 3))
         for k in range(_MESSAGES):
-            stamp = round(k * _PERIOD * 1e9)
+            stamp = round(k * _PERIOD * SECOND)
             writer.write(channel, raw, stamp, stamp)
     arrivals: list[float] = []
     executor = EventsExecutor()

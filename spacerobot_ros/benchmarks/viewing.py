@@ -27,6 +27,7 @@ from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.run import ros
 from spacerobot_ros.session.viewing import viewing
 from spacerobot_ros.termination import ended_on_request, tool
+from spacerobot_ros.times import SECOND
 
 _SCENARIO = "servicer"
 
@@ -148,9 +149,9 @@ def run_viewer_benchmark(
                         client = beside.enter_context(_viewer_and_browser(Path(folder)))
                         browser = client.browser
                     goals.spin(_SETTLING, stopped)
-                    before, began = client.count if client else 0, stack.time_ns / 1e9
+                    before, began = client.count if client else 0, stack.time_ns / SECOND
                     goals.spin(seconds, stopped)
-                    spans.append((viewed, began, stack.time_ns / 1e9))
+                    spans.append((viewed, began, stack.time_ns / SECOND))
                     if client is not None:
                         counts.append((client.count - before) / seconds)
             stack.finish()
@@ -264,7 +265,7 @@ def _deadlines(bag: Bag) -> Array:
             skipped = int(values.get("deadlines_missed", skipped))
             if status.name.endswith(": timing"):
                 late = int(values["ticks_late"]) + int(values["commands_late"]) + skipped
-                rows.append((time_ns / 1e9, 2 * int(values["ticks"]), late))
+                rows.append((time_ns / SECOND, 2 * int(values["ticks"]), late))
     if len(rows) < 2:
         raise SpaceRobotError("The flight was too short to count its deadlines.")
     return np.array(rows, float)

@@ -31,6 +31,7 @@ from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.simulation.initial_state import InitialState
+from spacerobot_ros.times import SECOND
 
 _FREE = "coordinated_control.gains."
 """Parameters of the controller that may differ from lane to lane."""
@@ -163,8 +164,8 @@ def _poses(goals: Sequence[Goal | None]) -> Array | None:
 
 def _ticks(longest: float, period_ns: int) -> int:
     """Return the first tick at which a flight is interrupted."""
-    tick = max(1, int(longest * 1e9 / period_ns) - 1)
-    while tick * period_ns / 1e9 < longest:
+    tick = max(1, int(longest * SECOND / period_ns) - 1)
+    while tick * period_ns / SECOND < longest:
         tick += 1
     return tick
 
@@ -182,7 +183,7 @@ def _flight(
     if decided == 0:
         return "It ends before it begins."
     n, end = flights.robot.n, result.end_state[row]
-    duration = int(result.end_tick[row]) * period_ns / 1e9
+    duration = int(result.end_tick[row]) * period_ns / SECOND
     statuses = [(0, ControllerStatus(ControllerState.TRACKING))]
     if decision is Decision.NONE:
         outcome = Outcome.INTERRUPTED

@@ -17,6 +17,7 @@ from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import Goal
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
+from spacerobot_ros.times import SECOND
 
 END_EFFECTOR = "end_effector"
 """Key of the goal of the end-effector; that of the base is ``base``."""
@@ -200,7 +201,7 @@ class ControlExecutive:
         """
         pursued = self._goal_state is ControllerState.TRACKING
         if commanded_until_ns is not None:
-            if not pursued or commanded_until_ns < round(self._started * 1e9):
+            if not pursued or commanded_until_ns < round(self._started * SECOND):
                 return False
         elif not (pursued or self._pending):
             self._file.delete()

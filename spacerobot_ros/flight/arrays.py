@@ -19,6 +19,7 @@ from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.execution.status import PlannerStatus, manoeuvre_time
 from spacerobot_ros.simulation.commands import Refusal
+from spacerobot_ros.times import SECOND
 
 if TYPE_CHECKING:
     from spacerobot_ros.flight.scenario import Scenario
@@ -139,14 +140,14 @@ class FlightArrays:
         """
         planned = manoeuvre_time(
             (
-                (stamp_ns / 1e9, status)
+                (stamp_ns / SECOND, status)
                 for stamp_ns, status in self.statuses
                 if isinstance(status, PlannerStatus)
             ),
             float(self.time[-1]),
         )
         tracked = tracking_time(
-            (stamp_ns / 1e9, status.state)
+            (stamp_ns / SECOND, status.state)
             for stamp_ns, status in self.statuses
             if isinstance(status, ControllerStatus)
         )

@@ -17,6 +17,7 @@ from spacerobot_ros.simulation.commands import CommandValidator, Refusal
 from spacerobot_ros.simulation.faults import FaultyPlant
 from spacerobot_ros.simulation.reported_state import ReportedState
 from spacerobot_ros.simulation.thrusters import thrusters_in
+from spacerobot_ros.times import SECOND
 
 if TYPE_CHECKING:
     import os
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
     from spacerobot_ros.flight.scenario import Scenario
 
-_SECOND = 1_000_000_000
 
 _FIRST_CAPACITY = 1024
 
@@ -163,8 +163,8 @@ class FlightLog:
             robot=robot,
             outcome=outcome,
             sentence=sentence,
-            control_period=self._period_ns / _SECOND,
-            time=np.arange(count) * self._period_ns / _SECOND,
+            control_period=self._period_ns / SECOND,
+            time=np.arange(count) * self._period_ns / SECOND,
             **{
                 name: states.pop(name)
                 for name in ("pose", "twist", "q", "qdot", "effort", "momentum")

@@ -18,7 +18,6 @@ Which messages make a state is decided by the same
 from __future__ import annotations
 
 import math
-import struct
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -58,11 +57,7 @@ from spacerobot_ros.simulation.commands import CommandSource, CommandValidator
 from spacerobot_ros.simulation.faults import FaultyPlant
 from spacerobot_ros.simulation.reported_state import ReportedState
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
-
-_SECOND = 1_000_000_000
-
-_STAMP = struct.Struct("<4xiI")
-"""What a pairing sees of a message: its stamp."""
+from spacerobot_ros.times import HEADER_STAMP, SECOND, stamp_bytes
 
 _REFERENCE = "joint_reference"
 
@@ -275,7 +270,7 @@ class _LockstepFlight:
 
     @property
     def _time(self) -> float:
-        return self._tick * self._period_ns / _SECOND
+        return self._tick * self._period_ns / SECOND
 
     @property
     def _ends_at(self) -> float:
@@ -536,7 +531,7 @@ class _Controller:
         reference = None
         if self._reference is not None:
             reference = Reference(joints=self._held.at_command(*self._reference))
-        now = self._stamp_ns / _SECOND
+        now = self._stamp_ns / SECOND
         result = self.executive.command(now, measured, self._q, self._qdot, reference)
         if send is not None:
             send(result.realised.tau, result.realised.wrench_B)
@@ -544,4 +539,4 @@ class _Controller:
 
 
 def _stamp(stamp_ns: int) -> bytes:
-    return _STAMP.pack(*divmod(stamp_ns, _SECOND))
+    return bytes(HEADER_STAMP.start) + stamp_bytes(stamp_ns)

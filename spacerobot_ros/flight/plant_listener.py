@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
-
-_SECOND = 1_000_000_000
+from spacerobot_ros.times import SECOND
 
 
 @dataclass(frozen=True)
@@ -107,4 +106,4 @@ def _rested(status: PlantStatus) -> Stopped | None:
         since, why = last, "The joints were brought to rest: no command came in time."
     if not (math.isfinite(last) and math.isfinite(since)):
         return None
-    return Stopped(why, round(last * _SECOND), round(since * _SECOND))
+    return Stopped(why, round(last * SECOND), round(since * SECOND))

@@ -25,9 +25,8 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS
-
-_SECOND = 1_000_000_000
 
 
 def recorded_scenario(bag: Bag) -> Scenario:
@@ -213,7 +212,7 @@ def _decision(
     goals = robot.get("goal_pose")
     if goals is None:
         raise RecordingError(f"The bag {robot.bag.path} holds no goal pose.")
-    goal_id = GoalIds().of(*divmod(int(goals.stamp_ns[0]), _SECOND))
+    goal_id = GoalIds().of(*divmod(int(goals.stamp_ns[0]), SECOND))
     follower, status = GoalFollower(goal_id, unnamed=True), None
     for _, status in statuses:
         if follower.take(status):

@@ -19,10 +19,9 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.visuals import carried_meshes
 from spacerobot_ros.planning import GaitSchedule, Goal
 from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.times import SECOND, set_stamp
 from spacerobot_ros.topics import TOPICS, Topic, state_topics
 from spacerobot_ros.version import __version__
-
-_SECOND = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ def save_flight(
 
 def _states(flight: FlightArrays, maker: MessageMaker) -> Iterator[_Stream]:
     """Yield the topics of the plant's state, in the order of their publication."""
-    period = round(flight.control_period * _SECOND)
+    period = round(flight.control_period * SECOND)
     stamps: NDArray[np.int64] = np.arange(len(flight.time), dtype=np.int64) * period
     config, robot = flight.scenario.plant, flight.robot
     quantities = _quantities(flight)
@@ -83,7 +82,7 @@ def _states(flight: FlightArrays, maker: MessageMaker) -> Iterator[_Stream]:
     clock = TOPICS["/clock"]
     yield _Stream(clock, stamps, maker.stamped(maker.blank(clock.type), stamps, {}))
     lost = flight.quantities["pose_lost"][:, 0] > 0 if "pose_lost" in flight.quantities else None
-    every = max(1, round(config.base_pose_period * _SECOND / period))
+    every = max(1, round(config.base_pose_period * SECOND / period))
     for topic in state_topics():
         if not all(field.quantity in quantities for field in topic.state):
             continue
@@ -156,7 +155,7 @@ def _others(flight: FlightArrays, maker: MessageMaker) -> Iterator[_Stream]:
             ]
             times = np.array([time for time, _ in found], dtype=np.int64)
             yield _Stream(TOPICS[name], times, messages)
-    times = np.array([round((e.time_s or 0.0) * _SECOND) for e in flight.events], dtype=np.int64)
+    times = np.array([round((e.time_s or 0.0) * SECOND) for e in flight.events], dtype=np.int64)
     events = [
         _status(maker, "", event.sentence, event.level, event.to_values(None))
         for event in flight.events
@@ -165,7 +164,7 @@ def _others(flight: FlightArrays, maker: MessageMaker) -> Iterator[_Stream]:
 
 
 def _commands(flight: FlightArrays, maker: MessageMaker) -> Iterator[_Stream]:
-    period = round(flight.control_period * _SECOND)
+    period = round(flight.control_period * SECOND)
     velocity = flight.scenario.plant.actuation == "velocity"
     for name, commands in flight.commands.items():
         stamps = commands.tick * period
@@ -196,14 +195,14 @@ def _plans(flight: FlightArrays, maker: MessageMaker, world: str) -> Iterator[_S
 def _trajectory(maker: MessageMaker, schedule: GaitSchedule, start_ns: int, frame: str) -> bytes:
     message = maker.blank("trajectory_msgs/msg/JointTrajectory")
     message.header.frame_id = frame
-    _stamp(message.header.stamp, start_ns)
+    set_stamp(message.header.stamp, start_ns)
     message.joint_names = list(schedule.joint_names)
     velocities = np.vstack([schedule.velocities, np.zeros(len(schedule.joint_names))])
-    period = round(schedule.control_period * _SECOND)
+    period = round(schedule.control_period * SECOND)
     for k, (q, qdot) in enumerate(zip(schedule.positions, velocities, strict=True)):
         point = maker.blank("trajectory_msgs/msg/JointTrajectoryPoint")
         point.positions, point.velocities = np.array(q), np.array(qdot)
-        point.time_from_start.sec, point.time_from_start.nanosec = divmod(k * period, _SECOND)
+        set_stamp(point.time_from_start, k * period)
         message.points.append(point)
     return maker.serialised(message)
 
@@ -211,10 +210,10 @@ def _trajectory(maker: MessageMaker, schedule: GaitSchedule, start_ns: int, fram
 def _path(maker: MessageMaker, schedule: GaitSchedule, start_ns: int, world: str) -> bytes:
     message, path = maker.blank("nav_msgs/msg/Path"), schedule.path
     message.header.frame_id = world
-    _stamp(message.header.stamp, start_ns)
+    set_stamp(message.header.stamp, start_ns)
     for time, r, o in zip(path.time, path.position, path.quaternion, strict=True):
         pose = _posed(maker, Goal(r, o), world)
-        _stamp(pose.header.stamp, start_ns + round(float(time) * _SECOND))
+        set_stamp(pose.header.stamp, start_ns + round(float(time) * SECOND))
         message.poses.append(pose)
     return maker.serialised(message)
 
@@ -237,7 +236,3 @@ def _status(
     for key, value in values.items():
         message.values.append(maker.made("diagnostic_msgs/msg/KeyValue", key=key, value=value))
     return maker.serialised(message)
-
-
-def _stamp(stamp: Any, time_ns: int) -> None:
-    stamp.sec, stamp.nanosec = divmod(time_ns, _SECOND)

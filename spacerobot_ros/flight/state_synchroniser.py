@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-HEADER_STAMP = slice(4, 12)
-"""Where the stamp of a serialised message is that begins with a header: after the encapsulation,
-seconds and nanoseconds of four bytes each. They are only compared."""
+from spacerobot_ros.times import HEADER_STAMP
 
 CONTRADICTION = (
     "odom: two messages of one time differ; more than one node publishes it, and such poses are "

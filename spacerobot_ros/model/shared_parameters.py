@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from spacerobot_ros.model.robot_source import BelievedRobotConfig
 from spacerobot_ros.parameters import parameter
+from spacerobot_ros.times import SECOND
 
 
 @dataclass(frozen=True)
@@ -82,4 +83,4 @@ class CommanderConfig(WatchdogConfig, BelievedRobotConfig):
     @property
     def control_period(self) -> float:
         """How long a command is held, a whole number of nanoseconds, s."""
-        return round(1e9 / self.tick_rate) / 1e9
+        return round(SECOND / self.tick_rate) / SECOND

@@ -24,8 +24,6 @@ from spacerobot_ros.bag import BagWriter, QosProfile, Recording, RecordingState
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.flight.state_synchroniser import HEADER_STAMP
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns
 from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
@@ -38,6 +36,7 @@ from spacerobot_ros.nodes.common.transforms import (
     TRANSFORMS,
 )
 from spacerobot_ros.nodes.common.watchdog import Role
+from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns, set_stamp
 from spacerobot_ros.topics import NOT_RECORDED
 from spacerobot_ros.version import __version__
 
@@ -108,7 +107,7 @@ class RecorderNode(FlightNode):
             next_free=config.when_exists == "next",
             chunk_size=_CHUNK_SIZE,
             max_size=round(config.max_size * 1e6),
-            max_duration_ns=round(config.max_duration * NANOSECONDS),
+            max_duration_ns=round(config.max_duration * SECOND),
         )
         self.recording = Recording(writer, config.clock_wait, self._on_failure)
         self._clock = self.resolve_topic_name(_CLOCK)
@@ -393,7 +392,7 @@ class RecorderNode(FlightNode):
         bag = "" if self.recording is None else self.recording.writer.path.name
         array = DiagnosticArray(status=[diagnostic_status(name, level, sentence, values, bag)])
         now_ns = self.recording.now_ns if self.recording is not None else 0
-        array.header.stamp.sec, array.header.stamp.nanosec = divmod(now_ns, NANOSECONDS)
+        set_stamp(array.header.stamp, now_ns)
         self._diagnostics.publish(array)
 
 

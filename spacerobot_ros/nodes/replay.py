@@ -24,12 +24,13 @@ from spacerobot_ros.bag.config import ReplayConfig
 from spacerobot_ros.bag.playback import ReaderWait, ReplayStatus, renamed
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.model.visuals import MeshFolder, carries_meshes
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS, raw_publish
+from spacerobot_ros.nodes.common.cdr import raw_publish
 from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.transforms import TRANSFORM_TYPE
 from spacerobot_ros.nodes.common.watchdog import Role
+from spacerobot_ros.times import LATEST_NS, SECOND, set_stamp
 
 _READER_CHECK = 0.05
 """Wall s between two looks for readers."""
@@ -40,11 +41,8 @@ _BURST = 500
 _ACKNOWLEDGED = Duration(seconds=2)
 """How long a reader may take for the last messages."""
 
-_LONGEST_WAIT_NS = 3600 * NANOSECONDS
+_LONGEST_WAIT_NS = 3600 * SECOND
 """What a timer holds is less than the times that a bag may have."""
-
-_LAST_CLOCK_NS = 2**31 * NANOSECONDS - 1
-"""The last time that a clock message holds: in the year 2038."""
 
 _DEEPEST_QUEUE = 10_000
 """The middleware takes memory for queues: what a bag says may be anything."""
@@ -249,9 +247,9 @@ class ReplayNode(FlightNode):
             It is of a time that a clock cannot show.
         """
         if self.config.clock:
-            if message.log_time_ns > _LAST_CLOCK_NS:
+            if message.log_time_ns > LATEST_NS:
                 raise RecordingError(
-                    f"a message on {message.topic} is of {message.log_time_ns / NANOSECONDS:.9g} "
+                    f"a message on {message.topic} is of {message.log_time_ns / SECOND:.9g} "
                     "s, and a clock ends at 2^31 s."
                 )
             self._publish_clock(message.log_time_ns)
@@ -265,12 +263,12 @@ class ReplayNode(FlightNode):
             self._publish_clock(self._playback.bag_time(self._now()))
 
     def _publish_clock(self, time_ns: int) -> None:
-        time_ns = min(time_ns, _LAST_CLOCK_NS)
+        time_ns = min(time_ns, LATEST_NS)
         if time_ns == self._last_clock:
             return
         self._last_clock = time_ns
         message = ClockMessage()
-        message.clock.sec, message.clock.nanosec = divmod(time_ns, NANOSECONDS)
+        set_stamp(message.clock, time_ns)
         self._clock_publisher.publish(message)
 
     def _end_if_done(self) -> None:
@@ -317,7 +315,7 @@ class ReplayNode(FlightNode):
         if not self._begun:
             return
         offset = min(max(message.data, 0.0), self._playback.duration_s)
-        self._seek(self._playback.start_ns + round(offset * NANOSECONDS))
+        self._seek(self._playback.start_ns + round(offset * SECOND))
         self._set_timer()
         self._publish_status()
 
@@ -333,7 +331,7 @@ class ReplayNode(FlightNode):
         playback = self._playback
         position = playback.bag_time(self._now()) - playback.start_ns
         status = ReplayStatus(
-            position_s=min(max(position / NANOSECONDS, 0.0), playback.duration_s),
+            position_s=min(max(position / SECOND, 0.0), playback.duration_s),
             duration_s=playback.duration_s,
             paused=self._paused or not self._begun,
             ended=playback.ended,
@@ -358,7 +356,7 @@ class ReplayNode(FlightNode):
             response.message = "The replay has ended."
             return response
         response.success = True
-        response.message = f"{message.topic} at {message.log_time_ns / NANOSECONDS:.9f} s"
+        response.message = f"{message.topic} at {message.log_time_ns / SECOND:.9f} s"
         self._end_if_done()
         return response
 

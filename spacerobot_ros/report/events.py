@@ -14,6 +14,7 @@ from spacerobot_ros.bag import RecordedRobot
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.report.style import INK, MUTED, PALETTE, inches, panel
+from spacerobot_ros.times import SECOND
 
 LANE = 0.62
 """Room that a lane with its key takes below a time axis, inches."""
@@ -144,7 +145,7 @@ def read_events(robot: RecordedRobot, began: float, *, stamped: bool) -> list[Fl
             event = Event.from_values(values, message.message)
         except SpaceRobotError:
             continue
-        time = event.time_s if stamped and event.time_s is not None else time_ns / 1e9
+        time = event.time_s if stamped and event.time_s is not None else time_ns / SECOND
         # Not true of nan either.
         if event.kind in _MARKS and abs(time - began) < 1e12:
             found.append(FlightEvent(time - began, message.name, event))

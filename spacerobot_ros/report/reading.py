@@ -25,6 +25,7 @@ from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.report.events import FlightEvent, read_events
 from spacerobot_ros.report.flight import Flight, SentGoal, Status
 from spacerobot_ros.report.signals import Signal, rotvecs
+from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS
 
 _SAME_CLOCK = 1.0
@@ -118,7 +119,7 @@ class _Recorded(RecordedRobot):
         series = self.get(name)
         if series is None:
             return []
-        return [(ns / 1e9 - self._began, message) for ns, message in series.messages()]
+        return [(ns / SECOND - self._began, message) for ns, message in series.messages()]
 
     def signal(self, name: str, path: str, width: int | None = None) -> Signal:
         """Return numbers of a topic, without the messages in which one is missing.

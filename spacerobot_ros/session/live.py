@@ -18,6 +18,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.run import make_stack, ros
 from spacerobot_ros.termination import ended_on_request
+from spacerobot_ros.times import stamp_to_ns
 
 _DISCOVERY = 10.0
 """Wall s to wait for a commander that takes goals."""
@@ -26,7 +27,6 @@ _LATCHED = 1.0
 """Wall s to wait for the status of earlier goals, so that it does not pass for an answer."""
 
 _LOOK_PERIOD = 0.1
-_SECOND = 10**9
 
 
 class _Sentences:
@@ -99,7 +99,7 @@ def send_goal(
         clocks = {"own": 0, "global": 0}
 
         def on_clock(message: Clock, which: str) -> None:
-            clocks[which] = message.clock.sec * _SECOND + message.clock.nanosec
+            clocks[which] = stamp_to_ns(message.clock)
 
         clients = [
             MissionClient(

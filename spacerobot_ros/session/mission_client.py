@@ -25,14 +25,13 @@ from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.times import set_stamp
 
 _LOOK_PERIOD = 0.2
 """Wall s from one look of a follower to the next."""
 
 _LONGEST_DELIVERY = 5.0
 """Wall s in which a goal reaches those that take it."""
-
-_SECOND = 10**9
 
 
 class MissionClient:
@@ -142,7 +141,7 @@ class MissionClient:
         """
         self._sent += 1
         stamp = Time()
-        stamp.sec, stamp.nanosec = divmod(self._now() + self._sent, _SECOND)
+        set_stamp(stamp, self._now() + self._sent)
         self._follower = GoalFollower(GoalIds().of(stamp.sec, stamp.nanosec))
         if self._shape_topic is not None and self._joint_names is not None:
             shape = goal.joint_positions

@@ -28,13 +28,13 @@ from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.scenario import COMMANDERS, Kill, Scenario
 from spacerobot_ros.model.robot_source import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.connections import Connections, unconnected
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.stack import Stack, namespace_words
 from spacerobot_ros.termination import child_options
+from spacerobot_ros.times import SECOND, stamp_to_ns
 from spacerobot_ros.topics import NOT_RECORDED
 
 _START = 60.0
@@ -275,7 +275,7 @@ class MultiProcessStack(Stack):
         # A killed plant has no clock: the wall's goes on for it.
         factor = self.scenario.plant.real_time_factor
         since = factor * (time.monotonic() - self._clock_seen)
-        killed, started = self._timeline.due(self._time_ns / NANOSECONDS + since)
+        killed, started = self._timeline.due(self._time_ns / SECOND + since)
         for name in killed:
             self.kill(name)
         for name in started:
@@ -302,7 +302,7 @@ class MultiProcessStack(Stack):
             return process.wait()
 
     def _on_clock(self, message: Clock) -> None:
-        self._time_ns = message.clock.sec * NANOSECONDS + message.clock.nanosec
+        self._time_ns = stamp_to_ns(message.clock)
         self._clock_seen = time.monotonic()
 
     def _connected(self) -> bool:

@@ -30,6 +30,7 @@ from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.stack import InProcessStack, Stack
 from spacerobot_ros.termination import ended_on_request
+from spacerobot_ros.times import SECOND
 
 _Status = TypeVar("_Status", PlannerStatus, ControllerStatus)
 
@@ -115,13 +116,13 @@ def run_scenario(
                 def look() -> bool:
                     if progress is not None:
                         with suppress(OSError):  # A closed terminal ends no flight.
-                            progress(stack.time_ns / 1e9, stack.client.ends_at or time_limit)
-                    return stopped() or stack.time_ns / 1e9 >= longest
+                            progress(stack.time_ns / SECOND, stack.client.ends_at or time_limit)
+                    return stopped() or stack.time_ns / SECOND >= longest
 
                 stack.spin(look)
                 wall_time = time.perf_counter() - began
                 if progress is not None and not stopped():
-                    flown = stack.time_ns / 1e9
+                    flown = stack.time_ns / SECOND
                     progress(flown, flown)
                 stack.finish()
                 return RunResult(_summary(stack, wall_time))
@@ -238,7 +239,7 @@ def _statuses(
         for time_ns, message in series.messages():
             values = {pair.key: pair.value for pair in message.values}
             with suppress(SpaceRobotError):
-                found.append((time_ns / 1e9, read(values)))
+                found.append((time_ns / SECOND, read(values)))
     return found
 
 

@@ -28,11 +28,11 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.senders import Senders
+from spacerobot_ros.times import SECOND
 
 NEVER = -math.inf
 """The stamp of no command."""
 
-_SECOND = 10**9
 
 _START = 1.0
 """Time for which a stamp of zero is that of the first state where commands never grow old, s."""
@@ -181,7 +181,7 @@ class CommandSource:
         self, topic: str, quantity: Quantity, limits: Array, senders: Senders | None = None
     ) -> None:
         self.topic, self.quantity, self.limits = topic, quantity, limits
-        self.senders = senders or Senders(_SECOND)
+        self.senders = senders or Senders(SECOND)
         self.sender: int | None = None
         self.command: Array = np.zeros(len(limits))
         self.stamp_ns: float = NEVER
@@ -222,7 +222,7 @@ class CommandValidator:
 
     def __init__(self, plant: Plant, config: PlantConfig) -> None:
         robot = plant.robot
-        silence_ns = round((config.command_timeout or _START) * _SECOND)
+        silence_ns = round((config.command_timeout or _START) * SECOND)
         joints = partial(CommandSource, "joint_commands", senders=Senders(silence_ns))
         self.sources = [joints("velocity", robot.velocity_limit)]
         """Those whose commands are the arguments of a step, in that order: the joints' first."""
@@ -295,7 +295,7 @@ class CommandValidator:
                 return self._refuse(source, _not_this_tick(stamp_ns, now_ns), now_ns)
             refusal = self._unsound(source, values)
         else:
-            if not stamp_ns and (self._earliest or now_ns > (self._timeout or _START) * _SECOND):
+            if not stamp_ns and (self._earliest or now_ns > (self._timeout or _START) * SECOND):
                 # An unset stamp means now; at the start it is the first state's.
                 stamp_ns, unset = now_ns, True
             elif stamp_ns % self._period:
@@ -380,7 +380,7 @@ class CommandValidator:
         silent, last = [], NEVER
         for source in self.sources:
             age = now_ns - source.stamp_ns
-            if self._timeout and source.stamp_ns != NEVER and age > self._timeout * _SECOND:
+            if self._timeout and source.stamp_ns != NEVER and age > self._timeout * SECOND:
                 last = max(last, source.stamp_ns)
                 source.rest()
                 silent.append(source)
@@ -411,19 +411,19 @@ class CommandValidator:
         """Return why a command does not belong to this moment of real time, if it does not."""
         if source.senders.by_turns and self._one_commander:
             return Refusal(Reason.SECOND_COMMANDER, "two publishers command by turns")
-        age = (now_ns - stamp_ns) / _SECOND
+        age = (now_ns - stamp_ns) / SECOND
         if self._timeout and age > self._timeout:
             return Refusal(Reason.STALE, f"it is {age:.3g} s old")
         if age < 0:
             return Refusal(Reason.EARLY, f"it is {-age:.3g} s ahead of time")
         if stamp_ns % self._period:
-            period = self._period / _SECOND
+            period = self._period / SECOND
             return Refusal(
                 Reason.UNKNOWN_STATE,
-                f"it is stamped {stamp_ns / _SECOND:.9g} s, and states have multiples of "
+                f"it is stamped {stamp_ns / SECOND:.9g} s, and states have multiples of "
                 f"{period:.9g} s",
             )
-        late = (source.stamp_ns - stamp_ns) / _SECOND
+        late = (source.stamp_ns - stamp_ns) / SECOND
         if late > 0:
             return Refusal(Reason.OUT_OF_ORDER, f"it is {late:.3g} s older than the one in force")
         if late == 0 and source.commanders > 1 and self._one_commander:
@@ -449,8 +449,8 @@ def _not_this_tick(stamp_ns: int, now_ns: int) -> Refusal:
     early = stamp_ns > now_ns
     return Refusal(
         Reason.EARLY if early else Reason.STALE,
-        f"it is {'ahead of time' if early else 'stale'}: stamped {stamp_ns / _SECOND:.9g} s, the "
-        f"plant is at {now_ns / _SECOND:.9g} s",
+        f"it is {'ahead of time' if early else 'stale'}: stamped {stamp_ns / SECOND:.9g} s, the "
+        f"plant is at {now_ns / SECOND:.9g} s",
     )
 
 

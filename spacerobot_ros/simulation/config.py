@@ -8,8 +8,7 @@ from typing import Any
 from spacerobot_ros.model.robot_source import RobotConfig
 from spacerobot_ros.model.shared_parameters import WatchdogConfig
 from spacerobot_ros.parameters import group, parameter
-
-_SECOND = 10**9
+from spacerobot_ros.times import SECOND
 
 _LARGEST = 1e6
 """Largest error of a sensor, m or rad (a second): more is no measurement, and its square counts."""
@@ -20,7 +19,7 @@ _FAR = 1e9
 
 def period_ns(tick_rate: float) -> int:
     """Return the duration of a tick in ns: stamps are whole multiples of it."""
-    return round(_SECOND / tick_rate)
+    return round(SECOND / tick_rate)
 
 
 def _bias(default: tuple[float, ...], description: str, unit: str) -> Any:
@@ -195,4 +194,4 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     @property
     def control_period(self) -> float:
         """Duration of a tick, s."""
-        return self.period_ns / _SECOND
+        return self.period_ns / SECOND

@@ -10,10 +10,9 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.faults import FaultyPlant
+from spacerobot_ros.times import SECOND
 
 _SEPARATOR = "; "
-
-_SECOND = 1e9
 
 
 class PlantState(str, Enum):
@@ -165,7 +164,7 @@ class PlantMonitor:
             resets=self.resets,
             timeouts=self._commands.timeouts,
             last_command_s=(
-                self._commands.last_stamp_ns / _SECOND if self._commands.timeouts else None
+                self._commands.last_stamp_ns / SECOND if self._commands.timeouts else None
             ),
             faults=tuple(str(fault) for fault in self._plant.active),
         )

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from spacerobot_ros.simulation.commands import CommandValidator
-
-_SECOND = 1e9
+from spacerobot_ros.times import SECOND
 
 _LONGEST_LAG = 10
 """Ticks that a real-time plant may be late and still make up; what is beyond is lost for good."""
@@ -104,7 +103,7 @@ class RealTime:
     @property
     def period(self) -> float:
         """Wall time of a tick, s."""
-        return self._pace / _SECOND
+        return self._pace / SECOND
 
     def start(self, now_ns: int, tick: int) -> None:
         """Let time go on from a tick, whose state is due now."""
@@ -142,17 +141,17 @@ class RealTime:
         """Return all that was counted, and the rate of ticks since the last call."""
         late = self._ticks_late, self._answers_late
         worse, self._reported = late != self._reported, late
-        elapsed = (self._now - self._reported_at) / _SECOND
+        elapsed = (self._now - self._reported_at) / SECOND
         rate = (self._ticks - self._ticks_reported) / elapsed if elapsed > 0 else 0.0
         self._ticks_reported, self._reported_at = self._ticks, self._now
         return Timing(
             tick_rate=rate,
             ticks=self._ticks,
             ticks_late=self._ticks_late,
-            worst_tick=self._worst_tick / _SECOND,
+            worst_tick=self._worst_tick / SECOND,
             commands=self._answers,
             commands_late=self._answers_late,
-            worst_command=self._worst_answer / _SECOND,
-            command_age=(self._state_ns - self._answered_ns) / _SECOND,
+            worst_command=self._worst_answer / SECOND,
+            command_age=(self._state_ns - self._answered_ns) / SECOND,
             worse=worse,
         )

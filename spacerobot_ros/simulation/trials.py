@@ -30,6 +30,7 @@ from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
 from spacerobot_ros.simulation.config import period_ns
 from spacerobot_ros.simulation.initial_state import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
+from spacerobot_ros.times import SECOND
 
 _MOST_PIECES = 1000
 """Schedules that end short of the goal on purpose may follow each other this often."""
@@ -63,7 +64,7 @@ class Problem:
     @property
     def control_period(self) -> float:
         """How long a command is held, s."""
-        return period_ns(self.config.tick_rate) / 1e9
+        return period_ns(self.config.tick_rate) / SECOND
 
     def method(self, name: str) -> GaitMethod:
         """Build a gait method with its options."""

@@ -15,13 +15,13 @@ from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.building import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator, Refusal
 from spacerobot_ros.simulation.reported_state import ReportedState
+from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import Topic, state_topics
 from spacerobot_ros.verification.recorded_flight import RecordedFlight, read_flight
 
 TOLERANCE = 1e-9
 """Deviation that is no difference, absolute below 1 (SI units) and relative above."""
 
-_SECOND = 1e9
 
 _MOST_TICKS_A_STATE, _MOST_SILENT_TICKS = 10, 20_000
 """A recorder that was paused for a while leaves a gap; stamps of no flight leave a larger one."""
@@ -175,7 +175,7 @@ def _published(flight: RecordedFlight) -> list[_Published]:
         if between.size:
             raise RecordingError(
                 f"A message on {series.topic} of the bag {flight.path} is stamped "
-                f"{stamps[between[0]] / _SECOND:.9g} s, between the ticks of the plant in it."
+                f"{stamps[between[0]] / SECOND:.9g} s, between the ticks of the plant in it."
             )
         labels = [each.labels(names) for each in topic.state]
         table = np.hstack(
@@ -310,7 +310,7 @@ def _require_no_reset(
         back: NDArray[np.bool_] = np.all(near, axis=1)
         repeated = np.flatnonzero((np.diff(p.ticks) <= 0) & back[1:] & ~back[:-1])
         if repeated.size:
-            time = p.ticks[repeated[0] + 1] * flight.config.period_ns / _SECOND
+            time = p.ticks[repeated[0] + 1] * flight.config.period_ns / SECOND
             raise RecordingError(
                 f"In the bag {flight.path} the plant was reset at {time:.9g} s; only flights "
                 "without a reset can be verified."
@@ -337,7 +337,7 @@ class _Comparison:
     def result(self) -> Verification:
         """Find the first difference and, before it, the largest deviation."""
         difference = self._first_difference()
-        end = np.inf if difference is None else round(difference.time * _SECOND / self._period)
+        end = np.inf if difference is None else round(difference.time * SECOND / self._period)
         largest, largest_at = 0.0, None
         for p, expected, deviation in self._pairs:
             before = p.ticks < end
@@ -349,7 +349,7 @@ class _Comparison:
         ticks = self._done.end - self._done.first
         return Verification(
             ticks=ticks,
-            duration=ticks * self._period / _SECOND,
+            duration=ticks * self._period / SECOND,
             messages=sum(len(p.ticks) for p, _, _ in self._pairs),
             largest=largest,
             largest_at=largest_at,
@@ -383,7 +383,7 @@ class _Comparison:
         self, p: _Published, expected: Floats, row: int, column: int, remark: str = ""
     ) -> Difference:
         return Difference(
-            float(p.ticks[row] * self._period / _SECOND),
+            float(p.ticks[row] * self._period / SECOND),
             p.name,
             p.labels[column],
             float(p.values[row, column]),
@@ -409,4 +409,4 @@ class _Comparison:
         return ""
 
     def _time(self, tick: int) -> str:
-        return f"{tick * self._period / _SECOND:.9g} s"
+        return f"{tick * self._period / SECOND:.9g} s"

@@ -23,8 +23,7 @@ from spacerobot_ros.simulation.commands import (
     require_values,
 )
 from spacerobot_ros.simulation.config import PlantConfig
-
-_SECOND = 10**9
+from spacerobot_ros.times import stamp_to_ns
 
 RecordedCommand = NDArray[np.float64] | CommandError
 """The values of a command, or why its message is malformed."""
@@ -64,7 +63,7 @@ class RecordedFlight:
         series = self.recorded.get(source.topic)
         for _, message in series.messages() if series is not None else ():
             stamp = message.header.stamp
-            tick, rest = divmod(stamp.sec * _SECOND + stamp.nanosec, self.config.period_ns)
+            tick, rest = divmod(stamp_to_ns(stamp), self.config.period_ns)
             if not rest and tick not in commands:
                 prefix = self.config.frame_prefix
                 commands[tick] = read_command(message, source, self.robot, prefix)

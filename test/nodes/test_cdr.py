@@ -29,8 +29,8 @@ from spacerobot_ros.nodes.common.cdr import (
     MessageTemplate,
     TemplateReader,
     UnreadableError,
-    stamp_bytes,
 )
+from spacerobot_ros.times import stamp_bytes
 
 MESSAGES = (
     Clock, DiagnosticArray, DiagnosticStatus, Float64MultiArray, JointState, JointTrajectory,

@@ -33,7 +33,8 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("control",),  # above planning, whose goals it takes
         ("planning",),
         ("model",),
-        ("events", "parameters", "private_files", "resources", "termination", "topics", "version"),
+        ("events", "parameters", "private_files", "resources", "termination"),
+        ("times", "topics", "version"),
         ("output_files",),
         ("errors",),
     ),

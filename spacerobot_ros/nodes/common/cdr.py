@@ -9,7 +9,6 @@ client, other strings) the reader deserialises it the ordinary way and learns th
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Literal, TypeVar
@@ -27,9 +26,10 @@ from rosidl_parser.definition import (
 )
 from sensor_msgs.msg import JointState
 
-from spacerobot_ros.errors import CommandError, SpaceRobotError
+from spacerobot_ros.errors import CommandError
 from spacerobot_ros.model.description import Array as FloatArray
 from spacerobot_ros.simulation.commands import joint_order, require_values
+from spacerobot_ros.times import LATEST_NS, SECOND, read_stamp_ns
 
 _ENCAPSULATION = 4
 _BYTE_ORDER = 2
@@ -40,12 +40,8 @@ _SIZES = {
     "boolean": 1, "octet": 1, "char": 1, "uint8": 1, "int8": 1, "uint16": 2, "int16": 2,
     "uint32": 4, "int32": 4, "float": 4, "uint64": 8, "int64": 8, "double": 8,
 }  # fmt: skip
-_TIME = struct.Struct("<iI")
-
-NANOSECONDS = 1_000_000_000
-
-_LATEST_NS = 2**31 * NANOSECONDS - 1
-"""The last time that a stamp can carry, ns: its seconds are 32 bits."""
+_TIME_SIZE = 8
+"""Bytes of a time."""
 
 _LONGEST = 10_000
 """A message with a longer sequence is not taken apart: that of a million joints takes a minute."""
@@ -152,7 +148,7 @@ class MessageTemplate:
         self._layout = Layout.of(prototype)
         self._feeds: list[tuple[slice, memoryview]] = []
         self._times = [
-            slice(offset, offset + _TIME.size)
+            slice(offset, offset + _TIME_SIZE)
             for path, offset in self._layout.offsets.items()
             if path in ("header.stamp.sec", "clock.sec") or path.endswith(".header.stamp.sec")
         ]
@@ -174,35 +170,6 @@ class MessageTemplate:
         for place in self._times:
             buffer[place] = stamp
         return bytes(buffer)
-
-
-def stamp_bytes(time_ns: int) -> bytes:
-    """Return a time as it stands in a serialised builtin_interfaces/Time.
-
-    Raises
-    ------
-    SpaceRobotError
-        A stamp cannot carry it.
-    """
-    try:
-        return _TIME.pack(*divmod(time_ns, NANOSECONDS))
-    except struct.error:
-        raise SpaceRobotError(
-            f"Stamps carry times up to 2^31 s (68 years), not {time_ns / NANOSECONDS:.10g} s."
-        ) from None
-
-
-def carried(time_ns: int) -> int:
-    """Return the nearest time that a stamp can carry, for times ahead in plans and paths, ns."""
-    return min(time_ns, _LATEST_NS)
-
-
-def first_time_ns(raw: bytes) -> int:
-    """Return the time that a serialised message begins with, ns; 0 if it is before zero."""
-    seconds, nanoseconds = _TIME.unpack_from(raw, _ENCAPSULATION)
-    time_ns: int = seconds * NANOSECONDS + nanoseconds
-    # Once for every message: three comparisons take less time than min and max.
-    return time_ns if 0 <= time_ns <= _LATEST_NS else 0 if time_ns < 0 else _LATEST_NS
 
 
 def raw_publish(publisher: Publisher) -> Callable[[bytes], None]:
@@ -290,8 +257,7 @@ class TemplateReader(Generic[M]):
     @property
     def stamp_ns(self) -> int:
         """Header stamp of the accepted message, ns."""
-        seconds, nanoseconds = _TIME.unpack_from(self._raw, self._stamp)
-        return int(seconds * NANOSECONDS + nanoseconds)
+        return read_stamp_ns(self._raw, self._stamp)
 
     def _remember_stretches(self, raw: bytes) -> None:
         """Keep the fixed spans joined where only padding can lie between them."""
@@ -388,8 +354,8 @@ class JointReader:
         """
         self.require(raw)
         stamp = self._reader.stamp_ns
-        if stamp > _LATEST_NS and self._complete:
-            raise UnreadableError(f"no answer can carry its stamp of {stamp / NANOSECONDS:.10g} s")
+        if stamp > LATEST_NS and self._complete:
+            raise UnreadableError(f"no answer can carry its stamp of {stamp / SECOND:.10g} s")
         for target, place in self._copies:
             target[:] = raw[place]
         if self._order is not None:

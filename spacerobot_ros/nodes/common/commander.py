@@ -25,7 +25,7 @@ from spacerobot_ros.flight.state_synchroniser import StateSynchroniser
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.robot_source import robot_from_text, robot_of
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS, JointReader, first_time_ns
+from spacerobot_ros.nodes.common.cdr import JointReader
 from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
 from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.state_times import StateTimes
@@ -33,6 +33,7 @@ from spacerobot_ros.nodes.common.transforms import KnownFrames, StateFrames, rob
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.simulation.status import PlantStatus
+from spacerobot_ros.times import SECOND, first_time_ns, set_stamp
 
 _LOOK_PERIOD = 0.1
 """Wall s between two looks at states that were set aside."""
@@ -103,7 +104,7 @@ class CommanderNode(FlightNode):
         self._said: DiagnosticStatus | None = None
         """The last status of the node."""
         period = self.config.diagnostics_period or math.inf
-        self._diagnostics_period_ns = period * NANOSECONDS
+        self._diagnostics_period_ns = period * SECOND
         self._diagnosed_ns, self._diagnosed = 0, time.monotonic()
         self._known_frames = KnownFrames(self)
         self._answered = time.monotonic()
@@ -144,7 +145,7 @@ class CommanderNode(FlightNode):
     def simulated_time_s(self) -> float | None:
         """Time of the last state, s; None before the first."""
         times = getattr(self, "_times", None)
-        return None if times is None or not times.now_ns else times.now_ns / NANOSECONDS
+        return None if times is None or not times.now_ns else times.now_ns / SECOND
 
     def on_silence(self, silence: Silence) -> None:
         """Give up the goals for a silent plant, where that is asked for."""
@@ -318,7 +319,7 @@ class CommanderNode(FlightNode):
                 )
             )
         self._diagnosed_ns, self._diagnosed = times.now_ns, time.monotonic()
-        array.header.stamp.sec, array.header.stamp.nanosec = divmod(times.now_ns, NANOSECONDS)
+        set_stamp(array.header.stamp, times.now_ns)
         self._diagnostics.publish(array)
 
     def _on_plant_status(self, message: DiagnosticStatus) -> None:

@@ -10,12 +10,11 @@ from std_msgs.msg import String
 from spacerobot_ros.bag import QosProfile, Recording
 from spacerobot_ros.bag.rosbag2 import LATCHED
 from spacerobot_ros.errors import CommandError, RecordingError, RobotDescriptionError
-from spacerobot_ros.flight.state_synchroniser import HEADER_STAMP
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns
 from spacerobot_ros.nodes.common.streams import Take
 from spacerobot_ros.nodes.common.transforms import TRANSFORM_TYPE, RobotTransforms, StateFrames
+from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns
 
 _STREAM = QosProfile(depth=100)
 
@@ -46,7 +45,7 @@ class RecordedTransforms:
         is_published: Callable[[], bool],
     ) -> None:
         self._recording, self._topics, self._is_published = recording, topics, is_published
-        self._period_ns = round(period * NANOSECONDS)
+        self._period_ns = round(period * SECOND)
         self._odom, self._joint_states = b"", b""
         self._last_ns, self._next_ns = 0, 0
         self._description: RobotDescription | None = None

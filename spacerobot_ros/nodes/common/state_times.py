@@ -6,8 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from spacerobot_ros.flight.state_synchroniser import HEADER_STAMP
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS, first_time_ns
+from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns
 
 LONGEST_DOUBT = 0.2
 """Wall s after which a state of another time is believed that no state of the old time follows."""
@@ -64,7 +63,7 @@ class StateTimes:
 
     def __init__(self, control_period: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._period = round(control_period * NANOSECONDS)
+        self._period = round(control_period * SECOND)
         self._step = self._period
         """Time between two states as far as is known, ns."""
         self._longest = -1
@@ -197,7 +196,7 @@ class StateTimes:
         ]
         self._doubtful, self._doubtful_odom = None, b""
         for name, raw in parts:
-            ahead = (first_time_ns(raw) - self._last_ns) / NANOSECONDS
+            ahead = (first_time_ns(raw) - self._last_ns) / SECOND
             self.ignored += 1
             self.last_ignored = (
                 f"A message on '{name}' is ignored: its stamp is {abs(ahead):.4g} s "

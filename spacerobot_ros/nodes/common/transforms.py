@@ -20,8 +20,9 @@ from rclpy.serialization import deserialize_message
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.link_transforms import Frames, LinkTransforms
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS, JointReader, TemplateReader
+from spacerobot_ros.nodes.common.cdr import JointReader, TemplateReader
 from spacerobot_ros.nodes.common.messages import chained, message_class
+from spacerobot_ros.times import SECOND
 
 TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
 TRANSFORMS, STATIC_TRANSFORMS = "/tf", "/tf_static"
@@ -79,7 +80,7 @@ class TransformTemplate:
 
     def serialised(self, time_ns: int, poses: Array) -> bytes:
         """Return the message with the poses (k, 7), all of one time."""
-        seconds, nanoseconds = divmod(time_ns, NANOSECONDS)
+        seconds, nanoseconds = divmod(time_ns, SECOND)
         self._words[self._stamps] = seconds
         self._words[self._stamps + 1] = nanoseconds
         self._doubles[self._places] = poses

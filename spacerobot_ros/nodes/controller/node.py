@@ -24,18 +24,13 @@ from spacerobot_ros.flight.plant_listener import Change, Stopped
 from spacerobot_ros.flight.state_synchroniser import CONTRADICTION, Pairing, StateSynchroniser
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.nodes.common.cdr import (
-    NANOSECONDS,
-    JointReader,
-    MessageTemplate,
-    TemplateReader,
-    stamp_bytes,
-)
+from spacerobot_ros.nodes.common.cdr import JointReader, MessageTemplate, TemplateReader
 from spacerobot_ros.nodes.common.commander import CommanderNode
 from spacerobot_ros.nodes.common.messages import diagnostic_status, goal_of, goal_sentence
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
+from spacerobot_ros.times import SECOND, stamp_bytes
 
 JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
 """Topics of references from outside; where one has a publisher, every state waits for it."""
@@ -282,7 +277,7 @@ class CoordinatedControlNode(CommanderNode):
         try:
             q, qdot = self._joints.values["position"], self._joints.values["velocity"]
             measured = self._measured(q, qdot) if pairing is Pairing.WHOLE else None
-            now = stamp / NANOSECONDS
+            now = stamp / SECOND
             result = self._executive.command(now, measured, q, qdot, self._reference())
         except (CommandError, NotFiniteError) as error:
             self._log_refusal(error)

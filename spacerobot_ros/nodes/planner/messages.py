@@ -18,19 +18,13 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from spacerobot_ros.errors import CommandError
 from spacerobot_ros.model.description import Shape
-from spacerobot_ros.nodes.common.cdr import (
-    NANOSECONDS,
-    JointReader,
-    Layout,
-    MessageTemplate,
-    TemplateReader,
-    carried,
-)
+from spacerobot_ros.nodes.common.cdr import JointReader, Layout, MessageTemplate, TemplateReader
 from spacerobot_ros.nodes.common.messages import diagnostic_status, shape_marker
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
 from spacerobot_ros.planning.execution.state_average import BaseMeasurement
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.planning.execution.tracker import Setpoint
+from spacerobot_ros.times import LATEST_NS, SECOND, set_stamp
 
 
 class StateReader:
@@ -128,10 +122,10 @@ def path_message(path: BasePath, start_ns: int, frame: str) -> Path:
     """Return a predicted base path that begins at ``start_ns`` as nav_msgs/Path."""
 
     def header(time_ns: int) -> Header:
-        sec, nanosec = divmod(carried(time_ns), NANOSECONDS)
+        sec, nanosec = divmod(min(time_ns, LATEST_NS), SECOND)
         return Header(frame_id=frame, stamp=Time(sec=sec, nanosec=nanosec))
 
-    instants = (path.time * NANOSECONDS).round().astype(np.int64) + start_ns
+    instants = (path.time * SECOND).round().astype(np.int64) + start_ns
     poses = []
     for instant, r, o in zip(
         instants.tolist(), path.position.tolist(), path.quaternion.tolist(), strict=True
@@ -154,7 +148,7 @@ def serialised_trajectory(schedule: GaitSchedule, stamp_ns: int, frame: str) -> 
     zeros = [0.0] * n
     prototype = JointTrajectory(joint_names=list(schedule.joint_names))
     prototype.header.frame_id = frame
-    prototype.header.stamp.sec, prototype.header.stamp.nanosec = divmod(stamp_ns, NANOSECONDS)
+    set_stamp(prototype.header.stamp, stamp_ns)
     prototype.points = [
         JointTrajectoryPoint(positions=zeros, velocities=zeros, time_from_start=Duration())
         for _ in range(3)
@@ -172,8 +166,8 @@ def serialised_trajectory(schedule: GaitSchedule, stamp_ns: int, frame: str) -> 
     count = len(schedule.positions)
     records = np.tile(np.frombuffer(raw[ends[1] : ends[2]], np.uint8), (count, 1))
     velocities = np.vstack([schedule.velocities, np.zeros(n)])
-    times = np.arange(count, dtype=np.int64) * round(schedule.control_period * NANOSECONDS)
-    clock = np.stack([times // NANOSECONDS, times % NANOSECONDS], axis=1).astype("<u4")
+    times = np.arange(count, dtype=np.int64) * round(schedule.control_period * SECOND)
+    clock = np.stack([times // SECOND, times % SECOND], axis=1).astype("<u4")
     for values, offset in zip((schedule.positions, velocities, clock), at[2], strict=True):
         data = np.ascontiguousarray(values).view(np.uint8)
         first = offset - ends[1]

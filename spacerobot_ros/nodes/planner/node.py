@@ -21,7 +21,6 @@ from spacerobot_ros.flight.plant_listener import Change, Stopped
 from spacerobot_ros.flight.state_synchroniser import CONTRADICTION, Pairing, StateSynchroniser
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.nodes.common.cdr import stamp_bytes
 from spacerobot_ros.nodes.common.commander import CommanderNode
 from spacerobot_ros.nodes.common.messages import goal_of, goal_sentence, shape_of
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
@@ -46,6 +45,7 @@ from spacerobot_ros.planning.execution.status import (
     goal_values,
 )
 from spacerobot_ros.planning.execution.worker import LONGEST_END, PlanningWorker
+from spacerobot_ros.times import stamp_bytes
 
 # Python looks up the member of an enum as slowly as it calls a function; these are for every state.
 _WITHOUT_POSE, _LATE_POSE = Pairing.WITHOUT_POSE, Pairing.LATE_POSE

@@ -6,13 +6,13 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
 from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
 from spacerobot_ros.simulation.faults import FaultyPlant
 from spacerobot_ros.simulation.thrusters import ThrusterPlant, thrusters_in
 from spacerobot_ros.simulation.time_modes import RealTime
+from spacerobot_ros.times import set_stamp
 
 PROPELLANT = "propellant_kg"
 """Key of the propellant used, in the diagnostics."""
@@ -101,7 +101,7 @@ class PlantReport:
         before, self._reported = self._reported, self._counters()
         refused, limited = (now != then for now, then in zip(self._reported, before, strict=True))
         array = DiagnosticArray()
-        array.header.stamp.sec, array.header.stamp.nanosec = divmod(time_ns, NANOSECONDS)
+        set_stamp(array.header.stamp, time_ns)
         array.status = [
             self._command_status(refused=refused),
             self._actuator_status(limited=limited),

@@ -21,7 +21,6 @@ from spacerobot_ros.bag.recorded_robot import last_state
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.robot_source import robot_of
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, described_robot
 from spacerobot_ros.nodes.common.process import run_node
@@ -42,6 +41,7 @@ from spacerobot_ros.simulation.reported_state import ReportedState
 from spacerobot_ros.simulation.senders import Senders
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
 from spacerobot_ros.simulation.time_modes import Lockstep, RealTime
+from spacerobot_ros.times import SECOND
 
 _LOOK_PERIOD = 0.1
 """How often a plant looks for new subscribers and commanders, wall s."""
@@ -102,7 +102,7 @@ class PlantNode(FlightNode):
     @property
     def simulated_time_s(self) -> float:
         """The same, s."""
-        return self.time_ns / NANOSECONDS
+        return self.time_ns / SECOND
 
     @property
     def state(self) -> PlantState:
@@ -258,7 +258,7 @@ class PlantNode(FlightNode):
         """Publish the status and what has happened, if anything has."""
         assert self._monitor is not None
         self._faults_seen = self.plant.active
-        events = self._monitor.update(self._active, self.time_ns / NANOSECONDS)
+        events = self._monitor.update(self._active, self.time_ns / SECOND)
         if self._monitor.status is not self.status:
             self._publish_status(self._monitor.status)
         for event in events:
@@ -307,7 +307,7 @@ class PlantNode(FlightNode):
         try:
             limited = self.plant.step(*self._commands.begin_step())
         except SpaceRobotError as error:
-            time = self.time_ns / NANOSECONDS
+            time = self.time_ns / SECOND
             raise SpaceRobotError(f"The plant stops at {time:g} s: {error}") from error
         if limited:
             self._report.limited()
@@ -340,7 +340,7 @@ class PlantNode(FlightNode):
             self._publish_report()
 
     def _ticks(self, seconds: float) -> int:
-        return max(1, round(seconds * NANOSECONDS / self._period_ns)) if seconds else 0
+        return max(1, round(seconds * SECOND / self._period_ns)) if seconds else 0
 
     def _viewed_ticks(self, seconds: float, longest_wall: float) -> int:
         """Return the ticks of a period; in real time it is short enough for people to watch."""

@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Pose
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
-from spacerobot_ros.nodes.common.cdr import MessageTemplate, stamp_bytes
+from spacerobot_ros.nodes.common.cdr import MessageTemplate
 from spacerobot_ros.nodes.common.messages import message_class, shape_marker
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.streams import RawOutput
@@ -27,6 +27,7 @@ from spacerobot_ros.nodes.common.transforms import (
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.reported_state import ReportedState
+from spacerobot_ros.times import stamp_bytes
 from spacerobot_ros.topics import TOPICS, Topic
 
 _PATIENCE = 0.5

@@ -29,13 +29,13 @@ from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS
 from spacerobot_ros.nodes.common.messages import goal_of
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.watchdog import Pulse, Role
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.status import PlantStatus
+from spacerobot_ros.times import SECOND
 from spacerobot_ros.viewer.port import Firing, Measured, Momenta, Part, StackState
 
 LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -50,7 +50,7 @@ _FORGOTTEN_AFTER = 60.0
 _JITTER_NS = 200_000
 """By how many wall ns more than at best two messages of one tick may be published apart."""
 
-_EXPECTED_NO_MORE_NS = 10**9
+_EXPECTED_NO_MORE_NS = SECOND
 """Wall ns after which a plant no longer publishes what its momenta should be."""
 
 _MOST_POINTS = 1000
@@ -207,7 +207,7 @@ class Listener:
         """Return the simulated time of the last state, ns; the wall's before the first."""
         if self._measured is None:
             return time.time_ns()
-        return round(self._measured.time_s * NANOSECONDS)
+        return round(self._measured.time_s * SECOND)
 
     # -- streams --------------------------------------------------------------------------------
 

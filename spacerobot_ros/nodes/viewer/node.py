@@ -28,7 +28,6 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.nodes.common.cdr import NANOSECONDS, carried
 from spacerobot_ros.nodes.common.node import EVENTS, LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.remote_parameters import RemoteParameters
@@ -38,6 +37,7 @@ from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import Targets
 from spacerobot_ros.simulation.status import PlantState
+from spacerobot_ros.times import LATEST_NS, SECOND
 from spacerobot_ros.viewer.config import ViewerConfig
 from spacerobot_ros.viewer.page import Page
 from spacerobot_ros.viewer.port import (
@@ -427,7 +427,7 @@ class ViewerNode(FlightNode):
         self._sent += 1
         flag = time.time_ns() // _MICROSECOND_NS * _MICROSECOND_NS % _FLAG_NS
         time_ns = self._listener.time_ns() + flag + self._sent % 1000
-        sec, nanosec = divmod(carried(time_ns), NANOSECONDS)
+        sec, nanosec = divmod(min(time_ns, LATEST_NS), SECOND)
         self._send_shape(goals["base"])
         for part, goal in goals.items():
             message = PoseStamped()

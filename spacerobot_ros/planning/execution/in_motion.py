@@ -15,6 +15,7 @@ from spacerobot_ros.planning.execution.outputs import Pursuit
 from spacerobot_ros.planning.execution.take_over import TakeOver
 from spacerobot_ros.planning.execution.tracker import TrajectoryTracker
 from spacerobot_ros.planning.execution.worker import PlanningWorker
+from spacerobot_ros.times import SECOND
 
 _MOST_ATTEMPTS = 2
 """Plans in motion that are tried for a goal: each takes over twice as late as the one before."""
@@ -71,7 +72,7 @@ class InMotion:
 
     def begin_schedule(self, config: PlannerConfig, schedule: GaitSchedule, begins_ns: int) -> int:
         """Begin with a schedule; return how many measured poses are to be averaged meanwhile."""
-        self._replan_ns = begins_ns + round(config.replanning * 1e9)
+        self._replan_ns = begins_ns + round(config.replanning * SECOND)
         wanted = config.replanning > 0 or config.averaging > 1
         able = config.takeover_time > 0 and self._worker.starts_in_motion(schedule)
         return config.averaging if wanted and able else 0
@@ -101,11 +102,11 @@ class InMotion:
         state = self._tracker.averaged(state)
         if stamp_ns < self._replan_ns or pursuit.schedule.partial:
             return None
-        self._replan_ns = stamp_ns + round(config.replanning * 1e9)
+        self._replan_ns = stamp_ns + round(config.replanning * SECOND)
         position, quaternion = self._tracker.end
         goal, within = pursuit.identified.goal, config.tolerance
         error = PoseError.between(*self._tracker.expected_end, goal)
-        late = pursuit.ends_at - stamp_ns / 1e9 < _LATE * pursuit.manoeuvre_time
+        late = pursuit.ends_at - stamp_ns / SECOND < _LATE * pursuit.manoeuvre_time
         near = Tolerance(*(_NEAR_ENOUGH[late] * x for x in (within.position, within.attitude)))
         if near.admits(error, pursuit.schedule.controls & POSE):
             return None

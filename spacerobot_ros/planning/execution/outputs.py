@@ -13,6 +13,7 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.planning.execution.state_machine import PlanReason, Transition
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, goal_values
+from spacerobot_ros.times import SECOND
 
 
 class Severity(Enum):
@@ -85,7 +86,7 @@ class OutputQueue:
         **about: str,
     ) -> None:
         """Add an event about a goal."""
-        now = self.stamp_ns / 1e9
+        now = self.stamp_ns / SECOND
         self.waiting.append(FlightEvent(kind, sentence, level, now, identified.goal_id, about))
 
     def report(

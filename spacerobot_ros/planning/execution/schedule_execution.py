@@ -28,6 +28,7 @@ from spacerobot_ros.planning.execution.state_machine import Event, Phase, PlanRe
 from spacerobot_ros.planning.execution.status import PlannerState, remaining_error
 from spacerobot_ros.planning.execution.tracker import Setpoint, TrackingError, TrajectoryTracker
 from spacerobot_ros.planning.execution.worker import PlanningWorker
+from spacerobot_ros.times import SECOND
 
 _GAP, _GAP_PERIODS = 1.0, 10
 """Longest time between two states beyond which time has jumped: s, or control periods."""
@@ -65,7 +66,7 @@ class ScheduleExecution:
         """Stamp of the first state that the present schedule or plan answers, ns."""
         self.plant_rests = False
         """Whether the plant reports that no command is in force, for the owner to set."""
-        self._longest_gap = round(max(_GAP, _GAP_PERIODS * config.control_period) * 1e9)
+        self._longest_gap = round(max(_GAP, _GAP_PERIODS * config.control_period) * SECOND)
 
     @property
     def phase(self) -> Phase:
@@ -109,7 +110,7 @@ class ScheduleExecution:
             pursuit,
             identified=identified,
             corrections=0,
-            manoeuvre_time=pursuit.ends_at - self._stamp_ns / 1e9,
+            manoeuvre_time=pursuit.ends_at - self._stamp_ns / SECOND,
         )
         self._accepted(self._pursuit)
         sentence = "The schedule that is executed leads to this goal, too."
@@ -181,7 +182,7 @@ class ScheduleExecution:
         self._tracker.start(schedule, begins, average)
         self._commanded_from_ns = self._stamp_ns
         pursuit.manoeuvre_time += schedule.duration
-        pursuit.ends_at = begins / 1e9 + schedule.duration
+        pursuit.ends_at = begins / SECOND + schedule.duration
         pursuit.next_plan = PlanReason.CONTINUATION if schedule.partial else PlanReason.CORRECTION
         if start_ns is None:
             self._go(Event.PLANNED, Phase.EXECUTING)
@@ -201,10 +202,10 @@ class ScheduleExecution:
     @staticmethod
     def _cut_off(pursuit: Pursuit, stamp_ns: int) -> None:
         """Subtract the rest of the present schedule from the duration of the manoeuvre."""
-        remainder = pursuit.ends_at - stamp_ns / 1e9
+        remainder = pursuit.ends_at - stamp_ns / SECOND
         if remainder > 0:
             pursuit.manoeuvre_time -= min(remainder, pursuit.schedule.duration)
-            pursuit.ends_at = stamp_ns / 1e9
+            pursuit.ends_at = stamp_ns / SECOND
 
     def _on_end(self, stamp_ns: int) -> None:
         """End the schedule; its result is evaluated unless its goal was cancelled."""
@@ -230,7 +231,7 @@ class ScheduleExecution:
         if self._pursuit is not None:
             self._pursuit.next_plan = PlanReason.REPLAN
         self._go(Event.TIME_JUMPED, self._phase_at_rest())
-        before, now = self._stamp_ns / 1e9, stamp_ns / 1e9
+        before, now = self._stamp_ns / SECOND, stamp_ns / SECOND
         self._out.notice(
             Severity.WARNING,
             f"The time of the states has jumped from {before:.9g} s to {now:.9g} s, where no "

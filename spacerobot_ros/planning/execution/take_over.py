@@ -24,6 +24,7 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.mass_estimate import MassEstimate
+from spacerobot_ros.times import SECOND
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class TakeOver:
 
         None where the schedule, which began at ``start_ns``, is over by then.
         """
-        period_ns = round(schedule.control_period * 1e9)
+        period_ns = round(schedule.control_period * SECOND)
         now = max((stamp_ns - start_ns) // period_ns, 0)
         tick = now + max(1, math.ceil(after / schedule.control_period - 1e-9))
         if tick >= schedule.ticks:

@@ -16,6 +16,7 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.mass_estimate import MassEstimate, PathSensitivity
 from spacerobot_ros.planning.execution.stuck_joints import StuckJointWatch
 from spacerobot_ros.planning.execution.take_over import PathDeviation, TakeOver
+from spacerobot_ros.times import SECOND
 
 _AT_END = 1e-6
 """A schedule has ended when every joint is this near its last position, m or rad."""
@@ -67,7 +68,7 @@ class ScheduleFollower:
     ) -> None:
         self.schedule = schedule
         self._start_ns = start_ns
-        self._period_ns = round(schedule.control_period * 1e9)
+        self._period_ns = round(schedule.control_period * SECOND)
         self._last_tick = schedule.ticks
         self._end_ns = start_ns + self._last_tick * self._period_ns
         self._gain = min(shape_gain, 1.0 / schedule.control_period)
@@ -84,11 +85,11 @@ class ScheduleFollower:
         if late < 0:
             return False
         far = np.abs(self._positions[-1] - q).max(initial=0.0) > max(_AT_END, self._deadband)
-        return not far or late > _LONGEST_SETTLING * 1e9
+        return not far or late > _LONGEST_SETTLING * SECOND
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether the schedule says where the shape is to be at a time, or its end still does."""
-        return self._start_ns <= stamp_ns <= self._end_ns + _LONGEST_SETTLING * 1e9
+        return self._start_ns <= stamp_ns <= self._end_ns + _LONGEST_SETTLING * SECOND
 
     def take_over(self, stamp_ns: int, after: float) -> TakeOver | None:
         """Return the tick ``after`` s from now or later; None where the schedule is over then."""
@@ -141,21 +142,21 @@ class BrakingFollower:
         shape_gain: float,
     ) -> None:
         self.schedule = schedule
-        self._begin = (stamp_ns - start_ns) / 1e9
+        self._begin = (stamp_ns - start_ns) / SECOND
         self._stamp_ns, self._duration = stamp_ns, duration
         self._gain = min(shape_gain, 1.0 / schedule.control_period)
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether the shape is on its way to rest at a time."""
-        return 0 <= stamp_ns - self._stamp_ns <= self._duration * 1e9
+        return 0 <= stamp_ns - self._stamp_ns <= self._duration * SECOND
 
     def ended(self, stamp_ns: int, q: Array) -> bool:
         """Whether the shape is at rest."""
-        return (stamp_ns - self._stamp_ns) / 1e9 >= self._duration
+        return (stamp_ns - self._stamp_ns) / SECOND >= self._duration
 
     def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
         """Write the wanted shape now (n,) and the velocities to hold from now (n,)."""
-        since = (stamp_ns - self._stamp_ns) / 1e9
+        since = (stamp_ns - self._stamp_ns) / SECOND
         position[:] = self._shape(since)
         tick = self.schedule.control_period
         velocity[:] = (self._shape(since + tick) - position) / tick + self._gain * (position - q)
@@ -163,7 +164,7 @@ class BrakingFollower:
     def shapes(self, stamp_ns: int) -> Array:
         """Return the wanted shapes (N + 1, n) at the ticks from now until the rest."""
         tick = self.schedule.control_period
-        since = (stamp_ns - self._stamp_ns) / 1e9
+        since = (stamp_ns - self._stamp_ns) / SECOND
         ticks = max(1, math.ceil((self._duration - since) / tick - 1e-9))
         return np.array([self._shape(since + k * tick) for k in range(ticks + 1)])
 
@@ -208,7 +209,7 @@ class TrackingErrorCheck:
         self._period = schedule.control_period
         self._deviation = PathDeviation(schedule.path, average, sensitivity, masses)
         self._position, self._attitude = position or np.inf, attitude or np.inf
-        self._stamps = start_ns + (schedule.path.time * 1e9).round().astype(np.int64)
+        self._stamps = start_ns + (schedule.path.time * SECOND).round().astype(np.int64)
         self._slack = round(schedule.control_period * 0.5e9)
         self._next = 0
         self._used = position > 0 or attitude > 0 or average > 0
