@@ -82,10 +82,10 @@ expected: $(STAMP)/test ## write what the tests expect of parameters and plans a
 	PYTHONPATH=.:test $(BIN)/python3 -m support.expected
 
 MUTANTS := 400
-SEED := 1
 .PHONY: mutants
-mutants: $(STAMP)/mutants ## put random errors into the package; see out/mutants; MUTANTS=400 SEED=1
-	PYTHONPATH=.:test nice $(BIN)/python3 test/mutation/run.py --sample $(MUTANTS) --seed $(SEED)
+mutants: $(STAMP)/mutants ## put random errors into the whole package; see out/mutants; MUTANTS=400 SEED=[another each time]
+	PYTHONPATH=.:test nice $(BIN)/python3 test/mutation/run.py --sample $(MUTANTS) \
+	    $(if $(filter command line,$(origin SEED)),--seed $(SEED))
 
 .PHONY: hostile-bags
 hostile-bags: $(STAMP)/test ## read bags that were made to harm their reader, each in a process of its own
