@@ -177,11 +177,11 @@ def _flight(
     decision = Decision(int(result.decision[row]))
     decided, period_ns = int(result.decided_tick[row]), drawn.scenario.plant.period_ns
     if row in result.failures:
-        return "The plant refuses it."
+        return "was refused by the plant"
     if decision is Decision.LOST:
-        return "Control is lost."
+        return "lost control"
     if decided == 0:
-        return "It ends before it begins."
+        return "ended at its first state"
     n, end = flights.robot.n, result.end_state[row]
     duration = int(result.end_tick[row]) * period_ns / SECOND
     statuses = [(0, ControllerStatus(ControllerState.TRACKING))]

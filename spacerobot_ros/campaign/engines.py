@@ -10,7 +10,7 @@ from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.draws import Draw
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
-from spacerobot_ros.campaign.rows import FLIGHTS, Engine, Left, Row
+from spacerobot_ros.campaign.rows import FLIGHTS, Engine, Fallback, Row
 from spacerobot_ros.errors import SpaceRobotError
 
 ALL: Mapping[str, Callable[[], Engine]] = {
@@ -55,13 +55,13 @@ def fly_all(
     engine: Engine, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
 ) -> Iterator[Row]:
     """Yield a row for each draw; what an engine leaves is flown after the others."""
-    left: list[Left] = []
+    left: list[Fallback] = []
     for made in engine.fly(campaign, draws, stopped):
-        if isinstance(made, Left):
+        if isinstance(made, Fallback):
             left.append(made)
         else:
             yield made
-    reasons = {each.draw.number: each.why for each in left}
+    reasons = {each.draw.number: each.reason for each in left}
     for row in engine_called(FLIGHTS).fly(campaign, [each.draw for each in left], stopped):
         assert isinstance(row, Row), "it leaves nothing"
         yield replace(row, fallback=reasons[row.draw.number])

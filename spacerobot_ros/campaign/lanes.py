@@ -25,7 +25,7 @@ from spacerobot_ros.campaign.controlled_lanes import (
 )
 from spacerobot_ros.campaign.draws import Draw, drawn_flight
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, node_robot, robots_of
-from spacerobot_ros.campaign.rows import LANES, Left, Row
+from spacerobot_ros.campaign.rows import LANES, Fallback, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.arrays import Commands, FlightArrays, Outcome
@@ -111,14 +111,14 @@ class LanesEngine:
 
     def fly(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row | Left]:
+    ) -> Iterator[Row | Fallback]:
         """Fly draws in batches; leave those that need a planner or controller on the way."""
         plans = "planner" in campaign.scenario.commanders
         return (self._tracked if plans else self._controlled)(campaign, draws, stopped)
 
     def _controlled(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row | Left]:
+    ) -> Iterator[Row | Fallback]:
         """Fly draws of coordinated control."""
         common = DrawnFlight.of(campaign.scenario)
         for first in range(0, len(draws), _MOST_CONTROLLED):
@@ -134,7 +134,7 @@ class LanesEngine:
                 try:
                     require_lane(campaign, flight)
                 except SpaceRobotError as error:  # It alone: the others of its batch are flown.
-                    yield Left(draw, str(error))
+                    yield Fallback(draw, str(error))
                     continue
                 batch.append((draw, flight))
             if not batch:
@@ -142,17 +142,17 @@ class LanesEngine:
             try:
                 flown = fly_controlled(campaign, batch)
             except SpaceRobotError as error:  # Of one of them: each is flown by itself.
-                yield from (Left(draw, str(error)) for draw, _ in batch)
+                yield from (Fallback(draw, str(error)) for draw, _ in batch)
                 continue
             for draw, flight_or_reason in flown:
                 if isinstance(flight_or_reason, str):
-                    yield Left(draw, flight_or_reason)
+                    yield Fallback(draw, flight_or_reason)
                 else:
                     yield Row.of(campaign, draw, flight_or_reason, self.name)
 
     def _tracked(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row | Left]:
+    ) -> Iterator[Row | Fallback]:
         """Fly draws that follow the plans of a planner."""
         common, batch, ticks = DrawnFlight.of(campaign.scenario), list[_Planned](), 0
         began = time.perf_counter()
@@ -165,7 +165,7 @@ class LanesEngine:
                 yield Row.failed(draw, error, self.name)
                 continue
             if planned is None:
-                yield Left(draw, "No schedule begins at the first state.")
+                yield Fallback(draw, "had no schedule at the first state")
                 continue
             batch.append(planned)
             ticks += planned.schedule.ticks
@@ -190,7 +190,7 @@ class LanesEngine:
             self._kept = key, _first_plan(flight)
         return _Planned.of(draw, flight, self._kept[1], began)
 
-    def _flown(self, campaign: Campaign, batch: list[_Planned]) -> Iterator[Row | Left]:
+    def _flown(self, campaign: Campaign, batch: list[_Planned]) -> Iterator[Row | Fallback]:
         """Fly a batch in lanes."""
         began = time.perf_counter()
         flights, ends = _flights(batch)
@@ -199,9 +199,9 @@ class LanesEngine:
         for row, planned in enumerate(batch):
             flight = _flight(result, row, planned, flights, ends[row])
             if isinstance(flight, str):
-                yield Left(planned.draw, flight)
+                yield Fallback(planned.draw, flight)
             elif flight.duration > campaign.longest:
-                yield Left(planned.draw, "It is interrupted on the way.")
+                yield Fallback(planned.draw, "took longer than the campaign allows")
             else:
                 made = Row.of(campaign, planned.draw, flight, self.name)
                 yield replace(made, wall_time=taken + planned.plan_time)
@@ -304,20 +304,20 @@ def _flight(
 ) -> FlightArrays | str:
     """Return a flight whose goal is decided at the end of its schedule, or why it is not."""
     if row in result.failures:
-        return "The plant refuses it."
+        return "was refused by the plant"
     if any(counts[row].any() for counts in result.limited.values()):
-        return "A joint is limited."
+        return "had a joint at its limit"
     scenario, schedule = planned.flight.scenario, planned.schedule
     measured, q = result.measured_pose[row, end], result.measured_q[row, end]
     band = max(_AT_END, scenario.planner.shape_deadband)
     if np.abs(schedule.positions[-1] - q).max(initial=0.0) > band:
-        return "A joint does not follow."
+        return "had a joint that did not follow its schedule"
     error = PoseError.between(measured[:3], measured[3:], scenario.goal, q)
     left = remaining_error(error, schedule.controls)
     outcome, sentence = Outcome.REACHED, f"The goal is reached: {left}."
     if not scenario.planner.tolerance.admits(error, schedule.controls):
         if scenario.planner.max_corrections:
-            return "It is corrected."
+            return "needed corrections"
         outcome = Outcome.FAILED
         sentence = f"The goal is not reached: {left} after 0 correction(s)."
     kept = slice(0, end + 1)

@@ -396,10 +396,14 @@ def _outcomes(results: Results) -> str:
         for sentence, count in counts.most_common(4):
             rows.append([outcome, f"{count}", sentence])
     made = table(["outcome", "flights", "sentence"], rows, "outcomes")
-    left = Counter(text for text in results.columns.get("fallback", ()) if text)
-    if left:
-        counted = ", ".join(f"{text.rstrip('.')} ({count})" for text, count in left.most_common(6))
-        made += f'<p class="facts">Left to another engine: {escape(counted)}</p>'
+    fallbacks = Counter(text for text in results.columns.get("fallback", ()) if text)
+    for reason, count in fallbacks.most_common(6):
+        flights = f"{count} flight{'s' if count > 1 else ''}"
+        refused = reason.endswith(".")  # The sentence of an error.
+        line = (
+            f"used engine 'flights': {reason}" if refused else f"{reason} and used engine 'flights'"
+        )
+        made += f'<p class="facts">{escape(flights)} {escape(line)}</p>'
     return made
 
 

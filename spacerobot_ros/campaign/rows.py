@@ -40,7 +40,7 @@ class Row:
     engine
         What flew it.
     fallback
-        Why another engine than the campaign's flew it; empty: none did.
+        Why the engine ``flights`` flew it instead of the campaign's; empty if it did not.
     wall_time, plan_time
         What the flight, and planning in it, took, s.
     """
@@ -80,11 +80,14 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Left:
-    """A draw that an engine leaves to the engine ``flights``, and why."""
+class Fallback:
+    """A draw that an engine passes on to the engine ``flights``.
+
+    ``reason`` completes "the flight ..." ("needed corrections"), or is the sentence of an error.
+    """
 
     draw: Draw
-    why: str
+    reason: str
 
 
 class Engine(Protocol):
@@ -105,5 +108,5 @@ class Engine(Protocol):
 
     def fly(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row | Left]:
-        """Yield a row for each draw, or why it is left; fewer where it is stopped."""
+    ) -> Iterator[Row | Fallback]:
+        """Yield a row or a fallback for each draw; fewer if it is stopped."""

@@ -21,7 +21,7 @@ from spacerobot_ros.campaign.dataset import Dataset, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws
 from spacerobot_ros.campaign.engines import chosen_engine, engine_called, fly_all
 from spacerobot_ros.campaign.extras import needed
-from spacerobot_ros.campaign.rows import FLIGHTS, Left, Row
+from spacerobot_ros.campaign.rows import FLIGHTS, Fallback, Row
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.private_files import warn_once
 from spacerobot_ros.version import __version__
@@ -220,7 +220,7 @@ def _parsed(specification: _Specification) -> Campaign:
 
 def fly_task(
     specification: _Specification, draws: list[Draw], engine: str, *, all_of_them: bool = False
-) -> list[Row | Left]:
+) -> list[Row | Fallback]:
     """Fly some draws in a worker: a task of the scheduler.
 
     Parameters
@@ -468,7 +468,7 @@ class _Distribution:
         if alone:
             self._suspected = None
         try:
-            made: list[Row | Left] = future.result()
+            made: list[Row | Fallback] = future.result()
         except KilledWorker:
             return self._mourned(task.numbers, alone)
         except CancelledError as error:
@@ -483,9 +483,9 @@ class _Distribution:
                 f"{__version__}."
             ) from error
         rows = [each for each in made if isinstance(each, Row)]
-        left = [each for each in made if isinstance(each, Left)]
+        left = [each for each in made if isinstance(each, Fallback)]
         self._left += [each.draw.number for each in left]
-        self._reasons |= {each.draw.number: each.why for each in left}
+        self._reasons |= {each.draw.number: each.reason for each in left}
         if not alone and rows:
             took = sum(row.wall_time for row in rows if row.wall_time == row.wall_time)
             if took > 0:

@@ -248,7 +248,7 @@ def test_what_lanes_leave_is_flown_in_small_tasks(
     assert here.keys() == there.keys() == set(range(70))
     named = ("engine", "fallback", "outcome", "reason", "position_error_m", "duration_s")
     assert all(here[n][name] == there[n][name] for n in here for name in named)
-    left = sum(row["fallback"] == "It is corrected." for row in there.values())
+    left = sum(row["fallback"] == "needed corrections" for row in there.values())
     assert 5 < left < 70
     assert sum(size for size, engine in tasks if engine == "flights") == left
     assert max(size for size, engine in tasks if engine == "flights") < 64

@@ -129,7 +129,7 @@ def test_flights_in_lanes_are_interrupted_or_left_to_the_controller() -> None:
     lost = {number for number, row in one_by_one.items() if row.outcome == "aborted"}
     assert 0 < len(lost) < 6
     assert {n for n, row in lanes.items() if row.engine == "flights"} == lost
-    assert {lanes[number].fallback for number in lost} == {"Control is lost."}
+    assert {lanes[number].fallback for number in lost} == {"lost control"}
 
 
 def test_a_draw_that_is_refused_leaves_the_others_of_its_batch_in_lanes() -> None:

@@ -54,7 +54,7 @@ def filled(
         metrics = {"position_error_m": error(draw), "manoeuvre_time_s": 4.0, **others}
         outcome = "reached" if metrics["position_error_m"] < 0.05 else "failed"
         ok = passed(made.criteria, outcome, metrics)
-        left = "It is corrected." if draw.number % 50 == 0 else ""
+        left = "needed corrections" if draw.number % 50 == 0 else ""
         rows.append(Row(draw, outcome, f"{outcome}.", metrics, ok, "lanes", left, 0.01, 0.0))
     dataset.add(rows)
     dataset.close()
@@ -263,6 +263,6 @@ def test_the_pages_open_without_a_complaint_and_need_nothing_else(tmp_path: Path
         window.open(page)
         words = unescape(window.evaluate("document.body.innerText"))
     assert f"{share} of 120" in words
-    assert "Left to another engine: It is corrected (3)" in words
+    assert "3 flights needed corrections and used engine 'flights'" in words
     worst = max(Draws(made), key=bowl).number
     assert f"spacerobot campaign rerun '{one}' {worst}" in words

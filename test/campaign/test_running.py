@@ -21,7 +21,7 @@ from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
 from spacerobot_ros.campaign.report import Results
 from spacerobot_ros.campaign.rerunning import TOLERANCE, Rerun, largest_deviation, rerun_flight
-from spacerobot_ros.campaign.rows import ERROR, Left, Row
+from spacerobot_ros.campaign.rows import ERROR, Fallback, Row
 from spacerobot_ros.campaign.running import Progress, run_campaign
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
@@ -231,14 +231,14 @@ def test_a_task_of_lanes_leaves_what_others_fly_unless_all_of_it_is_asked_for() 
     part = running.fly_task(specification, draws, "lanes")
     whole = running.fly_task(specification, draws, "lanes", all_of_them=True)
     assert all(isinstance(each, Row) for each in whole)
-    left = {each.draw.number: each.why for each in part if isinstance(each, Left)}
+    left = {each.draw.number: each.reason for each in part if isinstance(each, Fallback)}
     assert 0 < len(left) < 8
     assert left == {
         each.draw.number: each.fallback
         for each in whole
         if isinstance(each, Row) and each.engine == "flights"
     }
-    assert set(left.values()) == {"It is corrected."}
+    assert set(left.values()) == {"needed corrections"}
 
 
 @pytest.fixture
