@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.control.status import CommandReport, ControllerStatus, tracking_time
-from spacerobot_ros.control.thrusters.table import IN_URDF, find_thrusters
+from spacerobot_ros.control.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.errors import PlanningError, SpaceRobotError
 from spacerobot_ros.flight.scenario import Published
 from spacerobot_ros.model import RobotDescription

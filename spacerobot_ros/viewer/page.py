@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spacerobot_ros.control.thrusters.table import ThrusterTable
+from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.errors import GoalError
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.planning import Goal

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spacerobot_ros.control.thrusters.table import ThrusterTable
+from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.errors import MeshError
 from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
 from spacerobot_ros.model.link_transforms import LinkTransforms

@@ -21,7 +21,7 @@ from spacerobot_ros.batch import (
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.laws.law import GainPair, Gains
 from spacerobot_ros.control.limits import MotionLimits
-from spacerobot_ros.control.thrusters.table import ThrusterTable, thruster_table
+from spacerobot_ros.control.thrusters import ThrusterTable, thruster_table
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.compilation import cxx_compiler

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from spacerobot_ros.control.thrusters.table import find_thrusters
+from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion

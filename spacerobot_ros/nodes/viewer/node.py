@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool, Trigger
 
-from spacerobot_ros.control.thrusters.table import ThrusterTable, find_thrusters
+from spacerobot_ros.control.thrusters import ThrusterTable, find_thrusters
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import RobotDescription
