@@ -324,7 +324,7 @@ def _flight(
     time = result.time[kept]
     n = schedule.positions.shape[1]
     # The shape is that of the schedule in every tick: its feedback had nothing to do.
-    status = replace(planned.gait, sentence=sentence)
+    status = replace(planned.gait, message=sentence)
     return FlightArrays(
         scenario=scenario,
         robot=planned.flight.nominal,

@@ -27,7 +27,7 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.output_files import write_output
 
 if TYPE_CHECKING:
-    from spacerobot_ros.simulation.trials import Problem, Record, Trial
+    from spacerobot_ros.simulation.trials import PlanEvaluation, Problem, Record
 
 
 _NO_GOAL = GoalOptions(None, None, None)
@@ -85,20 +85,20 @@ def command(
     The gait is simulated. Exit code 0: it ends within tolerance; 1: it does not, or the goal cannot
     be reached; 2: bad input.
     """
-    from spacerobot_ros.simulation.trials import Trial, compare, try_method
+    from spacerobot_ros.simulation.trials import PlanEvaluation, compare, try_method
 
     problem = problem_of(scenario, goal, settings)
     if count is not None:
         _try_random(problem, [method] if beside is None else [method, beside], count, within)
         return
-    found: Mapping[str, Trial | SpaceRobotError]
+    found: Mapping[str, PlanEvaluation | SpaceRobotError]
     with display(scenario):
         found = compare(problem) if comparing else {method: try_method(problem, method)}
     if comparing:
         for line in table(found):
             click.echo(line)
     trial = found.get(method)
-    if not isinstance(trial, Trial):
+    if not isinstance(trial, PlanEvaluation):
         fail()
     left = f"{trial.error.angle:.3g} rad and {trial.error.distance:.3g} m from the goal"
     if not comparing:
@@ -108,7 +108,7 @@ def command(
         content = json_of(problem, trial)
         if comparing:
             content["compared"] = {
-                name: each.duration if isinstance(each, Trial) else str(each)
+                name: each.duration if isinstance(each, PlanEvaluation) else str(each)
                 for name, each in found.items()
             }
         write_json(json_file, content, indent=None)
@@ -150,7 +150,7 @@ def problem_of(
     return goal.of(scenario_or_robot(name).with_settings(settings)).problem()
 
 
-def json_of(problem: Problem, trial: Trial) -> dict[str, Any]:
+def json_of(problem: Problem, trial: PlanEvaluation) -> dict[str, Any]:
     """Return what ``--json`` writes of a trial."""
     from spacerobot_ros.model.rotations import rotvec_from_quaternion
 
@@ -181,7 +181,7 @@ def json_of(problem: Problem, trial: Trial) -> dict[str, Any]:
     }
 
 
-def table(found: Mapping[str, Trial | SpaceRobotError]) -> Iterator[str]:
+def table(found: Mapping[str, PlanEvaluation | SpaceRobotError]) -> Iterator[str]:
     """Yield the lines of a comparison; errors that a method does not control are in brackets."""
     yield f"{'method':<14}{'manoeuvre':>12}{'planned in':>12}{'attitude':>14}{'position':>14}"
     yield f"{'':<14}{'s':>12}{'s':>12}{'rad off':>14}{'m off':>14}"

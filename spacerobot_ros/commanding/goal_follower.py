@@ -59,4 +59,4 @@ def decision_event(status: Status) -> Event | None:
     if not status.state.decided:
         return None
     kind = EventKind(f"goal_{status.state.value}")
-    return Event(kind, status.sentence, status.state.level, goal_id=status.goal_id)
+    return Event(kind, status.message, status.state.level, goal_id=status.goal_id)

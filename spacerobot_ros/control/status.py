@@ -81,8 +81,8 @@ class ControllerStatus:
     ----------
     state
         What became of the goal.
-    sentence
-        The same for people.
+    message
+        The text for the user.
     goal_id
         Which goal the status is about; empty: none, or one whose id is not known.
     command
@@ -90,7 +90,7 @@ class ControllerStatus:
     """
 
     state: ControllerState
-    sentence: str = ""
+    message: str = ""
     goal_id: str = ""
     command: CommandReport | None = None
 
@@ -109,7 +109,7 @@ class ControllerStatus:
         return values
 
     @classmethod
-    def from_values(cls, values: Mapping[str, str], sentence: str = "") -> ControllerStatus:
+    def from_values(cls, values: Mapping[str, str], message: str = "") -> ControllerStatus:
         """Return the status that :meth:`to_values` has turned into these pairs.
 
         Raises
@@ -131,7 +131,7 @@ class ControllerStatus:
                     },
                 )
             state = ControllerState(values["state"])
-            return cls(state, sentence, values.get("goal_id", ""), command)
+            return cls(state, message, values.get("goal_id", ""), command)
         except (KeyError, ValueError) as error:
             raise SpaceRobotError(f"This is no status of a controller: {error}.") from error
 

@@ -436,9 +436,9 @@ class _LockstepFlight:
         outcome = Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value)
         sentence = interrupted
         if decision is not None:
-            sentence = decision.sentence
+            sentence = decision.message
         elif not interrupted and self._status is not None:
-            sentence = self._monitor.status.sentence or self._status.sentence
+            sentence = self._monitor.status.sentence or self._status.message
         plan_time = 0.0
         if self._planner is not None:
             plan_time = self._planner.executive.statistics.plan_time_s

@@ -134,7 +134,7 @@ def recorded_flight(path: str | os.PathLike[str]) -> Flight:
         scenario=scenario,
         robot=description,
         outcome=Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value),
-        sentence=status.sentence if status is not None else "",
+        sentence=status.message if status is not None else "",
         control_period=config.control_period,
         time=stamps,
         pose=base[:, :7],

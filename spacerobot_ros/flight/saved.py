@@ -150,7 +150,7 @@ def _others(flight: FlightArrays, maker: MessageMaker) -> Iterator[_Stream]:
         if found:
             node = "/planner" if kind is PlannerStatus else "/coordinated_control"
             messages = [
-                _status(maker, node, status.sentence, status.state.level, status.to_values())
+                _status(maker, node, status.message, status.state.level, status.to_values())
                 for _, status in found
             ]
             times = np.array([time for time, _ in found], dtype=np.int64)

@@ -82,9 +82,9 @@ class SpaceRobot:
         parameters.require_physical([body.name for body in self.description.bodies])
         if np.array_equal(parameters.vector, self.inertial.vector):
             return self
-        return self.weighing_as(parameters.described(self.description))
+        return self.with_masses_of(parameters.described(self.description))
 
-    def weighing_as(self, description: RobotDescription) -> SpaceRobot:
+    def with_masses_of(self, description: RobotDescription) -> SpaceRobot:
         """Return the robot as a description of the same build says that it weighs."""
         return SpaceRobot(description, self._build)
 

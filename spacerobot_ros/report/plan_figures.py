@@ -19,18 +19,20 @@ from spacerobot_ros.report.style import (
     set_time,
     sheet,
 )
-from spacerobot_ros.simulation.trials import Problem, Trial
+from spacerobot_ros.simulation.trials import PlanEvaluation, Problem
 
 _COMPONENTS = ("x", "y", "z")
 
 
-def draw(problem: Problem, trial: Trial, format: PictureFormat = PictureFormat.PNG) -> bytes:
+def draw(
+    problem: Problem, trial: PlanEvaluation, format: PictureFormat = PictureFormat.PNG
+) -> bytes:
     """Return the picture of a plan and its goal."""
     with drawing():
         return picture_of(_figure(problem, trial), format)
 
 
-def _figure(problem: Problem, trial: Trial) -> Figure:
+def _figure(problem: Problem, trial: PlanEvaluation) -> Figure:
     robot, goal = problem.robot, problem.goal
     positions = trial.positions
     ticks = problem.control_period * np.arange(len(positions), dtype=np.float64)

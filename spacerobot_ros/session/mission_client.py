@@ -106,7 +106,7 @@ class MissionClient:
     @property
     def sentence(self) -> str:
         """The sentence of the last status; empty before the first."""
-        return "" if self.status is None else self.status.sentence
+        return "" if self.status is None else self.status.message
 
     @property
     def ends_at(self) -> float:

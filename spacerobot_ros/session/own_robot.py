@@ -18,7 +18,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.trials import Problem, Trial
+from spacerobot_ros.simulation.trials import PlanEvaluation, Problem
 
 _FIRST_TURN = math.radians(5.0)
 """Largest turn of the base in the first scenario of a robot, rad."""
@@ -184,9 +184,9 @@ def first_turn(robot: SpaceRobot, shape: Array, axes: Array) -> Array:
     return np.asarray(math.radians(degrees) * axis / np.linalg.norm(axis))
 
 
-def fastest(found: Mapping[str, object]) -> Trial | None:
+def fastest(found: Mapping[str, object]) -> PlanEvaluation | None:
     """Return the trial that reaches its goal in the shortest time, None if none does."""
-    reached = [each for each in found.values() if isinstance(each, Trial) and each.reached]
+    reached = [each for each in found.values() if isinstance(each, PlanEvaluation) and each.reached]
     return min(reached, key=lambda trial: trial.duration, default=None)
 
 

@@ -78,7 +78,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Trial:
+class PlanEvaluation:
     """The plan of a method for a problem, and how its flight in the plant ended.
 
     Attributes
@@ -144,7 +144,7 @@ def state_of(plant: VelocityPlant) -> RobotState:
     )
 
 
-def try_method(problem: Problem, name: str, method: GaitMethod | None = None) -> Trial:
+def try_method(problem: Problem, name: str, method: GaitMethod | None = None) -> PlanEvaluation:
     """Plan by a method, ``method`` if it is built already, and fly the schedule in the plant.
 
     Raises
@@ -181,12 +181,12 @@ def try_method(problem: Problem, name: str, method: GaitMethod | None = None) ->
             break
     limited = sum(int(counts.max(initial=0)) for counts in plant.limit_counts.values())
     pose, controls = plant.pose.copy(), schedule.controls
-    return Trial(name, pieces, error, pose, limited, plan_time, reached, controls)
+    return PlanEvaluation(name, pieces, error, pose, limited, plan_time, reached, controls)
 
 
-def compare(problem: Problem) -> dict[str, Trial | SpaceRobotError]:
-    """Return the trial of every method by its name, or why the method refuses."""
-    found: dict[str, Trial | SpaceRobotError] = {}
+def compare(problem: Problem) -> dict[str, PlanEvaluation | SpaceRobotError]:
+    """Return the evaluation of every method by its name, or the reason of its refusal."""
+    found: dict[str, PlanEvaluation | SpaceRobotError] = {}
     for name, method in METHODS.items():
         # That one only chooses among the others.
         if name == "auto":

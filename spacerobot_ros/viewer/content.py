@@ -144,11 +144,11 @@ def head(state: StackState, *, described: bool = True) -> str:
         lines.extend(_line(f"Fault: {each}", 1) for each in state.plant.faults)
     if state.planner is not None:
         status = state.planner
-        text = _status("Planner", status.state.value, status.sentence, status.state.level)
+        text = _status("Planner", status.state.value, status.message, status.state.level)
         lines.append(_faint(text, faint="planner" in state.absent))
     if state.controller is not None:
         control = state.controller
-        text = _status("Controller", control.state.value, control.sentence, control.state.level)
+        text = _status("Controller", control.state.value, control.message, control.state.level)
         lines.append(_faint(text, faint="controller" in state.absent))
     return padded("".join(lines))
 

@@ -22,7 +22,7 @@ from spacerobot_ros.cli.options import numbers
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.planning import METHODS, BasePath, GaitSchedule, Goal, PoseError
 from spacerobot_ros.session.run import RunResult
-from spacerobot_ros.simulation.trials import Problem, Record, Trial
+from spacerobot_ros.simulation.trials import PlanEvaluation, Problem, Record
 from spacerobot_ros.verification.comparison import Difference, Verification
 
 SUMMARY: dict[str, Any] = {
@@ -217,7 +217,7 @@ def test_numbers_for_people() -> None:
 # -- plans ------------------------------------------------------------------------------------
 
 
-def trial(problem: Problem, name: str, reached: bool = True) -> Trial:
+def trial(problem: Problem, name: str, reached: bool = True) -> PlanEvaluation:
     """Return a flight of two ticks and one more that ends 0.0123 m and 0.0456 rad off."""
     n, tool = problem.robot.n, METHODS[name]
     goal, pieces = Goal(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])), []
@@ -233,7 +233,7 @@ def trial(problem: Problem, name: str, reached: bool = True) -> Trial:
         pieces.append(schedule)
     pose = np.array([0.1, 0.2, 0.3, 0.0, 0.0, math.sin(0.2), math.cos(0.2)])
     error = PoseError(np.array([0.0, 0.0123, 0.0]), np.array([0.0, 0.0, 0.0456]))
-    return Trial(name, pieces, error, pose, 0, 0.6789, reached, tool.controls)
+    return PlanEvaluation(name, pieces, error, pose, 0, 0.6789, reached, tool.controls)
 
 
 def plan(patch: pytest.MonkeyPatch, reached: bool, *words: str) -> Result:
@@ -306,7 +306,7 @@ def test_a_comparison_has_a_row_for_each_method(
 ) -> None:
     from spacerobot_ros.simulation import trials
 
-    def compare(problem: Problem) -> dict[str, Trial | PlanningError]:
+    def compare(problem: Problem) -> dict[str, PlanEvaluation | PlanningError]:
         refusal = PlanningError("It has no slider.")
         found = {name: trial(problem, name) for name in ("square_path", "optimal")}
         return {"lie_bracket": refusal, **found}

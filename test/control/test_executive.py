@@ -104,7 +104,7 @@ def test_a_goal_is_reached_when_it_is_held_for_the_settling_time() -> None:
         assert loop.state == "tracking", "the time begins anew"
     loop.answer()
     assert loop.state == "reached"
-    assert_one_sentence(loop.status.sentence, "reached")
+    assert_one_sentence(loop.status.message, "reached")
     assert (loop.status.goal_id, loop.status.state.level) == ("7", 0)
     loop.place = np.zeros(3)
     loop.answer(5)
@@ -240,7 +240,7 @@ def test_abort_holds_the_robot_where_it_is() -> None:
     assert (loop.state, loop.status.state.level, loop.status.goal_id) == ("aborted", 1, "4")
     loop.answer(3)
     assert loop.state == "aborted"
-    assert_one_sentence(loop.status.sentence, "Aborted on request")
+    assert_one_sentence(loop.status.message, "Aborted on request")
     # A new goal is taken up from there.
     loop.aim(base=goal_at([1.25, 0.0, 0.0], "5"))
     np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
@@ -409,7 +409,7 @@ def test_a_status_survives_its_values(
     assert all(isinstance(value, str) for value in values.values())
     again = ControllerStatus.from_values(values, "A sentence.")
     assert again.to_values() == values
-    assert (again.state, again.goal_id, again.sentence) == (state, goal_id, "A sentence.")
+    assert (again.state, again.goal_id, again.message) == (state, goal_id, "A sentence.")
     assert state.decided == (state.value in ("reached", "failed", "refused", "aborted"))
 
 
@@ -478,13 +478,13 @@ def test_a_plant_that_stops_ends_the_goal_at_once_and_once(tmp_path: Path) -> No
     assert file.exists()
     assert loop.executive.plant_stopped("The plant is latched.")
     assert (loop.state, loop.status.goal_id) == ("aborted", "there")
-    assert loop.status.sentence == "Aborted by the plant: The plant is latched."
+    assert loop.status.message == "Aborted by the plant: The plant is latched."
     assert not file.exists()
     loop.place = np.array([0.4, 0.0, 0.0])
     wrench, _ = loop.answer()
     np.testing.assert_allclose(wrench, 0.0, atol=1e-12)
     loop.answer(5)
-    assert loop.status.sentence == "Aborted by the plant: The plant is latched."
+    assert loop.status.message == "Aborted by the plant: The plant is latched."
     assert not loop.executive.plant_stopped("The plant is latched.")
     assert kinds(loop) == [("goal_accepted", "there"), ("goal_aborted", "there")]
     # A goal that waits for its first state is given up as well.

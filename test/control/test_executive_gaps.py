@@ -50,7 +50,7 @@ def test_the_base_is_estimated_for_a_while_and_then_the_thrusters_are_off() -> N
     # The joints are slowed: their efforts take energy out of them.
     assert effort @ loop.rates < 0.0
     assert (loop.state, loop.status.state.level) == ("stopped", 2)
-    assert_one_sentence(loop.status.sentence, "thrusters off")
+    assert_one_sentence(loop.status.message, "thrusters off")
     loop.rates = np.zeros(2)
     np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
     assert loop.state == "tracking"

@@ -284,12 +284,12 @@ def test_one_joint_that_is_too_fast_for_long_enough_ends_the_goal() -> None:
     loop.rates = np.array([0.3, -1.21])
     loop.answer()
     assert (loop.state, loop.status.goal_id) == ("aborted", "g")
-    assert loop.status.sentence == (
+    assert loop.status.message == (
         "Aborted: control is lost, joint 'elbow' moves at -1.21/s instead of 0.8/s; "
         "the robot is brought to rest."
     )
     (event,) = [event for event in loop.events if event.kind is EventKind.GOAL_ABORTED]
-    assert (event.goal_id, event.sentence) == ("g", loop.status.sentence)
+    assert (event.goal_id, event.sentence) == ("g", loop.status.message)
     loop.answer(10)
     assert [e.kind for e in loop.events].count(EventKind.GOAL_ABORTED) == 1, "it is lost once"
 
@@ -338,7 +338,7 @@ def test_errors_that_grow_beyond_twice_what_a_goal_asks_for_end_it(margin: float
     loop.answer()
     assert (loop.state, loop.status.goal_id) == ("aborted", "g")
     away = f"{2 + margin + 0.01:.3g} m, 0 rad"
-    assert loop.status.sentence == (
+    assert loop.status.message == (
         f"Aborted: control is lost, the errors grow, the robot is {away} from the reference; "
         "the robot is brought to rest."
     )

@@ -27,13 +27,13 @@ def test_the_distances_of_a_sentence_are_those_of_its_kind() -> None:
     loop.answer()
     loop.place = np.array([0.03, -0.04, 0.0])
     loop.answer(3)
-    assert loop.status.sentence == "Holding; off by 0.04 m, 0 rad."
+    assert loop.status.message == "Holding; off by 0.04 m, 0 rad."
     loop.place = np.zeros(3)
     loop.aim(base=goal_at([0.3, 0.4, 0.0]), end_effector=goal_at(TIP))
     loop.answer()
-    assert loop.status.sentence == "Flying to the goal; 0.4 m, 0 rad from the reference."
+    assert loop.status.message == "Flying to the goal; 0.4 m, 0 rad from the reference."
     loop.answer(8)
-    assert loop.status.sentence == "The goal is not reached in time: 0.4 m, 0 rad from it."
+    assert loop.status.message == "The goal is not reached in time: 0.4 m, 0 rad from it."
 
 
 def test_the_time_without_a_base_is_reported() -> None:
@@ -42,7 +42,7 @@ def test_the_time_without_a_base_is_reported() -> None:
     for count in (1, 2, 3):
         loop.answer(measured=False)
         words = f"it is estimated since {count * PERIOD:.3g} s."
-        assert loop.status.sentence.endswith(words)
+        assert loop.status.message.endswith(words)
 
 
 @pytest.mark.parametrize(

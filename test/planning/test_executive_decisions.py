@@ -170,7 +170,7 @@ def test_the_next_goal_takes_the_result_of_a_refused_one_along() -> None:
     loop.tick()
     refused = loop.statuses[-1]
     assert (refused.state, refused.goal_id) == (PlannerState.REFUSED, "goal-2")
-    assert refused.sentence == "It is too far. The earlier goal is still pursued."
+    assert refused.message == "It is too far. The earlier goal is still pursued."
     until(loop, Phase.PLANNING)
     loop.held.release()
     reached = loop.until(PlannerState.REACHED)
@@ -191,7 +191,7 @@ def test_a_plant_that_stops_ends_the_goal_with_its_reason(
     loop.tick()
     status = loop.statuses[-1]
     assert (status.state, status.goal_id) == (PlannerState.ABORTED, "goal-1")
-    assert status.sentence == "Aborted by the plant: The plant is latched: a fuse is blown."
+    assert status.message == "Aborted by the plant: The plant is latched: a fuse is blown."
     assert not (tmp_path / "goal.json").exists()
     # Nothing moves, whatever was being planned, until there is another goal.
     loop.held.release()
@@ -380,7 +380,7 @@ def test_a_state_that_is_not_finite_ends_no_goal_silently() -> None:
     loop.measured.broken = True
     loop.tick()
     assert loop.statuses[-1].state is PlannerState.REFUSED
-    assert "not finite" in loop.statuses[-1].sentence
+    assert "not finite" in loop.statuses[-1].message
     loop.measured.broken = False
     assert loop.decide(NEAR).state is PlannerState.REACHED
     # Measured in flight, the joints are commanded to rest as long as nothing is known of them.
@@ -402,7 +402,7 @@ def test_a_goal_whose_result_cannot_be_measured_has_failed_with_the_reason() -> 
     loop.tick()
     status = loop.statuses[-1]
     assert (status.state, status.goal_id) == (PlannerState.FAILED, "goal-1")
-    assert status.sentence == "The measured state is not finite; see odom and joint_states."
+    assert status.message == "The measured state is not finite; see odom and joint_states."
     assert loop.executive.phase is Phase.IDLE
     loop.measured.broken = False
     assert loop.decide(OTHER).state is PlannerState.REACHED

@@ -47,7 +47,7 @@ def test_the_pose_that_is_already_there_is_reached() -> None:
     loop = Loop()
     status = loop.decide(HERE)
     assert status.state is PlannerState.REACHED
-    assert_one_sentence(status.sentence, "reached")
+    assert_one_sentence(status.message, "reached")
     (start,) = loop.starts
     assert start.schedule.ticks <= 1
     loop.tick(5)
@@ -72,8 +72,8 @@ def test_a_goal_that_is_refused_in_flight_does_not_disturb_the_earlier_one() -> 
     loop.propose(BEYOND_STROKE)
     loop.until(PlannerState.REACHED)
     assert loop.states == ["executing", "refused", "reached"]
-    assert "beyond stroke" in loop.statuses[1].sentence
-    assert loop.statuses[1].sentence.endswith(" The earlier goal is still pursued.")
+    assert "beyond stroke" in loop.statuses[1].message
+    assert loop.statuses[1].message.endswith(" The earlier goal is still pursued.")
     assert max(loop.error_to(NEAR)) <= 1e-3
     assert len(loop.starts) == 1
 
@@ -91,14 +91,14 @@ def test_a_robot_with_momentum_is_refused_with_the_true_reason(
     loop = Loop(initial=InitialState(**momenta))
     status = loop.decide(NEAR)
     assert loop.states == ["refused"]
-    assert_one_sentence(status.sentence, *mentions)
+    assert_one_sentence(status.message, *mentions)
 
 
 def test_a_robot_that_the_method_cannot_steer_is_refused() -> None:
     loop = Loop(robot="planar_chain")
     status = loop.decide(TURNED)
     assert loop.states == ["refused"]
-    assert_one_sentence(status.sentence, "three sliders", "planar_chain")
+    assert_one_sentence(status.message, "three sliders", "planar_chain")
 
 
 def test_a_goal_that_is_missed_fails_with_a_sentence() -> None:
@@ -107,7 +107,7 @@ def test_a_goal_that_is_missed_fails_with_a_sentence() -> None:
     loop.tick()
     loop.set(attitude_tolerance=1e-9)
     status = loop.until(PlannerState.FAILED)
-    assert_one_sentence(status.sentence, "not reached", "0 correction(s)")
+    assert_one_sentence(status.message, "not reached", "0 correction(s)")
     loop.tick(10)
     assert loop.speeds[-1] == 0.0
 
@@ -197,7 +197,7 @@ def test_abortion_brings_the_joints_to_rest_on_their_path() -> None:
     loop.propose(NEAR)
     loop.tick(15)
     assert loop.abort() == "The joints brake along the planned path within 1 s."
-    assert_one_sentence(loop.statuses[-1].sentence, "Aborted on request.")
+    assert_one_sentence(loop.statuses[-1].message, "Aborted on request.")
     began = len(loop.commands)
     loop.tick(83)
     path = loop.starts[0].schedule.positions

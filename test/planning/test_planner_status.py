@@ -58,7 +58,7 @@ def test_a_status_survives_its_message(
 ) -> None:
     status = PlannerStatus(
         state=state,
-        sentence="So it is.",
+        message="So it is.",
         goal_id=goal_id,
         goal=goal,
         corrections=corrections,

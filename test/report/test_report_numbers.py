@@ -106,7 +106,7 @@ def flight(path: Path, statuses: Any = FLOWN, **options: Any) -> Flight:
             say("/goal_pose", pose(5.0 + n, *goal), 5.0 + n)
         for topic, status, time in statuses:
             pairs = [KeyValue(key=k, value=v) for k, v in status.to_values().items()]
-            say(f"/{topic}", DiagnosticStatus(message=status.sentence, values=pairs), time)
+            say(f"/{topic}", DiagnosticStatus(message=status.message, values=pairs), time)
         for k in range(4):
             time, last = 5.0 + 0.5 * k, k == 3
             swing = (0.0, 3e-9, -4e-9, 0.0)[k]

@@ -76,7 +76,7 @@ class Mission:
     def report(self, status: PlannerStatus | ControllerStatus) -> None:
         """Publish a status, and wait for the client to receive it."""
         values = [KeyValue(key=key, value=value) for key, value in status.to_values().items()]
-        self.status.publish(DiagnosticStatus(message=status.sentence, values=values))
+        self.status.publish(DiagnosticStatus(message=status.message, values=values))
         self.harness.spin_until(lambda: self.client.status == status)
 
 

@@ -314,7 +314,7 @@ class Loop:
 
     @property
     def notices(self) -> list[str]:
-        return [output.sentence for output in self.outputs if isinstance(output, Notice)]
+        return [output.message for output in self.outputs if isinstance(output, Notice)]
 
     @property
     def transitions(self) -> list[Transition]:

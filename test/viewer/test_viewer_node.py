@@ -207,7 +207,7 @@ def test_a_goal_has_the_joint_positions_that_the_page_shows(harness: Harness) ->
     planner = stack.probe.create_publisher(DiagnosticStatus, "/planner/status", LATCHED)
     status = PlannerStatus(PlannerState.IDLE, "Waiting for a goal pose.")
     values = [KeyValue(key=k, value=v) for k, v in status.to_values().items()]
-    planner.publish(DiagnosticStatus(name="/planner", values=values, message=status.sentence))
+    planner.publish(DiagnosticStatus(name="/planner", values=values, message=status.message))
     harness.connect()
     stack.describe()
     final = stack.page._editor._final

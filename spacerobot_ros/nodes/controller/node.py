@@ -203,12 +203,12 @@ class CoordinatedControlNode(CommanderNode):
 
     def _publish_status(self, status: ControllerStatus) -> None:
         name, level = self.get_fully_qualified_name(), bytes([status.state.level])
-        self._said = diagnostic_status(name, level, status.sentence, status.to_values())
+        self._said = diagnostic_status(name, level, status.message, status.to_values())
         self._status.publish(self._said)
         if status.state.decided and self.config.stop_when_decided:
             self._running = False
         if status.state.level:
-            self.get_logger().warning(status.sentence, throttle_duration_sec=5.0)
+            self.get_logger().warning(status.message, throttle_duration_sec=5.0)
 
     # -- what the plant publishes -------------------------------------------------------------
 

@@ -92,7 +92,7 @@ def setpoint_template(joint_names: Sequence[str], setpoint: Setpoint) -> Message
 def status_message(status: PlannerStatus, name: str) -> DiagnosticStatus:
     """Return the status of the planner ``name``."""
     level = bytes([status.state.level])
-    return diagnostic_status(name, level, status.sentence, status.to_values())
+    return diagnostic_status(name, level, status.message, status.to_values())
 
 
 def goal_markers(

@@ -331,9 +331,9 @@ class PlannerNode(CommanderNode):
         if status.state.decided and self.config.stop_when_decided:
             self._running = False
         if status.state.level:
-            self.get_logger().warning(status.sentence)
+            self.get_logger().warning(status.message)
         else:
-            self.get_logger().info(status.sentence)
+            self.get_logger().info(status.message)
 
     def _announce(self, start: ScheduleStart) -> None:
         """Publish a schedule, its path and its goal; beside the flight where plans are made so."""

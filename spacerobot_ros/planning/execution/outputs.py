@@ -26,10 +26,10 @@ class Severity(Enum):
 
 @dataclass(frozen=True)
 class Notice:
-    """A sentence for the log."""
+    """A message for the log."""
 
     severity: Severity
-    sentence: str
+    message: str
 
 
 @dataclass(frozen=True)

@@ -44,9 +44,9 @@ class PlannerStatus:
     Attributes
     ----------
     state
-        What became of the goal.
-    sentence
-        The same for people.
+        State of the goal.
+    message
+        The text for the user.
     goal_id
         Which goal the status is about; empty: none, or one whose id is not known.
     goal
@@ -68,7 +68,7 @@ class PlannerStatus:
     """
 
     state: PlannerState
-    sentence: str = ""
+    message: str = ""
     goal_id: str = ""
     goal: tuple[float, ...] = ()
     corrections: int = 0
@@ -101,7 +101,7 @@ class PlannerStatus:
         return values
 
     @classmethod
-    def from_values(cls, values: Mapping[str, str], sentence: str = "") -> PlannerStatus:
+    def from_values(cls, values: Mapping[str, str], message: str = "") -> PlannerStatus:
         """Return the status that :meth:`to_values` has turned into these pairs.
 
         Raises
@@ -115,7 +115,7 @@ class PlannerStatus:
             numbers = {name: float(given.pop(name)) for name in _NUMBERS if name in given}
             return cls(
                 state=state,
-                sentence=sentence,
+                message=message,
                 goal_id=given.pop("goal_id", ""),
                 goal=tuple(float(word) for word in given.pop("goal", "").split()),
                 corrections=int(given.pop("corrections", "0")),
