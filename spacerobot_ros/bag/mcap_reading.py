@@ -123,7 +123,7 @@ def _check_chunks(summary: Summary, end: int) -> None:
         allowance.take(index.uncompressed_size, place)
 
 
-def indexed_bodies(
+def indexed_records(
     file: BinaryIO, indexes: Sequence[AttachmentIndex | MetadataIndex], wanted: Opcode
 ) -> Iterator[tuple[int, bytes]]:
     """Go through the records that an index of a summary names, each once: its place and body.

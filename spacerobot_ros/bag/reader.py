@@ -19,7 +19,7 @@ from spacerobot_ros.bag.definitions import MessageTypes
 from spacerobot_ros.bag.export import to_pandas, to_xarray
 from spacerobot_ros.bag.mcap_reading import (
     RawMessage,
-    indexed_bodies,
+    indexed_records,
     messages_in_file_order,
     messages_in_time_order,
     read_summary,
@@ -191,7 +191,7 @@ class Bag:
     def metadata(self) -> dict[str, dict[str, str]]:
         """Keys and values of every metadata record by its name; the last of several of one name."""
         with open_bag(self.path) as file:
-            found = indexed_bodies(file, self._summary.metadata_indexes, Opcode.METADATA)
+            found = indexed_records(file, self._summary.metadata_indexes, Opcode.METADATA)
             read = (parsed(Metadata.read, body, place) for place, body in found)
             return {metadata.name: metadata.metadata for metadata in read}
 
@@ -199,7 +199,7 @@ class Bag:
     def attachments(self) -> dict[str, bytes]:
         """Content of every attachment by its name; the last of several of one name."""
         with open_bag(self.path) as file:
-            found = indexed_bodies(file, self._summary.attachment_indexes, Opcode.ATTACHMENT)
+            found = indexed_records(file, self._summary.attachment_indexes, Opcode.ATTACHMENT)
             read = (parsed(Attachment.read, body, place) for place, body in found)
             return {attachment.name: attachment.data for attachment in read}
 

@@ -438,7 +438,7 @@ class _LockstepFlight:
         if decision is not None:
             sentence = decision.message
         elif not interrupted and self._status is not None:
-            sentence = self._monitor.status.sentence or self._status.message
+            sentence = self._monitor.status.message or self._status.message
         plan_time = 0.0
         if self._planner is not None:
             plan_time = self._planner.executive.statistics.plan_time_s

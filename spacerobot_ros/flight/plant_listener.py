@@ -54,7 +54,7 @@ class PlantListener:
         if status.latched_fault:
             return f"The plant is latched: {status.latched_fault}; call '{self._name}/rearm' first."
         if status.state is PlantState.FAILED:
-            return f"The plant has failed: {status.sentence}"
+            return f"The plant has failed: {status.message}"
         return ""
 
     @property
@@ -78,7 +78,7 @@ class PlantListener:
         news: list[Stopped | Change] = []
         if self.blocked:
             if before is None or not was_blocked or status.latched_fault != before.latched_fault:
-                news.append(Stopped(status.sentence))
+                news.append(Stopped(status.message))
             return news
         if before is None:
             return news
@@ -101,7 +101,7 @@ def _rested(status: PlantStatus) -> Stopped | None:
     """Return that a plant rests, or has rested meanwhile; None if its times are nonsense."""
     last, since = status.last_command_s, status.time_s
     last = since if last is None else last
-    why = status.sentence
+    why = status.message
     if status.reason != "timeout":
         since, why = last, "The joints were brought to rest: no command came in time."
     if not (math.isfinite(last) and math.isfinite(since)):

@@ -409,7 +409,7 @@ class CommandValidator:
 
     def _untimely(self, source: CommandSource, stamp_ns: int, now_ns: int) -> Refusal | None:
         """Return why a command does not belong to this moment of real time, if it does not."""
-        if source.senders.by_turns and self._one_commander:
+        if source.senders.multiple_publishers and self._one_commander:
             return Refusal(Reason.SECOND_COMMANDER, "two publishers command by turns")
         age = (now_ns - stamp_ns) / SECOND
         if self._timeout and age > self._timeout:

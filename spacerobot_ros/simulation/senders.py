@@ -26,13 +26,13 @@ class Senders:
     ----------
     current
         A number for the publisher of the last message; None where the middleware numbers nothing.
-    by_turns
+    multiple_publishers
         Whether that publisher and another one send by turns.
     """
 
     def __init__(self, silence_ns: int) -> None:
         self.current: int | None = None
-        self.by_turns = False
+        self.multiple_publishers = False
         self._silence = silence_ns
         self._next = -1
         self._heard = 0
@@ -43,7 +43,7 @@ class Senders:
     def note(self, number: int, now_ns: int) -> None:
         """Note the number of a message that comes at a simulated time (ns)."""
         if number == self._next:
-            self._next, self._heard, self.by_turns = number + 1, now_ns, False
+            self._next, self._heard, self.multiple_publishers = number + 1, now_ns, False
             return
         if not 0 < number < _UNNUMBERED:
             self.current = None
@@ -51,7 +51,7 @@ class Senders:
         if self.current is not None:
             self._others[self._next] = self.current, self._heard
         publisher, heard = self._others.pop(number, (0, 0))
-        self.by_turns = bool(publisher) and now_ns - heard <= self._silence
+        self.multiple_publishers = bool(publisher) and now_ns - heard <= self._silence
         if not publisher:
             self._publishers = publisher = self._publishers + 1
         if len(self._others) > _MOST_PUBLISHERS:

@@ -40,7 +40,7 @@ class PlantStatus:
     ----------
     state
         What it does.
-    sentence
+    message
         The same for people, with the reason.
     reason
         Why, as a word. Latched, or paused and latched: the word of the reason to refuse a command,
@@ -62,7 +62,7 @@ class PlantStatus:
     """
 
     state: PlantState
-    sentence: str = ""
+    message: str = ""
     reason: str = ""
     latched_fault: str = ""
     time_s: float = 0.0
@@ -95,7 +95,7 @@ class PlantStatus:
         return values | {"faults": _SEPARATOR.join(self.faults)}
 
     @classmethod
-    def from_values(cls, values: Mapping[str, str], sentence: str = "") -> PlantStatus:
+    def from_values(cls, values: Mapping[str, str], message: str = "") -> PlantStatus:
         """Return the status that :meth:`to_values` has turned into these pairs.
 
         Raises
@@ -107,7 +107,7 @@ class PlantStatus:
             faults, last = values.get("faults", ""), values.get("last_command_s")
             return cls(
                 state=PlantState(values["state"]),
-                sentence=sentence,
+                message=message,
                 reason=values.get("reason", ""),
                 latched_fault=values.get("latched_fault", ""),
                 time_s=float(values.get("time_s", "0")),
@@ -139,7 +139,7 @@ class PlantMonitor:
         self.status = PlantStatus(PlantState.INACTIVE, "The plant is inactive.")
         """The status of the last update."""
         self.failure = "", ""
-        """Reason and sentence of the error that stopped the plant; for the owner to set."""
+        """Reason and message of the error that stopped the plant; for the owner to set."""
 
     def update(self, activity: PlantState, time_s: float) -> list[Event]:
         """Take up what has changed.
@@ -174,51 +174,51 @@ class PlantMonitor:
         return _events(before, self.status)
 
     def _status(self, activity: PlantState) -> PlantStatus:
-        """Return state, sentence and reason of this moment."""
+        """Return state, message and reason of this moment."""
         commands, fault = self._commands, self._commands.fault
         match activity:
             case PlantState.INACTIVE:
-                sentence = "The plant is inactive"
+                message = "The plant is inactive"
                 if fault:
-                    sentence += f", and a fault is latched: {fault}"
+                    message += f", and a fault is latched: {fault}"
             case PlantState.FAILED:
-                reason, sentence = self.failure
-                return PlantStatus(activity, sentence, reason, fault)
+                reason, message = self.failure
+                return PlantStatus(activity, message, reason, fault)
             case PlantState.PAUSED:
-                sentence = "Time stands still until '~/pause' ends it"
+                message = "Time stands still until '~/pause' ends it"
                 if fault:
-                    sentence += f", and a fault is latched: {fault}"
+                    message += f", and a fault is latched: {fault}"
             case _ if fault:
                 activity = PlantState.LATCHED
-                sentence = f"Nothing moves until '~/rearm' is called: {fault}"
+                message = f"Nothing moves until '~/rearm' is called: {fault}"
             case _ if self._lockstep:
-                sentence = "Every tick takes the command that answers its state"
+                message = "Every tick takes the command that answers its state"
             case _ if commands.in_force:
-                sentence = "A command is in force"
+                message = "A command is in force"
             case _:
                 activity = PlantState.RESTING
                 if commands.timed_out:
-                    sentence = "The joints are brought to rest: the last command is too old"
-                    return PlantStatus(activity, f"{sentence}.", "timeout")
-                sentence = "The joints rest until a command arrives"
-                return PlantStatus(activity, f"{sentence}.", "no_command")
-        return PlantStatus(activity, f"{sentence}.", commands.fault_reason, fault)
+                    message = "The joints are brought to rest: the last command is too old"
+                    return PlantStatus(activity, f"{message}.", "timeout")
+                message = "The joints rest until a command arrives"
+                return PlantStatus(activity, f"{message}.", "no_command")
+        return PlantStatus(activity, f"{message}.", commands.fault_reason, fault)
 
 
 def _events(before: PlantStatus, now: PlantStatus) -> list[Event]:
     """Return what has happened between two statuses, in an order in which it can have happened."""
     events: list[Event] = []
 
-    def add(kind: EventKind, sentence: str, level: int = 0, **about: str) -> None:
-        events.append(Event(kind, sentence, level, now.time_s, about=about))
+    def add(kind: EventKind, message: str, level: int = 0, **about: str) -> None:
+        events.append(Event(kind, message, level, now.time_s, about=about))
 
     if now.resets != before.resets:
         add(EventKind.RESET, "The robot is back in its initial state.")
     if now.rearms != before.rearms:
         add(EventKind.REARMED, "Commands pass again.")
     if now.latched_fault and now.latched_fault != before.latched_fault:
-        sentence = f"A fault is latched: {now.latched_fault}."
-        add(EventKind.LATCHED, sentence, 2, reason=now.reason)
+        message = f"A fault is latched: {now.latched_fault}."
+        add(EventKind.LATCHED, message, 2, reason=now.reason)
     for fault in now.faults:
         if fault not in before.faults:
             add(EventKind.FAULT_INJECTED, f"A fault begins: {fault}.", 1, fault=fault)
@@ -232,15 +232,15 @@ def _events(before: PlantStatus, now: PlantStatus) -> list[Event]:
             add(EventKind.RESUMED, "Time goes on.")
         match now.state:
             case PlantState.RUNNING:
-                add(EventKind.RUNNING, now.sentence)
+                add(EventKind.RUNNING, now.message)
             case PlantState.RESTING:
                 level = 1 if now.reason == "timeout" else 0
-                add(EventKind.RESTING, now.sentence, level, reason=now.reason)
+                add(EventKind.RESTING, now.message, level, reason=now.reason)
             case PlantState.PAUSED:
-                add(EventKind.PAUSED, now.sentence)
+                add(EventKind.PAUSED, now.message)
             case _:
                 pass  # Latched has its event already; activation and failures have those of a node.
     elif now.reason != before.reason and now.state is PlantState.RESTING:
         level = 1 if now.reason == "timeout" else 0
-        add(EventKind.RESTING, now.sentence, level, reason=now.reason)
+        add(EventKind.RESTING, now.message, level, reason=now.reason)
     return events

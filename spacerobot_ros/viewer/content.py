@@ -139,7 +139,7 @@ def head(state: StackState, *, described: bool = True) -> str:
         lines.append(_line(text, 0))
     if state.plant is not None:
         plant = state.plant
-        text = _status("Plant", plant.state.value, plant.sentence, plant.level)
+        text = _status("Plant", plant.state.value, plant.message, plant.level)
         lines.append(_faint(text, faint="plant" in state.absent))
         lines.extend(_line(f"Fault: {each}", 1) for each in state.plant.faults)
     if state.planner is not None:

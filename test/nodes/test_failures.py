@@ -117,7 +117,7 @@ def test_a_step_that_raises_leaves_a_plant_that_says_why_and_can_be_started_agai
     shown = PlantStatus.from_values(values_of(message), message.message)
     assert (shown.state, shown.reason) == (PlantState.FAILED, "exception")
     assert message.level == DiagnosticStatus.ERROR
-    assert_one_sentence(shown.sentence, "plant", "ZeroDivisionError", "no luck")
+    assert_one_sentence(shown.message, "plant", "ZeroDivisionError", "no luck")
     monkeypatch.undo()
     before = rig.probe.count("joint_states")
     rig.activate()

@@ -198,7 +198,7 @@ def plant_status(loop: Loop, status: PlantStatus) -> None:
         )
         loop.harness.matched(loop.plant_topic)  # type: ignore[attr-defined]
     loop.plant_topic.publish(  # type: ignore[attr-defined]
-        diagnostic_status("/plant", bytes([status.level]), status.sentence, status.to_values())
+        diagnostic_status("/plant", bytes([status.level]), status.message, status.to_values())
     )
     loop.harness.settle(loop.probe)
 

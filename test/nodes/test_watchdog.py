@@ -176,7 +176,7 @@ def test_a_silent_commander_latches_a_plant_that_is_asked_to(harness: Harness) -
     flight.silence(flight.planner)
     harness.spin_until(lambda: flight.plant.state is PlantState.LATCHED, "the latch")
     assert flight.plant.status.reason == "watchdog"
-    assert "/planner" in flight.plant.status.sentence
+    assert "/planner" in flight.plant.status.message
     # The planner learns why when it is back.
     harness.executor.add_node(flight.planner)
     assert "'/planner' is silent" in flight.wait("aborted").message

@@ -138,7 +138,7 @@ def test_a_failure_says_why() -> None:
     rig.monitor.failure = "exception", "The plant has failed: no luck."
     rig.events(PlantState.FAILED)
     assert rig.state == (PlantState.FAILED, "exception")
-    assert rig.monitor.status.sentence == "The plant has failed: no luck."
+    assert rig.monitor.status.message == "The plant has failed: no luck."
     assert rig.monitor.status.level == 2
 
 

@@ -90,7 +90,7 @@ class Stack:
         self.description.publish(String(data=urdf))
         plant = PlantStatus(PlantState.RUNNING, "A command is in force.")
         values = [KeyValue(key=k, value=v) for k, v in plant.to_values().items()]
-        self.status.publish(DiagnosticStatus(name="/robot", values=values, message=plant.sentence))
+        self.status.publish(DiagnosticStatus(name="/robot", values=values, message=plant.message))
 
     def move(self, x: float, names: tuple[str, ...]) -> bool:
         odom = Odometry()

@@ -267,7 +267,7 @@ class PlantNode(FlightNode):
     def _publish_status(self, status: PlantStatus) -> None:
         self.status = status
         name, level = self.get_fully_qualified_name(), bytes([status.level])
-        message = diagnostic_status(name, level, status.sentence, status.to_values())
+        message = diagnostic_status(name, level, status.message, status.to_values())
         self._status.take(serialize_message(message))
 
     def _resumed(self, robot: SpaceRobot) -> tuple[InitialState | None, int]:

@@ -190,7 +190,7 @@ class StatusCheck:
         if now.state is PlantState.PAUSED and before.state is not PlantState.PAUSED:
             self.changes[EventKind.PAUSED] += 1
         if now.state is PlantState.FAILED:
-            self._report(f"the plant has failed: {now.sentence}")
+            self._report(f"the plant has failed: {now.message}")
 
     def look(self, now: State, before: State | None) -> str | None:
         """Compare the status with the state that is published under it."""
