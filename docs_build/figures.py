@@ -21,7 +21,7 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.planning import GaitSchedule, PlanRequest
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.trials import Problem, state_of, try_method
 
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures.json"

@@ -11,7 +11,7 @@ from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.config import PlantConfig
 
 RATE = 100.0  # Hz

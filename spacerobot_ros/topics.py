@@ -2,7 +2,7 @@
 
 Of the topics on which the plant publishes its state the table also says which numbers they carry:
 the plant's publisher and the re-simulation of a bag read it. A new one is an entry here and a
-quantity in :mod:`spacerobot_ros.simulation.reported_state`.
+quantity in :mod:`spacerobot_ros.simulation.sensors`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class StateField:
     path
         Where they are in the message: a part with numbers in it, or an array.
     quantity
-        What they are: a name in :attr:`~spacerobot_ros.simulation.reported_state.ReportedState.
+        What they are: a name in :attr:`~spacerobot_ros.simulation.sensors.ReportedState.
         quantities`.
     members
         The numbers of the part at ``path``, in their order; empty for an array.

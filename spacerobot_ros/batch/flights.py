@@ -22,9 +22,9 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.integration import steps_in
 from spacerobot_ros.planning.core.schedule import GaitSchedule
-from spacerobot_ros.simulation.building import PLANTS
+from spacerobot_ros.simulation.actuators import PLANTS
 from spacerobot_ros.simulation.config import SensorConfig
-from spacerobot_ros.simulation.initial_state import InitialState
+from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
 
 Counts = npt.NDArray[np.int64]

@@ -24,12 +24,10 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import Goal
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.tracker import ScheduleFollower
-from spacerobot_ros.simulation.building import PLANTS
+from spacerobot_ros.simulation.actuators import PLANTS, FaultyPlant, ThrusterPlant
 from spacerobot_ros.simulation.config import SensorConfig
-from spacerobot_ros.simulation.faults import FaultyPlant
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import Sensors
-from spacerobot_ros.simulation.thrusters import ThrusterPlant
 from spacerobot_ros.times import SECOND
 
 

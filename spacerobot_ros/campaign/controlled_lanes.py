@@ -30,7 +30,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.simulation.initial_state import InitialState
+from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
 
 _FREE = "coordinated_control.gains."

@@ -36,7 +36,7 @@ from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning import GaitSchedule, PoseError
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import PlannerStatus, remaining_error
-from spacerobot_ros.simulation.initial_state import InitialState
+from spacerobot_ros.simulation.plant import InitialState
 
 _INSTANTS = 40
 """States of a flight that are looked at, beside its last one."""

@@ -71,7 +71,7 @@ class FlightArrays:
         (N, 7) linear (kg m/s) and angular momentum (kg m^2/s) in the world, kinetic energy (J).
     quantities
         What else the plant reported, by the names of
-        :class:`~spacerobot_ros.simulation.reported_state.ReportedState`, (N, size) each: what was
+        :class:`~spacerobot_ros.simulation.sensors.ReportedState`, (N, size) each: what was
         measured, the end-effector, thrusters, momenta that are expected. What is measured without
         error is not there twice.
     commands

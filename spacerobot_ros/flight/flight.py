@@ -13,10 +13,9 @@ from spacerobot_ros.flight.arrays import Commands, FlightArrays, Outcome
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.simulation.actuators import FaultyPlant, thrusters_in
 from spacerobot_ros.simulation.commands import CommandValidator, Refusal
-from spacerobot_ros.simulation.faults import FaultyPlant
-from spacerobot_ros.simulation.reported_state import ReportedState
-from spacerobot_ros.simulation.thrusters import thrusters_in
+from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.times import SECOND
 
 if TYPE_CHECKING:

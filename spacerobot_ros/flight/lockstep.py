@@ -52,10 +52,9 @@ from spacerobot_ros.planning.execution.outputs import ScheduleStart
 from spacerobot_ros.planning.execution.state_average import BaseMeasurement
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.planning.execution.worker import PlanningWorker
-from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator
-from spacerobot_ros.simulation.faults import FaultyPlant
-from spacerobot_ros.simulation.reported_state import ReportedState
+from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
 from spacerobot_ros.times import HEADER_STAMP, SECOND, stamp_bytes
 

@@ -8,8 +8,8 @@ from enum import Enum
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.simulation.actuators import FaultyPlant
 from spacerobot_ros.simulation.commands import CommandValidator
-from spacerobot_ros.simulation.faults import FaultyPlant
 from spacerobot_ros.times import SECOND
 
 _SEPARATOR = "; "

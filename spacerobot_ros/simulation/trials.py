@@ -28,7 +28,7 @@ from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
 from spacerobot_ros.simulation.config import period_ns
-from spacerobot_ros.simulation.initial_state import InitialState
+from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 from spacerobot_ros.times import SECOND
 

@@ -15,8 +15,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP, steps_in
 from spacerobot_ros.model.model_functions import Composition
-from spacerobot_ros.simulation.initial_state import InitialState
-from spacerobot_ros.simulation.plant import Flags
+from spacerobot_ros.simulation.plant import Flags, InitialState
 
 
 class VelocityPlant:

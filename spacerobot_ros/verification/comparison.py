@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from spacerobot_ros.bag.reader import read_bag
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator, Refusal
-from spacerobot_ros.simulation.reported_state import ReportedState
+from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import Topic, state_topics
 from spacerobot_ros.verification.recorded_flight import RecordedFlight, read_flight

@@ -14,7 +14,7 @@ from support.fuzzing import NUMBERS, TEXTS, damaged, fuzz
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.plant.command_messages import CommandReader
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Reason
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.verification.recorded_flight import read_command

@@ -10,7 +10,7 @@ from support.fuzzing import NUMBERS, TEXTS, attempt, fuzz
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import (
     GROUPS,

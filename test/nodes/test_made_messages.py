@@ -25,7 +25,7 @@ from spacerobot_ros.nodes.plant.publisher import LinkMarkers
 from spacerobot_ros.planning import BasePath, Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 

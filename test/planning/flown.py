@@ -12,7 +12,7 @@ from support.planners import Planner
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState
-from spacerobot_ros.simulation.initial_state import InitialState
+from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
 Array = npt.NDArray[np.float64]

@@ -30,7 +30,7 @@ from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorke
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
-from spacerobot_ros.simulation.faults import FaultyPlant
+from spacerobot_ros.simulation.actuators import FaultyPlant
 
 TICK = 0.05
 SERVICER = (share_directory() / "urdf" / "servicer.urdf").read_text("utf-8")

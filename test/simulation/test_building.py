@@ -10,9 +10,9 @@ import pytest
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.building import PLANTS, build_plant
+from spacerobot_ros.simulation.actuators import PLANTS, build_plant
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.simulation.initial_state import InitialState
+from spacerobot_ros.simulation.plant import InitialState
 
 ARM = SpaceRobot.from_file(robot_file("three_joint_arm"))
 
@@ -60,5 +60,5 @@ def test_thrusters_need_a_plant_that_takes_a_wrench() -> None:
         "velocity": False,
         "effort": True,
     }
-    with pytest.raises(ParameterError, match="nothing pushes the base"):
+    with pytest.raises(ParameterError, match="has no wrench on the base"):
         build_plant(ARM, config(thrusters="urdf"))

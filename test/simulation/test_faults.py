@@ -18,19 +18,22 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
-from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.actuators import (
+    FaultyPlant,
+    build_plant,
+    thrusters_in,
+    with_thrusters,
+)
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import (
     KINDS,
     Fault,
     FaultTimeline,
-    FaultyPlant,
     Targets,
     parse_fault,
 )
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import Sensors
-from spacerobot_ros.simulation.thrusters import thrusters_in, with_thrusters
 
 URDF = Path(__file__).parents[2] / "urdf"
 TICK = 0.05

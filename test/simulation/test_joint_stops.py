@@ -15,7 +15,7 @@ from support.random_robots import random_robot_urdf
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState
-from spacerobot_ros.simulation.joint_stops import at_rest, pushed_out
+from spacerobot_ros.simulation.effort_plant import at_rest, pushed_out
 
 TICK = 0.01
 MASS, SLIDER, STROKE = 10.0, 2.0, 0.3  # kg, kg, m

@@ -13,9 +13,9 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.plant.publisher import StatePublisher
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
-from spacerobot_ros.simulation.reported_state import ReportedState
+from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.topics import TOPICS, StateField, Topic
 
 SLIDERS = SpaceRobot.from_file(robot_file("sliding_masses"))

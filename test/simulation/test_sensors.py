@@ -14,8 +14,8 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
+from spacerobot_ros.simulation.actuators import FaultyPlant
 from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
-from spacerobot_ros.simulation.faults import FaultyPlant
 from spacerobot_ros.simulation.sensors import Sensors
 
 TICK = 0.05

@@ -11,7 +11,7 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus

@@ -9,7 +9,7 @@ from support.oracles import Motion, PinocchioOracle
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.config import PlantConfig
 
 HOURS = 36_000

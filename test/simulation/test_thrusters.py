@@ -15,8 +15,12 @@ from spacerobot_ros.errors import CommandError, ParameterError, RobotDescription
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.simulation import EffortPlant, InitialState
-from spacerobot_ros.simulation.faults import FaultyPlant
-from spacerobot_ros.simulation.thrusters import ThrusterPlant, thrusters_in, with_thrusters
+from spacerobot_ros.simulation.actuators import (
+    FaultyPlant,
+    ThrusterPlant,
+    thrusters_in,
+    with_thrusters,
+)
 
 ROOT = Path(__file__).parents[2]
 SERVICER = (ROOT / "urdf" / "servicer.urdf").read_text(encoding="utf-8")

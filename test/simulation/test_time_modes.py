@@ -6,7 +6,7 @@ import pytest
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.time_modes import Lockstep, RealTime

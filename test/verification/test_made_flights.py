@@ -21,7 +21,7 @@ from spacerobot_ros.errors import RecordingError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.building import build_plant
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.verification import comparison
 from spacerobot_ros.verification.comparison import Verification, verify_bag

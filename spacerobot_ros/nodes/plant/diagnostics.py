@@ -8,9 +8,8 @@ from rclpy.node import Node
 
 from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
 from spacerobot_ros.nodes.common.node import STREAM
+from spacerobot_ros.simulation.actuators import FaultyPlant, ThrusterPlant, thrusters_in
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
-from spacerobot_ros.simulation.faults import FaultyPlant
-from spacerobot_ros.simulation.thrusters import ThrusterPlant, thrusters_in
 from spacerobot_ros.simulation.time_modes import RealTime
 from spacerobot_ros.times import set_stamp
 

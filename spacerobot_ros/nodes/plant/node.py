@@ -34,11 +34,10 @@ from spacerobot_ros.nodes.plant.publisher import (
     TransformPublisher,
 )
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.building import build_plant
-from spacerobot_ros.simulation.commands import CommandValidator
+from spacerobot_ros.simulation.actuators import build_plant
+from spacerobot_ros.simulation.commands import CommandValidator, Senders
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.simulation.reported_state import ReportedState
-from spacerobot_ros.simulation.senders import Senders
+from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
 from spacerobot_ros.simulation.time_modes import Lockstep, RealTime
 from spacerobot_ros.times import SECOND

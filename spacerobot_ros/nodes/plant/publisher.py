@@ -26,7 +26,7 @@ from spacerobot_ros.nodes.common.transforms import (
 )
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
-from spacerobot_ros.simulation.reported_state import ReportedState
+from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.times import stamp_bytes
 from spacerobot_ros.topics import TOPICS, Topic
 

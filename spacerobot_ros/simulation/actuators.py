@@ -1,0 +1,402 @@
+"""Actuators of a plant: thrusters and actuator faults around the rigid-body dynamics.
+
+:func:`build_plant` makes the plant of a configuration: :class:`.VelocityPlant` or
+:class:`.EffortPlant`, within a :class:`ThrusterPlant` if thrusters are modelled, within a
+:class:`FaultyPlant`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.control.thrusters import ThrusterModulator, ThrusterTable, find_thrusters
+from spacerobot_ros.errors import CommandError, ParameterError
+from spacerobot_ros.model import SpaceRobot, integration
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.simulation import effort_plant
+from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.simulation.effort_plant import EffortPlant
+from spacerobot_ros.simulation.faults import KINDS, WRENCH_AXES, Fault, FaultTimeline, Targets
+from spacerobot_ros.simulation.plant import InitialState, Plant, WrappedPlant
+from spacerobot_ros.simulation.velocity_plant import VelocityPlant
+
+_ROUNDING = 1e-6
+"""Rounding error allowed in the time of a fault, share of a tick."""
+
+_SHORTEST_STEP = 1e-5
+"""Shorter Runge-Kutta steps lose more to rounding than they gain, s."""
+
+_MOST_STEPS = 1e6
+"""Most Runge-Kutta steps of a tick: more take minutes."""
+
+
+class ThrusterPlant(WrappedPlant):
+    """A plant under efforts whose base wrench is realised by on/off pulses of thrusters.
+
+    The dynamics are stepped with the wrench that the thrusters really give, averaged over the
+    tick, so the momentum balance stays exact. Beside the attributes of :class:`Plant` there are
+
+    ``wrench``
+        (6,) mean force (N) over torque (N m) of the thrusters in the last tick, at the origin of
+        the base link, base components.
+    ``on_time``, ``duty``, ``thrust``
+        (m,) total on-time of each thruster (s), its duty cycle in the last tick, and its mean force
+        in the last tick (N).
+    ``pulses``
+        (m,) number of pulses of each thruster.
+    ``propellant``
+        Total consumption, kg. It does not change the mass of the robot.
+    ``unmet``, ``unmet_ticks``
+        (6,) part of the last commanded wrench that the thrusters could not give, and the number
+        of ticks with such a part.
+    ``thruster_health``, ``stuck_on``
+        (m,) real over nominal thrust (1 unless set), and whether a thruster is stuck open. The
+        allocation knows neither; see :meth:`exclude`.
+
+    Parameters
+    ----------
+    plant
+        The wrapped plant, stepped with efforts and a wrench.
+    control_period
+        Duration of a tick, s.
+    table
+        The thrusters.
+    excluded
+        Names of thrusters that are out of use.
+
+    Raises
+    ------
+    ParameterError
+        There is no thruster of an excluded name.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        control_period: float,
+        table: ThrusterTable,
+        excluded: Sequence[str] = (),
+    ) -> None:
+        super().__init__(plant)
+        self.table = table
+        self._control_period = control_period
+        self._modulator = ThrusterModulator(table, control_period, excluded)
+        self._wrenches, self._mass_flow = table.wrenches, table.mass_flow
+        count = len(table.names)
+        self.wrench = np.zeros(6)
+        self.on_time, self.duty, self.thrust = (np.zeros(count) for _ in range(3))
+        self.pulses, self.unmet = self._modulator.pulses, self._modulator.unmet
+        self.propellant = 0.0
+        self.thruster_health = np.ones(count)
+        self.stuck_on: npt.NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
+
+    @property
+    def missing(self) -> str:
+        """Wrenches that the thrusters in use cannot give, as a clause; empty: they give all."""
+        return self._modulator.missing
+
+    @property
+    def unmet_ticks(self) -> int:
+        """Number of ticks in which the thrusters could not give the whole commanded wrench."""
+        return self._modulator.unmet_periods
+
+    def exclude(self, name: str) -> None:
+        """Take a thruster out of use; the others give its share of the wrench, if they can.
+
+        Raises
+        ------
+        ParameterError
+            There is no thruster of that name.
+        """
+        self._modulator.exclude(name)
+
+    def reset(self) -> None:
+        """Return to the initial state, thrusters off; totals and counters go on."""
+        super().reset()
+        self._modulator.reset()
+        self.wrench[:] = self.duty[:] = self.thrust[:] = 0.0
+
+    def step(self, effort: npt.ArrayLike, wrench: npt.ArrayLike = 0.0) -> bool:
+        """Advance one tick under joint efforts (n,) and a commanded base wrench (6,).
+
+        Returns whether any joint was limited.
+
+        Raises
+        ------
+        CommandError
+            A command is not finite; the tick is not taken.
+        SpaceRobotError
+            The wrapped plant refuses the tick.
+        """
+        wanted = np.broadcast_to(np.asarray(wrench, dtype=float), (6,))
+        for command in (effort, wanted):
+            if not np.all(np.isfinite(command)):
+                raise CommandError(f"A command is not finite: {np.asarray(command).tolist()}.")
+        tick = self._control_period
+        on_time = self._modulator.fire(wanted)
+        on_time[self.stuck_on] = tick
+        self.duty[:] = on_time / tick
+        works = self.thruster_health * self.duty
+        self.thrust[:] = self.table.force * works
+        self.wrench[:] = self._wrenches @ works
+        self.on_time += on_time
+        self.propellant += tick * float(self._mass_flow @ works)
+        limited: bool = self.plant.step(effort, self.wrench)
+        return limited
+
+
+def with_thrusters(plant: Plant, control_period: float, source: str, excluded: str = "") -> Plant:
+    """Wrap a plant under efforts in the thrusters of ``source``.
+
+    Parameters
+    ----------
+    plant
+        A plant that takes any wrench.
+    control_period
+        Duration of a tick, s.
+    source
+        ``urdf``: those of its URDF; the path of a YAML file; empty: returns the plant unchanged.
+    excluded
+        Names of thrusters that are out of use, separated by spaces.
+
+    Raises
+    ------
+    ParameterError
+        The file or a thruster in it is refused, or an excluded thruster is unknown.
+    RobotDescriptionError
+        A thruster of the URDF is refused, or there is none.
+    """
+    if not source:
+        return plant
+    robot = plant.robot.description
+    return ThrusterPlant(plant, control_period, find_thrusters(source, robot), excluded.split())
+
+
+def thrusters_in(plant: Plant) -> ThrusterPlant | None:
+    """Return the thrusters of a plant, looking through its wrappers; None: it has none."""
+    while isinstance(plant, WrappedPlant) and not isinstance(plant, ThrusterPlant):
+        plant = plant.plant
+    return plant if isinstance(plant, ThrusterPlant) else None
+
+
+class FaultyPlant(WrappedPlant):
+    """A :class:`Plant` whose actuators have the faults of a timeline.
+
+    Its state arrays are those of the wrapped plant. A reset sets back neither the time nor the
+    faults. A tick without faults costs one comparison.
+
+    The command of a joint gets bias and noise added, then is scaled if the joint is slow; a stuck
+    joint is held in place (:meth:`Plant.hold`).
+
+    Parameters
+    ----------
+    plant
+        The wrapped plant.
+    faults
+        The faults, one per line (:func:`.parse_fault`).
+    control_period
+        Duration of a tick, s.
+    wrench
+        Whether steps take a wrench.
+    seed
+        Seed of the actuators' noise.
+
+    Raises
+    ------
+    ParameterError
+        A line is not a fault of this plant.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        faults: Iterable[str],
+        control_period: float,
+        *,
+        wrench: bool,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(plant)
+        self._thrusters = thrusters_in(plant)
+        nozzles = self._thrusters.table.names if self._thrusters is not None else ()
+        self.timeline = FaultTimeline(faults, Targets(plant.robot.joint_names, wrench, nozzles))
+        self.takes_wrench = wrench
+        """Whether a step takes a wrench on the base beside the joint commands."""
+        self.tick = 0
+        """Ticks since the beginning."""
+        self.step: Callable[..., bool] = self._step
+        self._control_period = control_period
+        self._rng = np.random.default_rng(seed)
+        self._index = {name: i for i, name in enumerate(self.robot.joint_names)}
+        n = self.robot.n
+        self._bias, self._noise, self._factor = np.zeros(n), np.zeros(n), np.ones(n)
+        self._wrench_factor, self._wrench_held = np.ones(6), np.zeros(6)
+        self._actuators_sound = True
+        self._seen: tuple[Fault, ...] = ()
+        self.look()
+
+    @property
+    def time(self) -> float:
+        """Simulated time, s."""
+        return self.tick * self._control_period
+
+    @property
+    def active(self) -> tuple[Fault, ...]:
+        """Active faults; a new tuple object after every change."""
+        return self._seen
+
+    def inject(self, text: str) -> None:
+        """Add faults, one per line, while the plant runs; the text ``clear`` removes all faults.
+
+        Raises
+        ------
+        ParameterError
+            A line is not a fault of this robot; none of the lines is added.
+        """
+        if text.strip() == "clear":
+            self.timeline.clear()
+        else:
+            self.timeline.read(text.splitlines(), self.time)
+        self.look()
+
+    def look(self) -> None:
+        """Apply the faults that are active at the present time."""
+        active = self.timeline.at(self.time + _ROUNDING * self._control_period)
+        self._next_tick = self.timeline.next_change / self._control_period - _ROUNDING
+        if active is self._seen:
+            return
+        self._seen = active
+        self._bias[:], self._noise[:], self._factor[:] = 0.0, 0.0, 1.0
+        self._wrench_factor[:], self._wrench_held[:] = 1.0, 0.0
+        held = np.zeros(self.robot.n, dtype=np.bool_)
+        variances = np.zeros_like(self._noise)
+        for fault in active:
+            axes = [fault.target in (axis, "all") for axis in WRENCH_AXES]
+            joint = self._index.get(fault.target, -1)
+            if fault.kind == "joint_stuck":
+                held[joint] = True
+            elif fault.kind == "joint_slow":
+                self._factor[joint] *= fault.value
+            elif fault.kind == "actuator_bias":
+                self._bias[joint] += fault.value
+            elif fault.kind == "actuator_noise":
+                variances[joint] += fault.value**2
+            elif fault.kind in ("thruster_off", "thruster_stuck"):
+                self._wrench_factor[axes] = 0.0
+                self._wrench_held[axes] = fault.value
+            elif fault.kind == "thruster_weak":
+                self._wrench_factor[axes] *= fault.value
+        self._noise[:] = np.sqrt(variances)
+        self.plant.hold(held)
+        self._disturb_nozzles(active)
+        self._actuators_sound = all(KINDS[f.kind].sensor for f in active)
+
+    def _disturb_nozzles(self, active: tuple[Fault, ...]) -> None:
+        thrusters = self._thrusters
+        if thrusters is None:
+            return
+        thrusters.thruster_health[:], thrusters.stuck_on[:] = 1.0, False
+        for fault in active:
+            if fault.kind.startswith("nozzle_"):
+                nozzle = thrusters.table.names.index(fault.target)
+                if fault.kind == "nozzle_open":
+                    thrusters.stuck_on[nozzle] = True
+                else:
+                    thrusters.thruster_health[nozzle] *= fault.value
+
+    def _step(self, *commands: Any) -> bool:
+        """Advance a tick under the commands of the wrapped plant."""
+        if self._actuators_sound:
+            limited = self.plant.step(*commands)
+        else:
+            limited = self.plant.step(*self._realised(*commands))
+        self.tick += 1
+        if self.tick >= self._next_tick:
+            self.look()
+        return limited
+
+    def _realised(self, joints: Array, *wrench: Array) -> list[Array]:
+        """Return the commands as the faulty actuators realise them (new arrays)."""
+        disturbed = joints + self._bias
+        if self._noise.any():
+            disturbed += self._noise * self._rng.standard_normal(self.robot.n)
+        realised = [self._factor * disturbed]
+        if wrench:
+            realised.append(self._wrench_factor * wrench[0] + self._wrench_held)
+        return realised
+
+
+@dataclass(frozen=True)
+class PlantKind:
+    """Plant class of an actuation mode.
+
+    Attributes
+    ----------
+    plant
+        Class, called with robot, control period (s), initial state and integration step (s).
+    integration_step
+        Default of the longest Runge-Kutta step, s.
+    wrench
+        Whether the plant takes a wrench on its base.
+    """
+
+    plant: Callable[..., Plant]
+    integration_step: float
+    wrench: bool
+
+
+PLANTS: dict[str, PlantKind] = {
+    "velocity": PlantKind(VelocityPlant, integration.DEFAULT_INTEGRATION_STEP, wrench=False),
+    "effort": PlantKind(EffortPlant, effort_plant.DEFAULT_INTEGRATION_STEP, wrench=True),
+}
+"""Plant classes by the value of the parameter ``actuation``."""
+
+
+def build_plant(
+    robot: SpaceRobot, config: PlantConfig, initial: InitialState | None = None
+) -> FaultyPlant:
+    """Build the plant of a configuration, with its thrusters and faults.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    config
+        The parameters of the plant.
+    initial
+        Initial state in place of the configuration's.
+
+    Raises
+    ------
+    ParameterError
+        The integration step is too short, or the initial state, a thruster or a fault is refused.
+    """
+    kind, step = PLANTS[config.actuation], config.integration_step
+    control_period = config.control_period
+    if 0.0 < step < _SHORTEST_STEP:
+        raise ParameterError(
+            f"Parameter 'integration_step' is {step}; it must be 0 (by the actuation) or at least "
+            f"{_SHORTEST_STEP:g} s."
+        )
+    if config.thrusters and not kind.wrench:
+        raise ParameterError(
+            f"Parameter 'thrusters' is '{config.thrusters}', but actuation "
+            f"'{config.actuation}' has no wrench on the base: set actuation to effort, or "
+            "thrusters to ''."
+        )
+    if step and control_period / step > _MOST_STEPS:
+        raise ParameterError(
+            f"Parameter 'integration_step' is {step:g} s, which is more than {_MOST_STEPS:.0e} "
+            f"steps in a tick of {control_period:g} s; choose longer steps or shorter ticks."
+        )
+    start = InitialState.of(config) if initial is None else initial
+    plant = kind.plant(robot, control_period, start, step or kind.integration_step)
+    plant = with_thrusters(plant, control_period, config.thrusters, config.thrusters_excluded)
+    return FaultyPlant(
+        plant, config.faults, control_period, wrench=kind.wrench, seed=config.sensors.seed
+    )
