@@ -119,14 +119,14 @@ campaigns: $(STAMP)/test ## kill workers and campaigns, fly rows again through R
 
 .PHONY: real-time
 real-time: $(STAMP)/demo ## fly ten minutes in real time in separate processes, at 100, then 200 and 500 Hz
-	$(BIN)/spacerobot bench --real-time 600 --rate 100
-	$(BIN)/spacerobot bench --real-time 60 --rate 200 --rate 500
+	$(BIN)/spacerobot bench real-time 600 --rate 100
+	$(BIN)/spacerobot bench real-time 60 --rate 200 --rate 500
 
 SOAK ?= 1800
 .PHONY: soak
 soak: $(STAMP)/demo ## fly half an hour (SOAK=SECONDS) in separate processes: memory, descriptors, threads; out/soak.png
 	@mkdir -p out
-	$(BIN)/spacerobot bench --soak $(SOAK) --json out/soak.json
+	$(BIN)/spacerobot bench soak $(SOAK) --json out/soak.json
 
 # Short flights, so that the bags of all scenarios stay small. A goal not met in time is no failure.
 REFERENCE := --set plant.marker_period=5 --set plant.diagnostics_period=5

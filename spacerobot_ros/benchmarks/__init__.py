@@ -1,4 +1,4 @@
-"""Speed of the stack: in lockstep, in real time, of its dynamics, and against another checkout.
+"""Benchmarks: lockstep, engines, planning, real time, long flights, another checkout.
 
-The benchmarks are part of the package because ``spacerobot bench`` is an installed command.
+They are part of the package because ``spacerobot bench`` is an installed command.
 """

@@ -1,57 +1,97 @@
-"""How well separate processes keep up with real time, and whether anything is lost or grows."""
+"""Separate processes in real time: deadlines, losses and memory, also beside a viewer."""
 
 from __future__ import annotations
 
 import math
 import multiprocessing
 import os
+import shutil
 import statistics
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, fields
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass, fields
+from itertools import cycle
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Thread
+from urllib.parse import urlsplit
 
 import numpy as np
+from geometry_msgs.msg import PoseStamped
 
 from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.scenario import load_scenario
+from spacerobot_ros.flight.scenario import Scenario, load_scenario
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
+from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.run import ros
-from spacerobot_ros.termination import ended_on_request
+from spacerobot_ros.session.viewing import viewing
+from spacerobot_ros.termination import ended_on_request, tool
+from spacerobot_ros.times import SECOND
 
 _MEMORY_PERIOD = 1.0
-"""Wall s between two looks at the processes' memory."""
+"""Wall time between two samples of the processes' memory, s."""
 
 _LONGEST_IDLE_END = 5.0
 
 _WARM_UP = 0.25
-"""Part of the time after which memory is to grow no more."""
+"""Part of the time after which memory should not grow any more."""
 
 _PRIORITIES = {"plant": 30, "planner": 20, "coordinated_control": 20, "recorder": 10}
 """Priorities of the kernel's real-time scheduling, where it is allowed; `chrt -f` sets the same."""
 
 _GOAL = Goal.checked([0.2, -0.15, 0.05], quaternion_from_rotvec([0.1, -0.05, 0.02]))
 _FEWEST_CYCLES = 170
-"""Fewer have too large loops for the turn."""
+"""Fewer cycles have too large loops for the rotation of the goal."""
 
 _STATES = ("/clock", "/odom", "/joint_states", "/momentum")
 
 
+@contextmanager
+def stack_in_processes(
+    scenario: Scenario,
+) -> Iterator[tuple[MultiProcessStack, Path, Callable[[], bool]]]:
+    """Have the nodes of a scenario in processes of their own.
+
+    Yields the stack, its bag, and a function that returns whether a signal has requested the end.
+    """
+    with ros(private=False), tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
+        bag = Path(folder, "flight.mcap")
+        stack = MultiProcessStack(scenario, bag)
+        try:
+            with ended_on_request() as stopped:
+                yield stack, bag, stopped
+        finally:
+            stack.close()
+
+
+def finish(stack: MultiProcessStack, stopped: Callable[[], bool]) -> None:
+    """End the flight and complete its bag.
+
+    Raises
+    ------
+    SpaceRobotError
+        A node did not end well, or a signal has interrupted the flight.
+    """
+    stack.finish()
+    if stopped():
+        raise SpaceRobotError("The flight in real time was interrupted.")
+
+
 @dataclass(frozen=True)
 class RealTimeFigures:
-    """What a flight in real time came to.
+    """Figures of a flight in real time.
 
     Deadlines (:class:`~spacerobot_ros.simulation.time_modes.RealTime`): one a tick for the
-    plant and one a state for its commander. Lost are messages that were published and are not in
-    the bag; memory is the resident set of all processes. The idle process does nothing but wait for
-    the same ticks: when it is late, the machine was.
+    plant and one a state for its commander. Lost messages were published and are not in the
+    bag; memory is the resident set of all processes. The idle process only waits for the same
+    ticks: when it is late, the machine was busy.
     """
 
     rate: float
@@ -78,7 +118,7 @@ class RealTimeFigures:
         return late / (2 * self.ticks)
 
     def lines(self) -> Iterator[str]:
-        """Yield the figures as lines for people."""
+        """Yield the figures as lines for the user."""
         worst = max(self.worst_tick_ms, self.worst_command_ms)
         yield (
             f"{self.rate:g} commands a second for {self.duration_s:.0f} s: "
@@ -107,7 +147,7 @@ class RealTimeFigures:
         }
 
 
-def run_benchmark(
+def real_time_benchmark(
     duration: float, rates: Sequence[float], show: Callable[[str], None]
 ) -> dict[str, float]:
     """Fly for ``duration`` s at each rate, show lines and return the figures by name."""
@@ -137,36 +177,25 @@ def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
         .with_overrides("planner", {"tick_rate": rate, **_gait(duration)})
     )
     memory: list[float] = []
-    with (
-        ros(private=False),
-        tempfile.TemporaryDirectory(prefix="spacerobot_") as folder,
-        ExitStack() as closing,
-    ):
-        bag = Path(folder, "flight.mcap")
-        stack = MultiProcessStack(scenario, bag)
+    with stack_in_processes(scenario) as (stack, bag, stopped), ExitStack() as closing:
         idle = _IdleProcess(1.0 / rate, duration)
+        closing.callback(idle.kill)
         prioritised = prioritise(stack)
-        try:
-            stopped = closing.enter_context(ended_on_request())
-            stack.start(_GOAL)
-            began = looked = time.monotonic()
+        stack.start(_GOAL)
+        began = sampled = time.monotonic()
 
-            def look() -> bool:
-                nonlocal looked
-                now = time.monotonic()
-                if now - looked >= _MEMORY_PERIOD:
-                    looked = now
-                    memory.append(_resident(stack))
-                return stopped() or now - began >= duration
+        def look() -> bool:
+            nonlocal sampled
+            now = time.monotonic()
+            if now - sampled >= _MEMORY_PERIOD:
+                sampled = now
+                memory.append(_resident(stack))
+            return stopped() or now - began >= duration
 
-            stack.spin(look)
-            stack.finish()
-            published = stack.statistics.commands_published
-        finally:
-            stack.close()
-            late = idle.end()
-        if stopped():
-            raise SpaceRobotError("The flight in real time was interrupted.")
+        stack.spin(look)
+        finish(stack, stopped)
+        published = stack.statistics.commands_published
+        late = idle.counts()
         return _figures(rate, read_bag(bag), published, memory, late, prioritised=prioritised)
 
 
@@ -185,16 +214,10 @@ def _figures(
     *,
     prioritised: bool,
 ) -> RealTimeFigures:
-    timing: dict[str, str] = {}
-    skipped = 0
-    for _, array in bag["/diagnostics"].messages():
-        for status in array.status:
-            values = {pair.key: pair.value for pair in status.values}
-            if status.name.endswith(": timing"):
-                timing = values
-            skipped = int(values.get("deadlines_missed", skipped))
-    if not published or not timing or timing["ticks"] == "0":
+    reports = list(_timing_reports(bag))
+    if not published or not reports or reports[-1][2]["ticks"] == "0":
         raise SpaceRobotError("The flight ended before the planner had commanded anything.")
+    _, skipped, timing = reports[-1]
     ticks = int(timing["ticks"])
     # Every tick publishes each state once, and the first one comes before the first tick.
     stamps = bag["/joint_states"].stamp
@@ -222,6 +245,17 @@ def _figures(
     )
 
 
+def _timing_reports(bag: Bag) -> Iterator[tuple[float, int, dict[str, str]]]:
+    """Yield of each report of the plant's timing: time (s), ticks skipped so far, its values."""
+    skipped = 0
+    for time_ns, array in bag["/diagnostics"].messages():
+        for status in array.status:
+            values = {pair.key: pair.value for pair in status.values}
+            skipped = int(values.get("deadlines_missed", skipped))
+            if status.name.endswith(": timing"):
+                yield time_ns / SECOND, skipped, values
+
+
 def prioritise(stack: MultiProcessStack) -> bool:
     """Have the kernel let the plant go first, then its commander; return whether it does."""
     try:
@@ -235,14 +269,14 @@ def prioritise(stack: MultiProcessStack) -> bool:
 
 
 class _IdleProcess:
-    """Waits for ticks and does nothing at them: its delays are those of the machine.
+    """A process that only waits for ticks: its delays are those of the machine.
 
     Parameters
     ----------
     period
-        s.
+        Time from one tick to the next, s.
     duration
-        s.
+        Time until the last tick, s.
     """
 
     def __init__(self, period: float, duration: float) -> None:
@@ -254,14 +288,17 @@ class _IdleProcess:
         self._process.start()
         sender.close()
 
-    def end(self) -> tuple[int, float]:
-        """Return how often it was late by more than a period, and beyond that at most, in ms."""
-        counts: tuple[int, float] = 0, math.nan
+    def counts(self) -> tuple[int, float]:
+        """Return how often it was late by more than a period, and the most beyond that, ms."""
         if self._receiver.poll(_LONGEST_IDLE_END):
-            counts = self._receiver.recv()
+            counts: tuple[int, float] = self._receiver.recv()
+            return counts
+        return 0, math.nan
+
+    def kill(self) -> None:
+        """End the process."""
         self._process.kill()
         self._process.join()
-        return counts
 
 
 def _wait_for_ticks(period: float, duration: float, sender: Connection) -> None:
@@ -292,3 +329,240 @@ def _resident(stack: MultiProcessStack) -> float:
         for line in Path(f"/proc/{process.pid}/status").read_text("utf-8").splitlines()
         if line.startswith("VmRSS:")
     )
+
+
+# -- beside a viewer -------------------------------------------------------------------------
+
+_SCENARIO = "servicer"
+
+_SETTLING = 10.0
+"""Wall time after the start or end of a viewer and its browser that does not count, s."""
+
+_GOAL_PERIOD = 15.0
+"""Wall time from one goal to the next, s: a robot at rest is not drawn again."""
+
+_GOALS = ((0.0, 0.0, 0.0), (0.3, 0.1, -0.1))
+"""Positions of the base, which goals name in turns, m."""
+
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+_BROWSER_OPTIONS = (
+    *("--headless=new", "--no-sandbox", "--no-first-run", "--disable-background-networking"),
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    "--window-size=1000,700",
+)
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Number of deadlines in a part of the flight, and of those that were missed."""
+
+    deadlines: int = 0
+    missed: int = 0
+
+    def __add__(self, other: Phase) -> Phase:
+        """Count two parts together."""
+        return Phase(self.deadlines + other.deadlines, self.missed + other.missed)
+
+    @property
+    def percent(self) -> float:
+        """Part of the deadlines that was missed, %."""
+        return 100.0 * self.missed / max(self.deadlines, 1)
+
+
+@dataclass(frozen=True)
+class ViewerFigures:
+    """Figures of a flight in real time with and without a viewer.
+
+    Attributes
+    ----------
+    updates_per_s
+        Messages that a client beside the browser received a second while the robot moved.
+    missed_without_percent, missed_with_percent
+        Deadlines of plant and controller that were missed.
+    deadlines_without, deadlines_with
+        Number of deadlines.
+    browser
+        Whether a browser had the page open as well.
+    prioritised
+        Whether the kernel let the plant and its controller go first.
+    """
+
+    updates_per_s: float
+    missed_without_percent: float
+    missed_with_percent: float
+    deadlines_without: int
+    deadlines_with: int
+    browser: bool
+    prioritised: bool
+
+    def lines(self) -> Iterator[str]:
+        """Yield the figures as lines for the user."""
+        client = "a browser and a client" if self.browser else "a client (no browser is installed)"
+        priorities = f"{'with' if self.prioritised else 'without'} real-time priorities"
+        yield f"viewer with {client}: {self.updates_per_s:.1f} updates a second received"
+        yield (
+            f"deadlines missed: {self.missed_without_percent:.3f} % of {self.deadlines_without} "
+            f"without it, {self.missed_with_percent:.3f} % of {self.deadlines_with} with it "
+            f"({priorities})"
+        )
+
+
+def viewer_benchmark(
+    seconds: float, show: Callable[[str], None], *, priorities: bool = True
+) -> dict[str, float]:
+    """Fly the servicer in real time in separate processes, in turns without and with a viewer.
+
+    There are two turns of each; the figures are returned by name.
+
+    Parameters
+    ----------
+    seconds
+        Wall time of a turn, s.
+    show
+        Called with lines for the user.
+    priorities
+        Whether the kernel is asked to let the plant and its controller go first.
+
+    Raises
+    ------
+    SpaceRobotError
+        A node has ended by itself, viser is not installed, or the flight was interrupted.
+    """
+    scenario = (
+        load_scenario(_SCENARIO)
+        .in_real_time(1.0)
+        .with_overrides("plant", {"diagnostics_period": 1.0})
+    )
+    spans: list[tuple[bool, float, float]] = []
+    counts: list[float] = []
+    browser = False
+    with stack_in_processes(scenario) as (stack, bag, stopped):
+        goals = _Goals(stack)
+        prioritised = priorities and prioritise(stack)
+        stack.start(None)
+        for viewed in (False, True, False, True):
+            with ExitStack() as closing:
+                client = None
+                if viewed:
+                    client = closing.enter_context(_viewer_and_browser(bag.parent))
+                    browser = client.browser
+                goals.spin(_SETTLING, stopped)
+                before, began = client.count if client else 0, stack.time_ns / SECOND
+                goals.spin(seconds, stopped)
+                spans.append((viewed, began, stack.time_ns / SECOND))
+                if client is not None:
+                    counts.append((client.count - before) / seconds)
+        finish(stack, stopped)
+        table = _deadlines(read_bag(bag))
+    phases = {False: Phase(), True: Phase()}
+    for viewed, start, end in spans:
+        phases[viewed] += _between(table, start, end)
+    figures = ViewerFigures(
+        updates_per_s=min(counts),
+        missed_without_percent=phases[False].percent,
+        missed_with_percent=phases[True].percent,
+        deadlines_without=phases[False].deadlines,
+        deadlines_with=phases[True].deadlines,
+        browser=browser,
+        prioritised=prioritised,
+    )
+    for line in figures.lines():
+        show(line)
+    return {f"viewer_{name}": float(value) for name, value in asdict(figures).items()}
+
+
+class _Goals:
+    """Goals that are sent in turns, so that the robot moves."""
+
+    def __init__(self, stack: MultiProcessStack) -> None:
+        self._stack, self._positions = stack, cycle(_GOALS)
+        self._topic = stack.client.node.create_publisher(PoseStamped, "goal_pose", STREAM)
+        self._due = 0.0
+
+    def spin(self, seconds: float, stopped: Callable[[], bool]) -> None:
+        """Spin the stack for a wall time, s, and send the goals that are due."""
+        end = time.monotonic() + seconds
+        while (now := time.monotonic()) < end and not stopped():
+            self._stack.require_alive()
+            if now >= self._due:
+                self._due = now + _GOAL_PERIOD
+                message = PoseStamped()
+                p = message.pose.position
+                p.x, p.y, p.z = next(self._positions)
+                message.pose.orientation.w = 1.0
+                self._topic.publish(message)
+            self._stack.executor.spin_once(timeout_sec=0.05)
+
+
+class _Client:
+    """A client of the page that counts the messages that it receives.
+
+    ``browser`` says whether there is a real one beside it.
+    """
+
+    def __init__(self, url: str, *, browser: bool) -> None:
+        import viser
+        from websockets.sync.client import connect
+        from websockets.typing import Subprotocol
+
+        self.count, self.browser = 0, browser
+        self._connection = connect(
+            f"ws://{urlsplit(url).netloc}",
+            subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
+            max_size=None,
+        )
+        self._thread = Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        with suppress(Exception):  # It is closed.
+            for _ in self._connection:
+                self.count += 1
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._connection.close()
+        self._thread.join(5.0)
+
+
+@contextmanager
+def _viewer_and_browser(folder: Path) -> Iterator[_Client]:
+    """Run a viewer with a client, and with a browser where one is installed."""
+    said: list[str] = []
+    with ExitStack() as closing:
+        closing.enter_context(viewing({"port": 0}, said.append))
+        url = said[0].split()[-1]
+        program = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
+        if program is not None:
+            profile = tempfile.mkdtemp(prefix="browser_", dir=folder)
+            closing.enter_context(
+                tool(
+                    [program, *_BROWSER_OPTIONS, f"--user-data-dir={profile}", url],
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                )
+            )
+        client = _Client(url, browser=program is not None)
+        closing.callback(client.close)
+        yield client
+
+
+def _deadlines(bag: Bag) -> Array:
+    """Return a row (time s, deadlines, missed ones) for each report of the plant's timing.
+
+    All are counted from the beginning.
+    """
+    rows = []
+    for time_s, skipped, values in _timing_reports(bag):
+        late = int(values["ticks_late"]) + int(values["commands_late"]) + skipped
+        rows.append((time_s, 2 * int(values["ticks"]), late))
+    if len(rows) < 2:
+        raise SpaceRobotError("The flight was too short to count its deadlines.")
+    return np.array(rows, float)
+
+
+def _between(table: Array, start: float, end: float) -> Phase:
+    """Return the counts between two times, s, by a table of counts from the beginning."""
+    time_s, deadlines, missed = table.T
+    at = np.clip(np.searchsorted(time_s, (start, end)), 0, len(time_s) - 1)
+    return Phase(int(np.ptp(deadlines[at])), int(np.ptp(missed[at])))

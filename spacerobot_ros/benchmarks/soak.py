@@ -1,10 +1,9 @@
-"""Whether separate processes stay as they are: memory, descriptors and threads of a long flight."""
+"""Memory, descriptors and threads of separate processes over a long flight."""
 
 from __future__ import annotations
 
 import os
 import random
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,24 +13,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from spacerobot_ros.benchmarks.real_time import finish, stack_in_processes
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.session.processes import MultiProcessStack
-from spacerobot_ros.session.run import ros
-from spacerobot_ros.termination import ended_on_request
 
 GOAL_PERIOD = 12.0
 """Wall s from one goal to the next."""
 
 _SAMPLE_PERIOD = 2.0
 _WARM_UP = 0.25
-"""Part of the time that does not count: buffers fill, plans are made for the first time."""
+"""Part of the time that does not count: buffers fill, first plans are made."""
 
 _MOST_SAMPLES = 400
-"""A trend is the median over all pairs: of more samples every second, third, ... is enough."""
+"""A slope is the median over all pairs: of more samples only every second, third, ... counts."""
 
 _SEED = 13
 _FARTHEST, _WIDEST = 0.05, 0.0001
@@ -46,26 +44,27 @@ QUANTITIES: Mapping[str, tuple[str, float, float]] = {
     "descriptors": ("", 0.5, 0.0),
     "threads": ("", 0.5, 0.0),
 }
-"""What is sampled of each process: its unit, and the growth that counts as flat over the flight and
-on top of it in an hour. A recorder keeps the index of its bag in memory: about 1 MiB an hour."""
+"""Sampled quantities of a process: unit, allowed growth over the flight, and more an hour.
+
+A recorder keeps the index of its bag in memory: about 1 MiB an hour."""
 
 Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Trend:
-    """How one quantity of one process has gone.
+    """Trend of one quantity of one process after the warm-up.
 
     Attributes
     ----------
     process, quantity
-        Whose and which.
+        Names of the process and of the quantity.
     first, last
-        Medians of the first and of the last tenth of what counts.
+        Medians of the first and of the last tenth of the samples.
     growth
-        By the robust slope, over the time that counts.
+        Growth by the robust slope.
     allowed
-        The growth that is flat.
+        Growth up to which the trend is flat.
     """
 
     process: str
@@ -77,21 +76,21 @@ class Trend:
 
     @property
     def flat(self) -> bool:
-        """Whether it has not grown: by the slope, nor by a late step that a median overlooks."""
+        """Whether neither the slope nor a late step, which a median overlooks, shows growth."""
         return max(self.growth, self.last - self.first) <= self.allowed
 
 
 def robust_slope(times: Floats, values: Floats) -> float:
     """Return the median of the slopes of all pairs of samples (Theil 1950, Sen 1968).
 
-    A third of the samples may be anything.
+    A third of the samples may be outliers.
 
     Parameters
     ----------
     times
         (n,) increasing, s.
     values
-        (n,) what was sampled then.
+        (n,) samples.
     """
     step = max(1, -(-len(times) // _MOST_SAMPLES))
     t, x = times[::step], values[::step]
@@ -102,7 +101,7 @@ def robust_slope(times: Floats, values: Floats) -> float:
 
 
 def trend_of(process: str, quantity: str, times: Floats, values: Floats) -> Trend:
-    """Return how the samples (n,) of one quantity at times (n,), s, have gone after the warm-up."""
+    """Return the trend of the samples (n,) of one quantity at times (n,), s, after the warm-up."""
     counts = times >= times[0] + _WARM_UP * (times[-1] - times[0])
     t, x = times[counts], values[counts]
     tenth = max(1, len(t) // 10)
@@ -118,7 +117,7 @@ def trend_of(process: str, quantity: str, times: Floats, values: Floats) -> Tren
     )
 
 
-def run_soak(
+def soak_benchmark(
     duration: float, show: Callable[[str], None], picture: Path | None = None
 ) -> dict[str, Any]:
     """Fly for ``duration`` wall s with a goal every 12 s; show a table and return all samples.
@@ -147,17 +146,10 @@ def run_soak(
             },
         )
     )
-    with ros(private=False), tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
-        stack = MultiProcessStack(scenario, Path(folder, "flight.mcap"))
-        try:
-            with ended_on_request() as stopped:
-                stack.start(None)
-                times, samples, goals = _fly(stack, duration, stopped)
-                stack.finish()
-                if stopped():
-                    raise SpaceRobotError("The flight was interrupted.")
-        finally:
-            stack.close()
+    with stack_in_processes(scenario) as (stack, _, stopped):
+        stack.start(None)
+        times, samples, goals = _fly(stack, duration, stopped)
+        finish(stack, stopped)
     trends = [
         trend_of(process, quantity, times, samples[process][quantity])
         for process in samples
@@ -185,7 +177,7 @@ def run_soak(
 def _fly(
     stack: MultiProcessStack, duration: float, stopped: Callable[[], bool]
 ) -> tuple[Floats, dict[str, dict[str, Floats]], dict[str, int]]:
-    """Return when was sampled, what, and what became of the goals."""
+    """Return the times, the samples by process and quantity, and counts of the goals' results."""
     rng = random.Random(_SEED)
     pids = {name: process.pid for name, process in stack.processes.items()}
     pids["supervisor"] = os.getpid()
@@ -224,7 +216,7 @@ def _goal(rng: random.Random) -> Goal:
 
 
 def _count(stack: MultiProcessStack, goals: dict[str, int]) -> None:
-    """Count what became of the goal before the next one."""
+    """Count the result of the goal that was sent last."""
     status = stack.client.status
     if status is not None and status.state is not PlannerState.IDLE:
         goals[status.state.value] = goals.get(status.state.value, 0) + 1
@@ -246,7 +238,7 @@ def _lines(file: Path) -> dict[str, str]:
 
 
 def _table(trends: Sequence[Trend], goals: Mapping[str, int], duration: float) -> Iterator[str]:
-    """Yield the trends as lines for people."""
+    """Yield the trends as lines for the user."""
     became = ", ".join(f"{count} {state}" for state, count in sorted(goals.items()))
     yield f"{duration:.0f} s in separate processes, a goal every {GOAL_PERIOD:g} s: {became}"
     yield f"{'process':<22}{'':<13}{'first':>9}{'last':>9}{'growth':>9}{'allowed':>9}"

@@ -2,199 +2,224 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
 from spacerobot_ros.cli.errors import fail
-from spacerobot_ros.cli.options import PATH, json_option, write_json
+from spacerobot_ros.cli.options import PATH, DefaultGroup, json_option, write_json
+
+if TYPE_CHECKING:
+    from spacerobot_ros.benchmarks.checkouts import Checkout
+
+_json_option = json_option("Write the figures as JSON.")
 
 
-@click.command("bench")
-@click.option(
-    "--ticks",
-    default=20_000,
+def _against_option(help: str) -> Callable[..., Any]:
+    return click.option("--against", type=PATH, metavar="CHECKOUT", help=help)
+
+
+_rounds_option = click.option(
+    "--rounds",
+    default=5,
     show_default=True,
-    type=click.IntRange(min=100),
-    help="Ticks to fly in lockstep.",
+    type=click.IntRange(min=1),
+    help="With --against: number of measurements of each checkout; their medians are compared.",
 )
-@click.option(
-    "--real-time",
-    "seconds",
-    type=click.FloatRange(min=5.0),
-    metavar="S",
-    help="Instead: fly in real time for S s, in separate processes; deadlines, losses, memory.",
+
+
+class _Benchmarks(DefaultGroup):
+    """The benchmarks, also by the options that chose them up to version 0.2.0."""
+
+    default = "ticks"
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Replace ``--BENCHMARK VALUE`` by ``BENCHMARK VALUE``."""
+        for number, word in enumerate(args):
+            option, equals, value = word.partition("=")
+            name = option.removeprefix("--")
+            if option != name and name in self.commands:
+                click.echo(
+                    f"`spacerobot bench {option}` is deprecated: use `spacerobot bench {name}`.",
+                    err=True,
+                )
+                rest = [*args[:number], *args[number + 1 :]]
+                return super().parse_args(ctx, [name, *([value] if equals else []), *rest])
+        return super().parse_args(ctx, args or [self.default])
+
+
+@click.group("bench", cls=_Benchmarks)
+def command() -> None:
+    """Measure the speed of the package on this machine.
+
+    `spacerobot bench` alone is short for `spacerobot bench ticks`.
+    """
+
+
+@command.command("ticks")
+@click.argument("ticks", default=20_000, type=click.IntRange(min=100))
+@_against_option(
+    "Instead: measure CPU times of flights and plans of this checkout and of CHECKOUT in turns, "
+    "and print the ratios."
 )
+@_rounds_option
+@_json_option
+def ticks(ticks: int, against: Path | None, rounds: int, json_file: Path | None) -> None:
+    """Fly in lockstep, plan by each method, step the dynamics.
+
+    A flight has TICKS [20000]. A minimal exchange of as many messages, and MuJoCo, are measured
+    beside it.
+    """
+    if against is None:
+        from spacerobot_ros.benchmarks.ticks import ticks_benchmark
+
+        _write(json_file, ticks_benchmark(ticks, click.echo))
+    else:
+        _compare(against, lambda there: there.measure("tick_times", ticks=ticks), rounds, json_file)
+
+
+@command.command("real-time")
+@click.argument("seconds", default=60.0, type=click.FloatRange(min=5.0))
 @click.option(
     "--rate",
     "rates",
     multiple=True,
+    default=(100.0,),
+    show_default=True,
     type=click.FloatRange(min=1.0, max=1e4),
     metavar="HZ",
-    help="With --real-time: commands a second. May be repeated.  [default: 100]",
+    help="Commands a second. May be repeated.",
 )
-@click.option(
-    "--soak",
-    type=click.FloatRange(min=10.0),
-    metavar="S",
-    help="Instead: fly in real time for S s with a goal every 12 s; whether memory, descriptors "
-    "and threads of all processes stay flat. With --json also a picture beside it.",
-)
-@click.option(
-    "--viewer",
-    "viewed",
-    type=click.FloatRange(min=5.0),
-    metavar="S",
-    help="Instead: fly the servicer in real time, in separate processes, in turns of S s without "
-    "and with a viewer and a browser; updates received, deadlines missed.",
-)
+@_against_option("Instead: fly by this checkout and by CHECKOUT in turns, and print the ratios.")
+@_rounds_option
+@_json_option
+def real_time(
+    seconds: float,
+    rates: tuple[float, ...],
+    against: Path | None,
+    rounds: int,
+    json_file: Path | None,
+) -> None:
+    """Fly in separate processes in real time.
+
+    Deadlines, losses and memory of SECONDS [60] are measured.
+    """
+    if against is None:
+        from spacerobot_ros.benchmarks.real_time import real_time_benchmark
+
+        _write(json_file, real_time_benchmark(seconds, rates, click.echo))
+    else:
+        words = ["-m", "spacerobot_ros", "bench", "real-time", str(seconds)]
+        words += [f"--rate={rate}" for rate in rates]
+        _compare(against, lambda there: there.run([*words, "--json"]), rounds, json_file)
+
+
+@command.command("soak")
+@click.argument("seconds", default=1800.0, type=click.FloatRange(min=10.0))
+@json_option("Write all samples as JSON, and draw them beside it (.png).")
+def soak(seconds: float, json_file: Path | None) -> None:
+    """Fly long, and find memory and descriptors that grow.
+
+    Memory, descriptors and threads of every process are sampled for SECONDS [1800], with a goal
+    every 12 s. Exit code 0: none of them grows; 1: one grows.
+    """
+    from spacerobot_ros.benchmarks.soak import soak_benchmark
+
+    picture = None if json_file is None else json_file.with_suffix(".png")
+    figures = soak_benchmark(seconds, click.echo, picture)
+    _write(json_file, figures, indent=None)
+    if not figures["flat"]:
+        fail()
+
+
+@command.command("viewer")
+@click.argument("seconds", default=60.0, type=click.FloatRange(min=5.0))
 @click.option(
     "--no-priorities",
     is_flag=True,
-    help="With --viewer: give plant and controller the same priority as all other processes.",
+    help="Give plant and controller the same priority as all other processes.",
 )
-@click.option(
-    "--planning",
-    "goals",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Instead: plan N goals for each of four robots, without the cache of plans; CPU time. "
-    "With --against also ratios of durations.",
-)
+@_json_option
+def viewer(seconds: float, no_priorities: bool, json_file: Path | None) -> None:
+    """Fly in real time without and with a viewer.
+
+    Updates received and deadlines missed are counted, with a viewer and a browser and without, in
+    turns of SECONDS [60].
+    """
+    from spacerobot_ros.benchmarks.real_time import viewer_benchmark
+
+    _write(json_file, viewer_benchmark(seconds, click.echo, priorities=not no_priorities))
+
+
+@command.command("planning")
+@click.argument("goals", default=20, type=click.IntRange(min=1))
 @click.option(
     "--long-search",
     "starts",
     type=click.IntRange(min=1),
     metavar="N",
-    help="With --planning: compare the durations with those of a search from N initial guesses.",
+    help="Compare the durations with those of a search from N initial guesses.",
 )
 @click.option(
     "--library",
     type=click.IntRange(min=1),
     metavar="N",
-    help="With --planning: plan also with a library of the manoeuvres to N other goals.",
+    help="Plan also with a library of the manoeuvres to N other goals.",
 )
-@click.option(
-    "--first-plans",
-    is_flag=True,
-    help="Instead: plan for robots of 7, 12 and 14 joints, first with an empty cache, then in "
-    "another process; CPU time.",
-)
-@click.option(
-    "--campaign",
-    is_flag=True,
-    help="Instead: fly thousands of flights in lanes, and the same in the plant and in MuJoCo's "
-    "rollout; CPU time.",
-)
-@click.option(
-    "--against",
-    type=PATH,
-    metavar="PATH",
-    help="Measure the checkout at PATH in turns with this one, and print the ratios.",
-)
-@click.option(
-    "--rounds",
-    default=3,
-    show_default=True,
-    type=click.IntRange(min=1),
-    help="With --against: how often each checkout is measured; the medians are compared.",
-)
-@json_option("Write the figures as JSON.")
-def command(
-    ticks: int,
-    seconds: float | None,
-    rates: tuple[float, ...],
-    soak: float | None,
-    viewed: float | None,
-    no_priorities: bool,
-    goals: int | None,
+@_against_option("Plan the same goals by CHECKOUT, and compare CPU times and durations.")
+@_json_option
+def planning(
+    goals: int,
     starts: int | None,
     library: int | None,
-    first_plans: bool,
-    campaign: bool,
-    json_file: Path | None,
     against: Path | None,
-    rounds: int,
+    json_file: Path | None,
 ) -> None:
-    """Measure the speed of the stack on this machine.
+    """Plan goals of four robots by optimal.
 
-    The speed of a bare ping-pong of messages is measured beside it. Exit code 1: memory,
-    descriptors or threads grow (--soak).
+    The CPU time of GOALS [20] for each robot is measured, without the cache of plans.
     """
-    _require_one_benchmark()
-    figures: Mapping[str, Any]
-    if soak is not None:
-        from spacerobot_ros.benchmarks.soak import run_soak
+    from spacerobot_ros.benchmarks.planning import planning_benchmark
 
-        picture = None if json_file is None else json_file.with_suffix(".png")
-        figures = run_soak(soak, click.echo, picture)
-        if json_file is not None:
-            write_json(json_file, figures, indent=None)
-        if not figures["flat"]:
-            fail()
-        return
-    if campaign:
-        from spacerobot_ros.benchmarks.lanes import lanes_benchmark
+    _write(json_file, planning_benchmark(goals, against, starts, library, click.echo))
 
-        figures = lanes_benchmark(click.echo)
-    elif viewed is not None:
-        from spacerobot_ros.benchmarks.viewing import run_viewer_benchmark
 
-        figures = run_viewer_benchmark(viewed, click.echo, priorities=not no_priorities)
-    elif goals is not None:
-        from spacerobot_ros.benchmarks.planning import run_planning_benchmark
+@command.command("first-plans")
+@_against_option("Plan by CHECKOUT, too.")
+@_json_option
+def first_plans(against: Path | None, json_file: Path | None) -> None:
+    """Plan for large robots from an empty cache.
 
-        figures = run_planning_benchmark(goals, against, starts, library, click.echo)
-    elif first_plans:
-        from spacerobot_ros.benchmarks.first_plans import run_first_plan_benchmark
+    The CPU time of the first plans for robots of 7, 12 and 14 joints is measured, and that of the
+    next process.
+    """
+    from spacerobot_ros.benchmarks.planning import first_plan_benchmark
 
-        figures = run_first_plan_benchmark(against, click.echo)
-    elif against is not None:
-        from spacerobot_ros.benchmarks.against import compare_checkouts
+    _write(json_file, first_plan_benchmark(against, click.echo))
 
-        words = ["--ticks", str(ticks)]
-        if seconds is not None:
-            rate_words = [word for rate in rates for word in ("--rate", str(rate))]
-            words = ["--real-time", str(seconds), *rate_words]
-        figures = compare_checkouts(against, words, click.echo, rounds)
-    elif seconds is None:
-        from spacerobot_ros.benchmarks import bench
 
-        figures = bench.run_benchmark(ticks, click.echo)
-    else:
-        from spacerobot_ros.benchmarks import real_time
+@command.command("campaign")
+@_json_option
+def campaign(json_file: Path | None) -> None:
+    """Fly in SIMD lanes, by the plant and by MuJoCo.
 
-        figures = real_time.run_benchmark(seconds, rates or (100.0,), click.echo)
+    The CPU time of thousands of flights is measured.
+    """
+    from spacerobot_ros.benchmarks.engines import lanes_benchmark
+
+    _write(json_file, lanes_benchmark(click.echo))
+
+
+def _compare(
+    other: Path, measure: Callable[[Checkout], Any], rounds: int, json_file: Path | None
+) -> None:
+    from spacerobot_ros.benchmarks.checkouts import compare
+
+    _write(json_file, compare(other, measure, click.echo, rounds))
+
+
+def _write(json_file: Path | None, figures: Any, indent: int | None = 2) -> None:
     if json_file is not None:
-        write_json(json_file, figures)
-
-
-_BENCHMARKS = (*("--real-time", "--soak", "--viewer", "--planning", "--first-plans", "--campaign"),)
-"""Options that each choose another benchmark."""
-
-_OF_ONE = {
-    "--rate": "--real-time",
-    "--no-priorities": "--viewer",
-    "--long-search": "--planning",
-    "--library": "--planning",
-}
-"""Options that count with one benchmark alone."""
-
-
-def _require_one_benchmark() -> None:
-    """Refuse options that would have no effect."""
-    context = click.get_current_context()
-    given = {
-        option.opts[0]
-        for option in context.command.params
-        if option.name and context.get_parameter_source(option.name) is ParameterSource.COMMANDLINE
-    }
-    chosen = [name for name in _BENCHMARKS if name in given]
-    if len(chosen) > 1:
-        raise click.UsageError(f"{' and '.join(chosen)} are benchmarks of their own: choose one.")
-    for name, benchmark in _OF_ONE.items():
-        if name in given and benchmark not in given:
-            raise click.UsageError(f"{name} is an option of {benchmark}.")
+        write_json(json_file, figures, indent)

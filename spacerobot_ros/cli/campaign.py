@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from spacerobot_ros.cli.errors import end_if_requested, fail
-from spacerobot_ros.cli.options import PATH
+from spacerobot_ros.cli.options import PATH, DefaultGroup
 from spacerobot_ros.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -21,13 +21,8 @@ if TYPE_CHECKING:
 _ENGINES = ("auto", "lanes", "flights", "ros")
 
 
-class _Campaigns(click.Group):
-    """A group whose first command, ``fly``, need not be named."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        if args and args[0] not in (*self.commands, *ctx.help_option_names):
-            args = ["fly", *args]
-        return super().parse_args(ctx, args)
+class _Campaigns(DefaultGroup):
+    default = "fly"
 
 
 @click.group("campaign", cls=_Campaigns)

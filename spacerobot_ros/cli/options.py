@@ -25,6 +25,19 @@ else:  # Generic in new versions only.
 
 PATH = click.Path(path_type=Path)
 
+
+class DefaultGroup(click.Group):
+    """A group whose command :attr:`default` need not be named."""
+
+    default = ""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Insert the name of the default command where the first word names none."""
+        if args and args[0] not in (*self.commands, *ctx.help_option_names):
+            args = [self.default, *args]
+        return super().parse_args(ctx, args)
+
+
 bag_argument = click.argument("bag", type=PATH)
 namespace_option = click.option(
     "--namespace", metavar="NAME", help="Robot of a bag that has several [the first]."

@@ -1,14 +1,17 @@
-"""Durations of plans beside those of others, and what is planned."""
+"""Benchmarks of planning: goals, durations, and the cost of first plans."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from spacerobot_ros.benchmarks.planning import duration_figures
-from spacerobot_ros.benchmarks.planning_goals import CASES, measure, requests
+from spacerobot_ros.benchmarks.measurements import CASES, first_plan, plans, requests
+from spacerobot_ros.benchmarks.planning import duration_figures, first_plan_benchmark
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
+
+MOST_CPU = {7: 8.0, 12: 20.0, 14: 40.0}
+"""From an empty cache to the first plan, s, by the number of joints."""
 
 
 def test_durations_are_compared_goal_by_goal() -> None:
@@ -34,6 +37,26 @@ def test_goals_are_the_same_ones_every_time(name: str) -> None:
 
 
 def test_plans_are_measured() -> None:
-    found = measure(robot_file("planar_chain"), CASES["planar_chain"], 1, 7, {"answers": 1})
+    found = plans(str(robot_file("planar_chain")), "planar_chain", 1, 7, {"answers": 1})
     assert found["cpu_s"][0] > 0
     assert 0.5 < found["duration_s"][0] < 10
+
+
+@pytest.mark.slow
+def test_a_first_plan_is_measured() -> None:
+    found = first_plan(str(robot_file("three_joint_arm")))
+    assert found["joints"] == 3
+    assert 0 < found["plan_cpu_s"] < found["cpu_s"]
+
+
+@pytest.mark.slow
+def test_robots_of_many_joints_are_planned_for_soon() -> None:
+    lines: list[str] = []
+    figures = first_plan_benchmark(None, lines.append)
+    assert len(lines) == len(figures)
+    assert {found["joints"] for found in figures.values()} == set(MOST_CPU)
+    for found in figures.values():
+        assert found["first_cpu_s"] <= MOST_CPU[found["joints"]]
+        # The next process finds what the first has compiled.
+        assert found["next_cpu_s"] < found["first_cpu_s"]
+        assert 0 < found["more_cpu_s"] < found["next_cpu_s"]

@@ -53,7 +53,7 @@ def test_a_short_soak_samples_every_process(
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
     monkeypatch.setattr("faulthandler.enable", lambda: None)
     file = tmp_path / "soak.json"
-    result = CliRunner().invoke(main, ["bench", "--soak", "40", "--json", str(file)])
+    result = CliRunner().invoke(main, ["bench", "soak", "40", "--json", str(file)])
     figures = json.loads(file.read_text("utf-8"))
     assert result.exit_code == (0 if figures["flat"] else 1), result.output
     processes = {"plant", "planner", "recorder", "supervisor"}

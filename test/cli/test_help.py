@@ -1,4 +1,4 @@
-"""What the command line tells of itself, and options that would have no effect."""
+"""Help texts of the command line, and names of commands that are deprecated."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import click
 import pytest
 from support.command_line import CliRunner
 
+from spacerobot_ros.cli.bench import command as bench
 from spacerobot_ros.cli.campaign import command as campaign
 from spacerobot_ros.cli.main import COMMANDS, CommandGroup, main
 
@@ -17,6 +18,7 @@ def commands() -> dict[str, click.Command]:
     return {
         **{name: each for name, each in found.items() if each is not None},
         **{f"campaign {name}": each for name, each in campaign.commands.items()},
+        **{f"bench {name}": each for name, each in bench.commands.items()},
     }
 
 
@@ -33,7 +35,7 @@ def test_every_option_says_what_it_does() -> None:
     assert [name for name, option in options.items() if (option.help or "").startswith(".")] == []
 
 
-@pytest.mark.parametrize("words", [[], ["campaign"]])
+@pytest.mark.parametrize("words", [[], ["bench"], ["campaign"]])
 def test_the_list_of_commands_has_whole_sentences(words: list[str]) -> None:
     listed = CliRunner().invoke(main, [*words, "--help"]).output.partition("Commands:\n")[2]
     assert listed
@@ -49,16 +51,26 @@ def test_the_help_of_campaigns_is_that_of_all_their_commands(word: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    ("old", "new"),
     [
-        (["--no-priorities"], "--no-priorities is an option of --viewer."),
-        (["--rate", "200", "--soak", "60"], "--rate is an option of --real-time."),
-        (["--library", "8"], "--library is an option of --planning."),
-        (["--long-search", "8", "--first-plans"], "--long-search is an option of --planning."),
-        (["--soak", "60", "--campaign"], "--soak and --campaign are benchmarks of their own"),
+        (["--real-time", "1", "--rate", "200"], "real-time"),
+        (["--rate=200", "--real-time=1"], "real-time"),
+        (["--soak", "1"], "soak"),
+        (["--no-priorities", "--viewer", "1"], "viewer"),
+        (["--planning", "0", "--long-search", "8", "--library", "8"], "planning"),
+        (["--ticks", "1"], "ticks"),
     ],
 )
-def test_bench_refuses_what_would_have_no_effect(words: list[str], sentence: str) -> None:
-    result = CliRunner().invoke(main, ["bench", *words])
+def test_options_that_chose_a_benchmark_still_do(old: list[str], new: str) -> None:
+    """The value is out of range, so that nothing is measured."""
+    result = CliRunner().invoke(main, ["bench", *old])
     assert result.exit_code == 2
-    assert sentence in result.output
+    assert f"is deprecated: use `spacerobot bench {new}`." in result.output
+    assert f"Usage: main bench {new} " in result.output
+    assert "is not in the range" in result.output
+
+
+def test_bench_alone_is_ticks() -> None:
+    result = CliRunner().invoke(main, ["bench", "--rounds", "0"])
+    assert result.exit_code == 2
+    assert "Usage: main bench ticks " in result.output

@@ -1,8 +1,8 @@
-"""Speed of the stack as ratios to peers measured in the same run.
+"""Speed of the stack in lockstep, beside a minimal exchange of messages in the same run.
 
-Machines differ and are shared: the ratios say more than the figures. The peer of the lockstep
-run is the least that ROS can do with as many topics: one node publishes ready-made bytes on the
-plant's topics, one answers with a command, and raw subscriptions write it all into an MCAP file.
+Machines differ and are shared: the ratio says more than the figures. The minimal exchange is the
+least that ROS can do with as many topics: one node publishes ready-made bytes on the plant's
+topics, one answers with a command, and raw subscriptions write all of it into an MCAP file.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from __future__ import annotations
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from spacerobot_ros.bag import BagWriter
-from spacerobot_ros.benchmarks.dynamics import dynamics_benchmark
+from spacerobot_ros.benchmarks.engines import dynamics_benchmark, median_cpu_times
 from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import c_compiler
@@ -37,7 +38,7 @@ from spacerobot_ros.nodes import ReplayNode
 from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import PlanRequest
-from spacerobot_ros.resources import share_directory
+from spacerobot_ros.resources import robot_file
 from spacerobot_ros.session.run import ros
 from spacerobot_ros.session.stack import InProcessStack
 from spacerobot_ros.simulation import VelocityPlant
@@ -59,61 +60,69 @@ _GAITS = (
     ("arm_attitude", "area_loop"),
     ("planar_chain", "square_path"),
 )
-"""Scenarios of the papers, and the methods that are theirs."""
+"""Scenarios of the papers with their methods."""
 
 _PLANS = 5
+_PLANT_TICKS = 5_000
 
 _PERIOD = 0.01
 _MESSAGES = 500
 _PATIENCE = 2.0
-"""Wall s for what is on its way when the replay has ended."""
+"""Wall time for the messages that are still under way when the replay has ended, s."""
 
 _REPLAYED = "/bench/joint_states"
 
 
-def run_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float | str]:
-    """Measure, show lines for people and return the figures by name.
+def ticks_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float | str]:
+    """Measure, show lines for the user and return the figures by name.
 
-    The stack and its peer take turns, and medians are compared: what else the machine does then
-    falls on both.
+    The stack and the minimal exchange take turns, and medians are compared, so that the machine's
+    other load affects both alike.
     """
-    stack_rates, bare_stack_rates, peer_rates = [], [], []
+    flights: dict[str, list[_Speed]] = {"recorded": [], "unrecorded": [], "minimal": []}
     with ros(private=True), tempfile.TemporaryDirectory() as folder:
         bag = Path(folder, "bench.mcap")
         for _ in range(_ROUNDS):
-            peer_rates.append(_peer_rate(ticks, bag))
+            flights["minimal"].append(_minimal_exchange(ticks, bag))
             bag.unlink()
-            stack_rates.append(_stack_rate(ticks, bag))
+            flights["recorded"].append(_stack(ticks, bag))
             bag.unlink()
-            bare_stack_rates.append(_stack_rate(ticks, None))
+            flights["unrecorded"].append(_stack(ticks, None))
             show(
-                f"round: {stack_rates[-1]:8.0f} ticks/s with plant, planner and recorder, "
-                f"{peer_rates[-1]:8.0f} bare"
+                f"round: {flights['recorded'][-1].cpu_us:.1f} us of CPU time a tick with plant, "
+                f"planner and recorder, {flights['minimal'][-1].cpu_us:.1f} us minimal exchange"
             )
         spacing, worst_spacing = _replay_spacing(Path(folder))
-    stack_rate, peer_rate = statistics.median(stack_rates), statistics.median(peer_rates)
-    unrecorded = statistics.median(bare_stack_rates)
+    stack, unrecorded, minimal = (_median(flights[name]) for name in flights)
+    cost = 1 - unrecorded.cpu_us / stack.cpu_us
     tick = _plant_tick()
     figures: dict[str, float | str] = {
-        "ticks_per_s": stack_rate,
-        "bare_ticks_per_s": peer_rate,
-        "unrecorded_ticks_per_s": unrecorded,
-        "recorder_cost": 1 - stack_rate / unrecorded,
-        "ratio_to_bare": stack_rate / peer_rate,
+        "ticks_per_s": stack.ticks_per_s,
+        "bare_ticks_per_s": minimal.ticks_per_s,
+        "unrecorded_ticks_per_s": unrecorded.ticks_per_s,
+        "tick_cpu_us": stack.cpu_us,
+        "bare_tick_cpu_us": minimal.cpu_us,
+        "recorder_cost": cost,
+        "ratio_to_bare": minimal.cpu_us / stack.cpu_us,
         "replay_spacing_error_s": spacing,
-        "plant_tick_us": 1e6 * tick,
+        "plant_tick_us": tick,
         "compiler": c_compiler() or "none (virtual machine)",
     }
-    show(f"lockstep, recorded: {stack_rate:.0f} ticks/s (median of {_ROUNDS})")
-    show(f"bare ping-pong with as many topics and a raw recorder: {peer_rate:.0f} ticks/s")
-    show(f"ratio: {100 * stack_rate / peer_rate:.0f} %")
-    cost = 100 * (1 - stack_rate / unrecorded)
-    show(f"without the recorder: {unrecorded:.0f} ticks/s; recording costs {cost:.0f} % of them")
+    show(
+        f"lockstep, recorded: {stack.ticks_per_s:.0f} ticks/s, {stack.cpu_us:.1f} us of CPU time a "
+        f"tick (medians of {_ROUNDS})"
+    )
+    show(
+        f"minimal exchange with as many topics and a raw recorder: {minimal.ticks_per_s:.0f} "
+        f"ticks/s, {minimal.cpu_us:.1f} us of CPU time a tick"
+    )
+    show(f"ratio of the CPU times: {minimal.cpu_us / stack.cpu_us:.2f}")
+    show(f"the recorder takes {100 * cost:.0f} % of the CPU time")
     show(
         f"replay at rate 1, 100 messages a second: spacing off by {1e3 * spacing:.2f} ms (median), "
         f"{1e3 * worst_spacing:.1f} ms at most"
     )
-    show(f"one plant tick alone: {1e6 * tick:.1f} us (compiler: {figures['compiler']})")
+    show(f"one plant tick alone: {tick:.1f} us (compiler: {figures['compiler']})")
     for name, first, later in _planning_times():
         figures |= {f"plan_{name}_first_s": first, f"plan_{name}_s": later}
         show(f"planning by {name}: {1e3 * later:.0f} ms, the first time {1e3 * first:.0f} ms")
@@ -125,7 +134,7 @@ def run_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float | 
 
 
 def _dynamics_lines(figures: dict[str, float | str]) -> Iterator[str]:
-    """Yield how the dynamics of the six-joint robot compare with MuJoCo's."""
+    """Yield lines that compare the dynamics of the six-joint robot with MuJoCo's."""
     if "step_us" in figures:
         yield f"one RK4 step of the servicer's dynamics: {figures['step_us']:.1f} us"
     yield f"... in the virtual machine: {figures['step_without_compiler_us']:.1f} us"
@@ -139,30 +148,51 @@ def _dynamics_lines(figures: dict[str, float | str]) -> Iterator[str]:
     yield f"... without a compiler: {without:.2f}"
 
 
-def _stack_rate(ticks: int, bag: Path | None) -> float:
-    """Ticks a second of the first ``ticks`` of the sliding-mass flight, planning left out."""
+@dataclass(frozen=True)
+class _Speed:
+    """Ticks a second of wall time, and the CPU time of a tick, us."""
+
+    ticks_per_s: float
+    cpu_us: float
+
+    @classmethod
+    def of(cls, ticks: int, wall: float, cpu: float) -> _Speed:
+        """Return the speed of a number of ticks that took these times, s."""
+        return cls(ticks / wall, 1e6 * cpu / ticks)
+
+
+def _median(speeds: Sequence[_Speed]) -> _Speed:
+    return _Speed(
+        statistics.median(each.ticks_per_s for each in speeds),
+        statistics.median(each.cpu_us for each in speeds),
+    )
+
+
+def _stack(ticks: int, bag: Path | None) -> _Speed:
+    """Fly the first ``ticks`` of sliding_masses; planning does not count."""
     scenario = load_scenario("sliding_masses").with_overrides("planner", {"method": "lie_bracket"})
     stack = InProcessStack(scenario, bag)
     try:
         stack.start(stack.scenario.goal)
-        first, began = 0, 0.0
+        first, began, used = 0, 0.0, 0.0
 
         def look() -> bool:
-            nonlocal first, began
+            nonlocal first, began, used
             if not first:
-                first, began = stack.plant.tick, time.perf_counter()
+                first, began, used = stack.plant.tick, time.perf_counter(), time.process_time()
             return stack.plant.tick >= first + ticks
 
         stack.spin(look)
-        rate = (stack.plant.tick - first) / (time.perf_counter() - began)
+        wall, cpu = time.perf_counter() - began, time.process_time() - used
+        speed = _Speed.of(stack.plant.tick - first, wall, cpu)
         stack.finish()
     finally:
         stack.close()
-    return rate
+    return speed
 
 
-def _peer_rate(ticks: int, path: Path) -> float:
-    """Ticks a second of the bare ping-pong."""
+def _minimal_exchange(ticks: int, path: Path) -> _Speed:
+    """Exchange as many messages as the stack does, and record them."""
     qos = QoSProfile(depth=1000)
     a, b, recorder = (rclpy.create_node(name) for name in ("ping", "pong", "raw_recorder"))
     executor = EventsExecutor()
@@ -203,15 +233,15 @@ def _peer_rate(ticks: int, path: Path) -> float:
             executor.add_node(node)
         while not all(p.get_subscription_count() for p in (*(p for p, *_ in publishers), reply)):
             executor.spin_once(timeout_sec=0.01)
-        began = time.perf_counter()
+        began, used = time.perf_counter(), time.process_time()
         ping()
         executor.spin_until_future_complete(done, timeout_sec=1e6)
-        elapsed = time.perf_counter() - began
+        speed = _Speed.of(ticks, time.perf_counter() - began, time.process_time() - used)
         writer.finish()
     executor.shutdown()
     for node in (a, b, recorder):
         node.destroy_node()
-    return ticks / elapsed
+    return speed
 
 
 def _writing(writer: Writer, channel: int) -> Callable[[bytes], None]:
@@ -230,15 +260,16 @@ def _filled(kind: type[Any], n: int) -> Any:
 
 
 def _plant_tick() -> float:
-    """Duration of one tick of the sliding-mass plant without ROS, s."""
-    robot = SpaceRobot.from_file(share_directory() / "urdf" / "sliding_masses.urdf")
+    """Return the CPU time of one tick of the sliding-mass plant without ROS, us."""
+    robot = SpaceRobot.from_file(robot_file("sliding_masses"))
     plant = VelocityPlant(robot, 0.05)
     command = np.full(robot.n, 1e-6)
-    repeats = 20_000
-    began = time.perf_counter()
-    for _ in range(repeats):
-        plant.step(command)
-    return (time.perf_counter() - began) / repeats
+
+    def run() -> None:
+        for _ in range(_PLANT_TICKS):
+            plant.step(command)
+
+    return median_cpu_times({"tick": (run, _PLANT_TICKS)}, _ROUNDS)["tick"]
 
 
 def _planning_times() -> Iterator[tuple[str, float, float]]:
@@ -259,9 +290,9 @@ def _planning_times() -> Iterator[tuple[str, float, float]]:
 
 
 def _replay_spacing(folder: Path) -> tuple[float, float]:
-    """Return by how much the spacing of 500 messages, 100 a second, is missed at rate 1.
+    """Replay 500 messages, 100 a second; return the errors of their spacing.
 
-    Returns the median and the largest error of the time from one message to the next, s.
+    They are the median and the largest error of the time from one message to the next, s.
     """
     bag = folder / "spacing.mcap"
     with BagWriter(bag) as writer:

@@ -1,0 +1,353 @@
+"""CPU times of the plant, of SIMD lanes and of MuJoCo with the same robots and motions."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.batch import (
+    Flights,
+    FollowedSchedule,
+    HeldCommands,
+    Starts,
+    fly_lanes,
+    fly_one_by_one,
+)
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import c_compiler
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
+
+_STEP = 0.001
+"""Integration step of the dynamics benchmark, s."""
+
+_STEPS = 1000
+"""Steps in one call of either engine."""
+
+_ROUNDS = 21
+
+_LEAST_INERTIA = 1e-12
+"""MuJoCo has no point masses, kg m^2."""
+
+
+def median_cpu_times(
+    runs: Mapping[str, tuple[Callable[[], object], int]], rounds: int
+) -> dict[str, float]:
+    """Return the median CPU time of a part of each run, us.
+
+    The runs take turns, so that the machine's other load affects all alike.
+
+    Parameters
+    ----------
+    runs
+        By name: a function, and the number of equal parts (steps, ticks) of a call.
+    rounds
+        Number of calls of each.
+    """
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(rounds):
+        for name, (run, parts) in runs.items():
+            began = time.process_time()
+            run()
+            times[name].append(1e6 * (time.process_time() - began) / parts)
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+# -- steps of the dynamics --------------------------------------------------------------------
+
+
+def dynamics_benchmark() -> dict[str, float | str]:
+    """Return the CPU time of one RK4 step of 1 ms of ``servicer.urdf``, and ratios to MuJoCo.
+
+    Each engine takes a thousand steps in one call, which loops in compiled code: one tick of
+    :class:`EffortPlant` and ``mujoco.mj_step(model, data, nstep=1000)``. All start from the same
+    drifting motion, without force and away from the joint limits. The plant integrates position,
+    momenta and limits besides; MuJoCo runs without the parts that this robot does not need
+    (constraints, contacts, sensors, its own check of the state).
+
+    Returns
+    -------
+    ``step_us``, ``step_without_compiler_us`` (CasADi's virtual machine), ``mujoco_step_us``;
+    ``ratio_to_mujoco`` and ``ratio_to_mujoco_without_compiler``: how many times faster than MuJoCo
+    the plant is; ``compiler`` and ``mujoco``: name and version. Without a compiler or MuJoCo their
+    figures are missing.
+    """
+    robot = SpaceRobot.from_file(robot_file("servicer"))
+    compiler = c_compiler()
+    result: dict[str, float | str] = {"compiler": compiler or "none (virtual machine)"}
+    runs: dict[str, tuple[Callable[[], object], int]] = {}
+    if compiler:
+        runs["step_us"] = _plant_steps(robot), _STEPS
+    with _virtual_machine():
+        # Built anew, because functions are compiled where a model is built.
+        runs["step_without_compiler_us"] = (
+            _plant_steps(SpaceRobot(robot.description)),
+            _STEPS,
+        )
+    try:
+        import mujoco
+    except ImportError:
+        result["mujoco"] = "not installed: no comparison"
+    else:
+        result["mujoco"] = mujoco.__version__
+        runs["mujoco_step_us"] = _mujoco_steps(mujoco, robot), _STEPS
+    result |= median_cpu_times(runs, _ROUNDS)
+    for ratio, name in (
+        ("ratio_to_mujoco", "step_us"),
+        ("ratio_to_mujoco_without_compiler", "step_without_compiler_us"),
+    ):
+        if name in runs and "mujoco_step_us" in runs:
+            result[ratio] = float(result["mujoco_step_us"]) / float(result[name])
+    return result
+
+
+def _rates(n: int) -> Array:
+    """Return joint rates (n,), rad/s: slow enough to stay within the limits in all rounds."""
+    return 0.02 * np.cos(np.arange(n))
+
+
+def _plant_steps(robot: SpaceRobot) -> Callable[[], None]:
+    """Return a function that takes a thousand steps of the plant."""
+    start = InitialState(joint_velocities=_rates(robot.n))
+    plant = EffortPlant(robot, _STEPS * _STEP, start, _STEP)
+    nothing = np.zeros(robot.n)
+
+    def run() -> None:
+        if plant.step(nothing):
+            raise RuntimeError("a joint has reached its stop: the benchmark measures free motion")
+
+    return run
+
+
+def _mujoco_steps(mujoco: Any, robot: SpaceRobot) -> Callable[[], None]:
+    """Return a function that takes a thousand steps of MuJoCo in the same motion."""
+    model = mujoco_model(mujoco, robot.description, _STEP)
+    data = mujoco.MjData(model)
+    rates = _rates(robot.n)
+    twist = np.concatenate(robot.base_twist([0, 0, 0, 1], np.zeros(robot.n), rates))
+    data.qvel[:6] = twist  # The base is not rotated: world and base components are the same.
+    for name, rate in zip(robot.joint_names, rates, strict=True):
+        data.joint(name).qvel[:] = rate
+    return lambda: mujoco.mj_step(model, data, nstep=_STEPS)
+
+
+def mujoco_model(mujoco: Any, description: RobotDescription, step: float) -> Any:
+    """Return MuJoCo's model of a robot in free space, without contacts, sensors and the like.
+
+    It integrates by Runge-Kutta 4 with steps of ``step`` s, as the plant does.
+    """
+    spec = mujoco.MjSpec.from_string(description.urdf)
+    spec.worldbody.first_body().add_freejoint()
+    spec.compiler.boundinertia = _LEAST_INERTIA
+    model = spec.compile()
+    for name in ("CONSTRAINT", "GRAVITY", "SENSOR", "SPRING", "DAMPER", "ISLAND", "AUTORESET"):
+        model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    model.opt.timestep = step
+    return model
+
+
+@contextmanager
+def _virtual_machine() -> Iterator[None]:
+    """Have functions that are built in this context run in CasADi's virtual machine."""
+    before = os.environ.get("SPACEROBOT_COMPILE")
+    os.environ["SPACEROBOT_COMPILE"] = "0"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["SPACEROBOT_COMPILE"]
+        else:
+            os.environ["SPACEROBOT_COMPILE"] = before
+
+
+# -- flights in SIMD lanes -------------------------------------------------------------------
+
+_COUNT = 2000
+"""Flights in lanes, in one round."""
+
+_ROLLED = 64
+"""Flights of MuJoCo's rollout in one round: one thread flies them one after another."""
+
+_LANE_ROUNDS = 5
+
+_MANY = 10_000
+"""Flights of which the whole time is measured."""
+
+_SPREAD = 0.05
+"""Largest relative change of masses and inertias."""
+
+_AGREED = 50
+"""Number of flights that the plant flies as well, for comparison."""
+
+
+@dataclass(frozen=True)
+class _Case:
+    """A robot and its commands.
+
+    Attributes
+    ----------
+    name
+        Prefix of the figures.
+    robot, actuation
+        The robot, and ``velocity`` or ``effort``.
+    control_period
+        Time of a tick, s.
+    ticks
+        Number of ticks of a flight.
+    commands
+        (ticks + 1, n) joint positions, or (ticks, n) efforts.
+    """
+
+    name: str
+    robot: SpaceRobot
+    actuation: str
+    control_period: float
+    ticks: int
+    commands: Array
+
+    def flights(self, count: int, seed: int) -> Flights:
+        """Return flights with random masses, inertias and starts."""
+        rng, robot = np.random.default_rng(seed), self.robot
+        bodies = len(robot.description.bodies)
+        low, high = 1 - _SPREAD, 1 + _SPREAD
+        inertial = robot.inertial.scaled(
+            rng.uniform(low, high, (count, bodies)), rng.uniform(low, high, (count, bodies))
+        )
+        starts = Starts.alike(robot, InitialState(), count)
+        starts.position[:] = 0.01 * rng.normal(size=(count, 3))
+        program = (
+            HeldCommands(self.commands)
+            if self.actuation == "effort"
+            else FollowedSchedule(self.commands)
+        )
+        return Flights(
+            robot, self.actuation, self.control_period, self.ticks, starts, program, inertial
+        )
+
+    def campaign(self, count: int, seed: int) -> Array:
+        """Draw and fly; return the final distances (count,) from the goal, m."""
+        result = fly_lanes(self.flights(count, seed))
+        return result.errors(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))[0][:, -1]
+
+
+def lanes_benchmark(show: Callable[[str], None]) -> dict[str, float | str]:
+    """Return CPU times of a tick and of flights, and how many times faster SIMD lanes are.
+
+    Lanes include everything that a campaign does with a flight: drawing masses, inertias and
+    starts, limits, peaks, and the error at the end. The plant and MuJoCo only step: the plant tick
+    by tick as everywhere in this package, MuJoCo's ``rollout`` in one call for all its flights.
+    Medians of runs in turns are compared.
+    """
+    figures: dict[str, float | str] = {}
+    sliders, servicer = (
+        SpaceRobot.from_file(robot_file(name)) for name in ("sliding_masses", "servicer")
+    )
+    phases = np.linspace(0.0, 6.0, 781)[:, None] + np.arange(3)
+    shapes = 0.5 * (np.sin(phases) - np.sin(phases[0]))
+    phases = np.linspace(0.0, 6.0, 781)[:, None] + np.arange(servicer.n)
+    arm = 0.3 * (np.sin(phases) - np.sin(phases[0]))
+    efforts = 2.0 * np.cos(np.linspace(0, 6, 50))[:, None] * np.ones(servicer.n)
+    cases = (
+        _Case("sliders velocity", sliders, "velocity", 0.05, 780, shapes),
+        _Case("servicer velocity", servicer, "velocity", 0.05, 780, arm),
+        _Case("servicer effort", servicer, "effort", 0.01, 50, efforts),
+        _Case("sliders effort", sliders, "effort", 0.01, 50, efforts[:, :3]),
+    )
+    for case in cases:
+        found = _measured(case)
+        figures["engine"] = found.pop("engine")
+        figures |= {f"{case.name}: {name}": value for name, value in found.items()}
+        show(_line(case.name, found))
+    began = time.process_time()
+    cases[0].campaign(_MANY, 1)
+    figures["sliders velocity: cpu_s_of_10000_flights_of_39_s"] = time.process_time() - began
+    show(
+        f"{_MANY} open-loop flights of {cases[0].ticks * cases[0].control_period:g} s: "
+        f"{time.process_time() - began:.2f} s of CPU time, drawing and errors among it"
+    )
+    show(f"engine: {figures['engine']}")
+    return figures
+
+
+def _measured(case: _Case) -> dict[str, float | str]:
+    few = case.flights(_AGREED, 2)
+    result, plant = fly_lanes(few), fly_one_by_one(few)
+    largest = max(
+        float(np.abs(getattr(result, name) - getattr(plant, name)).max()) for name in ("pose", "q")
+    )
+    runs: dict[str, tuple[Callable[[], object], int]] = {
+        "lanes_us": (lambda: case.campaign(_COUNT, 0), _COUNT * case.ticks),
+        "plant_us": (_plant_run(case), case.ticks),
+    }
+    if case.actuation == "effort" and (rollout := _rollout(case)) is not None:
+        runs["mujoco_us"] = (rollout, _ROLLED * case.ticks)
+    found: dict[str, float | str] = {**median_cpu_times(runs, _LANE_ROUNDS)}
+    for name in ("plant", "mujoco"):
+        if f"{name}_us" in runs:
+            found[f"ratio_to_{name}"] = float(found[f"{name}_us"]) / float(found["lanes_us"])
+    found["largest_difference_to_plant"] = largest
+    found["steps_a_tick"] = few.substeps
+    found["engine"] = result.engine
+    return found
+
+
+def _line(name: str, found: Mapping[str, Any]) -> str:
+    text = (
+        f"{name}: {found['lanes_us']:.3f} us a tick of {found['steps_a_tick']} step(s) in lanes, "
+        f"{found['plant_us']:.3f} us by the plant ({found['ratio_to_plant']:.1f} times)"
+    )
+    if "mujoco_us" in found:
+        text += (
+            f", {found['mujoco_us']:.1f} us by MuJoCo's rollout "
+            f"({found['ratio_to_mujoco']:.1f} times)"
+        )
+    return f"{text}; largest difference {found['largest_difference_to_plant']:.1e}"
+
+
+def _plant_run(case: _Case) -> Callable[[], None]:
+    """Return a function that flies one flight by the plant, tick by tick."""
+    kind: Callable[..., VelocityPlant | EffortPlant]
+    kind = EffortPlant if case.actuation == "effort" else VelocityPlant
+    plant = kind(case.robot, case.control_period, InitialState())
+    commands = case.commands
+    if case.actuation == "velocity":
+        commands = np.diff(commands, axis=0) / case.control_period
+    ticks = list(commands)
+
+    def run() -> None:
+        plant.reset()
+        for command in ticks:
+            plant.step(command)
+
+    return run
+
+
+def _rollout(case: _Case) -> Callable[[], object] | None:
+    """Return the flights by MuJoCo's rollout under the same efforts; None without MuJoCo."""
+    try:
+        import mujoco
+        from mujoco import rollout
+    except ImportError:
+        return None
+    steps = case.flights(1, 0).substeps
+    model = mujoco_model(mujoco, case.robot.description, case.control_period / steps)
+    data = mujoco.MjData(model)
+    order = [model.joint(name).dofadr[0] for name in case.robot.joint_names]
+    forces = np.zeros((1, case.ticks * steps, model.nv))
+    forces[0][:, order] = np.repeat(case.commands, steps, axis=0)
+    state = mujoco.mjtState
+    size = mujoco.mj_stateSize(model, state.mjSTATE_FULLPHYSICS)
+    start = np.zeros(size)
+    mujoco.mj_getState(model, data, start, state.mjSTATE_FULLPHYSICS)
+    starts = np.tile(start, (_ROLLED, 1))
+    spec = int(state.mjSTATE_QFRC_APPLIED)
+    return lambda: rollout.rollout(model, data, starts, forces, control_spec=spec)

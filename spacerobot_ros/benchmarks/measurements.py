@@ -1,0 +1,286 @@
+"""Measurements that run with the package of any checkout, in a process of their own.
+
+``python measurements.py FUNCTION ARGUMENTS FILE`` calls a function of :data:`MEASUREMENTS` with
+keyword arguments (JSON), and writes its result to FILE as JSON. PYTHONPATH chooses the checkout.
+So functions here import only names that both checkouts have, and nothing of this folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import resource
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
+from spacerobot_ros.planning import Goal, PlanRequest, RobotState, Tolerance
+
+_PERIOD = 0.05
+"""Control period of the plans, s."""
+
+_LEAST_ANGLE = 0.05
+"""Smallest rotation of a goal, rad."""
+
+_SCATTER = 0.3
+"""Largest distance of a start from the case's, m or rad a joint."""
+
+# -- flights ----------------------------------------------------------------------------------
+
+_SHORT_FLIGHT = 5.0
+"""Simulated time of the flight that is subtracted: start, planning, end, s."""
+
+_SLIDING_PERIOD, _GAIT_START, _CYCLE = 0.05, 100.0, 3.0
+"""Of sliding_masses with ``lie_bracket``: control period, time before the cycles, one cycle, s."""
+
+_FEWEST_CYCLES = 170
+"""Fewer cycles have too large loops for the rotation of the goal."""
+
+_PLANNED: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ("sliding_masses", "lie_bracket", {}),
+    ("arm_attitude", "area_loop", {}),
+    ("planar_chain", "square_path", {}),
+    ("planar_chain", "optimal", {"cache": 0}),
+)
+"""Scenarios, methods and options of the plans."""
+
+_PLANS = 15
+_FLIGHTS = 3
+"""Number of flights without ROS of which medians are taken."""
+
+
+def tick_times(ticks: int) -> dict[str, float]:
+    """Return CPU times of flights and plans; only public functions and commands are used.
+
+    A tick's time is the difference of a long and a short flight over the difference of their
+    ticks, so that start, planning and end do not count.
+
+    Parameters
+    ----------
+    ticks
+        Number of ticks of the long flights of sliding_masses.
+
+    Returns
+    -------
+    In us a tick: ``stack_us`` (plant, planner and recorder as nodes), ``controlled_stack_us``
+    (with coordinated control), ``loop_us`` and ``controlled_loop_us`` (without ROS); in ms a plan:
+    ``plan_METHOD_ms``.
+    """
+    import spacerobot_ros
+
+    cycles = max(_FEWEST_CYCLES, math.ceil((ticks * _SLIDING_PERIOD - _GAIT_START) / _CYCLE) + 1)
+    gait = {"planner.lie_bracket.cycles": cycles}
+    words = ["sliding_masses", "--method", "lie_bracket"]
+    words += [f"--set={name}={value}" for name, value in gait.items()]
+    figures = {
+        "stack_us": _stack_tick(words, ticks * _SLIDING_PERIOD),
+        "controlled_stack_us": _stack_tick(["coordinated_control"], math.inf),
+    }
+    scenario = "sliding_masses"
+    planning = _cpu_time(lambda: spacerobot_ros.plan(scenario, method="lie_bracket", cycles=cycles))
+    figures["loop_us"] = _loop_tick(planning, scenario, method="lie_bracket", parameters=gait)
+    figures["controlled_loop_us"] = _loop_tick(0.0, "coordinated_control")
+    for scenario, method, options in _PLANNED:
+        plan = partial(spacerobot_ros.plan, scenario, method=method, **options)
+        figures[f"plan_{method}_ms"] = 1e3 * _cpu_time(plan)
+    return figures
+
+
+def _stack_tick(words: list[str], longest: float) -> float:
+    """Return the CPU time of a tick of ``spacerobot run`` in this process, us."""
+    _run(words, _SHORT_FLIGHT)  # Imports, and compiles.
+    (first, few), (second, many) = (_run(words, each) for each in (_SHORT_FLIGHT, longest))
+    return 1e6 * (second - first) / (many - few)
+
+
+def _run(words: list[str], longest: float) -> tuple[float, int]:
+    """Fly; return the CPU time, s, and the number of ticks."""
+    from spacerobot_ros.cli import start
+
+    with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
+        result = Path(folder, "result.json")
+        if math.isfinite(longest):
+            words = [*words, "--longest", str(longest)]
+        bag = str(Path(folder, "flight.mcap"))
+        sys.argv = ["spacerobot", "run", *words, "--bag", bag, "--json", str(result)]
+        began = time.process_time()
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+            start()
+        used = time.process_time() - began
+        return used, json.loads(result.read_text("utf-8"))["ticks"]
+
+
+def _loop_tick(planning: float, scenario: str, **arguments: Any) -> float:
+    """Return the CPU time of a tick of a flight without ROS, us; ``planning`` s are subtracted."""
+    import spacerobot_ros
+
+    ticks = len(spacerobot_ros.fly(scenario, **arguments).time) - 1
+    flying = _cpu_time(lambda: spacerobot_ros.fly(scenario, **arguments), _FLIGHTS)
+    return 1e6 * (flying - planning) / ticks
+
+
+def _cpu_time(run: Callable[[], object], count: int = _PLANS) -> float:
+    """Return the median CPU time of a call after the first one, s."""
+    times = []
+    for _ in range(1 + count):
+        began = time.process_time()
+        run()
+        times.append(time.process_time() - began)
+    return statistics.median(times[1:])
+
+
+# -- plans of `optimal` -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot's start, options, and kind of goals.
+
+    Attributes
+    ----------
+    start
+        Joint positions, m or rad, near which the plans start.
+    options
+        Options of the method.
+    angle
+        Largest rotation of a goal, rad.
+    planar
+        Whether goals are rotated about the third axis only.
+    sliding
+        Whether the position of a goal counts as well.
+    """
+
+    start: tuple[float, ...]
+    options: dict[str, Any]
+    angle: float = 1.0
+    planar: bool = False
+    sliding: bool = False
+
+
+CASES = {
+    "planar_chain": Case((0.0, 0.0), {}, angle=3.0, planar=True),
+    "sliding_masses": Case(
+        (0.0, 0.0, 0.0),
+        {
+            "max_velocity": (0.0647, 0.1871, 0.6550),
+            "max_acceleration": (0.228, 0.643, 3.564),
+        },
+        sliding=True,
+    ),
+    "three_joint_arm": Case((0.0, -math.pi / 4, math.pi / 2), {}),
+    "servicer": Case((0.0, -1.2, 2.0, 0.0, 0.8, 0.0), {}),
+}
+"""Cases by the names of their robots."""
+
+
+def requests(robot: SpaceRobot, case: Case, count: int, seed: int) -> Iterator[PlanRequest]:
+    """Yield random plan requests of a case; the same seed gives the same ones."""
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        scattered = np.array(case.start) + rng.uniform(-_SCATTER, _SCATTER, robot.n)
+        q = np.clip(scattered, robot.lower, robot.upper)
+        axis = rng.normal(size=3)
+        if case.planar:
+            axis = np.array([0.0, 0.0, axis[2]])
+        angle = rng.uniform(_LEAST_ANGLE, case.angle)
+        turn = quaternion_from_rotvec(axis / np.linalg.norm(axis) * angle)
+        position = np.zeros(3)
+        if case.sliding:
+            last = np.clip(q + rng.uniform(-1.0, 1.0, robot.n), robot.lower, robot.upper)
+            there = matrix_from_quaternion(turn) @ robot.center_of_mass(last)
+            position = robot.center_of_mass(q) - there
+        state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
+        yield PlanRequest(state, Goal.checked(position, turn), Tolerance(2e-3, 2e-3))
+
+
+def plans(
+    urdf: str, case: str, count: int, seed: int, options: dict[str, Any], library: int = 0
+) -> dict[str, list[float]]:
+    """Return the CPU time (s) and the duration (s; NaN: refused) of each plan of a case.
+
+    Functions that are built for the first goal do not count, nor does a library of the manoeuvres
+    to ``library`` other goals.
+    """
+    from spacerobot_ros.planning.methods.optimal.method import OptimalGait
+    from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
+
+    robot, chosen_case = SpaceRobot.from_file(urdf), CASES[case]
+    chosen = {**chosen_case.options, **options, "cache": 0}
+    if OptimalOptions().time_budget > 0:
+        # A version whose plans depend on the machine's speed: as on a fast machine.
+        chosen["time_budget"] = 1e6
+    method = OptimalGait(robot, _PERIOD, options=OptimalOptions(**chosen))
+    goals = list(requests(robot, chosen_case, count + 1, seed))
+    if library:
+        made = method.made_library(requests(robot, chosen_case, library, seed + 1))
+        assert made is not None
+        with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
+            file = Path(folder, "library.npz")
+            file.write_bytes(made.to_bytes())
+            chosen["library"] = str(file)
+            method = OptimalGait(robot, _PERIOD, options=OptimalOptions(**chosen))
+    times: list[float] = []
+    durations: list[float] = []
+    for request in goals:
+        began = time.process_time()
+        try:
+            duration = method.plan(request).duration
+        except PlanningError:
+            duration = math.nan
+        times.append(time.process_time() - began)
+        durations.append(duration)
+    return {"cpu_s": times[1:], "duration_s": durations[1:]}
+
+
+_TURN = (0.1, -0.15, 0.2)
+"""Rotation vector of the goal of a first plan, rad."""
+
+
+def first_plan(urdf: str) -> dict[str, float]:
+    """Return figures of the first plan in this process.
+
+    Returns
+    -------
+    The number of ``joints``; the CPU time of this process and of its compilers until the plan is
+    there, ``cpu_s``; that of the same plan again, ``plan_cpu_s``.
+    """
+    from spacerobot_ros.planning.methods.optimal.method import OptimalGait
+    from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
+
+    robot = SpaceRobot.from_file(urdf)
+    method = OptimalGait(robot, _PERIOD, options=OptimalOptions(cache=0))
+    q = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
+    goal = Goal.checked(np.zeros(3), quaternion_from_rotvec(_TURN))
+    request = PlanRequest(state, goal, Tolerance(2e-3, 2e-3))
+    method.plan(request)
+    used = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    total = sum(each.ru_utime + each.ru_stime for each in used)
+    began = time.process_time()
+    method.plan(request)
+    return {
+        "joints": robot.n,
+        "cpu_s": total,
+        "plan_cpu_s": time.process_time() - began,
+    }
+
+
+MEASUREMENTS = {"tick_times": tick_times, "plans": plans, "first_plan": first_plan}
+
+if __name__ == "__main__":
+    _, name_of, arguments, file_of = sys.argv
+    found: Any = MEASUREMENTS[name_of](**json.loads(arguments))  # type: ignore[operator]
+    Path(file_of).write_text(json.dumps(found), encoding="utf-8")
