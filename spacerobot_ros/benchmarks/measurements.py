@@ -12,6 +12,7 @@ import io
 import json
 import math
 import resource
+import runpy
 import statistics
 import sys
 import tempfile
@@ -19,6 +20,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -79,8 +81,7 @@ def tick_times(ticks: int) -> dict[str, float]:
     (with coordinated control), ``loop_us`` and ``controlled_loop_us`` (without ROS); in ms a plan:
     ``plan_METHOD_ms``.
     """
-    import spacerobot_ros
-
+    public = _public()
     cycles = max(_FEWEST_CYCLES, math.ceil((ticks * _SLIDING_PERIOD - _GAIT_START) / _CYCLE) + 1)
     gait = {"planner.lie_bracket.cycles": cycles}
     words = ["sliding_masses", "--method", "lie_bracket"]
@@ -90,11 +91,11 @@ def tick_times(ticks: int) -> dict[str, float]:
         "controlled_stack_us": _stack_tick(["coordinated_control"], math.inf),
     }
     scenario = "sliding_masses"
-    planning = _cpu_time(lambda: spacerobot_ros.plan(scenario, method="lie_bracket", cycles=cycles))
+    planning = _cpu_time(lambda: public.plan(scenario, method="lie_bracket", cycles=cycles))
     figures["loop_us"] = _loop_tick(planning, scenario, method="lie_bracket", parameters=gait)
     figures["controlled_loop_us"] = _loop_tick(0.0, "coordinated_control")
     for scenario, method, options in _PLANNED:
-        plan = partial(spacerobot_ros.plan, scenario, method=method, **options)
+        plan = partial(public.plan, scenario, method=method, **options)
         figures[f"plan_{method}_ms"] = 1e3 * _cpu_time(plan)
     return figures
 
@@ -108,8 +109,6 @@ def _stack_tick(words: list[str], longest: float) -> float:
 
 def _run(words: list[str], longest: float) -> tuple[float, int]:
     """Fly; return the CPU time, s, and the number of ticks."""
-    from spacerobot_ros.cli import start
-
     with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
         result = Path(folder, "result.json")
         if math.isfinite(longest):
@@ -118,17 +117,21 @@ def _run(words: list[str], longest: float) -> tuple[float, int]:
         sys.argv = ["spacerobot", "run", *words, "--bag", bag, "--json", str(result)]
         began = time.process_time()
         with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
-            start()
+            runpy.run_module("spacerobot_ros", run_name="__main__")
         used = time.process_time() - began
         return used, json.loads(result.read_text("utf-8"))["ticks"]
 
 
+def _public() -> Any:
+    """Return the package as a program of a user imports it."""
+    return import_module("spacerobot_ros")
+
+
 def _loop_tick(planning: float, scenario: str, **arguments: Any) -> float:
     """Return the CPU time of a tick of a flight without ROS, us; ``planning`` s are subtracted."""
-    import spacerobot_ros
-
-    ticks = len(spacerobot_ros.fly(scenario, **arguments).time) - 1
-    flying = _cpu_time(lambda: spacerobot_ros.fly(scenario, **arguments), _FLIGHTS)
+    fly = _public().fly
+    ticks = len(fly(scenario, **arguments).time) - 1
+    flying = _cpu_time(lambda: fly(scenario, **arguments), _FLIGHTS)
     return 1e6 * (flying - planning) / ticks
 
 
