@@ -6,14 +6,15 @@ from html import escape
 from itertools import zip_longest
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 
 from spacerobot_ros.campaign.config import Campaign
-from spacerobot_ros.campaign.report import STYLE, Results, named, panels, picture, table, write_page
+from spacerobot_ros.campaign.report import MADE_BY, Results, named, panels, picture
 from spacerobot_ros.campaign.statistics import Paired, paired, paired_success
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.report.style import INK, PALETTE
+from spacerobot_ros.output_files import write_output
+from spacerobot_ros.report.figures import INK, PALETTE, drawing
+from spacerobot_ros.report.page_parts import facts, html_page, table
 
 
 def require_same_draws(first: Campaign, second: Campaign) -> None:
@@ -83,16 +84,16 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
         f"{a} passes {int(passed_a.sum())} and {b} {int(passed_b.sum())} of {len(common)} draws; "
         f"{only_a} only {a}, {only_b} only {b} (McNemar's exact test: p = {p:.2g})."
     )
-    with mpl.rc_context(STYLE):
+    with drawing():
         body = [
             f"<header><h1>{escape(a)} and {escape(b)}</h1>",
-            f'<p class="facts"><span>{len(common)} draws that both have flown</span></p>',
+            facts([f"{len(common)} draws that both have flown"]),
             f'<p class="outcome">{escape(sentence)}</p></header>',
             "<h2>Paired differences</h2>",
             _table(found, a, b),
             _figure(first, second, rows_a, rows_b, names[:6]),
         ]
-    write_page(path, f"{a} and {b}", body)
+    write_output(path, html_page(f"{a} and {b}", body, MADE_BY))
     return [sentence, *(_line(each, b, a) for each in found)]
 
 
@@ -117,7 +118,7 @@ def _table(found: list[Paired], first: str, second: str) -> str:
         for each in found
     ]
     head = ["metric", "pairs", f"mean of {first}", f"mean of {second}", "difference"]
-    return table([*head, "95 % interval", "leaves out zero"], rows, "paired")
+    return table("paired", [*head, "95 % interval", "interval excludes 0"], rows)
 
 
 def _figure(

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import re
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -36,8 +32,12 @@ from spacerobot_ros.campaign.statistics import (
 )
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.output_files import write_output
-from spacerobot_ros.report.style import FAINT, INK, PALETTE
+from spacerobot_ros.report.figures import FAINT, INK, PALETTE, PictureFormat, drawing, picture_of
+from spacerobot_ros.report.page_parts import facts, figure, html_page, table, tiles
 from spacerobot_ros.version import __version__
+
+MADE_BY = f"Made by spacerobot_ros {__version__}."
+"""Footer of the pages of campaigns."""
 
 _WORST = 10
 _FAR = 100.0
@@ -48,29 +48,12 @@ _SHOWN = 6
 
 Flags = npt.NDArray[np.bool_]
 
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-
 _SHARES = (0.01, 0.5, 0.99)
 """Shares of all draws below the values that tell what a distribution is."""
 
 _TEXTS = ("outcome", "reason", "engine", "fallback", "versions")
 
 _ALWAYS = ("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "propellant_kg")
-
-STYLE: Any = {
-    "font.size": 8.5,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#e9ebee",
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "svg.hashsalt": "spacerobot",
-    "svg.fonttype": "path",
-    "text.parse_math": False,
-}
-"""Of all figures of campaigns."""
 
 
 @dataclass(frozen=True)
@@ -222,7 +205,8 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
         The file cannot be written.
     """
     results = Results.of(folder)
-    write_page(path, f"Campaign {results.campaign.name}", _body(results))
+    title = f"Campaign {results.campaign.name}"
+    write_output(path, html_page(title, _body(results), MADE_BY))
     lines = [f"success     {results.success}"]
     lines += [f"note        {results.bias}"] if results.bias else []
     lines += [f"required    {c}: {results.requirement(c)}" for c in results.campaign.criteria]
@@ -231,54 +215,9 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     return lines
 
 
-def write_page(path: Path, title: str, body: Sequence[str]) -> None:
-    """Write a page in the style of the reports of flights.
-
-    Raises
-    ------
-    SpaceRobotError
-        The file cannot be written.
-    """
-    css = files("spacerobot_ros.report").joinpath("page.css").read_text(encoding="utf-8")
-    text = (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{escape(_POLICY)}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<link rel="icon" href="data:,">\n'
-        f"<title>{escape(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n<main>\n"
-        + "\n".join(part for part in body if part)
-        + f"\n<footer><p>Made by spacerobot_ros {__version__}.</p></footer>\n"
-        + "</main>\n</body>\n</html>\n"
-    )
-    write_output(path, text)
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]], identity: str) -> str:
-    """Return a table; every column but the first has numbers to the right."""
-
-    def line(cells: Sequence[str], tag: str) -> str:
-        made = [f'<th scope="row">{escape(cells[0])}</th>' if tag == "td" else ""]
-        rest = cells[1:] if tag == "td" else cells
-        made += [f"<{tag}>{escape(cell)}</{tag}>" for cell in rest]
-        return f"<tr>{''.join(made)}</tr>\n"
-
-    body = "".join(line(cells, "td") for cells in rows)
-    return (
-        f'<div class="scroll"><table id="{identity}"><thead>\n{line(head, "th")}</thead>'
-        f"<tbody>\n{body}</tbody></table></div>"
-    )
-
-
-def picture(figure: Figure, name: str, caption: str) -> str:
+def picture(drawn: Figure, name: str, caption: str) -> str:
     """Return a figure for the page."""
-    stream = io.BytesIO()
-    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-    figure.savefig(stream, format="svg", metadata=nothing)
-    data = base64.b64encode(stream.getvalue()).decode()
-    return (
-        f'<figure id="{name}"><div class="scroll"><img src="data:image/svg+xml;base64,{data}" '
-        f'alt="{escape(caption)}"></div>\n<figcaption>{escape(caption)}</figcaption></figure>'
-    )
+    return figure(name, picture_of(drawn, PictureFormat.SVG), caption, escape(caption))
 
 
 def panels(count: int, across: int, height: float = 2.2) -> tuple[Figure, list[Any]]:
@@ -307,7 +246,7 @@ def named(metric: str) -> str:
 
 def _body(results: Results) -> list[str]:
     campaign, found = results.campaign, results.influences()
-    with mpl.rc_context(STYLE):
+    with drawing():
         return [
             f"<header><h1>{escape(campaign.name)}</h1>",
             f"<p>{escape(campaign.description)}</p>" if campaign.description else "",
@@ -336,32 +275,27 @@ def _body(results: Results) -> list[str]:
 def _facts(results: Results) -> str:
     campaign = results.campaign
     engines = Counter(results.columns["engine"])
-    facts = [
+    found = [
         f"scenario {campaign.scenario.name}",
         f"{len(results)} of {results.total} flights",
         f"sampler {campaign.sampler}, seed {campaign.seed}",
         "engine " + ", ".join(f"{name} ({count})" for name, count in engines.items()),
     ]
-    spans = "".join(f"<span>{escape(fact)}</span>" for fact in facts)
     note = f'<p class="missing">{escape(results.bias)}</p>' if results.bias else ""
-    return f'<p class="facts">{spans}</p>{note}'
+    return f"{facts(found)}{note}"
 
 
 def _headline(results: Results) -> str:
     success = results.success
     low, high = success.exact
     wall = float(np.nansum(results.columns["wall_time_s"]))
-    tiles = [
+    rows = [
         ("success", f"{100 * success.value:.4g} %", f"{success.count} of {success.total}"),
         ("95 % interval (Wilson)", f"{100 * success.low:.4g} to {100 * success.high:.4g} %", ""),
         ("95 % interval (Clopper-Pearson)", f"{100 * low:.4g} to {100 * high:.4g} %", ""),
         ("flown", f"{wall:.4g} s", "of workers' time"),
     ]
-    made = []
-    for label, value, note in tiles:
-        small = f"<small>{escape(note)}</small>" if note else ""
-        made.append(f"<div><dt>{escape(label)}</dt><dd>{escape(value)}{small}</dd></div>")
-    return f'<dl class="tiles">{"".join(made)}</dl>'
+    return tiles(rows)
 
 
 def _requirements(results: Results) -> str:
@@ -375,7 +309,7 @@ def _requirements(results: Results) -> str:
         rows.append([str(criterion), *_shared(met), f"{middle:.4g}", f"{high:.4g}"])
     rows.append(["all together", *_shared(results.success), "", ""])
     head = ["requirement", "met by", "95 % interval", "median", "95 percentile"]
-    return table(head, rows, "requirements")
+    return table("requirements", head, rows)
 
 
 def _shared(met: Share) -> list[str]:
@@ -395,7 +329,7 @@ def _outcomes(results: Results) -> str:
         counts = Counter(re.sub(r"-?\d[\d.e+-]*", "…", reason) for reason in reasons)
         for sentence, count in counts.most_common(4):
             rows.append([outcome, f"{count}", sentence])
-    made = table(["outcome", "flights", "sentence"], rows, "outcomes")
+    made = table("outcomes", ["outcome", "flights", "message"], rows)
     fallbacks = Counter(text for text in results.columns.get("fallback", ()) if text)
     for reason, count in fallbacks.most_common(6):
         flights = f"{count} flight{'s' if count > 1 else ''}"
@@ -416,7 +350,7 @@ def _percentiles(results: Results) -> str:
         numbers = [there.min(), *percentiles(values), there.max(), there.mean(), there.std()]
         rows.append([named(name), *(f"{x:.4g}" for x in numbers)])
     head = ["metric", "least", *(f"{p:g} %" for p in PERCENTILES), "most", "mean", "std"]
-    return table(head, rows, "percentiles")
+    return table("percentiles", head, rows)
 
 
 def _histograms(results: Results) -> str:
@@ -463,7 +397,7 @@ def _drivers(results: Results, found: Sequence[Influence]) -> str:
     note += "to both sides correlates with the distance from the median."
     if not sobol:
         note += " The sampler 'saltelli' adds Sobol indices."
-    return f'<p class="facts">{escape(note)}</p>' + table(head, rows, "drivers")
+    return f'<p class="facts">{escape(note)}</p>' + table("drivers", head, rows)
 
 
 def _scatter(results: Results, found: Sequence[Influence]) -> str:
@@ -495,7 +429,7 @@ def _worst_table(results: Results) -> str:
         command = f"spacerobot campaign rerun {shlex.quote(str(results.folder))} {number}"
         rows.append([str(number), command, results.columns["outcome"][row], *values])
     head = ["flight", "to fly it again, with a bag", "outcome", *map(named, names)]
-    return table(head, rows, "worst")
+    return table("worst", head, rows)
 
 
 def _convergence(results: Results) -> str:
@@ -537,4 +471,4 @@ def _dispersed(campaign: Campaign) -> str:
     if not rows:
         return '<p class="missing">Nothing but the noise: every flight has another seed.</p>'
     head = ["what", "distribution", "unit", *(f"{100 * share:g} %" for share in _SHARES)]
-    return table(head, rows, "dispersed")
+    return table("dispersed", head, rows)

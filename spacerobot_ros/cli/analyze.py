@@ -42,11 +42,11 @@ def command(robot: str, shape: str | None, picture: Path | None, json_file: Path
         click.echo(line)
     if json_file is not None:
         write_json(json_file, json_of(found))
-    from spacerobot_ros.report.analyze_figures import draw
-    from spacerobot_ros.report.style import PictureFormat
+    from spacerobot_ros.report.figures import PictureFormat
+    from spacerobot_ros.report.planning_figures import draw_analysis
 
     target = picture or Path("out") / f"{model.description.name}_curvature.png"
-    drawn = draw(found, PictureFormat.of(target))
+    drawn = draw_analysis(found, PictureFormat.of(target))
     if drawn is None:
         click.echo(f"{'picture':<13}none: no loops of the joints turn the base")
         return

@@ -66,7 +66,7 @@ def command(
     --only names, or of all figures.
     """
     from spacerobot_ros.report import write_figures
-    from spacerobot_ros.report.style import PictureFormat
+    from spacerobot_ros.report.figures import PictureFormat
 
     names = [name.strip().lower() for name in only.split(",") if name.strip()]
     folder = out or beside(bag, "_figures")

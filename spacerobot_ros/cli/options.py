@@ -172,7 +172,7 @@ def picture_option(help: str) -> Any:
     def checked(context: click.Context, option: click.Parameter, path: Path | None) -> Path | None:
         if path is not None:
             # Imports matplotlib, which takes a while.
-            from spacerobot_ros.report.style import PictureFormat
+            from spacerobot_ros.report.figures import PictureFormat
 
             PictureFormat.of(path)
         return path

@@ -114,10 +114,10 @@ def command(
         write_json(json_file, content, indent=None)
         click.echo(f"json        {json_file}")
     if picture is not None:
-        from spacerobot_ros.report.plan_figures import draw
-        from spacerobot_ros.report.style import PictureFormat
+        from spacerobot_ros.report.figures import PictureFormat
+        from spacerobot_ros.report.planning_figures import draw_plan
 
-        write_output(picture, draw(problem, trial, PictureFormat.of(picture)))
+        write_output(picture, draw_plan(problem, trial, PictureFormat.of(picture)))
         click.echo(f"picture     {picture}")
     if not trial.reached:
         fail(f"The goal is not reached within the planner's tolerance: {left}.")

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from spacerobot_ros.bag import RecordedRobot
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.report.style import INK, MUTED, PALETTE, inches, panel
+from spacerobot_ros.report.figures import INK, MUTED, PALETTE, inches, panel
 from spacerobot_ros.times import SECOND
 
 LANE = 0.62

@@ -1,16 +1,28 @@
-"""The page of a report: HTML that stands alone, without anything to fetch."""
+"""The page of a flight's report: numbers, tables, figures, and charts that uPlot draws."""
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
 from html import escape
+from typing import Any
 
-from spacerobot_ros.report.charts import chart_numbers, charts_of
-from spacerobot_ros.report.events import FlightEvent
+import numpy as np
+
+from spacerobot_ros.events import EventKind
+from spacerobot_ros.report.events import FlightEvent, mark_of
+from spacerobot_ros.report.figures import ReportFigure, TraceGroup
 from spacerobot_ros.report.flight import Flight
-from spacerobot_ros.report.live import Live, notices_of, own_file, policy_of, scripts_of
-from spacerobot_ros.report.plates import Plate
+from spacerobot_ros.report.page_parts import (
+    PagePart,
+    facts,
+    figure,
+    html_page,
+    package_file,
+    table,
+    tiles,
+)
+from spacerobot_ros.report.signals import Signal, simplified
 from spacerobot_ros.report.tables import (
     Table,
     headline,
@@ -20,27 +32,35 @@ from spacerobot_ros.report.tables import (
     runs_table,
 )
 
-_SCROLL = '<div class="scroll">'
-_HINT = '<p class="hint">Wider than this screen: scroll sideways →</p>'
 _USE = (
     '<p class="facts" id="use">Drag across a chart to look at a part of the time in all of them, '
     "click twice for the whole flight. Click once to see the robot at that instant above; the "
     "upright line is the instant that is shown there. Click a name to hide its trace.</p>"
 )
-_MOST_ROWS, _MOST_OPEN = 200, 20
-"""Rows of what happened that are on the page, and that need not be unfolded."""
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+_MAX_EVENT_ROWS, _MAX_UNFOLDED_ROWS = 200, 20
+"""Events in the table of the page; longer tables than the second are folded up."""
+
+_MAX_SAMPLES = 2000
+_MAX_SLICED_SAMPLES = 5000
+"""Samples of a chart: where the omitted ones lie on lines, and where they do not."""
+
+_LINE_TOLERANCE = 5e-4
+"""Largest distance of an omitted sample from its line, as a share of the trace's extent."""
+
+_MAX_CHART_EVENTS = 500
+
+Figures = Sequence[ReportFigure | str | None]
+"""Figures of a page; a text says why a figure is missing."""
 
 
 def page(
     flight: Flight,
-    player: Live,
-    plates: Sequence[Plate | str | None],
+    player: PagePart,
+    figures: Figures,
     beside: Sequence[Flight] = (),
 ) -> str:
     """Return the whole page; flights ``beside`` this one get a row in a table."""
-    charts, controls = charts_of(flight, plates), Live(programs=(own_file("page.js"),))
-    parts = (player, charts, controls)
+    charts, controls = charts_of(flight, figures), PagePart(programs=(package_file("page.js"),))
     name = flight.scenario
     title = ", ".join(filter(None, (name, flight.method, flight.robot_name)))
     body = [
@@ -50,7 +70,7 @@ def page(
         f"<p>{escape(flight.description)}</p>" if flight.description else "",
         _facts(flight),
         _outcome(flight),
-        _tiles(flight),
+        tiles(headline(flight)),
         "</header>",
         *_runs(flight, beside),
         player.markup,
@@ -59,38 +79,25 @@ def page(
         *_events(flight.events),
         "<h2>Figures</h2>",
         _USE if charts.data else "",
-        *_figures(plates),
+        *_figures(figures),
         *_parameters(flight),
-        notices_of(parts),
-        _footer(flight),
     ]
-    css = charts.style + own_file("page.css")
-    policy = "; ".join(filter(None, (_POLICY, policy_of(parts))))
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<link rel="icon" href="data:,">\n'
-        f"<title>{escape(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n<main>\n"
-        + "\n".join(part for part in body if part)
-        + f"\n</main>\n{scripts_of(parts)}\n</body>\n</html>\n"
-    )
+    return html_page(title, body, _footer(flight), (player, charts, controls))
 
 
 def _facts(flight: Flight) -> str:
-    facts = []
+    found = []
     if flight.method:
-        facts.append(f"method {flight.method}")
+        found.append(f"method {flight.method}")
     if flight.robot is not None:
         count = len(flight.robot.joint_names)
         joints = "1 joint" if count == 1 else f"{count} joints"
-        facts.append(f"robot {flight.robot_name}: {joints}, {flight.robot.total_mass:.5g} kg")
+        found.append(f"robot {flight.robot_name}: {joints}, {flight.robot.total_mass:.5g} kg")
     if flight.namespace:
-        facts.append(f"namespace {flight.namespace}")
+        found.append(f"namespace {flight.namespace}")
     if flight.other_robots:
-        facts.append(f"the bag also has {', '.join(flight.other_robots)}")
-    spans = "".join(f"<span>{escape(fact)}</span>" for fact in facts)
-    return f'<p class="facts">{spans}</p>' if facts else ""
+        found.append(f"the bag also has {', '.join(flight.other_robots)}")
+    return facts(found)
 
 
 def _outcome(flight: Flight) -> str:
@@ -107,17 +114,6 @@ def _outcome(flight: Flight) -> str:
     return f'<p class="outcome {escape(last.state)}">{state}{escape(sentence)}</p>'
 
 
-def _tiles(flight: Flight) -> str:
-    """The numbers of the run that are looked for first."""
-    made = []
-    for label, value, note in headline(flight):
-        small = f"<small>{escape(note)}</small>" if note else ""
-        # Names of methods may be broken where they have an underscore.
-        shown = escape(value).replace("_", "_<wbr>")
-        made.append(f"<div><dt>{escape(label)}</dt><dd>{shown}{small}</dd></div>")
-    return f'<dl class="tiles">{"".join(made)}</dl>' if made else ""
-
-
 def _runs(flight: Flight, beside: Sequence[Flight]) -> list[str]:
     if not beside:
         return []
@@ -130,87 +126,61 @@ def _numbers(flight: Flight) -> list[str]:
     if flight.goal is None:
         parts.append('<p class="missing">The bag holds no goal pose.</p>')
     if result.rows:
-        rows = "".join(
-            f'<tr><th scope="row">{escape(label)}</th><td>{escape(value)}</td></tr>\n'
-            for label, value in result.rows
-        )
-        parts.append(f'{_HINT}{_SCROLL}<table id="numbers"><tbody>\n{rows}</tbody></table></div>')
+        parts.append(table("numbers", (), result.rows))
     if joints is not None:
         parts.append(_table("joints", joints))
     return parts
 
 
 def _published(flight: Flight) -> list[str]:
-    table = published_table(flight)
-    if table is None:
+    found = published_table(flight)
+    if found is None:
         return []
     return [
         "<h2>Published figures beside measured ones</h2>",
-        _table("published", table),
+        _table("published", found),
         '<p class="facts">Source: “planner”, what the planner gave with its first schedule; '
         "“flight”, what was measured.</p>",
     ]
 
 
-def _table(identity: str, table: Table) -> str:
-    def row(cells: Sequence[str], tag: str) -> str:
-        made = []
-        for column, cell in enumerate(cells):
-            name, scope = ("th", ' scope="row"') if tag == "td" and column == 0 else (tag, "")
-            kind = ' class="number"' if column in table.numeric else ""
-            made.append(f"<{name}{scope}{kind}>{escape(cell)}</{name}>")
-        return f"<tr>{''.join(made)}</tr>\n"
-
-    body = "".join(row(cells, "td") for cells in table.rows)
-    return (
-        f'{_HINT}{_SCROLL}<table id="{identity}"><thead>\n{row(table.head, "th")}</thead>'
-        f"<tbody>\n{body}</tbody></table></div>"
-    )
+def _table(identity: str, given: Table) -> str:
+    return table(identity, given.head, given.rows, given.numeric)
 
 
-def _figures(plates: Sequence[Plate | str | None]) -> list[str]:
-    parts, number, numbers = [], 0, chart_numbers(plates)
-    for sentence in dict.fromkeys(plate for plate in plates if isinstance(plate, str)):
+def _figures(figures: Figures) -> list[str]:
+    parts, numbers = [], chart_numbers(figures)
+    for sentence in dict.fromkeys(each for each in figures if isinstance(each, str)):
         parts.append(f'<p class="missing">{escape(sentence)}</p>')
-    for plate in plates:
-        if not isinstance(plate, Plate):
-            continue
-        number += 1
-        data = base64.b64encode(plate.svg).decode()
-        parts.append(
-            f'<figure id="{plate.name}"{_charts(numbers.get(plate.name))}>{_HINT}'
-            f'<div class="scroll"><img src="data:image/svg+xml;base64,{data}" '
-            f'alt="{escape(plate.heading)}"></div>\n'
-            f"<figcaption><b>Figure {number}. {escape(plate.heading)}.</b> {_caption(plate)}"
-            "</figcaption></figure>"
-        )
+    drawn = [each for each in figures if isinstance(each, ReportFigure)]
+    for number, each in enumerate(drawn, start=1):
+        charts = f' data-charts="{numbers[each.name]}"' if each.name in numbers else ""
+        heading = escape(each.heading)
+        caption = f"<b>Figure {number}. {heading}.</b> {_caption(each)}"
+        parts.append(figure(each.name, each.svg, each.heading, caption, charts))
     return parts
 
 
-def _caption(plate: Plate) -> str:
-    if not plate.of_picture:
-        return escape(plate.caption)
-    before, aside, after = plate.caption.partition(plate.of_picture)
+def _caption(each: ReportFigure) -> str:
+    if not each.of_picture:
+        return escape(each.caption)
+    before, aside, after = each.caption.partition(each.of_picture)
     return f'{escape(before)}<span class="still">{escape(aside)}</span>{escape(after)}'
 
 
-def _charts(numbers: str | None) -> str:
-    return "" if numbers is None else f' data-charts="{numbers}"'
-
-
 def _events(events: Sequence[FlightEvent]) -> list[str]:
-    """What happened, in the order of time: all of it, or the first rows of very much."""
+    """Return the table of events by time; of very many the first rows."""
     if not events:
         return []
     rows = [
         (f"{each.time:.6g}", each.text, each.event.sentence, each.node.strip("/"))
         for each in sorted(events, key=lambda each: each.time)
     ]
-    more = len(rows) - _MOST_ROWS
-    table = Table(("Time (s)", "What", "In words", "Node"), rows[:_MOST_ROWS], (0,))
+    more = len(rows) - _MAX_EVENT_ROWS
+    head = ("Time (s)", "What", "In words", "Node")
     note = f'<p class="facts">{more} more are in the bag.</p>' if more > 0 else ""
-    shown = _table("events", table) + note
-    if len(rows) > _MOST_OPEN:
+    shown = table("events", head, rows[:_MAX_EVENT_ROWS], (0,)) + note
+    if len(rows) > _MAX_UNFOLDED_ROWS:
         shown = f"<details><summary>{len(rows)} events</summary>{shown}</details>"
     return ["<h2>What happened</h2>", shown]
 
@@ -238,5 +208,115 @@ def _parameters(flight: Flight) -> list[str]:
 def _footer(flight: Flight) -> str:
     version = flight.metadata.get("spacerobot", {}).get("version", "")
     by = f", recorded by spacerobot_ros {version}" if version else ""
-    text = f"Made from the bag {flight.file_name} alone: {flight.message_count} messages{by}."
-    return f"<footer><p>{escape(text)}</p></footer>"
+    return f"Made from the bag {flight.file_name} alone: {flight.message_count} messages{by}."
+
+
+# -- charts -------------------------------------------------------------------------------------
+
+
+def charts_of(flight: Flight, figures: Figures) -> PagePart:
+    """Return the charts of all figures over time.
+
+    The element of a figure names its charts by their numbers, in ``data-charts``
+    (:func:`chart_numbers`).
+    """
+    groups = [group for each in figures if isinstance(each, ReportFigure) for group in each.groups]
+    if not groups:
+        return PagePart()
+    charts = {
+        "end": flight.end,
+        "charts": [_chart(group) for group in groups],
+        "events": _chart_events(flight),
+    }
+    return PagePart(
+        data={"charts": charts},
+        programs=(package_file("vendor/uPlot.iife.min.js"), package_file("charts.js")),
+        style=package_file("vendor/uPlot.min.css"),
+        notices=(("uPlot", package_file("vendor/uPlot.LICENSE.txt")),),
+    )
+
+
+def _chart_events(flight: Flight) -> list[dict[str, Any]]:
+    """Return the events of a flight; the last of several of one kind and time counts them."""
+    found = []
+    together: dict[tuple[float, EventKind], list[str]] = {}
+    for each in sorted(flight.events, key=lambda each: each.time)[:_MAX_CHART_EVENTS]:
+        sentences = together.setdefault((each.time, each.event.kind), [])
+        text = f"{each.text} (+{len(sentences)})" if sentences else each.text
+        sentences.append(each.event.sentence)
+        shown = {"time": each.time, "sentence": " ".join(sentences), "text": text}
+        found.append(shown | mark_of(each.event.kind))
+    return found
+
+
+def chart_numbers(figures: Figures) -> dict[str, str]:
+    """Return the numbers of the charts of each figure, by its name."""
+    found, first = {}, 0
+    for each in figures:
+        if isinstance(each, ReportFigure) and each.groups:
+            found[each.name] = " ".join(str(first + k) for k in range(len(each.groups)))
+            first += len(each.groups)
+    return found
+
+
+def _chart(group: TraceGroup) -> dict[str, Any]:
+    signal = thinned(group.signal)
+    values = signal.values
+    if group.decades:
+        largest = float(np.nanmax(values, initial=0.0))
+        top = np.ceil(np.log10(largest)) if largest > 0 else -15.0
+        # uPlot's own logarithmic axes go wrong with numbers as small as rounding errors.
+        values = np.log10(np.maximum(values, 10.0 ** (top - group.decades)))
+    if group.rows:
+        values = values * 0.8 + np.arange(values.shape[1])[::-1]
+    low, high = _extent(group)
+    return {
+        "label": group.label,
+        "unit": group.unit,
+        "names": list(group.names),
+        "colours": list(group.colours),
+        "time": _packed(signal.time, "<f8"),
+        "values": [_packed(column, "<f4") for column in values.T],
+        "goals": [list(map(float, goal)) for goal in group.goals],
+        "limits": [[k, value] for k, value in group.limits if low < value < high],
+        "window": group.window,
+        "log": group.decades > 0,
+        "rows": group.rows,
+    }
+
+
+def _extent(group: TraceGroup) -> tuple[float, float]:
+    """Return the range of values (lower, upper) in which limits are drawn."""
+    goals = np.array([goal[3] for goal in group.goals])
+    numbers = np.append(group.signal.values, goals)
+    low, high = group.window or (float(np.min(numbers)), float(np.max(numbers)))
+    span = max(high - low, 1e-6)
+    return low - 0.2 * span, high + 0.2 * span
+
+
+def thinned(signal: Signal) -> Signal:
+    """Return fewer samples of a signal for a chart that looks the same.
+
+    Kept are the samples off the lines between others or, where these would be too many, the
+    smallest and the largest of every trace in each slice of time.
+    """
+    if len(signal) <= _MAX_SAMPLES:
+        return signal
+    extent = np.maximum(np.ptp(signal.values, axis=0), 1e-300)
+    kept, off = simplified(
+        Signal(signal.time, signal.values / (_LINE_TOLERANCE * extent)), _MAX_SAMPLES
+    )
+    if off > 1.0:
+        slices = max(1, _MAX_SLICED_SAMPLES // (2 * signal.width + 1))
+        edges = np.unique(np.linspace(0, len(signal), slices + 1).astype(int))
+        parts = [edges[:-1], np.array([len(signal) - 1])]
+        for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            part = signal.values[a:b]
+            parts += [a + part.argmin(axis=0), a + part.argmax(axis=0)]
+        kept = np.unique(np.concatenate(parts))
+    return Signal(signal.time[kept], signal.values[kept])
+
+
+def _packed(values: Any, kind: str) -> str:
+    """Return the bytes of numbers, little-endian, as base64."""
+    return base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()

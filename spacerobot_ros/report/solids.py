@@ -16,7 +16,7 @@ from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.kinematics import tree_kinematics
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.visuals import Visual, visuals_of
-from spacerobot_ros.report.style import colour
+from spacerobot_ros.report.figures import colour
 
 Image = npt.NDArray[np.float32]
 

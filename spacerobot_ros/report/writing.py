@@ -10,38 +10,10 @@ from matplotlib.figure import Figure
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.output_files import write_output
-from spacerobot_ros.report.figures_errors import errors_plate, sensors_plate
-from spacerobot_ros.report.figures_forces import efforts_plate, momentum_plate, thrusters_plate
-from spacerobot_ros.report.figures_motion import (
-    NO_STATES,
-    attitude_group,
-    attitude_plate,
-    pose_plate,
-    position_group,
-    position_plate,
-    rates_plate,
-    shape_groups,
-    shape_plate,
-    twist_plate,
-)
-from spacerobot_ros.report.figures_shape import cycles_plate, loops_plate
-from spacerobot_ros.report.figures_space import (
-    configurations_plate,
-    draw_goal_and_path,
-    draw_robot,
-    path_plate,
-    view_of,
-)
-from spacerobot_ros.report.flight import Flight
-from spacerobot_ros.report.meshcat import player_of
-from spacerobot_ros.report.over_time import draw_whole
-from spacerobot_ros.report.page import page
-from spacerobot_ros.report.plates import Plate
-from spacerobot_ros.report.reading import read_flight
-from spacerobot_ros.report.scene import scene_of
-from spacerobot_ros.report.style import (
+from spacerobot_ros.report.figures import (
     WIDTH,
     PictureFormat,
+    ReportFigure,
     drawing,
     legend_above,
     new_figure,
@@ -49,6 +21,37 @@ from spacerobot_ros.report.style import (
     picture_of,
     room_for,
 )
+from spacerobot_ros.report.figures_over_time import (
+    NO_STATES,
+    attitude_figure,
+    attitude_group,
+    draw_whole,
+    efforts_figure,
+    errors_figure,
+    momentum_figure,
+    pose_figure,
+    position_figure,
+    position_group,
+    rates_figure,
+    sensors_figure,
+    shape_figure,
+    shape_groups,
+    thrusters_figure,
+    twist_figure,
+)
+from spacerobot_ros.report.figures_space import (
+    configurations_figure,
+    cycles_figure,
+    draw_goal_and_path,
+    draw_robot,
+    loops_figure,
+    path_figure,
+    view_of,
+)
+from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.page import page
+from spacerobot_ros.report.reading import read_flight
+from spacerobot_ros.report.scene import player_of, scene_of
 from spacerobot_ros.resources import suggestion
 
 _WIDTHS = (40.0, 400.0)
@@ -60,39 +63,39 @@ _PICTURE_WIDTH = 1000
 _ROBOT_WIDTH = 3.9
 """Of the robot in the picture, inches."""
 
-FIGURES: dict[str, Callable[[Flight], Plate | str | None]] = {
-    "robot": configurations_plate,
-    "pose": pose_plate,
-    "position": position_plate,
-    "attitude": attitude_plate,
-    "cycles": cycles_plate,
-    "joints": shape_plate,
-    "velocities": rates_plate,
-    "loops": loops_plate,
-    "errors": errors_plate,
-    "sensors": sensors_plate,
-    "efforts": efforts_plate,
-    "thrusters": thrusters_plate,
-    "twist": twist_plate,
-    "momentum": momentum_plate,
-    "path": path_plate,
+FIGURES: dict[str, Callable[[Flight], ReportFigure | str | None]] = {
+    "robot": configurations_figure,
+    "pose": pose_figure,
+    "position": position_figure,
+    "attitude": attitude_figure,
+    "cycles": cycles_figure,
+    "joints": shape_figure,
+    "velocities": rates_figure,
+    "loops": loops_figure,
+    "errors": errors_figure,
+    "sensors": sensors_figure,
+    "efforts": efforts_figure,
+    "thrusters": thrusters_figure,
+    "twist": twist_figure,
+    "momentum": momentum_figure,
+    "path": path_figure,
 }
 """What :func:`write_figures` draws, by name."""
 
-_PLATES = (
-    configurations_plate,
-    position_plate,
-    attitude_plate,
-    cycles_plate,
-    shape_plate,
-    rates_plate,
-    loops_plate,
-    errors_plate,
-    sensors_plate,
-    efforts_plate,
-    thrusters_plate,
-    twist_plate,
-    momentum_plate,
+_REPORTED = (
+    configurations_figure,
+    position_figure,
+    attitude_figure,
+    cycles_figure,
+    shape_figure,
+    rates_figure,
+    loops_figure,
+    errors_figure,
+    sensors_figure,
+    efforts_figure,
+    thrusters_figure,
+    twist_figure,
+    momentum_figure,
 )
 
 
@@ -113,8 +116,8 @@ def write_report(
     flight = read_flight(bag, namespace)
     others = [read_flight(other) for other in beside]
     with drawing():
-        plates = [*(plate(flight) for plate in _PLATES), path_plate(flight, others)]
-        text = page(flight, player_of(scene_of(flight)), plates, others)
+        figures = [*(draw(flight) for draw in _REPORTED), path_figure(flight, others)]
+        text = page(flight, player_of(scene_of(flight)), figures, others)
     write_output(html, text)
 
 
@@ -179,8 +182,10 @@ def write_figures(
     with drawing(width / 25.4, "paper", style):
         for name in only or [name for name in FIGURES if name not in ("position", "attitude")]:
             try:
-                plate = FIGURES[name](flight)
-                picture = picture_of(plate.figure, format) if isinstance(plate, Plate) else b""
+                figure = FIGURES[name](flight)
+                picture = (
+                    picture_of(figure.figure, format) if isinstance(figure, ReportFigure) else b""
+                )
             except (ValueError, ArithmeticError, RuntimeError, TypeError) as error:
                 if style is None:
                     raise
@@ -188,11 +193,11 @@ def write_figures(
                 raise SpaceRobotError(
                     f"With the style file {style} nothing can be drawn: {error}."
                 ) from error
-            if isinstance(plate, Plate):
+            if isinstance(figure, ReportFigure):
                 made[name] = path = folder / f"{name}.{format.value}"
                 write_output(path, picture)
             else:
-                made[name] = plate or "The bag holds nothing for it."
+                made[name] = figure or "The bag holds nothing for it."
     return made
 
 

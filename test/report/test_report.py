@@ -34,10 +34,9 @@ from support.html_page import Page, leave_blank
 from spacerobot_ros.bag import RecordingError
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.report import figures_space, write_picture, write_report
-from spacerobot_ros.report.figures_motion import shape_plate
-from spacerobot_ros.report.plates import Plate
+from spacerobot_ros.report.figures import ReportFigure, drawing
+from spacerobot_ros.report.figures_over_time import shape_figure
 from spacerobot_ros.report.reading import read_flight
-from spacerobot_ros.report.style import drawing
 
 FIGURES = [
     "configurations",
@@ -200,10 +199,10 @@ def test_the_same_bag_makes_the_same_report(folder: Path, flown: Page) -> None:
 def test_dense_traces_become_bands_and_say_so(tmp_path: Path) -> None:
     bag = tell(tmp_path / "flight.mcap", Story(cyclic_shapes(cycles=70)))
     with drawing():
-        plate = shape_plate(read_flight(bag))
-    assert isinstance(plate, Plate)
-    assert "the smallest and the largest value in each slice of time" in plate.caption
-    assert len(plate.svg) < 250_000
+        figure = shape_figure(read_flight(bag))
+    assert isinstance(figure, ReportFigure)
+    assert "the smallest and the largest value in each slice of time" in figure.caption
+    assert len(figure.svg) < 250_000
 
 
 @pytest.mark.usefixtures("blank")
@@ -387,5 +386,5 @@ def test_leaves_the_style_of_others_alone(folder: Path, flown: Page) -> None:
     before = dict(mpl.rcParams)
     assert flown.figures
     with drawing():
-        assert isinstance(shape_plate(read_flight(folder / "flight.mcap")), Plate)
+        assert isinstance(shape_figure(read_flight(folder / "flight.mcap")), ReportFigure)
     assert dict(mpl.rcParams) == before

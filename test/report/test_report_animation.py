@@ -17,11 +17,10 @@ from support.html_page import leave_blank
 from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
 from spacerobot_ros.model.visuals import solid_mesh
-from spacerobot_ros.report import meshcat, write_report
+from spacerobot_ros.report import scene, write_report
 from spacerobot_ros.report.flight import Flight
-from spacerobot_ros.report.meshcat import Command, Scene
 from spacerobot_ros.report.reading import read_flight
-from spacerobot_ros.report.scene import key_frames, scene_of
+from spacerobot_ros.report.scene import Command, Scene, key_frames, scene_of
 from spacerobot_ros.report.signals import Cycles, Signal
 
 N = 6
@@ -180,7 +179,7 @@ def test_meshes_that_a_bag_carries_are_drawn(tmp_path: Path) -> None:
 def test_without_the_viewer_a_sentence_says_so(
     bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(meshcat, "viewer_script", lambda: None)
+    monkeypatch.setattr(scene, "viewer_script", lambda: None)
     leave_blank(monkeypatch)
     write_report(bag, tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")

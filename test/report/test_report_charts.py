@@ -12,10 +12,10 @@ from support.chromium import Browser, browser, chromium
 from support.flight_bags import GOAL, TICK, Story, goal_value, tell
 from support.html_page import leave_blank
 
-from spacerobot_ros.report import meshcat, write_report
-from spacerobot_ros.report.charts import charts_of, thinned
-from spacerobot_ros.report.figures_motion import shape_plate
+from spacerobot_ros.report import scene, write_report
+from spacerobot_ros.report.figures_over_time import shape_figure
 from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.page import charts_of, thinned
 from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.report.signals import Signal
 
@@ -99,8 +99,8 @@ def test_events_of_one_kind_at_once_are_counted(tmp_path: Path) -> None:
     events += [(1.0, {"event": "stuck_joint", "time": "1", "joints": "j"})]
     story = Story(np.zeros((60, 3)), events=sorted(events, key=lambda event: event[0]))
     flight = read_flight(tell(tmp_path / "faults.mcap", story))
-    plate = shape_plate(flight)
-    data = charts_of(flight, [plate]).data["charts"]["events"]
+    figure = shape_figure(flight)
+    data = charts_of(flight, [figure]).data["charts"]["events"]
     assert [event["text"] for event in data] == [
         "fault on: joint_slow j 0.5 at 1",
         "fault on: actuator_bias j 0.01 at 1 (+1)",
@@ -231,7 +231,7 @@ def test_licences_of_the_programs_are_with_them(window: Browser) -> None:
 
 def test_every_licence_is_there_once_with_its_words() -> None:
     """And not its name alone, with who has the copyright."""
-    found = meshcat._notices()
+    found = scene._notices()
     assert len({name for name, _ in found}) == len(found) >= 9
     for name, licence in found:
         assert len(licence) > 600, name

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from support.flight_bags import GOAL, TICK, Story, goal_value, still, tell
 
 from spacerobot_ros.events import EventKind
-from spacerobot_ros.report import figures_forces, figures_motion
+from spacerobot_ros.report import figures_over_time
 from spacerobot_ros.report.events import _MARKS
 from spacerobot_ros.report.flight import Flight
 from spacerobot_ros.report.reading import read_flight
@@ -70,19 +70,19 @@ def test_events_have_the_time_that_their_node_gave(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "plate",
+    "draw",
     [
-        figures_motion.position_plate,
-        figures_motion.attitude_plate,
-        figures_motion.shape_plate,
-        figures_motion.rates_plate,
-        figures_forces.momentum_plate,
+        figures_over_time.position_figure,
+        figures_over_time.attitude_figure,
+        figures_over_time.shape_figure,
+        figures_over_time.rates_figure,
+        figures_over_time.momentum_figure,
     ],
 )
 def test_a_lane_below_every_time_axis_has_every_event(
-    tmp_path: Path, plate: Callable[[Flight], Any]
+    tmp_path: Path, draw: Callable[[Flight], Any]
 ) -> None:
-    made = plate(read_flight(story(tmp_path)))
+    made = draw(read_flight(story(tmp_path)))
     assert "Below the time axis" in made.caption
     figure = made.figure
     timed = [axes for axes in figure.axes if axes.get_xlabel() == "time (s)"]
@@ -100,7 +100,7 @@ def test_a_lane_below_every_time_axis_has_every_event(
 
 @pytest.mark.parametrize("events", [[], EVENTS[7:]])
 def test_a_bag_without_events_has_no_lane(tmp_path: Path, events: list[Any]) -> None:
-    made = figures_motion.position_plate(read_flight(story(tmp_path, events)))
+    made = figures_over_time.position_figure(read_flight(story(tmp_path, events)))
     assert not isinstance(made, str)
     assert "Below the time axis" not in made.caption
     assert not lanes(made.figure)

@@ -23,18 +23,19 @@ from support.made_bags import array, joint_states, made_bag, odometry, pose, sta
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
-from spacerobot_ros.report.figures_errors import pose_errors, sensors_plate
-from spacerobot_ros.report.figures_forces import thrusters_plate
-from spacerobot_ros.report.figures_motion import (
+from spacerobot_ros.report.figures import ReportFigure
+from spacerobot_ros.report.figures_over_time import (
     attitude_group,
+    pose_errors,
+    position_figure,
     position_group,
-    position_plate,
+    sensors_figure,
     shape_groups,
+    thrusters_figure,
 )
 from spacerobot_ros.report.flight import Flight, joint_unit
-from spacerobot_ros.report.live import Live
 from spacerobot_ros.report.page import page
-from spacerobot_ros.report.plates import Plate
+from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.report.tables import (
     headline,
@@ -416,9 +417,9 @@ def test_where_sensors_err_the_numbers_are_true_and_the_measured_ones_beside_the
     assert top["Position error"] == ("0.403 m", "measured: 0.5 m")
     assert top["Attitude error"][1].endswith("; measured: 0.3 rad")
     assert rows_of(found)["Errors as measured"] == "0.5 m, 0.3 rad"
-    plate = sensors_plate(found)
-    assert plate is not None
-    position, attitude, turn = plate.groups
+    figure = sensors_figure(found)
+    assert figure is not None
+    position, attitude, turn = figure.groups
     np.testing.assert_allclose(position.signal.values, [[-0.25, 0, 0]] * 3, atol=1e-15)
     np.testing.assert_allclose(position.signal.time, [0.5, 1.0, 1.5])
     np.testing.assert_allclose(attitude.signal.values[0], [0, 0, -0.2], atol=1e-12)
@@ -426,7 +427,7 @@ def test_where_sensors_err_the_numbers_are_true_and_the_measured_ones_beside_the
     np.testing.assert_allclose(turn.signal.values, [[-0.1]] * 3)
     # Without such sensors all is as before.
     plain = flight(tmp_path, name="plain.mcap")
-    assert sensors_plate(plain) is None
+    assert sensors_figure(plain) is None
     assert "Errors as measured" not in rows_of(plain)
 
 
@@ -498,7 +499,9 @@ def test_what_the_page_says_of_a_flight(tmp_path: Path) -> None:
         "other": {"hidden": "nobody"},
     }
     found = flight(tmp_path, metadata=metadata)
-    text = page(found, Live("<p>player</p>"), [Plate("a", "Heading", "Caption.", Figure())])
+    text = page(
+        found, PagePart("<p>player</p>"), [ReportFigure("a", "Heading", "Caption.", Figure())]
+    )
     content = Reader(text)
     for words in (
         "a_scenario",
@@ -518,7 +521,7 @@ def test_what_the_page_says_of_a_flight(tmp_path: Path) -> None:
     assert "nobody" not in content.text
     assert "<title>a_scenario, lie_bracket, tester</title>" in text
     cut = flight(tmp_path, FLOWN[:2], name="cut.mcap")
-    assert "The recording ends before that is decided." in page(cut, Live(""), [])
+    assert "The recording ends before that is decided." in page(cut, PagePart(""), [])
 
 
 def test_whatever_a_bag_holds_is_text_on_the_page(tmp_path: Path) -> None:
@@ -547,8 +550,8 @@ def test_whatever_a_bag_holds_is_text_on_the_page(tmp_path: Path) -> None:
     found = flight(
         tmp_path, statuses, metadata=metadata, urdf=urdf, names=[odd(2), "turn"], name="<i>13&.mcap"
     )
-    plates: list[Plate | str] = [Plate("a", odd(14), odd(15), Figure()), odd(16)]
-    content = Reader(page(found, Live(""), plates, [found]))
+    figures: list[ReportFigure | str] = [ReportFigure("a", odd(14), odd(15), Figure()), odd(16)]
+    content = Reader(page(found, PagePart(""), figures, [found]))
     assert "i" not in content.tags
     read = content.text + " ".join(content.values)
     for n in (*range(1, 13), 14, 15, 16):
@@ -578,10 +581,10 @@ def test_propellant_is_what_the_plant_counted() -> None:
     # All thrusters of this robot push with 10 N: the impulse is that times how long they were on.
     on = bag["thrusters"].field("position")
     assert found.impulse.values[-1, 0] == pytest.approx(10.0 * float((on[-1] - on[0]).sum()))
-    plate = thrusters_plate(found)
-    assert plate is not None
-    assert [len(group.names) for group in plate.groups] == [6, 1, 1]
-    assert "18 of 24 thrusters were never on" in plate.caption
+    figure = thrusters_figure(found)
+    assert figure is not None
+    assert [len(group.names) for group in figure.groups] == [6, 1, 1]
+    assert "18 of 24 thrusters were never on" in figure.caption
 
 
 def test_a_flight_that_was_not_measured_at_its_end_is_drawn(tmp_path: Path) -> None:
@@ -589,6 +592,6 @@ def test_a_flight_that_was_not_measured_at_its_end_is_drawn(tmp_path: Path) -> N
     assert whole.cycles is not None
     early = whole.position.between(0.0, 0.5 * whole.end)
     cut = replace(whole, position=early, quaternion=whole.quaternion[: len(early)])
-    plate = position_plate(cut)
-    assert isinstance(plate, Plate)
-    assert plate.groups[0].signal.time[-1] < whole.cycles.last(3)[0]
+    figure = position_figure(cut)
+    assert isinstance(figure, ReportFigure)
+    assert figure.groups[0].signal.time[-1] < whole.cycles.last(3)[0]

@@ -1,4 +1,4 @@
-"""How the figures of a report look: one palette, one type of panel, output as SVG or PNG."""
+"""The figures of reports: style, panels, traces, and files (SVG, PDF, PNG)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -481,3 +483,58 @@ def scaled(unit: str, largest: float) -> tuple[float, str]:
     if unit not in ("m", "rad") or largest == 0.0 or largest >= 0.05:
         return 1.0, unit
     return (1e3, f"m{unit}") if largest >= 5e-5 else (1e6, f"µ{unit}")
+
+
+@dataclass(frozen=True)
+class TraceGroup:
+    """Traces that share a panel, called by ``names``, ``label`` and ``unit``.
+
+    Attributes
+    ----------
+    signal, names, label, unit, colours
+        The traces.
+    goals
+        (start, end, trace, value) of each.
+    limits
+        (trace, value) of each.
+    window
+        Lower and upper end of the axis where some peaks are far beyond what can be read beside
+        them; None: all is shown.
+    decades
+        So many powers of ten below the largest value are shown, on a logarithmic axis; 0: a linear
+        one.
+    rows
+        Whether each trace has a row of its own, one high: how much of the time something is on.
+    """
+
+    signal: Signal
+    names: Sequence[str]
+    label: str
+    unit: str
+    colours: Sequence[str]
+    goals: Sequence[tuple[float, float, int, float]] = ()
+    limits: Sequence[tuple[int, float]] = ()
+    window: tuple[float, float] | None = None
+    decades: int = 0
+    rows: bool = False
+
+
+@dataclass(frozen=True)
+class ReportFigure:
+    """A figure: a short name, its heading, what is to be seen, and the picture.
+
+    ``groups`` are its panels where they are over the time of the flight, each over all of it;
+    ``of_picture`` is the part of the caption that is about the picture and no chart of them.
+    """
+
+    name: str
+    heading: str
+    caption: str
+    figure: Figure
+    groups: Sequence[TraceGroup] = ()
+    of_picture: str = ""
+
+    @cached_property
+    def svg(self) -> bytes:
+        """The picture as SVG."""
+        return picture_of(self.figure, PictureFormat.SVG)

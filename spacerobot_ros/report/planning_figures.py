@@ -1,4 +1,8 @@
-"""Maps of the curvature over the shape space: paper 3, figures 2 and 3; paper 2, figures 6 to 8."""
+"""Pictures of the commands ``analyze`` and ``plan``: curvature maps of a robot, and one plan.
+
+Curvature maps over the shape space are those of paper 3, figures 2 and 3, and paper 2, figures 6
+to 8.
+"""
 
 from __future__ import annotations
 
@@ -13,26 +17,29 @@ from matplotlib.figure import Figure
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.model.rotations import rotvec_from_quaternion, rotvecs_from_quaternions
 from spacerobot_ros.planning.analysis import Analysis
-from spacerobot_ros.planning.core.controllability import (
-    curvature_matrices,
-    curvatures,
-    shape_box,
-)
+from spacerobot_ros.planning.core.controllability import curvature_matrices, curvatures, shape_box
 from spacerobot_ros.planning.methods.geometric_phase import PhasePlane, PlanarPhase, curvature_peaks
 from spacerobot_ros.planning.methods.nominal_shape import PLANES
-from spacerobot_ros.report.style import (
+from spacerobot_ros.report.figures import (
     FAINT,
     INK,
     MUTED,
     PALETTE,
     WIDTH,
     PictureFormat,
+    colour,
     drawing,
     new_figure,
     panel,
     picture_of,
+    room_for,
+    set_range,
+    set_time,
+    sheet,
 )
+from spacerobot_ros.simulation.trials import PlanEvaluation, Problem
 
 _FINE, _COARSE = 61, 37
 """Points a side of a map, of robots with up to three joints and with more."""
@@ -52,8 +59,8 @@ _BAR = WIDTH - 0.86
 _AXES = ("x", "y", "z")
 
 
-def draw(found: Analysis, format: PictureFormat = PictureFormat.PNG) -> bytes | None:
-    """Return the picture that suits the robot; None where no loop turns its base."""
+def draw_analysis(found: Analysis, format: PictureFormat = PictureFormat.PNG) -> bytes | None:
+    """Return the curvature maps of a robot as a picture; None where no loop turns its base."""
     with drawing():
         if found.planar.controllable:
             figure = _planar(found)
@@ -235,3 +242,66 @@ def _symbol(pair: Sequence[int], index: int) -> str:
 def _unit(robot: SpaceRobot, index: int) -> str:
     sliding = robot.description.movable_joints[index].kind is JointKind.PRISMATIC
     return "m" if sliding else "rad"
+
+
+# -- a plan -------------------------------------------------------------------------------------
+
+
+def draw_plan(
+    problem: Problem, trial: PlanEvaluation, format: PictureFormat = PictureFormat.PNG
+) -> bytes:
+    """Return the picture of a plan: joints, their velocities, base path, and goal."""
+    with drawing():
+        return picture_of(_plan(problem, trial), format)
+
+
+def _plan(problem: Problem, trial: PlanEvaluation) -> Figure:
+    robot, goal = problem.robot, problem.goal
+    positions = trial.positions
+    ticks = problem.control_period * np.arange(len(positions), dtype=np.float64)
+    rates = np.diff(positions, axis=0) / problem.control_period
+    path = trial.path
+    turned = rotvecs_from_quaternions(path.quaternion)
+    names = robot.joint_names
+    figure, rows = sheet([[1], [1], [1, 1]], [1.9, 1.9, 1.9], right=room_for(names) + 0.35)
+    joints, speeds, (place, attitude) = rows[0][0], rows[1][0], rows[2]
+    kinds = {joint.kind is JointKind.PRISMATIC for joint in robot.description.movable_joints}
+    units = [unit for unit, prismatic in (("m", True), ("rad", False)) if prismatic in kinds]
+    title = f"{trial.method}, {trial.duration:.6g} s: joints ({', '.join(units)})"
+    _panel(joints, title, ticks, positions, names)
+    # Held over a tick: steps.
+    held = np.repeat(rates, 2, axis=0)
+    title = f"held joint velocities ({', '.join(f'{unit}/s' for unit in units)})"
+    _panel(speeds, title, np.repeat(ticks, 2)[1:-1], held, names)
+    for axes, title, values, wanted in (
+        (place, "base position (m) and goal", path.position, goal.position),
+        (
+            attitude,
+            "base attitude, rotation vector (rad), and goal",
+            turned,
+            rotvec_from_quaternion(goal.quaternion),
+        ),
+    ):
+        _panel(axes, title, path.time, values, _AXES, wanted)
+        axes.set_xlabel("time (s)")
+    return figure
+
+
+def _panel(
+    axes: Axes,
+    title: str,
+    time: Array,
+    values: Array,
+    names: tuple[str, ...],
+    wanted: Array | None = None,
+) -> None:
+    axes.set_title(title)
+    set_range(axes, values, () if wanted is None else wanted.tolist())
+    end = float(time[-1]) if len(time) else 0.0
+    set_time(axes, 0.0, end)
+    for index, name in enumerate(names):
+        if wanted is not None:
+            axes.axhline(wanted[index], color=colour(index), linewidth=0.8, linestyle=":")
+        axes.plot(time, values[:, index], color=colour(index), label=name)
+    axes.axhline(0.0, color=FAINT, linewidth=0.6, zorder=0.5)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))

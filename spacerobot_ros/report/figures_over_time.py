@@ -1,0 +1,635 @@
+"""Figures over the time of a flight: motion, efforts, thrusters, momentum, errors.
+
+Traces of one unit share a panel; events stand below the time axes; gaits of equal cycles get
+close-ups. A function named after a figure returns it, or one sentence on why the bag has no such
+figure, or None where the flight is of another kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from spacerobot_ros.model.description import Joint
+from spacerobot_ros.model.rotations import (
+    quaternion_inverse,
+    quaternion_multiply,
+    rotvecs_from_quaternions,
+)
+from spacerobot_ros.report.events import LANE, draw_events
+from spacerobot_ros.report.figures import (
+    COLUMNS,
+    FAINT,
+    INK,
+    MUTED,
+    PALETTE,
+    SLICES,
+    ReportFigure,
+    TraceGroup,
+    colour,
+    draw_traces,
+    end_labels,
+    key,
+    legend_above,
+    narrow,
+    room_for,
+    scaled,
+    set_range,
+    set_time,
+    sheet,
+    short,
+    upper_edge,
+)
+from spacerobot_ros.report.flight import Flight, Target, joint_unit
+from spacerobot_ros.report.signals import Cycles, Indices, Signal, envelope
+
+SHOWN_CYCLES = 3
+"""Cycles in a close-up."""
+
+DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
+
+_ROW = 0.8
+"""Height of a trace that is always on, in its row."""
+
+BAND = (
+    "Where a trace has more samples than the picture has columns, the band spans the smallest and "
+    "the largest value in each slice of time."
+)
+
+EVENTS = (
+    "Below the time axis, what happened: goals and plans above, the robot and its faults below."
+)
+
+
+def draw_whole(axes: Axes, flight: Flight, group: TraceGroup, share: float = 1.0) -> bool:
+    """Draw a group over the whole flight; return whether traces were summed up as bands."""
+    if group.rows:
+        return _draw_rows(axes, flight, group, share)
+    colours = group.colours
+    values = np.concatenate([group.signal.values.ravel(), [g[3] for g in group.goals]])
+    if group.window is not None:
+        text = f"peaks of {np.abs(values).max():.3g} {group.unit} are beyond the axis"
+        axes.set_title(text, loc="right" if group.limits else "left", color=MUTED)
+        values = np.array(group.window)
+    set_range(axes, values, [bound for _, bound in group.limits])
+    low, high = axes.get_ylim()
+    keys = []
+    shown = [(k, bound) for k, bound in group.limits if low < bound < high]
+    for bound in {bound for _, bound in shown}:
+        owners = [k for k, other in shown if other == bound]
+        tint = MUTED if len(owners) == len(group.names) else colours[owners[0]]
+        axes.axhline(bound, color=tint, lw=1.0, ls=(0, DOTS), zorder=1.8)
+    if shown:
+        keys.append(key(MUTED, "limit (URDF)", DOTS))
+    dense = draw_traces(axes, group.signal, colours, share)
+    for start, end, index, value in group.goals:
+        axes.hlines(value, start, end, color=colours[index], ls=(0, DASHES), lw=1.2, zorder=3)
+    if group.goals:
+        keys.append(key(MUTED, "goal", DASHES))
+    later = [status.time for status in flight.executing[1:]]
+    for time in later:
+        axes.axvline(time, color=FAINT, lw=1.0, zorder=1.5)
+    if later:
+        keys.append(key(FAINT, "new schedule"))
+    legend_above(axes, keys)
+    set_time(axes, 0.0, flight.end)
+    axes.set_ylabel(f"{group.label} ({group.unit})")
+    _name_traces(axes, group.signal, group)
+    return dense
+
+
+def time_figure(
+    flight: Flight, name: str, heading: str, what: str, groups: list[TraceGroup]
+) -> ReportFigure:
+    """Return groups over time, one panel each, with close-ups where there are cycles.
+
+    ``what`` is the first words of the caption.
+    """
+    cycles = flight.cycles
+    rows, heights = [[1.0]], [2.3]
+    if any(group.rows for group in groups):
+        cycles = None
+        heights = [0.4 + 0.14 * len(group.names) if group.rows else 1.6 for group in groups]
+    elif cycles is not None and narrow():
+        rows, heights = [[1.0]] * 3, [2.0, 1.35, 1.35]
+    elif cycles is not None:
+        rows, heights = [[1.0], [1.0, 1.0]], [2.0, 1.35]
+    if len(heights) != len(rows) * len(groups):
+        heights = heights * len(groups)
+    right = room_for([name for group in groups for name in group.names])
+    lane = LANE if flight.events else 0.0
+    left = max([0.72, *(room_for(group.names) + 0.1 for group in groups if group.rows)])
+    figure, panels = sheet(rows * len(groups), heights, left=left, right=right, lane=lane)
+    share = min(1.0, 4 / len(groups))
+    dense = []
+    for number, group in enumerate(groups):
+        whole, *below = panels[number * len(rows) : (number + 1) * len(rows)]
+        dense.append(draw_whole(whole[0], flight, group, share))
+        if cycles is not None:
+            whole[0].set_title("whole flight")
+            first, last = (axes for row in below for axes in row)
+            dense.append(_first_part(first, group, cycles))
+            _last_cycles(last, group, cycles)
+    if flight.events:
+        for axes in (each for row in panels for each in row):
+            draw_events(axes, flight.events)
+    caption = f"{what}"
+    if any(group.goals for group in groups):
+        caption += "; dashed, the goal"
+    if any(group.limits for group in groups):
+        caption += "; dotted, the limits of the URDF, where they are in range"
+    caption += "."
+    aside = ""
+    if cycles is not None:
+        aside += (
+            f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
+            f"what comes before them, and {_close_up(cycles)}."
+        )
+    aside += f" {BAND}" if any(dense) else ""
+    caption += aside + (f" {EVENTS}" if flight.events else "")
+    return ReportFigure(name, heading, caption, figure, groups, aside)
+
+
+def _draw_rows(axes: Axes, flight: Flight, group: TraceGroup, share: float) -> bool:
+    """Draw each trace as a band in a row of its own, the first on top."""
+    columns = max(int(COLUMNS * share), 20)
+    count, signal = len(group.names), group.signal
+    dense = len(signal) > 2 * columns
+    for index, tint in enumerate(group.colours):
+        time, high = signal.time, signal.values[:, index]
+        if dense:
+            time, _, high = envelope(signal, index, columns)
+        foot = count - 1 - index
+        # From the sample before, which the value reaches back to.
+        on = high > 0
+        on[:-1] |= on[1:]
+        axes.fill_between(time, foot, foot + _ROW * high, on, step="pre", color=tint, linewidth=0.3)
+    axes.set_ylim(-0.2, count)
+    axes.set_yticks([count - 1 - k + _ROW / 2 for k in range(count)], group.names)
+    axes.tick_params(axis="y", length=0, labelsize="small")
+    axes.grid(axis="y", visible=False)
+    axes.set_title(f"{group.label} ({group.unit})")
+    set_time(axes, 0.0, flight.end)
+    return dense
+
+
+def _close_up(cycles: Cycles) -> str:
+    return f"the last {SHOWN_CYCLES} of them, as change since the first instant shown"
+
+
+def _first_part(axes: Axes, group: TraceGroup, cycles: Cycles) -> bool:
+    """Draw what comes before the cycles, or the first cycles where nothing does."""
+    end = cycles.start if cycles.start > 0 else SHOWN_CYCLES * cycles.period
+    part = group.signal.between(0.0, end)
+    whole = group.signal.values
+    set_range(axes, part.values, least=0.05 * float(np.ptp(whole)))
+    dense = draw_traces(axes, part, group.colours, 0.5)
+    set_time(axes, 0.0, end)
+    axes.set_title(f"first {end:.4g} s")
+    axes.set_ylabel(group.unit)
+    _name_traces(axes, part, group)
+    return dense
+
+
+def _name_traces(axes: Axes, part: Signal, group: TraceGroup) -> None:
+    if not len(part):
+        return
+    ends = part.values[-1].tolist()
+    end_labels(axes, list(zip(ends, group.names, group.colours, strict=True)))
+
+
+def _last_cycles(axes: Axes, group: TraceGroup, cycles: Cycles) -> None:
+    start, end = cycles.last(SHOWN_CYCLES)
+    part = group.signal.between(start, end).since_first()
+    factor, unit = scaled(group.unit, float(np.abs(part.values).max(initial=0.0)))
+    set_range(axes, factor * part.values)
+    draw_traces(axes, part, group.colours, factor=factor)
+    set_time(axes, start, end)
+    axes.set_title(f"last {SHOWN_CYCLES} cycles, change")
+    axes.set_ylabel(unit)
+
+
+JOINTS_A_PANEL = 6
+
+NO_STATES = "The bag holds no base poses (odom), so there is no picture of them."
+
+NO_JOINTS = "The bag holds no joint positions (joint_states)."
+
+
+def position_group(flight: Flight) -> TraceGroup:
+    """Return the base position and its goals."""
+    goals = [
+        (t.start, t.end, i, x)
+        for t in flight.targets
+        for i, x in enumerate(t.goal.position)
+        if flight.position_counts
+    ]
+    return TraceGroup(flight.position, ["x", "y", "z"], "base position", "m", PALETTE[:3], goals)
+
+
+def attitude_group(flight: Flight) -> TraceGroup:
+    """Return the base attitude as exponential coordinates, and its goals."""
+    goals = [
+        (t.start, t.end, i, x)
+        for t in flight.targets
+        for i, x in enumerate(flight.goal_rotvec(t.goal))
+    ]
+    return TraceGroup(
+        flight.attitude, ["x", "y", "z"], "rotation vector", "rad", PALETTE[:3], goals
+    )
+
+
+def shape_groups(flight: Flight) -> list[TraceGroup]:
+    """Return the joint positions, those of one unit and at most six joints together."""
+
+    def bounds(joint: Joint) -> list[float]:
+        return [joint.limits.lower, joint.limits.upper]
+
+    units = {"m": "m", "rad": "rad"}
+    return joint_groups(flight, flight.shape, "joint position", units, bounds, most=JOINTS_A_PANEL)
+
+
+def joint_groups(
+    flight: Flight,
+    signal: Signal,
+    label: str,
+    units: dict[str, str],
+    bounds: Callable[[Joint], list[float]],
+    most: int,
+) -> list[TraceGroup]:
+    """Group the columns (N, n) of a signal by unit; ``units`` maps a position's unit to its own."""
+    unknown = " or ".join(units.values())
+    each = [units.get(joint_unit(flight, name), unknown) for name in flight.joint_names]
+    groups = []
+    for unit in dict.fromkeys(each):
+        members = [i for i, other in enumerate(each) if other == unit]
+        for first in range(0, len(members), most):
+            chosen = members[first : first + most]
+            names = [flight.joint_names[i] for i in chosen]
+            limits = [
+                (k, bound)
+                for k, name in enumerate(names)
+                if (joint := flight.joint(name)) is not None
+                for bound in bounds(joint)
+            ]
+            part = Signal(signal.time, signal.values[:, chosen])
+            colours = [colour(i) for i in chosen]
+            groups.append(
+                TraceGroup(part, list(map(short, names)), label, unit, colours, limits=limits)
+            )
+    return groups
+
+
+def axis_groups(signal: Signal, parts: Sequence[tuple[str, str]]) -> list[TraceGroup]:
+    """Return a group of x, y and z for each label and unit, from columns side by side."""
+    return [
+        TraceGroup(
+            Signal(signal.time, signal.values[:, 3 * k : 3 * k + 3]),
+            list("xyz"),
+            label,
+            unit,
+            PALETTE[:3],
+        )
+        for k, (label, unit) in enumerate(parts)
+    ]
+
+
+def position_figure(flight: Flight) -> ReportFigure | str:
+    """Base position against the goal."""
+    if not len(flight.position):
+        return NO_STATES
+    what = "Position of the base link in the world frame"
+    return time_figure(flight, "position", "Base position", what, [position_group(flight)])
+
+
+def pose_figure(flight: Flight) -> ReportFigure | str:
+    """Base position over base attitude, against the goal."""
+    if not len(flight.position):
+        return NO_STATES
+    what = "Position of the base link in the world frame, and its attitude as a rotation vector"
+    groups = [position_group(flight), attitude_group(flight)]
+    return time_figure(flight, "pose", "Base pose", what, groups)
+
+
+def attitude_figure(flight: Flight) -> ReportFigure | str:
+    """Base attitude against the goal."""
+    if not len(flight.attitude):
+        return NO_STATES
+    what = (
+        "Attitude of the base link as exponential coordinates: the rotation vector, of the length "
+        "of the angle turned, about the axis of rotation"
+    )
+    if np.linalg.norm(flight.attitude.values, axis=1).max() > np.pi:
+        what += ", counted on continuously beyond half a turn"
+    return time_figure(flight, "attitude", "Base attitude", what, [attitude_group(flight)])
+
+
+def shape_figure(flight: Flight) -> ReportFigure | str:
+    """Joint positions, with the limits of the URDF that are in range."""
+    if not len(flight.shape) or not flight.joint_names:
+        return _no_joints(flight)
+    return time_figure(flight, "shape", "Shape", "Joint positions", shape_groups(flight))
+
+
+def _no_joints(flight: Flight) -> str:
+    """Return why there is no picture of the joints."""
+    jointless = flight.robot is not None and not flight.robot.joint_names
+    return "The robot has no joints." if jointless else NO_JOINTS
+
+
+def rates_figure(flight: Flight) -> ReportFigure | str:
+    """Joint velocities, one panel a joint."""
+    if not flight.joint_names:
+        return _no_joints(flight)
+    if not len(flight.rates):
+        return "The bag holds no joint velocities."
+    names, cycles = flight.joint_names, flight.cycles
+    height = 1.0 if len(names) <= 4 else 0.75
+    widths = [1.0] if cycles is None else [2.2, 1.0]
+    lane = LANE if flight.events else 0.0
+    bottom = 0.5 + lane
+    figure, panels = sheet([widths] * len(names), [height] * len(names), gap=0.36, bottom=bottom)
+    dense, groups = [], []
+    for i, (row, name) in enumerate(zip(panels, names, strict=True)):
+        signal = Signal(flight.rates.time, flight.rates.values[:, i : i + 1])
+        spans = [(0.0, flight.end)]
+        if cycles is not None:
+            spans.append(cycles.last(SHOWN_CYCLES))
+        joint = flight.joint(name)
+        limit = joint.limits.velocity if joint is not None else np.inf
+        unit = f"{joint_unit(flight, name)}/s"
+        bounds = [(0, limit), (0, -limit)]
+        groups.append(TraceGroup(signal, [name], short(name), unit, [colour(i)], limits=bounds))
+        for axes, (start, end) in zip(row, spans, strict=True):
+            set_range(axes, signal.values, [limit, -limit])
+            low, high = axes.get_ylim()
+            for bound in (limit, -limit):
+                if low < bound < high:
+                    axes.axhline(bound, color=MUTED, lw=1.0, ls=(0, DOTS), zorder=1.8)
+            part = signal.between(start, end)
+            dense.append(draw_traces(axes, part, [colour(i)], min(1.0, 6 / len(names))))
+            last = i == len(names) - 1
+            set_time(axes, start, end, last)
+            if not last:
+                axes.tick_params(labelbottom=False)
+        peak = float(np.abs(signal.values).max())
+        text = f"peak {peak:.4g} {unit}"
+        if np.isfinite(limit) and limit > 0:
+            text += f", {100 * peak / limit:.3g} % of the limit {limit:.4g} {unit}"
+        row[0].set_title(name, color=colour(i))
+        if not narrow():
+            row[0].set_title(text, loc="right", color=INK)
+        row[0].set_ylabel(unit)
+    figure.align_ylabels([row[0] for row in panels])
+    if cycles is not None:
+        panels[0][1].set_title(f"last {SHOWN_CYCLES} cycles")
+    if flight.events:
+        for axes in panels[-1]:
+            draw_events(axes, flight.events)
+    caption = "Velocity of each joint; dotted, its limit in the URDF, where that is in range."
+    aside = ""
+    if cycles is not None:
+        aside += f" Right: the last {SHOWN_CYCLES} of {cycles.count} cycles, to the same scale."
+    aside += f" {BAND}" if any(dense) else ""
+    caption += aside + (f" {EVENTS}" if flight.events else "")
+    return ReportFigure("velocities", "Joint velocities", caption, figure, groups, aside)
+
+
+def twist_figure(flight: Flight) -> ReportFigure | None:
+    """Velocity and angular velocity of the base link.
+
+    None where it rests, and of a gait of many equal cycles: there it shakes.
+    """
+    if flight.cycles is not None or not flight.twist.values.any():
+        return None
+    groups = axis_groups(flight.twist, (("velocity", "m/s"), ("rate", "rad/s")))
+    what = "Velocity of the base link's origin and its angular velocity, in the base link's frame"
+    return time_figure(flight, "twist", "Base velocity", what, groups)
+
+
+_DECADES = 4
+
+_PEAKS = 0.02
+"""Part of the samples that may be beyond the axis: the peaks."""
+
+_FAR = (3.0, 1e4)
+"""Least and largest ratio of the span of all samples to that of all but the peaks, between which
+the axis leaves the peaks out. Below it they can be read together; above it all but the peaks is a
+robot at rest, and the peaks are what happens.
+"""
+
+_SMALLEST = 1e-9
+"""Forces and torques that are rounding errors, N or N m."""
+
+
+def efforts_figure(flight: Flight) -> ReportFigure | None:
+    """Commanded thruster wrench and joint efforts."""
+
+    def bounds(joint: Joint) -> list[float]:
+        limit = joint.limits.effort
+        return [-limit, limit] if np.isfinite(limit) else []
+
+    def readable(groups: list[TraceGroup]) -> list[TraceGroup]:
+        return [replace(group, window=window_of(group.signal)) for group in groups]
+
+    wrench = axis_groups(flight.wrench, (("thruster force", "N"), ("thruster torque", "N m")))
+    wrench = [g for g in wrench if np.abs(g.signal.values).max(initial=0.0) > _SMALLEST]
+    joints: list[TraceGroup] = []
+    if np.abs(flight.efforts.values).max(initial=0.0) > _SMALLEST:
+        units, count = {"m": "N", "rad": "N m"}, len(flight.joint_names)
+        joints = joint_groups(flight, flight.efforts, "joints", units, bounds, most=count)
+    groups = readable(wrench + joints)
+    if not groups:
+        return None
+    what = (
+        "What was commanded: thruster force and torque at the base link's origin, in its frame, "
+        "and the efforts of the joints"
+    )
+    if not wrench:
+        what = "Commanded efforts of the joints; the thrusters gave nothing"
+    if any(group.window is not None for group in groups):
+        what += ". Axes leave out short peaks, so that the rest can be read"
+    return time_figure(flight, "efforts", "Wrench and efforts", what, groups)
+
+
+def window_of(signal: Signal) -> tuple[float, float] | None:
+    """Return lower and upper end of what can be read, where a few peaks are far beyond it."""
+    if not len(signal):
+        return None
+    low, high = (float(np.min(signal.values)), float(np.max(signal.values)))
+    inner = np.quantile(signal.values, (_PEAKS / 2, 1 - _PEAKS / 2), axis=0)
+    inner_low, inner_high = float(inner[0].min()), float(inner[1].max())
+    span = inner_high - inner_low
+    if not _FAR[0] * span < high - low < _FAR[1] * span:
+        return None
+    return max(low, inner_low - 0.3 * span), min(high, inner_high + 0.3 * span)
+
+
+def thrusters_figure(flight: Flight) -> ReportFigure | None:
+    """When each thruster was on, and what that took."""
+    names = flight.thruster_names
+    if not len(flight.duty) or not flight.duty.values.any():
+        return None
+    used = [k for k in range(len(names)) if flight.duty.values[:, k].any()]
+    duty = Signal(flight.duty.time, flight.duty.values[:, used])
+    tints = [colour(k) for k in range(len(used))]
+    label, unit = "thrusters", "part of each tick that they are on"
+    groups = [TraceGroup(duty, [short(names[k]) for k in used], label, unit, tints, rows=True)]
+    impulse, propellant = flight.impulse, flight.propellant
+    groups.append(TraceGroup(impulse, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
+    what = "How much of each tick each thruster was on; below, the impulse that all gave"
+    if propellant is not None:
+        grams = Signal(propellant.time, 1e3 * propellant.values)
+        groups.append(TraceGroup(grams, ["propellant"], "propellant", "g", [PALETTE[1]]))
+        what += " and the propellant that they took, by their specific impulse"
+    if len(used) < len(names):
+        what += f". {len(names) - len(used)} of {len(names)} thrusters were never on"
+    return time_figure(flight, "thrusters", "Thruster firings", what, groups)
+
+
+def momentum_figure(flight: Flight) -> ReportFigure | str:
+    """Change of the total momenta, and the kinetic energy."""
+    if not len(flight.momentum):
+        return "The bag holds no momentum."
+    time, balance = flight.momentum.time, flight.momentum.values
+    changes = np.column_stack(
+        [np.linalg.norm(balance[:, k : k + 3] - balance[0, k : k + 3], axis=1) for k in (0, 3)]
+    )
+    bottom = 0.5 + (LANE if flight.events else 0.0)
+    figure, ((above,), (below,)) = sheet([[1.0], [1.0]], [1.6, 1.1], bottom=bottom)
+    largest = float(changes.max())
+    top = np.ceil(np.log10(largest)) if largest > 0 else -15.0
+    above.set_yscale("log")
+    above.set_ylim(10.0 ** (top - _DECADES), 10.0**top)
+    # What is below the axis, zero above all, stands on its lower edge.
+    shown = np.maximum(changes, 10.0 ** (top - _DECADES))
+    for i in range(2):
+        above.plot(
+            *upper_edge(Signal(time, shown), i),
+            color=colour(i),
+            lw=2.6 - 1.3 * i,
+            marker="o" if len(time) == 1 else "",
+            clip_on=False,
+        )
+    set_time(above, 0.0, flight.end, label=False)
+    if not narrow():
+        above.set_title("change of the total momenta since the start")
+    above.set_ylabel("SI units")
+    above.minorticks_off()
+    above.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
+    names = ("|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)")
+    legend_above(above, [key(colour(i), name) for i, name in enumerate(names)])
+    energy = balance[:, 6:7]
+    set_range(below, np.append(energy, 0.0))
+    dense = draw_traces(below, Signal(time, energy), [colour(2)])
+    below.set_title("kinetic energy")
+    below.set_ylabel("J")
+    set_time(below, 0.0, flight.end)
+    if flight.events:
+        draw_events(below, flight.events)
+    largest_of = ", the largest in each slice of time" if len(time) > 2 * SLICES else ""
+    caption = (
+        "The momentum balance of the whole system. Top: how far the linear momentum p "
+        "and the angular momentum L about the centre of mass are from their values at the start, "
+        f"what thrusters have put in taken off{largest_of}, on a logarithmic axis; less than it "
+        "shows, and zero, lies on its lower edge. Bottom: kinetic energy."
+    )
+    aside = f" {BAND}" if dense else ""
+    caption += aside + (f" {EVENTS}" if flight.events else "")
+    groups = [
+        TraceGroup(
+            Signal(time, changes),
+            ["|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)"],
+            "change of the total momenta",
+            "SI units",
+            PALETTE[:2],
+            decades=_DECADES,
+        ),
+        TraceGroup(Signal(time, energy), ["energy"], "kinetic energy", "J", [colour(2)]),
+    ]
+    return ReportFigure("momentum", "Momentum balance", caption, figure, groups, aside)
+
+
+def power_of_ten(value: float) -> str:
+    """Return a power of ten as it is written, for a logarithmic axis."""
+    exponent = str(round(np.log10(value))).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f"10{exponent}"
+
+
+_SMALLEST_ERROR = 1e-12
+"""Errors of sensors that are rounding errors, m or rad."""
+
+
+def errors_figure(flight: Flight) -> ReportFigure | None:
+    """Goal minus pose of base and end-effector, in the components under control."""
+    if not flight.outputs and not flight.tool_goals:
+        return None
+    groups = []
+    base = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
+    for part, pose, targets in (
+        ("base", base, flight.targets),
+        ("end_effector", flight.tool, flight.tool_targets),
+    ):
+        errors = pose_errors(pose, targets)
+        chosen = flight.controls(part)
+        name = part.replace("_", "-")
+        for unit, what, members in (("m", "position", (0, 1, 2)), ("rad", "attitude", (3, 4, 5))):
+            axes = [i for i in members if i in chosen]
+            if len(errors) and axes:
+                signal = Signal(errors.time, errors.values[:, axes])
+                names = ["xyz"[i % 3] for i in axes]
+                colours = [PALETTE[i % 3] for i in axes]
+                groups.append(TraceGroup(signal, names, f"{name} {what}", unit, colours))
+    if not groups:
+        return None
+    what = (
+        "Goal minus pose, in the world frame, for the components under control; attitude as the "
+        "remaining rotation vector"
+    )
+    return time_figure(flight, "errors", "Output errors", what, groups)
+
+
+def pose_errors(pose: Signal, targets: Sequence[Target]) -> Signal:
+    """Return the goal minus poses (N, 7) while there is one: position, rotation vector (M, 6)."""
+    times, values = [np.empty(0)], [np.empty((0, 6))]
+    for target in targets:
+        part = pose.between(target.start, target.end)
+        if len(part):
+            inverse = quaternion_inverse(part.values[:, 3:])
+            turn = quaternion_multiply(target.goal.quaternion, inverse)
+            left = target.goal.position - part.values[:, :3]
+            times.append(part.time)
+            values.append(np.hstack([left, rotvecs_from_quaternions(turn)]))
+    return Signal(np.concatenate(times), np.concatenate(values))
+
+
+def sensors_figure(flight: Flight) -> ReportFigure | None:
+    """How far measured poses and joints are from what they were; None where sensors do not err."""
+    true = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
+    pose, at = _at_the_same_times(flight.sensed_pose, true)
+    turn = quaternion_multiply(pose.values[:, 3:], quaternion_inverse(true.values[at, 3:]))
+    offset = pose.values[:, :3] - true.values[at, :3]
+    errors = Signal(pose.time, np.hstack([offset, rotvecs_from_quaternions(turn)]))
+    groups = axis_groups(errors, (("base position", "m"), ("base attitude", "rad")))
+    shape, at = _at_the_same_times(flight.sensed_shape, flight.shape)
+    if len(shape):
+        bent = Signal(shape.time, shape.values - flight.shape.values[at])
+        units = {"m": "m", "rad": "rad"}
+        groups += joint_groups(flight, bent, "joints", units, lambda joint: [], JOINTS_A_PANEL)
+    groups = [g for g in groups if np.abs(g.signal.values).max(initial=0.0) > _SMALLEST_ERROR]
+    if not groups:
+        return None
+    what = "Measured minus true, at the stamps of what was measured"
+    return time_figure(flight, "sensors", "Errors of the sensors", what, groups)
+
+
+def _at_the_same_times(measured: Signal, true: Signal) -> tuple[Signal, Indices]:
+    """Return the samples that have a true one of their time, and which that is."""
+    if not len(true):
+        return Signal.none(measured.width), np.zeros(0, int)
+    at = np.clip(np.searchsorted(true.time, measured.time - 1e-9), 0, len(true) - 1)
+    same = np.abs(true.time[at] - measured.time) < 1e-9
+    return Signal(measured.time[same], measured.values[same]), at[same]

@@ -1,0 +1,173 @@
+"""Parts of HTML pages: shell and security policy, tables, figures, and the scripts of a page.
+
+Reports of flights and of campaigns are made of these. A page stands alone: its
+Content-Security-Policy lets it load nothing, and run its own scripts only, by their hashes. Text
+from a bag, which a stranger may have written, therefore never runs.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from html import escape
+from importlib.resources import files
+from typing import Any
+
+_HINT = '<p class="hint">Wider than this screen: scroll sideways →</p>'
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
+
+@dataclass(frozen=True)
+class PagePart:
+    """A part of a page that scripts bring to life.
+
+    Attributes
+    ----------
+    markup
+        HTML of the part.
+    data
+        JSON data by element id, under which the scripts find them.
+    programs
+        JavaScript, in the order of execution.
+    style
+        CSS.
+    notices
+        Name and licence of each third-party script.
+    """
+
+    markup: str = ""
+    data: dict[str, Any] = field(default_factory=dict)
+    programs: tuple[str, ...] = ()
+    style: str = ""
+    notices: tuple[tuple[str, str], ...] = ()
+
+
+def package_file(name: str) -> str:
+    """Return the text of a file of this package, such as ``page.css``."""
+    return files("spacerobot_ros.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def html_page(title: str, body: Sequence[str], footer: str, parts: Sequence[PagePart] = ()) -> str:
+    """Return a whole page.
+
+    Parameters
+    ----------
+    title, footer
+        Plain text.
+    body
+        HTML of the elements; empty texts are left out.
+    parts
+        Their scripts, styles and licences go into the page; their markup stands in ``body``.
+    """
+    policy = "; ".join(filter(None, (_POLICY, _script_policy(parts))))
+    css = "".join(part.style for part in parts) + package_file("page.css")
+    end = f"<footer><p>{escape(footer)}</p></footer>"
+    content = "\n".join(filter(None, (*body, _licences(parts), end)))
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<link rel="icon" href="data:,">\n'
+        f"<title>{escape(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n<main>\n"
+        f"{content}\n</main>\n{_scripts(parts)}\n</body>\n</html>\n"
+    )
+
+
+def _script_policy(parts: Sequence[PagePart]) -> str:
+    """Return the directive that allows the scripts of a page; empty if it has none."""
+    programs = [program for part in parts for program in part.programs]
+    hashes = [hashlib.sha256(program.encode()).digest() for program in programs]
+    allowed = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in hashes)
+    return f"script-src {allowed}" if allowed else ""
+
+
+def _scripts(parts: Sequence[PagePart]) -> str:
+    made = []
+    for part in parts:
+        for identity, content in part.data.items():
+            text = json.dumps(content, separators=(",", ":"))
+            # The name of a link must not end the script element that contains it.
+            text = text.replace("</", "<\\/").replace("<!--", "<\\u0021--")
+            made.append(f'<script type="application/json" id="{identity}">{text}</script>')
+    made += [f"<script>{program}</script>" for part in parts for program in part.programs]
+    return "\n".join(made)
+
+
+def _licences(parts: Sequence[PagePart]) -> str:
+    """Return the licences of third-party scripts, folded up."""
+    notices = [notice for part in parts for notice in part.notices]
+    if not notices:
+        return ""
+    texts = "".join(f"<h3>{escape(n)}</h3><pre>{escape(text.strip())}</pre>" for n, text in notices)
+    return f'<details id="licences"><summary>Licences of the scripts</summary>{texts}</details>'
+
+
+def facts(texts: Sequence[str]) -> str:
+    """Return short facts in one line; empty if there are none."""
+    spans = "".join(f"<span>{escape(fact)}</span>" for fact in texts)
+    return f'<p class="facts">{spans}</p>' if texts else ""
+
+
+def tiles(rows: Sequence[tuple[str, str, str]]) -> str:
+    """Return the main numbers as tiles, from label, value and note of each."""
+    made = []
+    for label, value, note in rows:
+        small = f"<small>{escape(note)}</small>" if note else ""
+        # Names of methods may be broken where they have an underscore.
+        shown = escape(value).replace("_", "_<wbr>")
+        made.append(f"<div><dt>{escape(label)}</dt><dd>{shown}{small}</dd></div>")
+    return f'<dl class="tiles">{"".join(made)}</dl>' if made else ""
+
+
+def table(
+    identity: str,
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    numeric: Sequence[int] = (),
+) -> str:
+    """Return a table; the first cell of a row is its header, ``numeric`` columns align right.
+
+    Without a ``head`` it has rows alone.
+    """
+
+    def row(cells: Sequence[str], tag: str) -> str:
+        made = []
+        for column, cell in enumerate(cells):
+            name, scope = ("th", ' scope="row"') if tag == "td" and column == 0 else (tag, "")
+            kind = ' class="number"' if column in numeric else ""
+            made.append(f"<{name}{scope}{kind}>{escape(cell)}</{name}>")
+        return f"<tr>{''.join(made)}</tr>\n"
+
+    body = "".join(row(cells, "td") for cells in rows)
+    titles = f"<thead>\n{row(head, 'th')}</thead>" if head else ""
+    return (
+        f'{_HINT}<div class="scroll"><table id="{identity}">{titles}'
+        f"<tbody>\n{body}</tbody></table></div>"
+    )
+
+
+def figure(name: str, svg: bytes, text: str, caption: str, attributes: str = "") -> str:
+    """Return a picture with its caption.
+
+    Parameters
+    ----------
+    name
+        Id of the element.
+    svg
+        The picture.
+    text
+        Plain text in place of the picture.
+    caption
+        HTML below it.
+    attributes
+        HTML attributes of the element, each after a space.
+    """
+    data = base64.b64encode(svg).decode()
+    return (
+        f'<figure id="{name}"{attributes}>{_HINT}'
+        f'<div class="scroll"><img src="data:image/svg+xml;base64,{data}" '
+        f'alt="{escape(text)}"></div>\n<figcaption>{caption}</figcaption></figure>'
+    )
