@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 DRAWING = {
     "robot in pictures": ("report/solids.py",),
-    "robot in pages": ("report/scene.py", "report/meshcat.py"),
+    "robot in pages": ("report/scene.py",),
     "robot, shared by both": ("model/visuals.py",),
 }
 """The modules that draw a robot; viewers use the shared one, too."""
