@@ -51,14 +51,14 @@ class _Benchmarks(DefaultGroup):
 
 
 @click.group("bench", cls=_Benchmarks)
-def command() -> None:
+def bench_command() -> None:
     """Measure the speed of the package on this machine.
 
     `spacerobot bench` alone is short for `spacerobot bench ticks`.
     """
 
 
-@command.command("ticks")
+@bench_command.command("ticks")
 @click.argument("ticks", default=20_000, type=click.IntRange(min=100))
 @_against_option(
     "Instead: measure CPU times of flights and plans of this checkout and of CHECKOUT in turns, "
@@ -80,7 +80,7 @@ def ticks(ticks: int, against: Path | None, rounds: int, json_file: Path | None)
         _compare(against, lambda there: there.measure("tick_times", ticks=ticks), rounds, json_file)
 
 
-@command.command("real-time")
+@bench_command.command("real-time")
 @click.argument("seconds", default=60.0, type=click.FloatRange(min=5.0))
 @click.option(
     "--rate",
@@ -116,7 +116,7 @@ def real_time(
         _compare(against, lambda there: there.run([*words, "--json"]), rounds, json_file)
 
 
-@command.command("soak")
+@bench_command.command("soak")
 @click.argument("seconds", default=1800.0, type=click.FloatRange(min=10.0))
 @json_option("Write all samples as JSON, and draw them beside it (.png).")
 def soak(seconds: float, json_file: Path | None) -> None:
@@ -134,7 +134,7 @@ def soak(seconds: float, json_file: Path | None) -> None:
         fail()
 
 
-@command.command("viewer")
+@bench_command.command("viewer")
 @click.argument("seconds", default=60.0, type=click.FloatRange(min=5.0))
 @click.option(
     "--no-priorities",
@@ -153,7 +153,7 @@ def viewer(seconds: float, no_priorities: bool, json_file: Path | None) -> None:
     _write(json_file, viewer_benchmark(seconds, click.echo, priorities=not no_priorities))
 
 
-@command.command("planning")
+@bench_command.command("planning")
 @click.argument("goals", default=20, type=click.IntRange(min=1))
 @click.option(
     "--long-search",
@@ -186,7 +186,7 @@ def planning(
     _write(json_file, planning_benchmark(goals, against, starts, library, click.echo))
 
 
-@command.command("first-plans")
+@bench_command.command("first-plans")
 @_against_option("Plan by CHECKOUT, too.")
 @_json_option
 def first_plans(against: Path | None, json_file: Path | None) -> None:
@@ -200,7 +200,7 @@ def first_plans(against: Path | None, json_file: Path | None) -> None:
     _write(json_file, first_plan_benchmark(against, click.echo))
 
 
-@command.command("campaign")
+@bench_command.command("campaign")
 @_json_option
 def campaign(json_file: Path | None) -> None:
     """Fly in SIMD lanes, by the plant and by MuJoCo.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from spacerobot_ros.cli.errors import end_if_requested, fail
-from spacerobot_ros.cli.options import PATH, DefaultGroup
+from spacerobot_ros.cli.options import PATH, DefaultGroup, bag_option, out_option, report_option
 from spacerobot_ros.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class _Campaigns(DefaultGroup):
 
 
 @click.group("campaign", cls=_Campaigns)
-def command() -> None:
+def campaign_command() -> None:
     """Fly a scenario many times with dispersed parameters.
 
     `spacerobot campaign FILE.yaml` is short for `spacerobot campaign fly FILE.yaml`.
@@ -64,11 +64,11 @@ def _cluster_options(function: Callable[..., Any]) -> Callable[..., Any]:
     return function
 
 
-@command.command("fly")
+@campaign_command.command("fly")
 @click.argument("file", type=PATH, required=False)
 @_cluster_options
-@click.option("--out", type=PATH, help="Folder of the results [out/NAME].")
-@click.option("--report", type=PATH, help="Report to write [OUT/report.html].")
+@out_option("Folder of the results [out/NAME].")
+@report_option("Report to write [OUT/report.html].")
 @click.option(
     "--compare",
     type=PATH,
@@ -106,18 +106,18 @@ def fly(
     end_if_requested()
 
 
-@command.command("report")
+@campaign_command.command("report")
 @click.argument("folder", metavar="DIR", type=PATH)
-@click.option("--report", type=PATH, help="Report to write [DIR/report.html].")
-def report_command(folder: Path, report: Path | None) -> None:
+@report_option("Report to write [DIR/report.html].")
+def report(folder: Path, report: Path | None) -> None:
     """Write the report of the flights in DIR again."""
     _write_report(folder, report)
 
 
-@command.command("rerun")
+@campaign_command.command("rerun")
 @click.argument("folder", metavar="DIR", type=PATH)
 @click.argument("number", metavar="N", type=click.IntRange(min=0))
-@click.option("--bag", type=PATH, help="Bag to write [DIR/flight_N.mcap, or the next free].")
+@bag_option("Bag to write [DIR/flight_N.mcap, or the next free].")
 def rerun(folder: Path, number: int, bag: Path | None) -> None:
     """Fly flight N of DIR alone through ROS, and record a bag.
 

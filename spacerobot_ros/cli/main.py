@@ -11,11 +11,18 @@ from spacerobot_ros.cli import start
 from spacerobot_ros.cli.errors import sentences
 from spacerobot_ros.version import __version__
 
-COMMANDS = (
-    *("analyze", "bench", "campaign", "export", "figures", "goal", "library", "new", "plan"),
-    *("replay", "report", "robots", "run", "salvage", "scenarios", "up", "verify"),
-)
-"""Each is the attribute ``command`` of the module of its name in this folder."""
+_MODULES = {
+    "bags": ("export", "figures", "replay", "report", "salvage", "verify"),
+    "bench": ("bench",),
+    "campaign": ("campaign",),
+    "flights": ("goal", "run", "scenarios", "up"),
+    "plan": ("library", "plan"),
+    "robots": ("analyze", "new", "robots"),
+}
+"""Modules of this folder, and the commands in each: NAME is its attribute ``NAME_command``."""
+
+COMMANDS = {name: module for module, names in _MODULES.items() for name in names}
+"""Modules by the names of their commands."""
 
 
 class CommandGroup(click.Group):
@@ -23,13 +30,14 @@ class CommandGroup(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands."""
-        return list(COMMANDS)
+        return sorted(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return a command by its name, None where there is none."""
         if cmd_name not in COMMANDS:
             return None
-        command: click.Command = import_module(f"spacerobot_ros.cli.{cmd_name}").command
+        module = import_module(f"spacerobot_ros.cli.{COMMANDS[cmd_name]}")
+        command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
 
     def invoke(self, ctx: click.Context) -> Any:

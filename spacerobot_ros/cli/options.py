@@ -38,26 +38,90 @@ class DefaultGroup(click.Group):
         return super().parse_args(ctx, args)
 
 
+def _path_option(*names: str) -> Callable[[str], Any]:
+    return lambda help: click.option(*names, type=PATH, help=help)
+
+
 bag_argument = click.argument("bag", type=PATH)
+bag_option = _path_option("--bag")
+json_option = _path_option("--json", "json_file")
+out_option = _path_option("--out", "-o", "--output")  # --output: up to version 0.2.0.
+report_option = _path_option("--report")
+
 namespace_option = click.option(
     "--namespace", metavar="NAME", help="Robot of a bag that has several [the first]."
 )
+processes_option = click.option(
+    "--processes", is_flag=True, help="Give each node a process of its own."
+)
+settings_option = click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="NODE.PARAMETER=VALUE",
+    help="Set a parameter of a node. May be repeated.",
+)
+view_option = click.option(
+    "--view", is_flag=True, help="Serve a page on which the robot is watched and steered."
+)
+
+
+def format_option(formats: Sequence[str], help: str) -> Any:
+    """Return the option ``--format`` as the argument ``format_name``; the first is the default."""
+    return click.option(
+        "--format",
+        "format_name",
+        type=click.Choice(formats, case_sensitive=False),
+        default=formats[0],
+        show_default=True,
+        help=help,
+    )
+
+
+def topic_option(help: str) -> Any:
+    """Return the option ``--topic`` as the argument ``topics``."""
+    return click.option(
+        "--topic", "topics", multiple=True, metavar="TOPIC", help=f"{help} May be repeated."
+    )
+
+
+def within_option(default: tuple[float, float], largest: str) -> Any:
+    """Return the option ``--within``: bounds of random goals, m and deg."""
+    return click.option(
+        "--within",
+        nargs=2,
+        type=float,
+        default=default,
+        metavar="M DEG",
+        show_default=True,
+        help=f"{largest} distance (m) and angle (deg) of the goals from the start.",
+    )
+
+
+def _attitude_options(*prefixes: str) -> Callable[..., Any]:
+    """Return a decorator: an attitude as the arguments ``rotvec`` and ``rpy_deg``."""
+    rotvec = click.option(
+        *(f"--{prefix}rotvec" for prefix in prefixes),
+        "rotvec",
+        nargs=3,
+        type=float,
+        metavar="RX RY RZ",
+        help="Attitude of the goal as a rotation vector (rad).",
+    )
+    rpy_deg = click.option(
+        *(f"--{prefix}rpy-deg" for prefix in prefixes),
+        "rpy_deg",
+        nargs=3,
+        type=float,
+        metavar="ROLL PITCH YAW",
+        help="Attitude of the goal by turns about the fixed axes x, y, z in this order (deg).",
+    )
+    return lambda command: rotvec(rpy_deg(command))
+
+
+attitude_options = _attitude_options("goal-", "")
 _pose_option = click.option(
     "--goal", nargs=7, type=float, metavar="X Y Z QX QY QZ QW", help="Goal pose (m, quaternion)."
-)
-_rotvec_option = click.option(
-    "--goal-rotvec",
-    nargs=3,
-    type=float,
-    metavar="RX RY RZ",
-    help="Attitude of the goal as a rotation vector (rad).",
-)
-_rpy_option = click.option(
-    "--goal-rpy-deg",
-    nargs=3,
-    type=float,
-    metavar="ROLL PITCH YAW",
-    help="Attitude of the goal by turns about the fixed axes x, y, z in this order (deg).",
 )
 
 
@@ -88,12 +152,10 @@ def goal_options(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command the options of a goal, as its argument ``goal``."""
 
     @wraps(command)
-    def with_goal(
-        *words: Any, goal: Any, goal_rotvec: Any, goal_rpy_deg: Any, **options: Any
-    ) -> None:
-        command(*words, goal=GoalOptions(goal, goal_rotvec, goal_rpy_deg), **options)
+    def with_goal(*words: Any, goal: Any, rotvec: Any, rpy_deg: Any, **options: Any) -> None:
+        command(*words, goal=GoalOptions(goal, rotvec, rpy_deg), **options)
 
-    return cast("Callable[..., None]", _pose_option(_rotvec_option(_rpy_option(with_goal))))
+    return cast("Callable[..., None]", _pose_option(_attitude_options("goal-")(with_goal)))
 
 
 def note_large_angles(rotvec: Sequence[float], other: str) -> None:
@@ -107,17 +169,8 @@ def note_large_angles(rotvec: Sequence[float], other: str) -> None:
         )
 
 
-settings_option = click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="NODE.PARAMETER=VALUE",
-    help="Set a parameter of a node. May be repeated.",
-)
-
-
 class Registered(_Choice):
-    """A choice of the names in registries, which are imported only where the names are needed.
+    """A choice of the names in registries, which are imported when the names are needed.
 
     Parameters
     ----------
@@ -141,14 +194,12 @@ class Registered(_Choice):
 
 
 METHODS = "spacerobot_ros.planning.methods.registry:METHODS"
-view_option = click.option(
-    "--view", is_flag=True, help="Serve a page on which the robot is watched and steered."
-)
+LAWS = "spacerobot_ros.control.laws.registry:LAWS"
 
 
 @contextmanager
 def viewing_if(view: bool, parameters: Mapping[str, Any], namespace: str = "") -> Iterator[None]:
-    """Run the viewer beside a command, if wanted; its address is written to standard error."""
+    """Run the viewer beside a command if ``view``; its address is written to standard error."""
     if not view:
         yield
         return
@@ -158,16 +209,8 @@ def viewing_if(view: bool, parameters: Mapping[str, Any], namespace: str = "") -
         yield
 
 
-LAWS = "spacerobot_ros.control.laws.registry:LAWS"
-
-
-def json_option(help: str) -> Any:
-    """Return the option ``--json``."""
-    return click.option("--json", "json_file", type=PATH, help=help)
-
-
 def picture_option(help: str) -> Any:
-    """Return the option ``--picture``, whose file is of a format that is written."""
+    """Return the option ``--picture``; the suffix of its file must be of a known format."""
 
     def checked(context: click.Context, option: click.Parameter, path: Path | None) -> Path | None:
         if path is not None:
@@ -181,7 +224,7 @@ def picture_option(help: str) -> Any:
 
 
 def beside(bag: Path, ending: str) -> Path:
-    """Return the file or folder beside a bag, or a folder with one, that is called as it is."""
+    """Return a path beside a bag (a file or a folder): its name without suffix, and an ending."""
     # The folder in which the command runs has no name of its own.
     named = bag if bag.name not in ("", "..") else bag.resolve()
     return named.with_name(f"{named.name if bag.is_dir() else named.stem}{ending}")
@@ -193,5 +236,5 @@ def write_json(path: Path, content: Any, indent: int | None = 2) -> None:
 
 
 def numbers(values: Iterable[float], digits: int = 5) -> str:
-    """Return numbers for people."""
+    """Return numbers as text, with ``digits`` decimals."""
     return ", ".join(f"{x:.{digits}f}" for x in values)

@@ -1,4 +1,4 @@
-"""The command ``spacerobot plan``."""
+"""Commands that plan without ROS: plan, library."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from spacerobot_ros.cli.options import (
     Registered,
     goal_options,
     json_option,
+    out_option,
     picture_option,
     settings_option,
+    within_option,
     write_json,
 )
 from spacerobot_ros.cli.progress import display
@@ -27,6 +29,7 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.output_files import write_output
 
 if TYPE_CHECKING:
+    from spacerobot_ros.planning import Goal
     from spacerobot_ros.simulation.trials import PlanEvaluation, Problem, Record
 
 
@@ -56,19 +59,11 @@ _NO_GOAL = GoalOptions(None, None, None)
     metavar="N",
     help="Instead: plan N random goals, and print figures of all.",
 )
-@click.option(
-    "--within",
-    nargs=2,
-    type=float,
-    default=(0.3, 180.0),
-    metavar="M DEG",
-    show_default=True,
-    help="With --random: largest distance (m) and angle (deg) of the goals from the start.",
-)
+@within_option((0.3, 180.0), "With --random: largest")
 @click.option(
     "--beside", type=Registered(METHODS), help="With --random: plan them by this method too."
 )
-def command(
+def plan_command(
     scenario: str,
     goal: GoalOptions,
     method: str,
@@ -197,13 +192,20 @@ def table(found: Mapping[str, PlanEvaluation | SpaceRobotError]) -> Iterator[str
         yield f"{name:<14}{times}{angle:>14}{distance:>14}"
 
 
+def _goals(problem: Problem, count: int, within: tuple[float, float]) -> list[Goal]:
+    """Return random goals; ``within`` are the largest distance, m, and angle, deg."""
+    from spacerobot_ros.simulation.trials import random_goals
+
+    return random_goals(problem, count, within[0], math.radians(within[1]))
+
+
 def _try_random(
     problem: Problem, methods: list[str], count: int, within: tuple[float, float]
 ) -> None:
     """Plan and print random goals; exit code 0: all that were simulated were reached."""
-    from spacerobot_ros.simulation.trials import random_goals, try_goals
+    from spacerobot_ros.simulation.trials import try_goals
 
-    goals = random_goals(problem, count, within[0], math.radians(within[1]))
+    goals = _goals(problem, count, within)
     show = partial(click.echo, err=True) if sys.stderr.isatty() else lambda line: None
     records = try_goals(problem, goals, methods, show)
     click.echo(
@@ -232,3 +234,51 @@ def _row(record: Record) -> str:
     low, middle, high = np.quantile(record.durations, [0.0, 0.5, 1.0])
     planned, longest = np.quantile(record.plan_times, [0.5, 1.0])
     return f"{counts}{low:>10.4g}{middle:>10.4g}{high:>10.4g}{planned:>11.3g}{longest:>9.3g}"
+
+
+@click.command("library")
+@click.argument("scenario", metavar="SCENARIO|ROBOT")
+@settings_option
+@click.option(
+    "--count",
+    default=80,
+    show_default=True,
+    type=click.IntRange(min=1),
+    help="Number of random goals to plan.",
+)
+@within_option((0.3, 60.0), "Largest")
+@out_option("File to write, for the parameter planner.optimal.library [in the cache].")
+def library_command(
+    scenario: str,
+    settings: tuple[str, ...],
+    count: int,
+    within: tuple[float, float],
+    out: Path | None,
+) -> None:
+    """Make a library of manoeuvres, by which plans are found faster.
+
+    Plans of the same robot, start, limits and options take the two manoeuvres that are nearest to
+    their goal as initial guesses. Exit code 1: no goal is reachable; 2: bad input.
+    """
+    from spacerobot_ros.planning import PlanRequest
+    from spacerobot_ros.planning.methods.optimal.method import OptimalGait
+    from spacerobot_ros.private_files import write_whole
+    from spacerobot_ros.simulation.trials import state_of
+
+    problem = problem_of(scenario, settings=settings)
+    method = problem.method("optimal")
+    assert isinstance(method, OptimalGait)
+    goals = _goals(problem, count, within)
+    with click.progressbar(goals, label=problem.name, file=sys.stderr) as bar:
+        state, tolerance = state_of(problem.plant()), problem.config.tolerance
+        library = method.made_library(PlanRequest(state, goal, tolerance) for goal in bar)
+    if library is None:
+        fail("None of the goals could be reached.")
+    if out is None:
+        where = method.keep_library(library)
+    else:
+        write_whole(out, library.to_bytes())
+        where = out
+    if where is None:
+        fail("The library could not be kept; --out chooses another place.")
+    click.echo(f"library     {where} ({len(library.turns)} of {count} goals)")

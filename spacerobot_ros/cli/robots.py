@@ -1,12 +1,245 @@
-"""The command ``spacerobot robots``."""
+"""Commands for robots: analyze, new, robots."""
 
 from __future__ import annotations
 
+import math
+import os
+import shlex
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
 import click
+
+from spacerobot_ros.cli.errors import fail
+from spacerobot_ros.cli.options import json_option, out_option, picture_option, write_json
+from spacerobot_ros.cli.progress import display
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.output_files import write_output
+
+if TYPE_CHECKING:
+    from spacerobot_ros.model import SpaceRobot
+    from spacerobot_ros.planning.analysis import Analysis
+    from spacerobot_ros.planning.core.controllability import Controllability
+
+_MOST_ROWS = 12
+"""Joints that are listed; of more the rest is counted."""
+
+
+@click.command("analyze")
+@click.argument("robot")
+@click.option("--shape", metavar="'Q1 Q2 ...'", help="Shape to analyse, m or rad [the best].")
+@picture_option("Picture of the curvature (.png, .svg, .pdf) [out/ROBOT_curvature.png].")
+@json_option("Write the findings as JSON.")
+def analyze_command(
+    robot: str, shape: str | None, picture: Path | None, json_file: Path | None
+) -> None:
+    """Analyse what loops of the joints of ROBOT do to its base.
+
+    ROBOT is a name or a URDF file. The methods that suit it are listed.
+    """
+    from spacerobot_ros.model import SpaceRobot
+    from spacerobot_ros.planning.analysis import analyze
+    from spacerobot_ros.resources import robot_file
+
+    model = SpaceRobot.from_file(robot_file(robot))
+    found = analyze(model, None if shape is None else _parsed(shape))
+    for line in lines_of(found):
+        click.echo(line)
+    if json_file is not None:
+        write_json(json_file, json_of(found))
+    from spacerobot_ros.report.figures import PictureFormat
+    from spacerobot_ros.report.planning_figures import draw_analysis
+
+    target = picture or Path("out") / f"{model.description.name}_curvature.png"
+    drawn = draw_analysis(found, PictureFormat.of(target))
+    if drawn is None:
+        click.echo(f"{'picture':<13}none: no loops of the joints turn the base")
+        return
+    write_output(target, drawn)
+    click.echo(f"{'picture':<13}{target}")
+
+
+def _parsed(text: str) -> list[float]:
+    try:
+        return [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        raise ParameterError(f"--shape is '{text}'; it must be numbers, one a joint.") from None
+
+
+def lines_of(found: Analysis) -> list[str]:
+    """Return the findings as lines that fit a screen."""
+    robot = found.robot
+    base = robot.description.bodies[0].inertia.mass
+    n, name = robot.n, robot.description.name
+    lines = [f"{name}: {n} joint(s), {robot.total_mass:.6g} kg, of which the base {base:.6g} kg"]
+    lines += _joint_rows(robot)
+    lines += ["", *_rotation_lines(found)]
+    lines += [f"{'position':<13}{_position(found)}", ""]
+    for method, objection in found.objections.items():
+        lines.append(f"{method:<13}{'no: ' + objection if objection else 'yes'}")
+    lines.append(f"{'auto':<13}{found.chosen or 'no method suits this robot'}")
+    return lines
+
+
+def json_of(found: Analysis) -> dict[str, Any]:
+    """Return the findings as what JSON can hold; infinite condition numbers and limits are null."""
+    robot = found.robot
+    finite = _finite(found)
+    return {
+        "robot": robot.description.name,
+        "mass_kg": robot.total_mass,
+        "bodies": {body.name: body.inertia.mass for body in robot.description.bodies},
+        "joints": [
+            {
+                "name": joint.name,
+                "kind": joint.kind.value,
+                "lower": _number(joint.limits.lower),
+                "upper": _number(joint.limits.upper),
+                "velocity": _number(joint.limits.velocity),
+                "effort": _number(joint.limits.effort),
+            }
+            for joint in robot.description.movable_joints
+        ],
+        "shape": found.shape.tolist(),
+        "at_shape": _finding(found.at_shape),
+        "anywhere": _finding(found.anywhere),
+        "curvature_matrix": None if found.nominal is None else found.nominal.M.tolist(),
+        "condition_over_shapes": {
+            "shapes": len(found.conditions),
+            "spanning": len(finite),
+            "best": min(finite, default=None),
+            "median": median(finite) if finite else None,
+        },
+        "planar": _finding(found.planar),
+        "sliding": _finding(found.sliding),
+        "methods": found.objections,
+        "auto": found.chosen or None,
+    }
+
+
+def _joint_rows(robot: SpaceRobot) -> list[str]:
+    from spacerobot_ros.model.description import JointKind
+
+    joints, bodies = robot.description.moving_joints, robot.description.bodies[1:]
+    width = max([5, *(len(joint.name) for joint in joints[:_MOST_ROWS])])
+    head = f"{'joint':<{width}}  {'kind':<11}{'on':<16}{'limits':>19}{'speed':>12}{'effort':>10}"
+    rows = [f"{head}{'mass':>12}"]
+    for joint, body in list(zip(joints, bodies, strict=True))[:_MOST_ROWS]:
+        unit, of_effort = ("m", "N") if joint.kind is JointKind.PRISMATIC else ("rad", "N m")
+        limits = joint.limits
+        room = f"{limits.lower:.4g} .. {limits.upper:.4g} {unit}"
+        if math.isinf(limits.lower):
+            room = "free"
+        speed, effort = f"{limits.velocity:.3g} {unit}/s", f"{limits.effort:.4g} {of_effort}"
+        follows = joint.mimic
+        rows.append(
+            f"{joint.name:<{width}}  {joint.kind.value:<11}{joint.parent[:15]:<16}{room:>19}"
+            f"{speed:>12}{effort:>10}{body.inertia.mass:>9.4g} kg"
+            + (f"  follows {follows.joint}" if follows is not None else "")
+        )
+    if len(joints) > _MOST_ROWS:
+        rows.append(f"and {len(joints) - _MOST_ROWS} more")
+    return rows
+
+
+def _rotation_lines(found: Analysis) -> list[str]:
+    lines = [f"{'rotation':<13}{found.anywhere.sentence}"]
+    if found.planar.controllable:
+        lines = [f"{'rotation':<13}{found.planar.sentence}"]
+    if found.nominal is not None:
+        at, values = found.nominal, ", ".join(f"{x:.3g}" for x in found.nominal.singular_values)
+        names = ", ".join(found.robot.joint_names[i] for i in at.joints)
+        shape = ", ".join(f"{x:.4g}" for x in found.shape)
+        lines += [
+            f"{'at shape':<13}({shape}): rank {found.at_shape.rank}, condition {at.condition:.3g}",
+            f"{'':<13}singular values ({values}) rad a unit of area, joints {names}",
+        ]
+        finite = _finite(found)
+        lines.append(
+            f"{'shape space':<13}rank 3 at {len(finite)} of {len(found.conditions)} shapes; "
+            f"condition {min(finite):.3g} at best, {median(finite):.3g} the median"
+        )
+    return lines
+
+
+def _position(found: Analysis) -> str:
+    from spacerobot_ros.planning.core.controllability import sliders_of
+
+    count = len(sliders_of(found.robot))
+    if found.sliding.controllable:
+        return f"{count} sliders with independent slots put the base where it is to be (paper 1)"
+    return "follows from attitude and shape: the centre of mass rests"
+
+
+def _finding(found: Controllability) -> dict[str, Any]:
+    return {
+        "controllable": found.controllable,
+        "rank": found.rank,
+        "wanted": found.needed,
+        "condition": _number(found.condition),
+        "singular_values": found.singular_values.tolist(),
+        "joints": list(found.joints),
+        "shape": found.shape.tolist(),
+        "sentence": found.sentence,
+    }
+
+
+def _finite(found: Analysis) -> list[float]:
+    """Return the condition numbers of the shapes where the brackets span all rotations."""
+    return [float(x) for x in found.conditions if math.isfinite(x)]
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+@click.command("new")
+@click.argument("robot", metavar="URDF")
+@out_option("Scenario file to write [NAME.yaml].")
+def new_command(robot: str, out: Path | None) -> None:
+    """Check a robot of your own, plan a first turn, write a scenario.
+
+    URDF is a URDF or xacro file, or the name of a robot. Exit code 0: a scenario that reaches its
+    goal is written; 1: no method reaches one; 2: the robot is refused.
+    """
+    from spacerobot_ros.bag import free_name
+    from spacerobot_ros.cli.plan import table
+    from spacerobot_ros.model import SpaceRobot
+    from spacerobot_ros.planning.analysis import analyze
+    from spacerobot_ros.resources import is_path, robot_file
+    from spacerobot_ros.session.own_robot import fastest, first_problem, remarks, scenario_text
+    from spacerobot_ros.simulation.trials import compare
+
+    file = robot_file(robot)
+    model = SpaceRobot.from_file(file)
+    name = file.name.split(".")[0]
+    with display(name):
+        known = analyze(model)
+    for line in lines_of(known):
+        click.echo(line)
+    for remark in remarks(model.description):
+        click.echo(f"{'to mind':<13}{remark}")
+    click.echo()
+    problem = first_problem(name, model, file)
+    with display(name):
+        found = compare(problem)
+    for line in table(found):
+        click.echo(line)
+    best = fastest(found)
+    if best is None:
+        fail("No method reaches the goal of a first flight; no scenario is written.")
+    target = free_name(out or Path(f"{name}.yaml"))
+    # Beside the scenario the robot is found by its name from anywhere.
+    from_there = os.path.relpath(file.resolve(), target.resolve().parent)
+    named = from_there if is_path(robot) else robot
+    write_output(target, scenario_text(problem, best.method, named))
+    click.echo(f"\n{best.method} is the fastest: {best.duration:.4g} s. The scenario is {target}:")
+    click.echo(f"  spacerobot run {shlex.quote(str(target))}")
 
 
 @click.command("robots")
-def command() -> None:
+def robots_command() -> None:
     """List the robots that come with the package."""
     from spacerobot_ros.model import load_robot
     from spacerobot_ros.resources import resource_names, robot_file

@@ -12,8 +12,8 @@ import pytest
 from support.command_line import CliRunner, Result
 from support.random_robots import random_robot_urdf
 
-from spacerobot_ros.cli.analyze import json_of, lines_of
 from spacerobot_ros.cli.main import main
+from spacerobot_ros.cli.robots import json_of, lines_of
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import METHODS
 from spacerobot_ros.planning.analysis import analyze

@@ -6,8 +6,8 @@ import click
 import pytest
 from support.command_line import CliRunner
 
-from spacerobot_ros.cli.bench import command as bench
-from spacerobot_ros.cli.campaign import command as campaign
+from spacerobot_ros.cli.bench import bench_command
+from spacerobot_ros.cli.campaign import campaign_command
 from spacerobot_ros.cli.main import COMMANDS, CommandGroup, main
 
 
@@ -17,8 +17,8 @@ def commands() -> dict[str, click.Command]:
     found = {name: group.get_command(context, name) for name in COMMANDS}
     return {
         **{name: each for name, each in found.items() if each is not None},
-        **{f"campaign {name}": each for name, each in campaign.commands.items()},
-        **{f"bench {name}": each for name, each in bench.commands.items()},
+        **{f"campaign {name}": each for name, each in campaign_command.commands.items()},
+        **{f"bench {name}": each for name, each in bench_command.commands.items()},
     }
 
 

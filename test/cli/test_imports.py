@@ -45,7 +45,7 @@ def test_every_command_is_listed_and_has_help() -> None:
     assert listed.exit_code == 0
     _, _, table = listed.output.partition("Commands:\n")
     names = tuple(line.split()[0] for line in table.splitlines())
-    assert names == COMMANDS == tuple(sorted(COMMANDS))
+    assert names == tuple(sorted(COMMANDS))
     for name in COMMANDS:
         shown = CliRunner().invoke(main, [name, "--help"], prog_name="spacerobot")
         assert shown.exit_code == 0

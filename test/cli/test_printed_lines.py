@@ -121,14 +121,14 @@ def test_a_flight_that_misses_its_goal_is_exit_1_and_the_sentence(
 def test_an_interrupted_flight_says_how_its_report_is_made(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from spacerobot_ros.cli import run as command
+    from spacerobot_ros.cli import flights as command
 
     monkeypatch.setattr(command, "termination", lambda: object())
     report = tmp_path / "ein Flug.html"
     result = run(monkeypatch, SUMMARY, *GOAL, "--report", str(report))
     line = result.stdout.removeprefix(LINES)
     words = shlex.split(line.partition("`")[2].partition("`")[0])
-    assert words == ["spacerobot", "report", "out/a.mcap", "--output", str(report)]
+    assert words == ["spacerobot", "report", "out/a.mcap", "--out", str(report)]
 
 
 @pytest.mark.parametrize("state", ["reached", "failed"])
@@ -463,6 +463,6 @@ def test_only_a_goal_that_is_reached_is_exit_0(
     assert sent == [[1.0, -2.0, 3.0], [0.0, 0.0, 0.0, 1.0], "/a", 7.0]
     runner.invoke(main, ["goal", "1", "2", "3", "0.6", "0", "0.8", "0"])
     assert sent == [[1.0, 2.0, 3.0], [0.6, 0.0, 0.8, 0.0], "", 0.0]
-    runner.invoke(main, ["goal", "1", "2", "3", "--rotvec", "0", "0", "1"])
+    runner.invoke(main, ["goal", "1", "2", "3", "--goal-rotvec", "0", "0", "1"])
     assert sent[1] == pytest.approx([0.0, 0.0, math.sin(0.5), math.cos(0.5)])
     assert runner.invoke(main, ["goal", "1", "2", "3", "4"]).exit_code == 2

@@ -1,4 +1,4 @@
-"""The command ``spacerobot run``."""
+"""Commands that fly: run, up, goal, scenarios."""
 
 from __future__ import annotations
 
@@ -13,12 +13,16 @@ from spacerobot_ros.cli.errors import end_if_requested, fail
 from spacerobot_ros.cli.options import (
     LAWS,
     METHODS,
-    PATH,
     GoalOptions,
     Registered,
+    attitude_options,
+    bag_option,
     goal_options,
     json_option,
+    note_large_angles,
     numbers,
+    processes_option,
+    report_option,
     settings_option,
     view_option,
     viewing_if,
@@ -38,9 +42,9 @@ if TYPE_CHECKING:
     "--method", type=Registered(METHODS, LAWS), help="Gait method or control law [the scenario's]."
 )
 @settings_option
-@click.option("--bag", type=PATH, help="Bag to write [out/SCENARIO.mcap, or the next free name].")
+@bag_option("Bag to write [out/SCENARIO.mcap, or the next free name].")
 @json_option("Write the result as JSON.")
-@click.option("--report", type=PATH, help="Write a report with pictures and a 3D view (HTML).")
+@report_option("Write a report with pictures and a 3D view (HTML).")
 @click.option(
     "--realtime",
     is_flag=False,
@@ -56,9 +60,9 @@ if TYPE_CHECKING:
     metavar="SECONDS",
     help="Simulated time after which the flight is interrupted.",
 )
-@click.option("--processes", is_flag=True, help="Give each node a process of its own.")
+@processes_option
 @view_option
-def command(
+def run_command(
     scenario: str,
     goal: GoalOptions,
     method: str | None,
@@ -94,7 +98,7 @@ def command(
     for line in (*_summary_lines(result.summary), *_published_lines(chosen, result.summary)):
         click.echo(line)
     if report is not None and termination() is not None:
-        words = shlex.join(["spacerobot", "report", str(path), "--output", str(report)])
+        words = shlex.join(["spacerobot", "report", str(path), "--out", str(report)])
         click.echo(f"report      none of what was interrupted: `{words}` makes one")
     end_if_requested()
     if report is not None:
@@ -170,3 +174,93 @@ def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
             if row.note:
                 lines.append(f"    {row.note}")
     return [f"  {'':<26}{'printed in the paper':<30}here", *lines] if lines else []
+
+
+@click.command("up")
+@click.argument("scenario", metavar="SCENARIO|ROBOT")
+@settings_option
+@bag_option("Bag to write [none].")
+@click.option(
+    "--rate",
+    default=1.0,
+    show_default=True,
+    type=click.FloatRange(min=0.0, min_open=True),
+    help="Simulated time per wall time.",
+)
+@processes_option
+@click.option(
+    "--namespace", default="", help="Namespace of all nodes and topics, also of /clock and /tf."
+)
+@view_option
+def up_command(
+    scenario: str,
+    settings: tuple[str, ...],
+    bag: Path | None,
+    rate: float,
+    processes: bool,
+    namespace: str,
+    view: bool,
+) -> None:
+    """Keep the nodes of a SCENARIO or a ROBOT running in real time.
+
+    A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. Send goals by topic or
+    with the command spacerobot goal. Ctrl-C, SIGTERM or SIGHUP ends the nodes.
+    """
+    from spacerobot_ros.flight.scenario import scenario_or_robot
+
+    chosen = scenario_or_robot(scenario).in_real_time(rate).with_settings(settings)
+    from spacerobot_ros.session.live import keep_up
+
+    with viewing_if(view, chosen.parameters("viewer"), namespace):
+        recorded = keep_up(chosen, bag, click.echo, processes=processes, namespace=namespace)
+    if recorded is not None:
+        click.echo(f"bag         {recorded}")
+
+
+@click.command("goal", context_settings={"ignore_unknown_options": True})
+@click.argument("pose", nargs=-1, type=float, metavar="X Y Z [QX QY QZ QW]")
+@attitude_options
+@click.option("--namespace", default="", help="Namespace of the stack.")
+@click.option(
+    "--timeout", default=0.0, help="Longest wait for the result, s of wall time; 0: no limit."
+)
+def goal_command(
+    pose: tuple[float, ...],
+    rotvec: tuple[float, float, float] | None,
+    rpy_deg: tuple[float, float, float] | None,
+    namespace: str,
+    timeout: float,
+) -> None:
+    """Send a goal pose to a running stack, and wait for the result.
+
+    Exit code 0: the goal was reached; 1: it was not; 2: bad input; 130: Ctrl-C has ended the
+    command, and the stack still pursues the goal.
+    """
+    if len(pose) not in (3, 7):
+        raise click.UsageError("A goal is X Y Z, or X Y Z QX QY QZ QW.")
+    if rotvec and rpy_deg:
+        raise click.UsageError("The attitude is given twice, in radians and in degrees.")
+    from spacerobot_ros.planning import Goal
+
+    wanted = Goal.checked(pose[:3], pose[3:] or (0.0, 0.0, 0.0, 1.0))
+    if rotvec:
+        note_large_angles(rotvec, "--goal-rpy-deg")
+        wanted = Goal.from_rotvec(pose[:3], rotvec)
+    if rpy_deg:
+        wanted = Goal.from_rpy(pose[:3], rpy_deg)
+    from spacerobot_ros.flight.arrays import Outcome
+    from spacerobot_ros.session.live import send_goal
+
+    outcome = send_goal(wanted, click.echo, namespace=namespace, timeout=timeout)
+    end_if_requested()
+    if outcome is not Outcome.REACHED:
+        fail()
+
+
+@click.command("scenarios")
+def scenarios_command() -> None:
+    """List the scenarios that come with the package."""
+    from spacerobot_ros.flight.scenario import load_scenario, scenario_names
+
+    for name in scenario_names():
+        click.echo(f"{name:<26}{load_scenario(name).description}")

@@ -1,0 +1,276 @@
+"""Commands for bags: export, figures, replay, report, salvage, verify."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from spacerobot_ros.cli.errors import fail
+from spacerobot_ros.cli.options import (
+    PATH,
+    bag_argument,
+    beside,
+    format_option,
+    namespace_option,
+    out_option,
+    picture_option,
+    topic_option,
+    view_option,
+    viewing_if,
+)
+
+
+@click.command("export")
+@bag_argument
+@format_option(
+    ("csv", "parquet", "mat"),
+    "csv and parquet: a folder with a file for each topic; mat: one file for MATLAB.",
+)
+@out_option("Folder or file to write [BAG_csv, BAG_parquet or BAG.mat].")
+@topic_option("Export only this topic, with or without the slash before it [all].")
+def export_command(bag: Path, format_name: str, out: Path | None, topics: tuple[str, ...]) -> None:
+    """Write the topics of a BAG as tables for other programs.
+
+    Existing files and folders are not overwritten.
+    """
+    from spacerobot_ros.bag import read_bag
+    from spacerobot_ros.bag.export import ExportFormat, export
+
+    opened = read_bag(bag)
+    stem = opened.path.with_suffix("")
+    beside = stem.with_suffix(".mat") if format_name == "mat" else Path(f"{stem}_{format_name}")
+    chosen = dict.fromkeys(opened[topic].topic for topic in topics) or opened.keys()
+    tables = (opened.table(topic) for topic in chosen)
+    made = export(tables, out or beside, ExportFormat(format_name))
+    for topic in chosen:
+        rows = made.rows.get(topic)
+        click.echo(f"{topic:<27} {'no messages, left out' if rows is None else f'{rows} rows'}")
+    click.echo(f"{'tables':<27} {made.path}")
+
+
+_MILLIMETRES = {"": 1.0, "mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72}
+
+
+def _millimetres(context: click.Context, option: click.Parameter, text: str) -> float:
+    found = re.fullmatch(r"([0-9]*\.?[0-9]+) *([a-z]*)", text.strip().lower())
+    if found is None or found[2] not in _MILLIMETRES:
+        raise click.BadParameter(f"'{text}' is no length such as 88mm, 18cm, 3.5in or 246pt.")
+    return float(found[1]) * _MILLIMETRES[found[2]]
+
+
+@click.command("figures")
+@bag_argument
+@click.option(
+    "--only", metavar="NAME,NAME", default="", help="Draw only these figures, such as pose,joints."
+)
+@format_option(
+    ("pdf", "svg", "png"),
+    "Format of the files; text in PDF and SVG can be searched and edited.",
+)
+@click.option(
+    "--width",
+    callback=_millimetres,
+    default="88mm",
+    show_default=True,
+    help="Width of a figure in mm, cm, in or pt; 88mm is one column.",
+)
+@click.option(
+    "--style",
+    type=PATH,
+    metavar="FILE.mplstyle",
+    help="Style file of matplotlib, or name of one of its styles: fonts, sizes, lines, colours.",
+)
+@click.option("--events", is_flag=True, help="Show events below the time axes.")
+@out_option("Folder of the figures [BAG_figures].")
+@namespace_option
+def figures_command(
+    bag: Path,
+    only: str,
+    format_name: str,
+    width: float,
+    style: Path | None,
+    events: bool,
+    out: Path | None,
+    namespace: str | None,
+) -> None:
+    """Draw figures of a BAG for a paper, one file each.
+
+    Files of the same names are replaced. Exit code 1: the bag lacks the data of a figure that
+    --only names, or of all figures.
+    """
+    from spacerobot_ros.report import write_figures
+    from spacerobot_ros.report.figures import PictureFormat
+
+    names = [name.strip().lower() for name in only.split(",") if name.strip()]
+    folder = out or beside(bag, "_figures")
+    made = write_figures(
+        bag,
+        folder,
+        names,
+        format=PictureFormat(format_name),
+        width=width,
+        style=style,
+        events=events,
+        namespace=namespace,
+    )
+    drawn = {name: result for name, result in made.items() if isinstance(result, Path)}
+    for name, path in drawn.items():
+        click.echo(f"{name:<11} {path}")
+    for name in names or () if drawn else made:
+        if name not in drawn:
+            click.echo(f"{name:<11} none: {made[name]}", err=True)
+    if not drawn or not drawn.keys() >= set(names):
+        fail()
+
+
+@click.command("replay")
+@bag_argument
+@click.option(
+    "--rate", default=1.0, show_default=True, metavar="FACTOR", help="Bag time per wall time."
+)
+@click.option(
+    "--start",
+    default=0.0,
+    metavar="SECONDS",
+    help="Where to begin, counted from the first message.",
+)
+@click.option("--duration", default=0.0, metavar="SECONDS", help="How much to replay [all].")
+@click.option("--loop", is_flag=True, help="Begin again at the end.")
+@topic_option("Replay only this topic [all].")
+@click.option(
+    "--remap", multiple=True, metavar="OLD:=NEW", help="Publish topic OLD as NEW. May be repeated."
+)
+@click.option(
+    "--clock",
+    is_flag=False,
+    flag_value=100.0,
+    default=0.0,
+    type=float,
+    metavar="[HZ]",
+    help="Publish bag time on /clock HZ times a second (100 without a number) [as recorded].",
+)
+@click.option("--paused", is_flag=True, help="Begin paused.")
+@view_option
+@click.option("--wait", default=3.0, show_default=True, help="Longest wait for readers (s).")
+def replay_command(
+    bag: Path,
+    rate: float,
+    start: float,
+    duration: float,
+    loop: bool,
+    topics: tuple[str, ...],
+    remap: tuple[str, ...],
+    clock: float,
+    paused: bool,
+    wait: float,
+    view: bool,
+) -> None:
+    """Publish the messages of a BAG again, at their recorded times.
+
+    The services /replay/pause, /replay/resume and /replay/step control it. With --view it stays
+    paused at the end until Ctrl-C, and can be played again.
+    """
+    values: dict[str, Any] = {
+        "bag": str(bag),
+        "rate": rate,
+        "start": start,
+        "duration": duration,
+        "loop": loop,
+        "topics": " ".join(topics),
+        "remap": " ".join(remap),
+        "clock": clock,
+        "paused": paused,
+        "wait": wait,
+        "hold": view,
+    }
+    from rclpy.parameter import Parameter
+
+    from spacerobot_ros.nodes import ReplayNode
+    from spacerobot_ros.nodes.common.process import run_node
+
+    given = [Parameter(name, value=value) for name, value in values.items()]
+    with viewing_if(view, {}):
+        code = run_node(lambda: ReplayNode(parameter_overrides=given), [])
+    sys.exit(code)
+
+
+@click.command("report")
+@bag_argument
+@out_option("HTML file [BAG.html].")
+@picture_option("Also draw an overview (.png, .svg, .pdf).")
+@click.option(
+    "--beside",
+    "others",
+    multiple=True,
+    type=PATH,
+    metavar="BAG",
+    help="Bag of another flight to compare with. May be repeated.",
+)
+@namespace_option
+def report_command(
+    bag: Path,
+    out: Path | None,
+    picture: Path | None,
+    others: tuple[Path, ...],
+    namespace: str | None,
+) -> None:
+    """Write an HTML report of a BAG, with pictures and a 3D view."""
+    from spacerobot_ros.report import write_picture, write_report
+
+    target = out or beside(bag, ".html")
+    write_report(bag, target, others, namespace=namespace)
+    click.echo(f"report      {target}")
+    if picture is not None:
+        write_picture(bag, picture, namespace=namespace)
+        click.echo(f"picture     {picture}")
+
+
+@click.command("salvage")
+@bag_argument
+@out_option("Bag to write [BAG-salvaged.mcap].")
+def salvage_command(bag: Path, out: Path | None) -> None:
+    """Make a complete bag of a BAG that was cut off or is damaged.
+
+    The damaged BAG is not changed.
+    """
+    from spacerobot_ros.bag.salvage import salvage_bag
+
+    saved = salvage_bag(bag, out)
+    click.echo(f"saved       {saved.messages} messages over {saved.duration:.9g} s")
+    click.echo(
+        f"lost        {saved.lost_bytes} bytes behind the last whole record, "
+        f"{saved.lost_chunks} damaged chunk(s)"
+        + (f"; the first: {saved.lost_because}" if saved.lost_because else "")
+    )
+    click.echo(f"bag         {saved.path}")
+
+
+@click.command("verify")
+@bag_argument
+@click.option(
+    "--tolerance",
+    default=1e-9,
+    show_default=True,
+    type=click.FloatRange(min=0.0),
+    help="Largest deviation that counts as equal (SI units; relative above 1).",
+)
+def verify_command(bag: Path, tolerance: float) -> None:
+    """Re-simulate a BAG from its commands, and compare the states.
+
+    Exit code 0: every recorded state follows from the commands; 1: one does not; 2: bad input.
+    """
+    from spacerobot_ros.verification.comparison import verify_bag
+
+    result = verify_bag(bag, tolerance)
+    click.echo(f"flown again {result.ticks} ticks, {result.duration:.9g} s")
+    click.echo(f"compared    {result.messages} messages")
+    where = result.largest_at
+    place = f", {where.field} of {where.topic} at {where.time:.9g} s" if where else ""
+    click.echo(f"largest     {result.largest:.3g}{place}")
+    if result.difference is not None:
+        fail(f"The bag differs: {result.difference}")
+    click.echo("verified    every published state is what the commands make it")
