@@ -48,9 +48,8 @@ from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
-from spacerobot_ros.planning.execution.outputs import ScheduleStart
 from spacerobot_ros.planning.execution.state_average import BaseMeasurement
-from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.planning.execution.status import PlannerStatus, ScheduleStart
 from spacerobot_ros.planning.execution.worker import PlanningWorker
 from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator

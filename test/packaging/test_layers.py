@@ -174,7 +174,7 @@ def test_modules_do_not_import_each_other_in_a_circle() -> None:
 MUTABLE = {
     "spacerobot_ros.nodes.common.cdr.Layout",
     "spacerobot_ros.nodes.common.state_times._Doubtful",
-    "spacerobot_ros.planning.execution.outputs.Pursuit",
+    "spacerobot_ros.planning.execution.executive.ActiveGoal",
     "spacerobot_ros.planning.methods.optimal.search._Progress",
     "spacerobot_ros.report.solids.Solids",
     "spacerobot_ros.simulation.trials.Record",

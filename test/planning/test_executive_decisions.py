@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,12 +28,11 @@ from support.planner_phases import (
 
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
+from spacerobot_ros.planning import RobotState
+from spacerobot_ros.planning.execution.executive import Phase
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
-from spacerobot_ros.planning.execution.state_machine import (
-    Phase,
-    PlanReason,
-)
 from spacerobot_ros.planning.execution.status import PlannerState
+from spacerobot_ros.planning.execution.worker import PlanJob, PlanReason
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 
 # -- why plans are requested ------------------------------------------------------------------
@@ -45,9 +43,9 @@ def reasons(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> list[PlanReason]:
     requested: list[PlanReason] = []
     request = loop.executive._request
 
-    def recorded(ticket: Any, state: Any) -> None:
-        requested.append(ticket.reason)
-        request(ticket, state)
+    def recorded(job: PlanJob, state: RobotState) -> None:
+        requested.append(job.reason)
+        request(job, state)
 
     monkeypatch.setattr(loop.executive, "_request", recorded)
     return requested

@@ -11,8 +11,11 @@ from support.planner_loop import TICK, robot_of
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal, RobotState
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.execution.mass_estimate import MassEstimate, PathSensitivity
-from spacerobot_ros.planning.execution.take_over import PathDeviation
+from spacerobot_ros.planning.execution.path_deviation import (
+    MassEstimate,
+    PathDeviation,
+    PathSensitivity,
+)
 
 Array = npt.NDArray[np.float64]
 

@@ -20,9 +20,8 @@ from support.planner_loop import TICK, HeldWorker, Loop, PlantState, robot_of
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitMethod, Goal
-from spacerobot_ros.planning.execution.executive import Executive
+from spacerobot_ros.planning.execution.executive import Executive, Phase
 from spacerobot_ros.planning.execution.state_average import BaseMeasurement
-from spacerobot_ros.planning.execution.state_machine import Phase
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.execution.worker import Planned, PlanningTask, PlanningWorker, Refused
 from spacerobot_ros.resources import share_directory

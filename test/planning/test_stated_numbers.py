@@ -23,7 +23,7 @@ from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import PlanRequest, Tolerance, plan
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.state_machine import Phase
+from spacerobot_ros.planning.execution.executive import Phase
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
 from spacerobot_ros.planning.methods.auto import _Result

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,11 +25,11 @@ from support.planner_loop import (
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.planning import BasePath, RobotState
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.executive import Phase
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile
-from spacerobot_ros.planning.execution.in_motion import InMotion
-from spacerobot_ros.planning.execution.state_machine import Phase
+from spacerobot_ros.planning.execution.path_deviation import PathDeviation
 from spacerobot_ros.planning.execution.status import PlannerState
-from spacerobot_ros.planning.execution.take_over import PathDeviation
+from spacerobot_ros.planning.execution.tracker import TrajectoryTracker
 
 Array = npt.NDArray[np.float64]
 
@@ -391,18 +390,18 @@ def test_noise_is_averaged_over_the_last_measurements() -> None:
 def test_a_base_that_is_off_as_its_joints_lag_is_on_its_way_to_the_end() -> None:
     """The base of this robot is at an eighth of its sliders' way, to the other side."""
     loop = flying(ticks=80, replan_period=1.0)
-    tracker, schedule = loop.executive._tracker, loop.starts[0].schedule
-    assert tracker.check_due(loop.measured.stamp_ns)
+    check, schedule = loop.executive._tracker.path_check, loop.starts[0].schedule
+    assert check.due(loop.measured.stamp_ns)
     k = round((loop.measured.stamp_ns - loop.starts[0].stamp_ns) / TICK_NS)
     lag = np.array([-0.04, 0.02, 0.03])
     pose = schedule.path.position[k] - lag / 8, schedule.path.quaternion[k]
-    averaged = tracker.averaged(RobotState(*pose, schedule.positions[k] + lag))
+    averaged = check.averaged(RobotState(*pose, schedule.positions[k] + lag))
     np.testing.assert_allclose(averaged.position, pose[0], atol=1e-9)
-    for position, _ in (tracker.end, tracker.expected_end):
+    for position, _ in (check.end, check.expected_end):
         np.testing.assert_allclose(position, schedule.path.position[-1], atol=5e-5)
-    off = tracker.averaged(RobotState(*pose, schedule.positions[k]))
+    off = check.averaged(RobotState(*pose, schedule.positions[k]))
     np.testing.assert_allclose(off.position, pose[0], atol=1e-9)
-    np.testing.assert_allclose(tracker.end[0], schedule.path.position[-1] - lag / 8, atol=1e-6)
+    np.testing.assert_allclose(check.end[0], schedule.path.position[-1] - lag / 8, atol=1e-6)
 
 
 def test_noise_of_joints_is_not_taken_for_another_shape() -> None:
@@ -415,14 +414,13 @@ def test_noise_of_joints_is_not_taken_for_another_shape() -> None:
 
 
 def test_goals_are_the_same_where_every_number_is() -> None:
-    from spacerobot_ros.planning.execution.in_motion import same_goal
-
-    assert same_goal(goal_at(TURNED), goal_at(TURNED))
-    assert not same_goal(goal_at(TURNED), goal_at(HERE))
+    assert goal_at(TURNED).equals(goal_at(TURNED))
+    assert not goal_at(TURNED).equals(goal_at(HERE))
     shaped = goal_at(TURNED)
     object.__setattr__(shaped, "joint_positions", np.zeros(3))
-    assert not same_goal(goal_at(TURNED), shaped)
-    assert same_goal(shaped, shaped)
+    assert not goal_at(TURNED).equals(shaped)
+    assert not shaped.equals(goal_at(TURNED))
+    assert shaped.equals(shaped)
 
 
 def test_the_remaining_motion_is_planned_again_where_plans_are_made_beside_the_flight() -> None:
@@ -443,9 +441,15 @@ def test_the_remaining_motion_is_planned_again_where_plans_are_made_beside_the_f
     ],
 )
 def test_measured_poses_are_averaged_where_they_are_needed(
-    parameters: dict[str, Any], averaged: int
+    parameters: dict[str, Any], averaged: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    able: Any = SimpleNamespace(starts_in_motion=lambda schedule: True)
-    nothing: Any = None
-    config = PlannerConfig(**{"takeover_time": AHEAD * TICK, **parameters})
-    assert InMotion(nothing, able).begin_schedule(config, nothing, 0) == averaged
+    wanted: list[int] = []
+    monkeypatch.setattr(
+        TrajectoryTracker,
+        "start",
+        lambda tracker, schedule, stamp_ns, average: wanted.append(average),
+    )
+    loop = Loop({"takeover_time": AHEAD * TICK, **parameters}, method=MovingStub())
+    loop.propose(NEAR)
+    loop.tick(parameters["averaging"])
+    assert wanted == [averaged]

@@ -14,14 +14,13 @@ from spacerobot_ros.planning import GaitSchedule, PlanRequest, RobotState, Toler
 from spacerobot_ros.planning.core.cancellation import Cancellation
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.path_deviation import PathCheck, TrackingError
 from spacerobot_ros.planning.execution.tracker import (
     BrakingFollower,
     ScheduleFollower,
-    TrackingError,
-    TrackingErrorCheck,
     TrajectoryTracker,
 )
-from spacerobot_ros.planning.execution.worker import Braking, PlanningTask, PlanningWorker
+from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
 
 Array = npt.NDArray[np.float64]
 
@@ -140,6 +139,15 @@ def turned(angle: float) -> Array:
     return np.asarray(Rotation.from_rotvec([0.0, angle, 0.0]).as_quat())
 
 
+def check_of(schedule: GaitSchedule, position: float, attitude: float) -> PathCheck:
+    config = PlannerConfig(drift_position=position, drift_attitude=attitude)
+    return PathCheck(robot_of(), schedule, START_NS, config)
+
+
+def state_at(position: Array, quaternion: Array) -> RobotState:
+    return RobotState(position, quaternion, np.zeros(3))
+
+
 @pytest.mark.parametrize(
     ("limits", "distance", "angle", "off"),
     [
@@ -158,9 +166,9 @@ def turned(angle: float) -> Array:
 def test_distance_and_angle_have_limits_of_their_own(
     limits: tuple[float, float], distance: float, angle: float, off: bool
 ) -> None:
-    check = TrackingErrorCheck(schedule_of(), START_NS, *limits)
+    check = check_of(schedule_of(), *limits)
     assert check.due(START_NS)
-    found = check.error(np.array([0.0, distance, 0.0]), turned(angle))
+    found = check.error(state_at(np.array([0.0, distance, 0.0]), turned(angle)))
     if off:
         assert found is not None
         assert (found.distance, found.angle) == pytest.approx((distance, angle))
@@ -172,25 +180,25 @@ def test_the_base_is_compared_with_the_pose_of_its_own_instant() -> None:
     time = np.array([0.0, 0.5, 2.0])
     places = np.outer([0.0, 1.0, 2.0], [1.0, 0.0, 0.0])
     path = BasePath(time, places, np.array([turned(0.0), turned(0.3), turned(0.6)]))
-    check = TrackingErrorCheck(schedule_of(path=path), START_NS, 1e-6, 1e-6)
+    check = check_of(schedule_of(path=path), 1e-6, 1e-6)
     due = []
     for tick in range(25):
         stamp = START_NS + tick * PERIOD_NS
         if check.due(stamp):
             due.append(tick)
             k = len(due) - 1
-            assert check.error(places[k], turned(0.3 * k)) is None
-            assert check.error(places[k - 1], turned(0.3 * k)) is not None
+            assert check.error(state_at(places[k], turned(0.3 * k))) is None
+            assert check.error(state_at(places[k - 1], turned(0.3 * k))) is not None
     assert due == [0, 5, 20]
 
 
 def test_instants_between_two_ticks_and_missed_ones_are_passed_over() -> None:
     path = BasePath(np.array([0.0, 0.06, 1.0]), np.zeros((3, 3)), np.tile(UPRIGHT, (3, 1)))
-    check = TrackingErrorCheck(schedule_of(path=path), START_NS, 1e-6, 0.0)
+    check = check_of(schedule_of(path=path), 1e-6, 0.0)
     assert check.due(START_NS + PERIOD_NS), "0.06 s is within half a tick of the first"
     assert not check.due(START_NS + 2 * PERIOD_NS)
     assert not check.due(START_NS + 15 * PERIOD_NS)
-    unused = TrackingErrorCheck(schedule_of(), START_NS, 0.0, 0.0)
+    unused = check_of(schedule_of(), 0.0, 0.0)
     assert not unused.due(START_NS)
     assert str(TrackingError(0.25, 1.5)) == "Off the path by 0.25 m and 1.5 rad"
 
@@ -252,7 +260,7 @@ def test_a_plan_in_flight_begins_where_the_momenta_bring_the_base_meanwhile() ->
     worker = PlanningWorker(robot, PlannerConfig(tick_rate=1 / PERIOD), method)
     resting = np.zeros((40, 3))
     follower = ScheduleFollower(schedule_of(resting), START_NS, 1.0)
-    braking = Braking(follower.braking(START_NS, 2.0), START_NS)
+    braking = follower.braking(START_NS, 2.0).shapes(START_NS)
     inertia = robot.inertia_matrix(np.zeros(3))[3:6, 3:6]
     np.testing.assert_allclose(inertia, np.diag(np.diag(inertia)), atol=1e-12)
     p, L = np.array([0.3, -0.2, 0.1]), np.array([0.05, 0.0, 0.0])

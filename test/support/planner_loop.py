@@ -20,12 +20,15 @@ from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.executive import Executive
+from spacerobot_ros.planning.execution.executive import Executive, Output, Transition
 from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
-from spacerobot_ros.planning.execution.outputs import Notice, Output, ScheduleStart
 from spacerobot_ros.planning.execution.state_average import BaseMeasurement
-from spacerobot_ros.planning.execution.state_machine import Transition
-from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.planning.execution.status import (
+    Notice,
+    PlannerState,
+    PlannerStatus,
+    ScheduleStart,
+)
 from spacerobot_ros.planning.execution.worker import (
     Planned,
     PlanningTask,

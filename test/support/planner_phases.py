@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from support.planner_loop import NEAR, Loop, MovingStub, Place, StubMethod
 
-from spacerobot_ros.planning.execution.state_machine import (
+from spacerobot_ros.planning.execution.executive import (
     Phase,
 )
 

@@ -34,14 +34,15 @@ from spacerobot_ros.nodes.planner.messages import (
     status_message,
 )
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.executive import Executive
+from spacerobot_ros.planning.execution.executive import Executive, Transition
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
-from spacerobot_ros.planning.execution.outputs import Notice, ScheduleStart, Severity
-from spacerobot_ros.planning.execution.state_machine import Transition
 from spacerobot_ros.planning.execution.status import (
+    Notice,
     PlannerState,
     PlannerStatistics,
     PlannerStatus,
+    ScheduleStart,
+    Severity,
     goal_values,
 )
 from spacerobot_ros.planning.execution.worker import LONGEST_END, PlanningWorker

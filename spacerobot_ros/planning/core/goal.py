@@ -125,6 +125,18 @@ class Goal:
             raise GoalError(f"The angles {rpy_deg!r} are not three finite numbers of degrees.")
         return cls.checked(position, quaternion_from_matrix(matrix_from_rpy(np.radians(angles))))
 
+    def equals(self, other: Goal) -> bool:
+        """Whether another goal is the same pose and shape, number by number."""
+        mine, others = self.joint_positions, other.joint_positions
+        same_shape = (
+            mine is others if mine is None or others is None else np.array_equal(mine, others)
+        )
+        return (
+            bool(same_shape)
+            and np.array_equal(self.position, other.position)
+            and np.array_equal(self.quaternion, other.quaternion)
+        )
+
 
 def _numbers(given: npt.ArrayLike, what: str) -> Array:
     try:

@@ -1,50 +1,204 @@
-"""What becomes of the goals of a planner: an explicit state machine, free of ROS.
+"""The planner's state machine: from goals and measured states to setpoints, without ROS.
 
-A node gives it goals (:meth:`Executive.propose`) and measured states (:meth:`Executive.update`),
-and gets a setpoint for every state and outputs to publish (:attr:`Executive.outputs`).
+Read top to bottom: the phases and the transitions between them, the data of a goal and of its
+plans, then the :class:`Executive`, whose :meth:`~Executive.update` answers every measured state.
+``docs/planner_state_machine.md`` draws the machine.
+
+Other modules do the work of a phase: :mod:`.tracker` computes the commands along a schedule,
+:mod:`.worker` makes plans, :mod:`.state_average` averages measured states, and
+:mod:`.path_deviation` compares the measured base with its predicted path.
 """
 
 from __future__ import annotations
 
-from spacerobot_ros.errors import PlanningError
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import NamedTuple
+
+from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
-from spacerobot_ros.planning.core.goal import PoseError, RobotState
-from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
-from spacerobot_ros.planning.execution.in_motion import same_goal
-from spacerobot_ros.planning.execution.outputs import Pursuit, Severity
-from spacerobot_ros.planning.execution.plan_desk import ReadyPlan, Ticket
-from spacerobot_ros.planning.execution.schedule_execution import ScheduleExecution
-from spacerobot_ros.planning.execution.state_average import MeasuredState
-from spacerobot_ros.planning.execution.state_machine import Event, Phase, PlanReason
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning.core.goal import POSE, Controlled, PoseError, RobotState
+from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.core.schedule import GaitSchedule
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.path_deviation import TrackingError
+from spacerobot_ros.planning.execution.state_average import MeasuredState, StateAverage
 from spacerobot_ros.planning.execution.status import (
+    Notice,
     PlannerState,
     PlannerStatistics,
     PlannerStatus,
+    ScheduleStart,
+    Severity,
+    goal_values,
     remaining_error,
 )
-from spacerobot_ros.planning.execution.take_over import TakeOver
-from spacerobot_ros.planning.execution.tracker import Setpoint
-from spacerobot_ros.planning.execution.worker import Braking, Planned, Refused
+from spacerobot_ros.planning.execution.tracker import Setpoint, TakeOver, TrajectoryTracker
+from spacerobot_ros.planning.execution.worker import (
+    OffPathJob,
+    PlanJob,
+    Planned,
+    PlanningTask,
+    PlanningWorker,
+    PlanReason,
+    ReadyPlan,
+    Refused,
+    RemainingJob,
+    TakeOverJob,
+)
+
+_GAP, _GAP_PERIODS = 1.0, 10
+"""A longer time between two states, or a negative one, is a jump of time: s, control periods."""
+
+_MOST_ATTEMPTS = 2
+"""Plans in motion that are tried for a goal: each takes over twice as late as the one before."""
+
+_LATE = 1 / 3
+"""A motion is late when this share of it is left, or less."""
+
+
+# -- phases and transitions -------------------------------------------------------------------
+
+
+class Phase(Enum):
+    """Activity of an executive."""
+
+    IDLE = "idle"  # There is no goal; the joints rest.
+    MEASURING = "measuring"  # A new goal waits for measured states to plan from; the joints rest.
+    PLANNING = "planning"  # A plan is being made.
+    EXECUTING = "executing"  # A schedule is tracked.
+    REPLANNING = "replanning"  # A schedule is tracked; a plan is made that takes over in motion.
+    TAKING_OVER = "taking over"  # A schedule is tracked until the tick of the plan that follows.
+    BRAKING = "braking"  # The joints brake along the planned path.
+    EVALUATING = "evaluating"  # A schedule has ended; measured states are compared with the goal.
+
+
+class Event(Enum):
+    """Cause of a change of phase."""
+
+    NEW_GOAL = "new goal"
+    PLAN_REQUESTED = "plan requested"  # The measured state is known, and a plan from it requested.
+    PLANNED = "planned"
+    REFUSED = "refused"  # The method has found no plan.
+    PLAN_LATE = "plan late"  # The tick at which a plan was to take over has come without it.
+    TAKEN_OVER = "taken over"  # The tick has come at which a plan takes over.
+    SCHEDULE_ENDED = "schedule ended"
+    AT_REST = "at rest"  # The braking is over.
+    TRACKING_ERROR = "tracking error"  # The base is off its path, and plans are made from rest.
+    JOINTS_STUCK = "joints stuck"
+    TIME_JUMPED = "time jumped"  # The schedule does not cover the time of the states.
+    REACHED = "reached"
+    FAILED = "failed"  # No correction is left, or the measured state is not finite.
+    ABORTED = "aborted"  # The goal is given up on request.
+    PLANT_STOPPED = "plant stopped"  # The plant does not obey commands: the goal is given up.
+    PLANT_RESET = "plant reset"  # The robot is in another state than before.
+    DEACTIVATED = "deactivated"
+
+
+class Transition(NamedTuple):
+    """A change of phase and its cause."""
+
+    source: Phase
+    event: Event
+    target: Phase
+
+
+_AT_REST = (Phase.MEASURING, Phase.EVALUATING)
+_IN_MOTION = (Phase.EXECUTING, Phase.REPLANNING, Phase.TAKING_OVER, Phase.BRAKING)
+_RULES: tuple[tuple[Iterable[Phase], Event, Iterable[Phase]], ...] = (
+    ((Phase.IDLE, *_AT_REST), Event.NEW_GOAL, [Phase.MEASURING]),
+    ((*_AT_REST, Phase.EXECUTING, Phase.BRAKING), Event.PLAN_REQUESTED, [Phase.PLANNING]),
+    ([Phase.PLANNING], Event.PLANNED, [Phase.EXECUTING]),
+    ([Phase.PLANNING], Event.REFUSED, [Phase.IDLE, *_AT_REST, Phase.EXECUTING, Phase.BRAKING]),
+    ((Phase.EXECUTING, Phase.REPLANNING), Event.SCHEDULE_ENDED, _AT_REST),
+    ([Phase.EVALUATING], Event.REACHED, [Phase.IDLE]),
+    ([Phase.EVALUATING], Event.FAILED, [Phase.IDLE]),
+    # Plans that take over in motion.
+    ([Phase.EXECUTING], Event.PLAN_REQUESTED, [Phase.REPLANNING]),
+    ([Phase.REPLANNING], Event.PLANNED, [Phase.TAKING_OVER]),
+    ([Phase.REPLANNING], Event.REFUSED, [Phase.EXECUTING]),
+    ([Phase.REPLANNING], Event.PLAN_LATE, [Phase.EXECUTING]),
+    ([Phase.REPLANNING, Phase.TAKING_OVER], Event.NEW_GOAL, [Phase.EXECUTING]),
+    ([Phase.TAKING_OVER], Event.TAKEN_OVER, [Phase.EXECUTING]),
+    # Braking, to plan from rest.
+    ([Phase.EXECUTING], Event.NEW_GOAL, [Phase.BRAKING]),
+    ([Phase.EXECUTING], Event.TRACKING_ERROR, [Phase.BRAKING]),
+    ([Phase.BRAKING], Event.AT_REST, [Phase.IDLE, *_AT_REST]),
+    # Interruptions.
+    (_IN_MOTION, Event.JOINTS_STUCK, _AT_REST),
+    (_IN_MOTION, Event.TIME_JUMPED, _AT_REST),
+    ([Phase.BRAKING], Event.TIME_JUMPED, [Phase.IDLE]),
+    ((Phase.PLANNING, *_IN_MOTION), Event.PLANT_RESET, _AT_REST),
+    ([Phase.BRAKING], Event.PLANT_RESET, [Phase.IDLE]),
+    (_IN_MOTION, Event.ABORTED, [Phase.BRAKING]),
+    ((*_AT_REST, Phase.PLANNING), Event.ABORTED, [Phase.IDLE]),
+    (set(Phase) - {Phase.IDLE}, Event.PLANT_STOPPED, [Phase.IDLE]),
+    (Phase, Event.DEACTIVATED, [Phase.IDLE]),
+)
+TRANSITIONS = frozenset(
+    Transition(source, event, target)
+    for sources, event, targets in _RULES
+    for source in sources
+    for target in targets
+)
+"""Every allowed transition; ``docs/planner_state_machine.md`` explains each."""
+
+
+class IllegalTransitionError(RuntimeError):
+    """A defect of the executive: a transition that is not in :data:`TRANSITIONS`."""
+
+
+Output = PlannerStatus | ScheduleStart | Notice | Transition | FlightEvent
+"""An output of an executive beside its setpoints."""
+
 
 # Python looks up the member of an enum as slowly as it calls a function; these are for every state.
 _EXECUTING, _EVALUATING = Phase.EXECUTING, Phase.EVALUATING
 
 
-class Executive(ScheduleExecution):
+@dataclass
+class ActiveGoal:
+    """A goal that was accepted, its present schedule, and its corrections so far."""
+
+    identified: IdentifiedGoal
+    schedule: GaitSchedule
+    """The schedule that was executed last."""
+    begins_ns: int
+    """Stamp of the state from which the first one was planned."""
+    corrections: int = 0
+    manoeuvre_time: float = 0.0
+    """Duration of all its schedules, s."""
+    ends_at: float = 0.0
+    """Simulated time at which the last one ends, s."""
+    next_plan: PlanReason = PlanReason.CORRECTION
+    """Reason of the next plan, if one is needed."""
+    stuck_at: dict[str, float] = field(default_factory=dict)
+    """Positions of the stuck joints, m or rad, as measured for the last plan."""
+    required: frozenset[Controlled] = frozenset()
+    """Parts of the goal that plans without the stuck joints must control."""
+
+
+class Executive:
     """Brings one robot to one goal after the other, and answers every state with a setpoint.
 
     With a worker that plans at once, the measured state waits for its plan, and a plan that is
     requested while the joints move begins with their braking. With one that plans in the
     background, the joints brake to rest before a plan is requested, and hold their shape until it
-    is there. Where the method allows for it, neither happens: a plan takes over in motion, at a
-    tick ahead (:mod:`.in_motion`).
+    is there. Where the methods of both schedules allow it, neither happens: a plan takes over in
+    motion, at a tick ahead. That tick follows from parameters and from the stamp of the request,
+    not from the time that planning takes.
 
     Parameters
     ----------
     robot
         The model.
     config
-        Of the planner.
+        Of the planner. It may be replaced: tolerances and corrections then apply from now on.
     worker
         Makes the plans; None: a :class:`PlanningWorker`.
     goal_file
@@ -56,58 +210,95 @@ class Executive(ScheduleExecution):
         An option of the gait method does not go with the robot or with another option.
     """
 
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        config: PlannerConfig,
+        worker: PlanningWorker | None = None,
+        goal_file: GoalFile | None = None,
+    ) -> None:
+        self._robot, self.config = robot, config
+        self._worker = worker or PlanningWorker(robot, config)
+        self._file = goal_file or GoalFile("")
+        self._average = StateAverage(robot, config.averaging, config.rest_tolerance)
+        self._tracker = TrajectoryTracker(robot, config)
+        self._longest_gap = round(max(_GAP, _GAP_PERIODS * config.control_period) * 1e9)
+        self.phase = Phase.IDLE
+        """The present phase; :meth:`_go` alone changes it."""
+        self.outputs: deque[Output] = deque()
+        """Outputs to publish and log, in order; the owner takes them out."""
+        self.plant_rests = False
+        """Whether the plant reports that no command is in force; the owner sets it."""
+        self._stamp_ns = 0
+        """Stamp of the state that is answered, ns."""
+        self._waiting: IdentifiedGoal | None = None
+        """A new goal that waits to be planned for."""
+        self._attempts = 0
+        """Plans in motion for it that were late or refused."""
+        self._plan: PlanJob | ReadyPlan | None = None
+        """The plan that is being made, or waits for its tick (``TAKING_OVER``)."""
+        self._active: ActiveGoal | None = None
+        """The goal that is executed or evaluated."""
+        self._replan_ns = 0
+        """Stamp from which on the remaining motion is planned again, ns."""
+        self._commanded_from_ns = 0
+        """Stamp of the first state that the present schedule or plan answers, ns."""
+        self._plan_time, self._plans, self._commands = 0.0, 0, 0
+
+    @property
+    def setpoint(self) -> Setpoint:
+        """The return value of every :meth:`update`; its arrays stay in place."""
+        return self._tracker.setpoint
+
     @property
     def measuring(self) -> bool:
-        """Whether a base that is measured now will be planned from, or evaluated."""
-        return self._proposed is not None or self._machine.phase is _EVALUATING
+        """Whether the next measured base will be planned from, or evaluated."""
+        return self._waiting is not None or self.phase is _EVALUATING
 
     @property
     def statistics(self) -> PlannerStatistics:
-        """What was done so far."""
-        return PlannerStatistics(self._desk.plan_time, self._desk.plans, self._commands)
+        """Time and number of plans for the latest goal, and the number of commands."""
+        return PlannerStatistics(self._plan_time, self._plans, self._commands)
 
-    # -- what comes from outside --------------------------------------------------------------
+    # -- requests of the owner ----------------------------------------------------------------
 
     def propose(self, identified: IdentifiedGoal) -> None:
         """Plan for a goal from the states that are measured next; it replaces any other."""
-        self._proposed = identified
-        self._in_motion.begin_goal()
+        self._waiting, self._attempts = identified, 0
         self._average.restart()
         match self.phase:
             case Phase.IDLE | Phase.MEASURING | Phase.EVALUATING:
                 self._go(Event.NEW_GOAL, Phase.MEASURING)
             case Phase.REPLANNING | Phase.TAKING_OVER:
-                self._desk.drop()
+                self._drop_plan()
                 self._go(Event.NEW_GOAL, Phase.EXECUTING)
 
     def abort(self) -> str | None:
         """Give up all goals and come to rest.
 
-        Returns what the joints do then, as a sentence; None where nothing was done for any goal.
+        Returns a message about the joints; None where nothing was done for any goal.
         """
-        goal_id, sentence = self._goal_id(), "The joints rest."
+        goal_id, message = self._latest_id(), "The joints rest."
         self._file.delete()
         match self.phase:
             case Phase.IDLE:
                 return None
+            case Phase.MEASURING if self._active is None:
+                self._waiting = None
+                self._go(Event.ABORTED, Phase.IDLE)
+                return None
+            case Phase.MEASURING | Phase.PLANNING | Phase.EVALUATING:
+                self._go(Event.ABORTED, Phase.IDLE)
             case Phase.EXECUTING | Phase.REPLANNING | Phase.TAKING_OVER | Phase.BRAKING:
-                self._desk.drop()
                 self._tracker.brake(self._stamp_ns)
                 duration = self.config.abort_time
-                sentence = f"The joints brake along the planned path within {duration:g} s."
+                message = f"The joints brake along the planned path within {duration:g} s."
                 self._go(Event.ABORTED, Phase.BRAKING)
-            case Phase.MEASURING | Phase.PLANNING | Phase.EVALUATING:
-                waits_only = self.phase is Phase.MEASURING and self._pursuit is None
-                self._go(Event.ABORTED, Phase.IDLE)
-                if waits_only:
-                    self._proposed = None
-                    return None
-                self._desk.drop()
-        self._proposed = self._pursuit = None
+        self._forget_goals()
         self.outputs.append(
-            PlannerStatus(PlannerState.ABORTED, f"Aborted on request. {sentence}", goal_id=goal_id)
+            PlannerStatus(PlannerState.ABORTED, f"Aborted on request. {message}", goal_id=goal_id)
         )
-        return sentence
+        return message
 
     def plant_stopped(
         self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
@@ -119,13 +310,13 @@ class Executive(ScheduleExecution):
         Parameters
         ----------
         why
-            The sentence of the plant; it becomes part of the status.
+            The message of the plant; it becomes part of the status.
         commanded_until_ns
             For a plant that rests because commands did not come: the stamp of the last one that it
             had. None: it obeys nothing.
         rests_since_ns
-            Since when it rests then, ns. A goal goes on for which nothing was commanded until then,
-            and one whose plan has taken so long that no state was answered.
+            Stamp since which it rests then, ns. A goal goes on for which nothing was commanded
+            until then, and one whose plan has taken so long that no state was answered.
 
         Returns
         -------
@@ -139,31 +330,35 @@ class Executive(ScheduleExecution):
         self._file.delete()
         if self.phase is Phase.IDLE:
             return False
-        goal_id, pursued = self._goal_id(), self._proposed or self._desk.current or self._pursuit
+        has_goal, goal_id = self._latest() is not None, self._latest_id()
         self._tracker.stop()
-        self._desk.drop()
         self._average.restart()
-        self._proposed = self._pursuit = None
+        self._forget_goals()
         self._go(Event.PLANT_STOPPED, Phase.IDLE)
-        if pursued is None:
+        if has_goal:
+            message = f"Aborted by the plant: {why}"
+            self.outputs.append(PlannerStatus(PlannerState.ABORTED, message, goal_id=goal_id))
+        return has_goal
+
+    def _was_obeyed(self, commanded_until_ns: int, rests_since_ns: int) -> bool:
+        """Whether a plant has obeyed the active goal before it came to rest."""
+        active, since = self._active, self._commanded_from_ns
+        if active is None or commanded_until_ns < active.begins_ns:
             return False
-        sentence = f"Aborted by the plant: {why}"
-        self.outputs.append(PlannerStatus(PlannerState.ABORTED, sentence, goal_id=goal_id))
-        return True
+        return commanded_until_ns >= since or rests_since_ns <= since
 
     def plant_reset(self) -> None:
         """Plan again for the present goal, if any: the robot is in another state than before."""
         self._average.forget()
         # The shape that is held is one of before, like the schedule.
         self._tracker.stop()
-        if self._pursuit is not None:
-            self._pursuit.next_plan = PlanReason.REPLAN
+        if self._active is not None:
+            self._active.next_plan = PlanReason.REPLAN
         if self.phase in (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING):
             return
-        # What is planned begins at a state that is gone.
-        self._plan_again_for(self._desk.drop())
+        self._drop_plan()
         self._go(Event.PLANT_RESET, self._phase_at_rest())
-        self._out.notice(Severity.WARNING, "The plant was reset: the motion is planned again.")
+        self._notice(Severity.WARNING, "The plant was reset: the motion is planned again.")
 
     def cancel_plan(self) -> None:
         """Have a plan that is being made end without a result; may be called in any thread."""
@@ -172,10 +367,11 @@ class Executive(ScheduleExecution):
     def stop(self) -> None:
         """Give up everything at once and wait for the worker to end; the goal file stays."""
         self._tracker.stop()
-        self._desk.drop()
+        self._forget_goals()
         self._worker.close()
-        self._proposed = self._pursuit = None
         self._go(Event.DEACTIVATED, Phase.IDLE)
+
+    # -- measured states ----------------------------------------------------------------------
 
     def observe(self, measured: MeasuredState) -> None:
         """Take note of a base that was measured for a state after it was answered."""
@@ -190,37 +386,35 @@ class Executive(ScheduleExecution):
         stamp, q, tracker = measured.stamp_ns, measured.q, self._tracker
         if not 0 <= stamp - self._stamp_ns <= self._longest_gap and tracker.active:
             self._on_time_jump(stamp)
-        self._out.stamp_ns = stamp
+        self._stamp_ns = stamp
         if tracker.ended(stamp, q):
             self._on_end(stamp)
-        phase = self._machine.phase
-        # In most states a schedule is tracked, and nothing else is to be done.
-        if phase is not _EXECUTING or self._proposed is not None or tracker.check_due(stamp):
-            self._act(phase, measured)
+        # While a schedule is tracked, most states need nothing but a command.
+        if self.phase is not _EXECUTING or self._waiting is not None or tracker.check_due(stamp):
+            self._act(measured)
         if tracker.active:
             stuck = tracker.track(stamp, q, obeyed=not self.plant_rests)
-            if stuck and self._pursuit is not None:
-                self._on_stuck(stuck)
+            if stuck and self._active is not None:
+                self._on_stuck(self._active, stuck)
         if not tracker.active:
             tracker.hold(q, obeyed=not self.plant_rests)
         self._commands += 1
         return tracker.setpoint
 
-    def _act(self, phase: Phase, measured: MeasuredState) -> None:
-        """Do the work of a phase beside tracking."""
-        match phase:
+    def _act(self, measured: MeasuredState) -> None:
+        """Do the work of the present phase beside tracking."""
+        match self.phase:
             case Phase.MEASURING | Phase.EVALUATING:
                 self._measure_at_rest(measured)
             case Phase.PLANNING:
                 self._take_result()
             case Phase.REPLANNING | Phase.TAKING_OVER:
                 self._await_take_over()
-            case Phase.EXECUTING | Phase.BRAKING if self._proposed is not None:
-                self._measure_in_motion(measured)
+            case Phase.EXECUTING | Phase.BRAKING if self._waiting is not None:
+                self._measure_in_motion(self._waiting, measured)
             case Phase.EXECUTING:
-                self._check_tracking(measured)
-
-    # -- measuring ----------------------------------------------------------------------------
+                assert self._active is not None
+                self._check_path(self._active, measured)
 
     def _add(self, measured: MeasuredState) -> bool:
         """Add a state to the average; return whether its base was measured."""
@@ -230,37 +424,70 @@ class Executive(ScheduleExecution):
         self._average.add(base.pose, base.twist, measured.q, base.qdot)
         return True
 
-    def _measure_at_rest(self, measured: MeasuredState) -> None:
-        """Plan for a new goal, or evaluate the present one, once the state is known."""
+    def _worker_is_free(self) -> bool:
+        """Whether a plan can be requested; one that was cancelled may still be ending."""
         if self._worker.busy:
-            # A plan that was cancelled has yet to end: it uses the functions of the robot.
             self._worker.poll()
+            return False
+        return True
+
+    # -- at rest: MEASURING and EVALUATING ----------------------------------------------------
+
+    def _measure_at_rest(self, measured: MeasuredState) -> None:
+        """Plan for a new goal, or evaluate the active one, once the state is known."""
+        if not self._worker_is_free():
             return
         self._add(measured)
         if not self._average.complete:
             return
         if self.phase is Phase.MEASURING:
-            self._plan_for_new_goal()
+            assert self._waiting is not None
+            self._plan_for(self._waiting)
         # Where that was refused the state is still known, unless it took time.
         if self.phase is Phase.EVALUATING:
-            self._evaluate()
+            assert self._active is not None
+            self._evaluate(self._active)
         self._average.restart()
 
-    def _measure_in_motion(self, measured: MeasuredState) -> None:
-        """Plan for a new goal from the state now, or from rest if the plan will take time.
+    def _evaluate(self, active: ActiveGoal) -> None:
+        """Compare the measured pose with the goal; plan the remaining motion, or be done."""
+        controls = active.schedule.controls
+        try:
+            state = self._average.state()
+        except PlanningError as reason:
+            self._report(PlannerState.FAILED, str(reason), active.identified)
+            self._end_goal(Event.FAILED)
+            return
+        error = PoseError.between(state.position, state.quaternion, active.identified.goal, state.q)
+        if self.config.tolerance.admits(error, controls):
+            message = f"The goal is reached: {remaining_error(error, controls)}."
+            self._report(PlannerState.REACHED, message, active.identified, active, error)
+            self._end_goal(Event.REACHED)
+            return
+        if active.next_plan is PlanReason.CORRECTION:
+            if active.corrections >= self.config.max_corrections:
+                self._fail(active, error, f" after {active.corrections} correction(s).")
+                return
+            off = remaining_error(error, controls)
+            self._count_correction(active, f"The remaining motion is planned: {off}.")
+        self._request(RemainingJob(active.identified, active.next_plan, error), state)
+
+    # -- in motion: EXECUTING and BRAKING -----------------------------------------------------
+
+    def _measure_in_motion(self, waiting: IdentifiedGoal, measured: MeasuredState) -> None:
+        """Plan for a new goal from the state now, or brake first if the plan will take time.
 
         A plan takes over in motion where the methods allow for it.
         """
         take_over = None
-        if self.phase is Phase.EXECUTING and not self.plant_rests:
-            take_over = self._in_motion.take_over(
-                self.config, self._pursuit, self._stamp_ns, measured.q
-            )
+        if self.phase is Phase.EXECUTING and self._attempts < _MOST_ATTEMPTS and self._can_replan():
+            after = self.config.takeover_time * 2**self._attempts
+            take_over = self._tracker.take_over(self._stamp_ns, measured.q, after)
         if take_over is None and self._worker.background:
             if self.phase is Phase.EXECUTING:
                 self._brake_for_replan(Event.NEW_GOAL)
             return
-        if not self._desk.free():
+        if not self._worker_is_free():
             return
         base = measured.base()
         if base is not None:
@@ -269,47 +496,16 @@ class Executive(ScheduleExecution):
         if not self._average.count:
             return
         if take_over is None:
-            self._plan_for_new_goal()
+            self._plan_for(waiting)
         else:
-            self._plan_in_motion(take_over)
+            self._plan_in_motion(waiting, take_over)
         self._average.restart()
 
-    def _check_tracking(self, measured: MeasuredState) -> None:
-        """Plan again when the base is too far off the path that was predicted, or in time."""
-        pursuit = self._pursuit
-        assert pursuit is not None
-        self._average.restart()
-        corrected = pursuit.corrections >= self.config.max_corrections
-        if not self._desk.free():
-            return
-        if corrected and (self.plant_rests or not self._in_motion.replans(self.config, pursuit)):
-            return
-        if not self._add(measured):
-            return
-        try:
-            state = self._average.state()
-        except PlanningError as reason:
-            self._out.notice(Severity.WARNING, f"The path is not known: {reason}")
-            return
-        error = None if corrected else self._tracker.error(state)
-        if error is None:
-            self._plan_remaining(pursuit, state)
-        elif self._worker.background:
-            self._correct_tracking(pursuit, error)
-            self._brake_for_replan(Event.TRACKING_ERROR)
-        else:
-            ticket = Ticket(pursuit.identified, PlanReason.TRACKING_ERROR, tracking_error=error)
-            self._request(ticket, state)
-
-    # -- planning in motion -------------------------------------------------------------------
-
-    def _plan_in_motion(self, take_over: TakeOver) -> None:
-        """Have a plan made for the new goal that takes over without a stop."""
-        identified, pursuit = self._proposed, self._pursuit
-        assert identified is not None
-        assert pursuit is not None
-        if same_goal(identified.goal, pursuit.identified.goal):
-            self._go_on_for(identified, pursuit)
+    def _plan_in_motion(self, waiting: IdentifiedGoal, take_over: TakeOver) -> None:
+        """Request a plan for a new goal that takes over without a stop."""
+        assert self._active is not None
+        if waiting.goal.equals(self._active.identified.goal):
+            self._keep_schedule_for(waiting, self._active)
             return
         averages = self.config.averaging > 1
         if averages and not self._tracker.check_due(self._stamp_ns):
@@ -320,160 +516,469 @@ class Executive(ScheduleExecution):
             # The next state may be better; if none is, the schedule ends.
             return
         if averages:
-            state = self._tracker.averaged(state)
-        self._proposed = None
-        self._desk.begin_goal()
-        self._request(Ticket(identified, PlanReason.IN_MOTION, take_over=take_over), state)
+            state = self._tracker.path_check.averaged(state)
+        self._begin_plans()
+        self._request(
+            TakeOverJob(waiting, PlanReason.IN_MOTION, take_over=take_over, aim=waiting.goal), state
+        )
 
-    def _plan_remaining(self, pursuit: Pursuit, state: RobotState) -> None:
-        """Have the remaining motion planned again from a state that is due, if it is time."""
-        if self.plant_rests:
+    def _keep_schedule_for(self, identified: IdentifiedGoal, active: ActiveGoal) -> None:
+        """Make a goal with the same pose and shape the active one; its schedule goes on."""
+        self._waiting = None
+        left = active.ends_at - self._stamp_ns / 1e9
+        self._active = replace(active, identified=identified, corrections=0, manoeuvre_time=left)
+        self._accepted(self._active)
+        message = "The schedule that is executed leads to this goal, too."
+        self._report(PlannerState.EXECUTING, message, identified, self._active)
+
+    def _check_path(self, active: ActiveGoal, measured: MeasuredState) -> None:
+        """Plan again when the base is too far off its predicted path, or periodically."""
+        self._average.restart()
+        corrected = active.corrections >= self.config.max_corrections
+        if not self._worker_is_free():
             return
-        found = self._in_motion.remaining(self.config, pursuit, self._stamp_ns, state)
-        if found is not None:
-            ticket = Ticket(
-                pursuit.identified,
-                PlanReason.SHRINKING_HORIZON,
-                take_over=found.take_over,
-                aim=found.aim,
-            )
-            self._request(ticket, found.state)
+        replans = self.config.replanning > 0 and self._can_replan()
+        if corrected and not replans:
+            return
+        if not self._add(measured):
+            return
+        try:
+            state = self._average.state()
+        except PlanningError as reason:
+            self._notice(Severity.WARNING, f"The path is not known: {reason}")
+            return
+        error = None if corrected else self._tracker.path_check.error(state)
+        if error is None:
+            if replans:
+                self._replan_remaining(active, state)
+        elif self._worker.background:
+            self._correct_path(active, error)
+            self._brake_for_replan(Event.TRACKING_ERROR)
+        else:
+            self._request(OffPathJob(active.identified, PlanReason.TRACKING_ERROR, error), state)
+
+    def _can_replan(self) -> bool:
+        """Whether a plan may take over in motion from the schedule that is tracked."""
+        return (
+            self._active is not None
+            and not self.plant_rests
+            and self.config.takeover_time > 0
+            and not self._tracker.stuck
+            and self._worker.starts_in_motion(self._active.schedule)
+        )
+
+    def _replan_remaining(self, active: ActiveGoal, state: RobotState) -> None:
+        """Plan the remaining motion again from a state that is due, if it is time for it.
+
+        (Shrinking horizon.) It is not where the present motion leads near enough to the goal.
+        """
+        state = self._tracker.path_check.averaged(state)
+        if self._stamp_ns < self._replan_ns or active.schedule.partial:
+            return
+        self._replan_ns = self._stamp_ns + round(self.config.replanning * 1e9)
+        aim = self._tracker.path_check.aim(
+            active.identified.goal,
+            self.config.tolerance,
+            active.schedule.controls & POSE,
+            late=active.ends_at - self._stamp_ns / 1e9 < _LATE * active.manoeuvre_time,
+        )
+        if aim is None:
+            return
+        take_over = self._tracker.take_over(self._stamp_ns, state.q, self.config.takeover_time)
+        if take_over is None:
+            return
+        job = TakeOverJob(
+            active.identified, PlanReason.SHRINKING_HORIZON, take_over=take_over, aim=aim
+        )
+        self._request(job, replace(state, q=take_over.shapes[0].copy()))
+
+    def _brake_for_replan(self, event: Event) -> None:
+        """Come to rest along the planned path: in the background plans are made from rest."""
+        assert self._active is not None
+        self._active.next_plan = PlanReason.REPLAN
+        self._tracker.brake(self._stamp_ns)
+        self._average.restart()
+        self._go(event, Phase.BRAKING)
+
+    # -- in motion: REPLANNING and TAKING_OVER ------------------------------------------------
 
     def _await_take_over(self) -> None:
         """Take the plan that is made in motion, and have it take over at its tick."""
         if self.phase is Phase.REPLANNING:
             self._take_result()
-        ready, ticket = self._desk.ready, self._desk.ticket
-        if ready is not None and self._stamp_ns >= ready.take_over.stamp_ns:
-            self._switch(ready)
-        elif ticket is not None and ticket.is_late(self._stamp_ns):
-            self._on_late(ticket)
+        match self._plan:
+            case ReadyPlan(job) as ready if self._stamp_ns >= job.take_over.stamp_ns:
+                self._switch(ready)
+            case TakeOverJob(take_over=take_over) as job if self._stamp_ns >= take_over.stamp_ns:
+                self._on_late(job)
 
-    def _on_late(self, ticket: Ticket) -> None:
-        """Go on along the schedule of now: a new goal is planned for once more."""
-        self._plan_again_for(self._desk.drop())
-        if ticket.reason.for_new_goal:
-            self._in_motion.attempt_failed()
+    def _switch(self, ready: ReadyPlan) -> None:
+        """Track the plan that is ready from its first tick on."""
+        job, schedule, begins_ns = ready.job, ready.schedule, ready.job.take_over.stamp_ns
+        self._plan = None
+        if job.reason.for_new_goal:
+            self._accept(ActiveGoal(job.identified, schedule, begins_ns))
+        reason = job.reason.value
+        self._event(
+            EventKind.PLAN_TAKEN_OVER,
+            f"A plan takes over in motion: {reason}.",
+            job.identified,
+            reason=reason,
+            method=schedule.method,
+            duration_s=f"{schedule.duration:.9g}",
+        )
+        self._execute(schedule, take_over_ns=begins_ns)
+
+    def _on_late(self, job: TakeOverJob) -> None:
+        """Continue along the present schedule; a new goal is planned for once more."""
+        self._drop_plan()
+        self._attempts += job.reason.for_new_goal
         self._go(Event.PLAN_LATE, Phase.EXECUTING)
-        sentence = "The plan was not ready when it was to take over."
-        self._out.notice(Severity.WARNING, sentence)
-        reason = ticket.reason.value
-        self._out.happened(EventKind.PLAN_LATE, sentence, ticket.identified, 1, reason=reason)
+        message = "The plan was not ready when it was to take over."
+        self._notice(Severity.WARNING, message)
+        self._event(EventKind.PLAN_LATE, message, job.identified, 1, reason=job.reason.value)
 
-    # -- planning -----------------------------------------------------------------------------
+    # -- plans: request, result, schedule -----------------------------------------------------
 
-    def _plan_for_new_goal(self) -> None:
-        assert self._proposed is not None
+    def _plan_for(self, waiting: IdentifiedGoal) -> None:
+        """Request a plan for a new goal that begins at rest, or with braking."""
         reason = PlanReason.BLEND if self._tracker.active else PlanReason.NEW_GOAL
-        ticket = Ticket(self._proposed, reason)
-        self._proposed = None
-        self._desk.begin_goal()
+        job = PlanJob(waiting, reason)
+        self._begin_plans()
         try:
             state = self._average.state()
         except PlanningError as refusal:
             self._go(Event.PLAN_REQUESTED, Phase.PLANNING)
-            self._conclude_plan(ticket, Refused(str(refusal)))
+            self._conclude(job, Refused(str(refusal)))
         else:
-            self._request(ticket, state)
+            self._request(job, state)
 
-    def _request(self, ticket: Ticket, state: RobotState) -> None:
+    def _begin_plans(self) -> None:
+        """Count plans for the goal that waits, which is planned for now."""
+        self._waiting = None
+        self._plan_time, self._plans = 0.0, 0
+
+    def _request(self, job: PlanJob, state: RobotState) -> None:
         """Request a plan from a measured state; unless it is to take over, the joints brake."""
-        pursuit, braking = None if ticket.reason.for_new_goal else self._pursuit, None
-        if pursuit is not None and pursuit.stuck_at is None:
+        goal, active = job.identified.goal, None if job.reason.for_new_goal else self._active
+        if active is not None and len(active.stuck_at) != len(self._tracker.stuck):
             names = self._robot.joint_names
-            pursuit.stuck_at = {names[i]: float(state.q[i]) for i in self._tracker.stuck}
-        if ticket.take_over is not None:
+            active.stuck_at = {names[i]: float(state.q[i]) for i in self._tracker.stuck}
+        braking, take_over = None, None
+        if isinstance(job, TakeOverJob):
+            goal, take_over = job.aim, job.take_over
             self._go(Event.PLAN_REQUESTED, Phase.REPLANNING)
         else:
-            follower = self._tracker.braked(self._stamp_ns)
-            braking = None if follower is None else Braking(follower, self._stamp_ns)
+            braking = self._tracker.braking_shapes(self._stamp_ns)
             self._commanded_from_ns = self._stamp_ns
             self._go(Event.PLAN_REQUESTED, Phase.PLANNING)
-        self._desk.request(ticket, state, self.config.tolerance, pursuit, braking)
+        request = PlanRequest(
+            state,
+            goal,
+            self.config.tolerance,
+            correction=job.reason in (PlanReason.CORRECTION, PlanReason.CONTINUATION),
+            previous=None if active is None else active.schedule,
+        )
+        reason = job.reason.value
+        message = f"A plan is made: {reason}."
+        self._event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
+        task = PlanningTask(request, braking=braking, take_over=take_over)
+        if active is not None:
+            task = replace(task, stuck=active.stuck_at, required=active.required)
+        self._plan = job
+        self._worker.submit(task)
         self._take_result()
 
     def _take_result(self) -> None:
-        """Act on the result of the plan that is being made, if it is there."""
-        taken = self._desk.take()
-        if taken is not None:
-            self._conclude_plan(*taken)
+        """Act on the result of the plan that is being made, if there is one."""
+        result = self._worker.poll()
+        if result is None:
+            return
+        job = self._plan
+        assert isinstance(job, PlanJob)
+        self._plan = None
+        self._plan_time += result.wall_time
+        self._plans += 1
+        self._notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
+        if isinstance(result, Planned):
+            # A plan may aim beside the goal; its result is judged by the goal.
+            schedule = replace(result.schedule, goal=job.identified.goal)
+            result = replace(result, schedule=schedule)
+            self._event(
+                EventKind.PLAN_READY,
+                f"The plan is {_gait_by(schedule.method)} of {schedule.duration:.6g} s.",
+                job.identified,
+                method=schedule.method,
+                duration_s=f"{schedule.duration:.9g}",
+            )
+        self._conclude(job, result)
 
-    def _conclude_plan(self, ticket: Ticket, result: Planned | Refused) -> None:
-        """Execute a plan, or report why there is none, depending on the reason of the request."""
-        pursuit = self._pursuit
-        match ticket.reason, result:
-            case PlanReason.IN_MOTION | PlanReason.SHRINKING_HORIZON, Planned(schedule=schedule):
-                assert ticket.take_over is not None
-                self._desk.ready = ReadyPlan(ticket, ticket.take_over, schedule)
+    def _conclude(self, job: PlanJob, result: Planned | Refused) -> None:
+        """Execute a plan, or report the refusal, depending on the job alone."""
+        active = self._active
+        match job, result:
+            case TakeOverJob() as takes_over, Planned(schedule=schedule):
+                self._plan = ReadyPlan(takes_over, schedule)
                 self._go(Event.PLANNED, Phase.TAKING_OVER)
-            case PlanReason.IN_MOTION, Refused(reason=reason):
-                self._plan_again_for(ticket.identified)
-                self._in_motion.attempt_failed()
-                again = "from a later tick" if self._in_motion.tries_again else "from rest"
-                sentence = f"No plan begins in motion, so the goal is planned for {again}: {reason}"
-                self._out.notice(Severity.WARNING, sentence)
+            case TakeOverJob(reason=PlanReason.IN_MOTION), Refused(reason=reason):
+                self._waiting = self._waiting or job.identified
+                self._attempts += 1
+                again = "from a later tick" if self._attempts < _MOST_ATTEMPTS else "from rest"
+                message = f"No plan begins in motion, so the goal is planned for {again}: {reason}"
+                self._notice(Severity.WARNING, message)
                 self._go(Event.REFUSED, Phase.EXECUTING)
-            case PlanReason.SHRINKING_HORIZON, Refused(reason=reason):
-                sentence = f"The remaining motion is not planned again: {reason}"
-                self._out.notice(Severity.INFO, sentence)
+            case TakeOverJob(), Refused(reason=reason):
+                message = f"The remaining motion is not planned again: {reason}"
+                self._notice(Severity.INFO, message)
                 self._go(Event.REFUSED, Phase.EXECUTING)
-            case PlanReason.NEW_GOAL | PlanReason.BLEND, Planned(schedule=schedule):
-                self._accept(Pursuit(ticket.identified, schedule, self._stamp_ns))
+            case OffPathJob(error=error), Planned(schedule=schedule):
+                assert active is not None
+                self._correct_path(active, error)
                 self._execute(schedule)
-            case PlanReason.NEW_GOAL | PlanReason.BLEND, Refused(reason=reason):
-                earlier = " The earlier goal is still pursued." if pursuit is not None else ""
-                self._out.report(PlannerState.REFUSED, f"{reason}{earlier}", ticket.identified)
+            case OffPathJob(error=error), Refused(reason=reason):
+                message = f"{error}, and the remaining motion cannot be planned again: {reason}"
+                self._notice(Severity.WARNING, message)
                 self._go(Event.REFUSED, self._phase_without_plan())
-            case PlanReason.TRACKING_ERROR, Planned(schedule=schedule):
-                assert pursuit is not None
-                assert ticket.tracking_error is not None
-                self._correct_tracking(pursuit, ticket.tracking_error)
-                self._execute(schedule)
-            case PlanReason.TRACKING_ERROR, Refused(reason=reason):
-                self._out.notice(
-                    Severity.WARNING,
-                    f"{ticket.tracking_error}, and the remaining motion cannot be planned again: "
-                    f"{reason}",
-                )
-                self._go(Event.REFUSED, self._phase_without_plan())
-            # CORRECTION, CONTINUATION, REPLAN, STUCK_JOINTS: what remains after a schedule.
+            case RemainingJob(error=remaining), Planned(schedule=schedule):
+                self._execute(schedule, remaining)
+            case RemainingJob(error=remaining), Refused(reason=reason):
+                assert active is not None
+                self._fail(active, remaining, f", and {reason}", Event.REFUSED)
             case _, Planned(schedule=schedule):
-                self._execute(schedule, ticket.remaining)
+                self._accept(ActiveGoal(job.identified, schedule, self._stamp_ns))
+                self._execute(schedule)
             case _, Refused(reason=reason):
-                assert ticket.remaining is not None
-                self._fail(ticket.remaining, f", and {reason}", Event.REFUSED)
+                earlier = " The earlier goal is still pursued." if active is not None else ""
+                self._report(PlannerState.REFUSED, f"{reason}{earlier}", job.identified)
+                self._go(Event.REFUSED, self._phase_without_plan())
 
-    def _brake_for_replan(self, event: Event) -> None:
-        """Come to rest along the planned path: in the background plans are made from rest."""
-        assert self._pursuit is not None
-        self._pursuit.next_plan = PlanReason.REPLAN
-        self._tracker.brake(self._stamp_ns)
-        self._average.restart()
-        self._go(event, Phase.BRAKING)
+    def _accept(self, active: ActiveGoal) -> None:
+        """Make a new goal the active one, to be flown to with all joints."""
+        self._active, self._tracker.stuck = active, []
+        self._accepted(active)
 
-    # -- evaluating ---------------------------------------------------------------------------
-
-    def _evaluate(self) -> None:
-        """Compare the measured pose with the goal; plan the remaining motion, or be done."""
-        pursuit = self._pursuit
-        assert pursuit is not None
-        goal, controls = pursuit.identified.goal, pursuit.schedule.controls
+    def _accepted(self, active: ActiveGoal) -> None:
+        """Report that a goal is accepted, and save it."""
+        self._event(EventKind.GOAL_ACCEPTED, "The goal is accepted.", active.identified)
         try:
-            state = self._average.state()
-        except PlanningError as reason:
-            self._out.report(PlannerState.FAILED, str(reason), pursuit.identified)
-            self._forget_pursuit(Event.FAILED)
-            return
-        error = PoseError.between(state.position, state.quaternion, goal, state.q)
-        if self.config.tolerance.admits(error, controls):
-            sentence = f"The goal is reached: {remaining_error(error, controls)}."
-            self._out.report(PlannerState.REACHED, sentence, pursuit.identified, pursuit, error)
-            self._forget_pursuit(Event.REACHED)
-            return
-        if pursuit.next_plan is PlanReason.CORRECTION:
-            if pursuit.corrections >= self.config.max_corrections:
-                self._fail(error, f" after {pursuit.corrections} correction(s).", Event.FAILED)
+            self._file.save({BASE: active.identified})
+        except ParameterError as error:
+            message = f"{error} The goal is pursued, but would not be resumed."
+            self._notice(Severity.ERROR, message)
+
+    def _execute(
+        self,
+        schedule: GaitSchedule,
+        remaining: PoseError | None = None,
+        take_over_ns: int | None = None,
+    ) -> None:
+        """Track a schedule for the active goal.
+
+        ``remaining`` is the error to the goal at its start; ``take_over_ns`` the stamp of its first
+        tick where it takes over in motion.
+        """
+        active, config = self._active, self.config
+        assert active is not None
+        in_motion = take_over_ns is not None
+        begins = self._stamp_ns if take_over_ns is None else take_over_ns
+        self._cut_off(active, begins)
+        active.schedule = schedule
+        self._replan_ns = begins + round(config.replanning * 1e9)
+        averages = (config.replanning > 0 or config.averaging > 1) and config.takeover_time > 0
+        averages = averages and self._worker.starts_in_motion(schedule)
+        self._tracker.start(schedule, begins, config.averaging if averages else 0)
+        self._commanded_from_ns = self._stamp_ns
+        active.manoeuvre_time += schedule.duration
+        active.ends_at = begins / 1e9 + schedule.duration
+        active.next_plan = PlanReason.CONTINUATION if schedule.partial else PlanReason.CORRECTION
+        self._go(Event.TAKEN_OVER if in_motion else Event.PLANNED, Phase.EXECUTING)
+        start = ", which begins in motion" if in_motion else ""
+        self._report(
+            PlannerState.EXECUTING,
+            f"Executing {_gait_by(schedule.method)} of {schedule.duration:.6g} s{start}.",
+            active.identified,
+            active,
+            remaining,
+            schedule,
+        )
+        self.outputs.append(ScheduleStart(schedule, begins))
+
+    @staticmethod
+    def _cut_off(active: ActiveGoal, stamp_ns: int) -> None:
+        """Subtract the rest of the present schedule from the duration of the manoeuvre."""
+        remainder = active.ends_at - stamp_ns / 1e9
+        if remainder > 0:
+            active.manoeuvre_time -= min(remainder, active.schedule.duration)
+            active.ends_at = stamp_ns / 1e9
+
+    def _correct_path(self, active: ActiveGoal, error: TrackingError) -> None:
+        message = f"{error}: the remaining motion is planned again."
+        self._count_correction(active, message)
+        self._notice(Severity.WARNING, message)
+
+    def _count_correction(self, active: ActiveGoal, message: str) -> None:
+        active.corrections += 1
+        count = str(active.corrections)
+        self._event(EventKind.CORRECTION, message, active.identified, 1, corrections=count)
+
+    # -- ends of schedules and goals ----------------------------------------------------------
+
+    def _on_end(self, stamp_ns: int) -> None:
+        """End the schedule; its result is evaluated unless its goal was given up."""
+        ready = self._plan
+        if isinstance(ready, ReadyPlan):
+            # No state was measured since the tick at which it takes over.
+            self._switch(ready)
+            if not self._tracker.ended(stamp_ns, ready.schedule.positions[-1]):
                 return
-            left = remaining_error(error, controls)
-            self._count_correction(pursuit, f"The remaining motion is planned: {left}.")
-        self._request(Ticket(pursuit.identified, pursuit.next_plan, remaining=error), state)
+        self._drop_plan()
+        at_rest = self.phase is Phase.BRAKING
+        self._tracker.stop(at_last_shape=not at_rest)
+        self._average.restart()
+        self._go(Event.AT_REST if at_rest else Event.SCHEDULE_ENDED, self._phase_at_rest())
+
+    def _on_time_jump(self, stamp_ns: int) -> None:
+        """Plan the remaining motion where the schedule does not cover the present time."""
+        if self._tracker.covers(stamp_ns):
+            return
+        self._drop_plan()
+        self._tracker.stop()
+        self._average.restart()
+        if self._active is not None:
+            self._active.next_plan = PlanReason.REPLAN
+        self._go(Event.TIME_JUMPED, self._phase_at_rest())
+        before, now = self._stamp_ns / 1e9, stamp_ns / 1e9
+        self._notice(
+            Severity.WARNING,
+            f"The time of the states has jumped from {before:.9g} s to {now:.9g} s, where no "
+            "motion is planned.",
+        )
+
+    def _on_stuck(self, active: ActiveGoal, stuck: Sequence[int]) -> None:
+        """Stop, and plan the remaining motion with the joints that are not stuck."""
+        tracker = self._tracker
+        tracker.stuck += stuck
+        self._drop_plan()
+        tracker.stop()
+        self._cut_off(active, self._stamp_ns)
+        active.required = active.schedule.controls & POSE
+        active.next_plan = PlanReason.STUCK_JOINTS
+        self._average.restart()
+        self._go(Event.JOINTS_STUCK, self._phase_at_rest())
+        names = ", ".join(self._robot.joint_names[i] for i in tracker.stuck)
+        message = f"Stuck: {names}. The remaining motion is planned without."
+        self._notice(Severity.WARNING, message)
+        self._event(EventKind.STUCK_JOINT, message, active.identified, 1, joints=names)
+
+    def _drop_plan(self) -> None:
+        """Drop the plan that is being made or ready; a new goal of it waits again."""
+        self._worker.cancel()
+        plan, self._plan = self._plan, None
+        job = plan.job if isinstance(plan, ReadyPlan) else plan
+        if job is not None and job.reason.for_new_goal:
+            self._waiting = self._waiting or job.identified
+
+    def _phase_without_plan(self) -> Phase:
+        """Return the next phase where there is no plan."""
+        if self._tracker.active:
+            return Phase.BRAKING if self._tracker.braking else Phase.EXECUTING
+        return self._phase_at_rest()
+
+    def _phase_at_rest(self) -> Phase:
+        """Return the next phase when the joints have come to rest."""
+        if self._waiting is not None:
+            return Phase.MEASURING
+        return Phase.IDLE if self._active is None else Phase.EVALUATING
+
+    def _fail(
+        self, active: ActiveGoal, remaining: PoseError, why: str, event: Event = Event.FAILED
+    ) -> None:
+        """Report that the active goal is not reached; ``why`` ends the message."""
+        off = remaining_error(remaining, active.schedule.controls)
+        message = f"The goal is not reached: {off}{why}"
+        self._report(PlannerState.FAILED, message, active.identified, active, remaining)
+        self._end_goal(event)
+
+    def _end_goal(self, event: Event) -> None:
+        """End the active goal: nothing is to be resumed."""
+        self._file.delete()
+        self._active = None
+        self._go(event, self._phase_at_rest())
+
+    def _forget_goals(self) -> None:
+        """Drop the plan and every goal."""
+        self._drop_plan()
+        self._waiting = self._active = None
+
+    def _latest(self) -> IdentifiedGoal | None:
+        """Return the goal that was proposed last, of those that are not decided."""
+        plan = self._plan.job if isinstance(self._plan, ReadyPlan) else self._plan
+        current = plan or self._active
+        return self._waiting or (None if current is None else current.identified)
+
+    def _latest_id(self) -> str:
+        latest = self._latest()
+        return "" if latest is None else latest.goal_id
+
+    # -- outputs ------------------------------------------------------------------------------
+
+    def _go(self, event: Event, target: Phase) -> None:
+        """Change the phase and report it; no other method does."""
+        transition = Transition(self.phase, event, target)
+        if transition not in TRANSITIONS:
+            raise IllegalTransitionError(
+                f"{self.phase.name} may not become {target.name} by {event.name}."
+            )
+        self.phase = target
+        self.outputs.append(transition)
+
+    def _notice(self, severity: Severity, message: str) -> None:
+        self.outputs.append(Notice(severity, message))
+
+    def _event(
+        self,
+        kind: EventKind,
+        message: str,
+        identified: IdentifiedGoal,
+        level: int = 0,
+        **about: str,
+    ) -> None:
+        """Report an event about a goal."""
+        now = self._stamp_ns / 1e9
+        self.outputs.append(FlightEvent(kind, message, level, now, identified.goal_id, about))
+
+    def _report(
+        self,
+        state: PlannerState,
+        message: str,
+        identified: IdentifiedGoal,
+        active: ActiveGoal | None = None,
+        remaining: PoseError | None = None,
+        schedule: GaitSchedule | None = None,
+    ) -> None:
+        """Report a status of a goal, with corrections, durations, remaining error and schedule."""
+        status = PlannerStatus(state, message, identified.goal_id, goal_values(identified.goal))
+        if active is not None:
+            status = replace(
+                status,
+                corrections=active.corrections,
+                manoeuvre_time_s=active.manoeuvre_time,
+                ends_at_s=active.ends_at,
+            )
+        if remaining is not None:
+            status = replace(
+                status, position_error_m=remaining.distance, attitude_error_rad=remaining.angle
+            )
+        if schedule is not None:
+            status = replace(
+                status,
+                method=schedule.method,
+                duration_s=schedule.duration,
+                notes=schedule.notes,
+            )
+        self.outputs.append(status)
+
+
+def _gait_by(method: str) -> str:
+    """Return the gait of a method with its article, such as "an optimal gait", for messages."""
+    return f"{'an' if method[:1] in tuple('aeiou') else 'a'} {method} gait"

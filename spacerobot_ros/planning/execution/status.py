@@ -1,4 +1,4 @@
-"""What a planner reports: the state of its goal, and its statistics."""
+"""Outputs of a planner: the status of its goal, notices, schedules, and statistics."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from enum import Enum
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError
-from spacerobot_ros.planning.core.schedule import Notes
+from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 
 
 class PlannerState(str, Enum):
@@ -127,6 +127,30 @@ class PlannerStatus:
             raise SpaceRobotError(f"This is no status of a planner: {error}.") from error
 
 
+class Severity(Enum):
+    """Severity of a notice."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A message for the log."""
+
+    severity: Severity
+    message: str
+
+
+@dataclass(frozen=True)
+class ScheduleStart:
+    """A schedule that is tracked from a stamp on, ns."""
+
+    schedule: GaitSchedule
+    stamp_ns: int
+
+
 _NUMBERS = (
     *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "ends_at_s", "duration_s"),
 )
@@ -135,7 +159,7 @@ _NUMBERS = (
 
 @dataclass(frozen=True)
 class PlannerStatistics:
-    """What a planner has done so far, for benchmarks and summaries.
+    """Counts of plans and commands, for benchmarks and summaries.
 
     Attributes
     ----------

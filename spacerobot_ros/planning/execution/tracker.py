@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import attitude_error, matrix_from_quaternion
-from spacerobot_ros.planning.core.goal import RobotState
+from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.mass_estimate import MassEstimate, PathSensitivity
+from spacerobot_ros.planning.execution.path_deviation import (
+    MassEstimate,
+    PathCheck,
+    PathSensitivity,
+)
 from spacerobot_ros.planning.execution.stuck_joints import StuckJointWatch
-from spacerobot_ros.planning.execution.take_over import PathDeviation, TakeOver
 from spacerobot_ros.times import SECOND
 
 _AT_END = 1e-6
@@ -38,14 +40,39 @@ class Setpoint:
 
 
 @dataclass(frozen=True)
-class TrackingError:
-    """How far the base is off the path that its schedule predicts: m, rad."""
+class TakeOver:
+    """A tick of a schedule at which another one takes over.
 
-    distance: float
-    angle: float
+    Attributes
+    ----------
+    stamp_ns
+        Its stamp, ns.
+    shapes
+        (K + 1, n) from the tick now to that tick, m or rad.
+    motion
+        How the joints move then.
+    """
 
-    def __str__(self) -> str:
-        return f"Off the path by {self.distance:.3g} m and {self.angle:.3g} rad"
+    stamp_ns: int
+    shapes: Array
+    motion: InitialMotion
+
+    @classmethod
+    def of(
+        cls, schedule: GaitSchedule, start_ns: int, stamp_ns: int, after: float
+    ) -> TakeOver | None:
+        """Return the first tick that is ``after`` s or later than now.
+
+        None where the schedule, which began at ``start_ns``, is over by then.
+        """
+        period_ns = round(schedule.control_period * SECOND)
+        now = max((stamp_ns - start_ns) // period_ns, 0)
+        tick = now + max(1, math.ceil(after / schedule.control_period - 1e-9))
+        if tick >= schedule.ticks:
+            return None
+        positions = schedule.positions
+        motion = InitialMotion(schedule.velocities[tick - 1], positions[tick:])
+        return cls(start_ns + tick * period_ns, positions[now : tick + 1].copy(), motion)
 
 
 class ScheduleFollower:
@@ -177,87 +204,6 @@ class BrakingFollower:
         return np.asarray(positions[k] + (ticks - k) * ahead)
 
 
-class TrackingErrorCheck:
-    """Compares measured poses with a predicted base path, at the path's own instants.
-
-    Parameters
-    ----------
-    schedule
-        What is tracked.
-    start_ns
-        Stamp of its first tick, ns.
-    position, attitude
-        Largest distance and angle that are near enough, m and rad; 0: any.
-    average
-        Measured poses whose mean deviation from the path counts for plans in motion; 0: none are.
-    sensitivity, masses
-        Derivatives of the path by errors of masses, and their estimate: see
-        :class:`.PathDeviation`.
-    """
-
-    def __init__(
-        self,
-        schedule: GaitSchedule,
-        start_ns: int,
-        position: float,
-        attitude: float,
-        average: int = 0,
-        sensitivity: Array | None = None,
-        masses: MassEstimate | None = None,
-    ) -> None:
-        self._path, self._positions = schedule.path, schedule.positions
-        self._period = schedule.control_period
-        self._deviation = PathDeviation(schedule.path, average, sensitivity, masses)
-        self._position, self._attitude = position or np.inf, attitude or np.inf
-        self._stamps = start_ns + (schedule.path.time * SECOND).round().astype(np.int64)
-        self._slack = round(schedule.control_period * 0.5e9)
-        self._next = 0
-        self._used = position > 0 or attitude > 0 or average > 0
-
-    def due(self, stamp_ns: int) -> bool:
-        """Whether the path predicts a pose for this time."""
-        if not self._used:
-            return False
-        stamps = self._stamps
-        while self._next < len(stamps) and stamps[self._next] < stamp_ns - self._slack:
-            self._next += 1
-        return self._next < len(stamps) and stamps[self._next] <= stamp_ns + self._slack
-
-    @property
-    def shape(self) -> Array:
-        """The shape (n,) that the schedule has where a pose is due."""
-        time = self._path.time[self._next]
-        return np.asarray(self._positions[round(time / self._period)])
-
-    def add(self, position: Array, quaternion: Array, lag: Array) -> None:
-        """Add a pose that is due to the mean deviation, without the part (6,) of lagging joints."""
-        self._deviation.add(self._next, position, quaternion, lag)
-
-    @property
-    def pose(self) -> tuple[Array, Array]:
-        """The pose that is due by the mean deviation: position (3,), attitude (4,)."""
-        return self._deviation.pose(self._next)
-
-    @property
-    def end(self) -> tuple[Array, Array]:
-        """Where the path leads to by the mean deviation: position (3,), attitude (4,)."""
-        return self._deviation.end(self._next)
-
-    @property
-    def expected_end(self) -> tuple[Array, Array]:
-        """Where the path leads to with the estimated errors of masses: (3,), (4,)."""
-        return self._deviation.expected_end(self._next)
-
-    def error(self, position: Array, quaternion: Array) -> TrackingError | None:
-        """Return the tracking error of a pose that is due, None if it is small enough."""
-        k = self._next
-        turn = attitude_error(quaternion, self._path.quaternion[k])
-        distance = float(np.linalg.norm(position - self._path.position[k]))
-        angle = float(np.linalg.norm(turn))
-        too_far = distance > self._position or angle > self._attitude
-        return TrackingError(distance, angle) if too_far else None
-
-
 class TrajectoryTracker:
     """Tracks one schedule after the other, and holds the shape in between.
 
@@ -305,21 +251,24 @@ class TrajectoryTracker:
         sensitivity = None
         if average and self._sensitivity is not None:
             sensitivity = self._sensitivity.along(schedule)
-        self._check = TrackingErrorCheck(
-            *(schedule, stamp_ns, config.drift_position, config.drift_attitude),
-            *(average, sensitivity, self._masses),
+        self.path_check = PathCheck(
+            self._robot, schedule, stamp_ns, config, average, sensitivity, self._masses
         )
         self._watch.restart()
 
-    def braked(self, stamp_ns: int) -> BrakingFollower | None:
-        """Return how the joints would brake from now on; None where they rest."""
+    def brake(self, stamp_ns: int) -> None:
+        """Brake along the planned path from now on."""
+        self._follower = self._braking_from(stamp_ns)
+
+    def braking_shapes(self, stamp_ns: int) -> Array | None:
+        """Return the shapes (N + 1, n) at the ticks of a braking from now on; None at rest."""
+        follower = self._braking_from(stamp_ns)
+        return None if follower is None else follower.shapes(stamp_ns)
+
+    def _braking_from(self, stamp_ns: int) -> BrakingFollower | None:
         if isinstance(self._follower, ScheduleFollower):
             return self._follower.braking(stamp_ns, self._config.abort_time)
         return self._follower
-
-    def brake(self, stamp_ns: int) -> None:
-        """Brake along the planned path from now on."""
-        self._follower = self.braked(stamp_ns)
 
     def take_over(self, stamp_ns: int, q: Array, after: float) -> TakeOver | None:
         """Return the tick ``after`` s from now or later at which a plan may take over.
@@ -354,35 +303,7 @@ class TrajectoryTracker:
 
     def check_due(self, stamp_ns: int) -> bool:
         """Whether the pose at this time is to be compared with the predicted one."""
-        return isinstance(self._follower, ScheduleFollower) and self._check.due(stamp_ns)
-
-    def averaged(self, state: RobotState) -> RobotState:
-        """Return a state that is due with its pose by the mean deviation from the path."""
-        self._check.add(state.position, state.quaternion, self._lag(state))
-        position, quaternion = self._check.pose
-        return replace(state, position=position, quaternion=quaternion)
-
-    def _lag(self, state: RobotState) -> Array:
-        """Return the deviation (6,) in W of the base that comes from joints which lag."""
-        lag = state.q - self._check.shape
-        lag[np.abs(lag) <= self._config.shape_deadband] = 0.0
-        displacement_B = -self._robot.connection(state.q) @ lag
-        R_WB = matrix_from_quaternion(state.quaternion)
-        return np.concatenate([R_WB @ displacement_B[:3], R_WB @ displacement_B[3:]])
-
-    @property
-    def end(self) -> tuple[Array, Array]:
-        """Where the path leads to by the mean deviation: position (3,), attitude (4,)."""
-        return self._check.end
-
-    @property
-    def expected_end(self) -> tuple[Array, Array]:
-        """Where the path leads to with the estimated errors of masses: (3,), (4,)."""
-        return self._check.expected_end
-
-    def error(self, state: RobotState) -> TrackingError | None:
-        """Return the tracking error of a state that is due, None if it is small enough."""
-        return self._check.error(state.position, state.quaternion)
+        return isinstance(self._follower, ScheduleFollower) and self.path_check.due(stamp_ns)
 
     def track(self, stamp_ns: int, q: Array, *, obeyed: bool = True) -> list[int]:
         """Write the setpoint for the shape ``q`` (n,) now; return which joints are found stuck.

@@ -1,4 +1,4 @@
-"""Makes plans: at once while time stands still, or in a thread while states are answered."""
+"""Plans on request: at once while time stands still, or in a thread while states are answered."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from threading import Thread
 
 import numpy as np
@@ -14,13 +15,14 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
-from spacerobot_ros.planning.core.goal import Controlled, RobotState
+from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.take_over import TakeOver
-from spacerobot_ros.planning.execution.tracker import BrakingFollower
+from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
+from spacerobot_ros.planning.execution.path_deviation import TrackingError
+from spacerobot_ros.planning.execution.tracker import TakeOver
 from spacerobot_ros.planning.methods.registry import METHODS, build_method
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 
@@ -28,12 +30,61 @@ LONGEST_END = 1.5
 """Wall s that a thread may take to end after its cancellation."""
 
 
-@dataclass(frozen=True)
-class Braking:
-    """What brakes before a planned gait begins, and from when on, ns."""
+class PlanReason(Enum):
+    """Reason of a request for a plan; the value is the word ``reason`` of events."""
 
-    follower: BrakingFollower
-    stamp_ns: int
+    NEW_GOAL = "new goal"  # A new goal, from rest.
+    BLEND = "blend"  # A new goal while the joints move: the plan begins with their braking.
+    IN_MOTION = "new goal in motion"  # A new goal; its plan takes over at a tick ahead.
+    SHRINKING_HORIZON = "shrinking horizon"  # The remaining motion again, from a tick ahead.
+    CORRECTION = "correction"  # The schedule has ended, and the goal is not reached.
+    CONTINUATION = "continuation"  # The schedule was partial on purpose: its next piece.
+    TRACKING_ERROR = "tracking error"  # The base is off its path; the plan begins with braking.
+    REPLAN = "replan"  # The schedule was braked, or does not apply any more.
+    STUCK_JOINTS = "stuck joints"  # Joints do not follow; the plan is made with the others.
+
+    @property
+    def for_new_goal(self) -> bool:
+        """Whether the plan is for a goal that is not active yet."""
+        return self in (PlanReason.NEW_GOAL, PlanReason.BLEND, PlanReason.IN_MOTION)
+
+
+@dataclass(frozen=True)
+class PlanJob:
+    """A requested plan; of this class for a new goal from rest, or with braking first."""
+
+    identified: IdentifiedGoal
+    reason: PlanReason
+
+
+@dataclass(frozen=True)
+class RemainingJob(PlanJob):
+    """A plan from rest for the active goal, which is off by ``error``."""
+
+    error: PoseError
+
+
+@dataclass(frozen=True)
+class OffPathJob(PlanJob):
+    """A plan for the active goal that begins with braking, because the base is off its path."""
+
+    error: TrackingError
+
+
+@dataclass(frozen=True)
+class TakeOverJob(PlanJob):
+    """A plan that takes over in motion, to end at ``aim``: the goal, or the goal shifted."""
+
+    take_over: TakeOver
+    aim: Goal
+
+
+@dataclass(frozen=True)
+class ReadyPlan:
+    """A plan that waits for the tick at which it takes over."""
+
+    job: TakeOverJob
+    schedule: GaitSchedule
 
 
 @dataclass(frozen=True)
@@ -49,7 +100,8 @@ class PlanningTask:
     required
         Parts of the goal that a plan without them must control.
     braking
-        What is tracked and brakes first; None: the joints rest.
+        (K + 1, n) shapes at the ticks, m or rad, in which the joints brake before the gait; None:
+        they rest.
     take_over
         When the plan takes over from a schedule that is tracked until then; None: it begins at
         rest, or with the braking. The state of the request is that of now.
@@ -58,7 +110,7 @@ class PlanningTask:
     request: PlanRequest
     stuck: Mapping[str, float] = field(default_factory=dict)
     required: frozenset[Controlled] = frozenset()
-    braking: Braking | None = None
+    braking: Array | None = None
     take_over: TakeOver | None = None
 
 
@@ -211,17 +263,16 @@ class PlanningWorker:
 
     def _blended(
         self,
-        braking: Braking,
+        shapes: Array,
         request: PlanRequest,
         method: GaitMethod,
         cancellation: Cancellation,
     ) -> GaitSchedule:
-        """Return one schedule: braking to rest, then the gait that is planned from there.
+        """Return one schedule: braking in ``shapes`` (K + 1, n), then a gait from rest.
 
-        No joint velocity jumps. Where the base will be at rest is predicted.
+        No joint velocity jumps. The pose of the base at rest is predicted.
         """
-        state, period = request.state, braking.follower.schedule.control_period
-        shapes = braking.follower.shapes(braking.stamp_ns)
+        state, period = request.state, self._config.control_period
         shapes[0] = state.q
         at_rest, positions, attitudes = self._predicted(state, shapes)
         times: Array = period * np.arange(len(shapes), dtype=float)

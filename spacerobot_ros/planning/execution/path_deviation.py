@@ -1,0 +1,402 @@
+"""Deviation of the measured base from its predicted path, and the errors of masses behind it.
+
+At zero momentum the path of the shape and ratios of masses and inertias alone determine how the
+base turns. Where it turns otherwise than predicted, the model's masses and inertias are wrong. To
+first order the deviation of the base path is linear in their relative errors: a sensitivity of the
+path multiplies each. Linear least squares over many noisy poses, with a prior on the errors, give
+the estimate (one step of Gauss-Newton about the model).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    hat,
+    matrix_from_quaternion,
+    quaternion_from_rotvec,
+    quaternion_multiply,
+)
+from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState, Tolerance
+from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
+from spacerobot_ros.planning.execution.config import PlannerConfig
+
+_SHAPES = 48
+"""Largest number of shapes along a path for which the model is evaluated."""
+
+_STEP = 1e-6
+"""Relative step of the finite differences."""
+
+_SPREAD = 0.1
+"""Standard deviation of the relative errors of masses and inertias, before any measurement."""
+
+_NOISE = 1e-3
+"""Standard deviation of each component of a measured pose, m or rad."""
+
+_LARGEST = 6 * _SPREAD
+"""Relative errors beyond this have another cause, such as a jump of the measurements."""
+
+_NEAR_ENOUGH, _AIM = (0.6, 0.8), (0.4, 0.6)
+"""Shares of the tolerances, early and late in a motion: the remaining motion is planned again
+where its expected error exceeds the first, and the new plan may end within the second. Turns of
+the base that are left for late take long."""
+
+
+@dataclass(frozen=True)
+class TrackingError:
+    """Deviation of the base from the path that its schedule predicts: m, rad."""
+
+    distance: float
+    angle: float
+
+    def __str__(self) -> str:
+        return f"Off the path by {self.distance:.3g} m and {self.angle:.3g} rad"
+
+
+class PathCheck:
+    """Compares measured states with the predicted base path of a schedule, at its own instants.
+
+    The methods are for a state that is :meth:`due`.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    schedule
+        The schedule that is tracked.
+    start_ns
+        Stamp of its first tick, ns.
+    config
+        Of the planner: bounds of the tracking error, and the deadband of shapes.
+    average
+        Measured poses whose mean deviation from the path counts for plans in motion; 0: none are.
+    sensitivity, masses
+        Derivatives of the path by errors of masses, and their estimate: see :class:`PathDeviation`.
+    """
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        schedule: GaitSchedule,
+        start_ns: int,
+        config: PlannerConfig,
+        average: int = 0,
+        sensitivity: Array | None = None,
+        masses: MassEstimate | None = None,
+    ) -> None:
+        self._robot, self._path, self._positions = robot, schedule.path, schedule.positions
+        self._period, self._deadband = schedule.control_period, config.shape_deadband
+        self._deviation = PathDeviation(schedule.path, average, sensitivity, masses)
+        self._position = config.drift_position or np.inf
+        self._attitude = config.drift_attitude or np.inf
+        self._stamps = start_ns + (schedule.path.time * 1e9).round().astype(np.int64)
+        self._slack = round(schedule.control_period * 0.5e9)
+        self._next = 0
+        self._used = config.drift_position > 0 or config.drift_attitude > 0 or average > 0
+
+    def due(self, stamp_ns: int) -> bool:
+        """Whether the path predicts a pose for this time."""
+        if not self._used:
+            return False
+        stamps = self._stamps
+        while self._next < len(stamps) and stamps[self._next] < stamp_ns - self._slack:
+            self._next += 1
+        return self._next < len(stamps) and stamps[self._next] <= stamp_ns + self._slack
+
+    def error(self, state: RobotState) -> TrackingError | None:
+        """Return the tracking error of a state, None if it is within its bounds."""
+        k = self._next
+        turn = attitude_error(state.quaternion, self._path.quaternion[k])
+        distance = float(np.linalg.norm(state.position - self._path.position[k]))
+        angle = float(np.linalg.norm(turn))
+        too_far = distance > self._position or angle > self._attitude
+        return TrackingError(distance, angle) if too_far else None
+
+    def averaged(self, state: RobotState) -> RobotState:
+        """Add a state to the mean deviation; return it with its pose by the mean deviation."""
+        k = self._next
+        self._deviation.add(k, state.position, state.quaternion, self._lag(state))
+        position, quaternion = self._deviation.pose(k)
+        return replace(state, position=position, quaternion=quaternion)
+
+    def _lag(self, state: RobotState) -> Array:
+        """Return the deviation (6,) in W of the base that comes from joints which lag."""
+        lag = state.q - self._positions[round(self._path.time[self._next] / self._period)]
+        lag[np.abs(lag) <= self._deadband] = 0.0
+        displacement_B = -self._robot.connection(state.q) @ lag
+        R_WB = matrix_from_quaternion(state.quaternion)
+        return np.concatenate([R_WB @ displacement_B[:3], R_WB @ displacement_B[3:]])
+
+    @property
+    def end(self) -> tuple[Array, Array]:
+        """End of the path by the mean deviation: position (3,), attitude (4,)."""
+        return self._deviation.end(self._next)
+
+    @property
+    def expected_end(self) -> tuple[Array, Array]:
+        """End of the path with the estimated errors of masses: position (3,), attitude (4,)."""
+        return self._deviation.expected_end(self._next)
+
+    def aim(
+        self, goal: Goal, within: Tolerance, controls: frozenset[Controlled], *, late: bool
+    ) -> Goal | None:
+        """Return the goal for a plan of the remaining motion; None where its expected end is near.
+
+        Plans are made with the masses of the URDF. So the goal is shifted by the error that is
+        expected from the estimated masses, as far as it exceeds a share of the tolerance.
+        """
+        position, quaternion = self.end
+        error = PoseError.between(*self.expected_end, goal)
+        near = Tolerance(*(_NEAR_ENOUGH[late] * x for x in (within.position, within.attitude)))
+        if near.admits(error, controls):
+            return None
+        moved = error.position * _excess(error.distance, _AIM[late] * within.position)
+        turn = error.rotvec * _excess(error.angle, _AIM[late] * within.attitude)
+        aimed = quaternion_multiply(quaternion, quaternion_from_rotvec(turn))
+        return Goal(position + moved, aimed, goal.joint_positions)
+
+
+def _excess(error: float, allowed: float) -> float:
+    """Return the share of an error beyond the part that is allowed."""
+    return max(0.0, 1.0 - allowed / error) if error > 0 else 0.0
+
+
+class PathDeviation:
+    """Mean deviation of the measured base from a predicted path, over the last measurements.
+
+    At zero momentum the base follows the path of the shape, seen from its own pose: a base that is
+    off the predicted path by a rotation and a displacement keeps to that path, rotated and
+    displaced.
+
+    Parameters
+    ----------
+    path
+        The prediction.
+    count
+        Measurements to average.
+    sensitivity
+        (K, 6, P) derivatives of the path by errors of masses and inertias, as
+        :class:`PathSensitivity` returns them; None: these errors are not estimated.
+    masses
+        The estimate of these errors, which the measurements improve.
+    """
+
+    def __init__(
+        self,
+        path: BasePath,
+        count: int,
+        sensitivity: Array | None = None,
+        masses: MassEstimate | None = None,
+    ) -> None:
+        self._path = path
+        self._recent: deque[tuple[int, Array]] = deque(maxlen=count)
+        self._lag = np.zeros(6)
+        if sensitivity is None or masses is None:
+            sensitivity, masses = np.zeros((len(path.time), 6, 0)), MassEstimate(0)
+        self._sensitivity, self._masses = sensitivity, masses
+        masses.next_path()
+
+    def add(self, k: int, position: Array, quaternion: Array, lag: Array | float = 0.0) -> None:
+        """Add a measured position (3,) and attitude (4,) at instant k of the path.
+
+        ``lag`` (6,) is the part of its deviation, displacement (m) and rotation vector (rad) in W,
+        that comes from joints which lag behind the schedule. It vanishes when they catch up, so it
+        is no part of the mean deviation.
+        """
+        predicted = self._path.quaternion[k]
+        turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, quaternion)
+        deviation = np.concatenate([position - self._path.position[k], turn]) - lag
+        self._lag[:] = lag
+        self._recent.append((k, deviation))
+        self._masses.add(self._sensitivity[k], deviation)
+
+    def pose(self, k: int) -> tuple[Array, Array]:
+        """Return where the base is at instant k: position (3,) and attitude (4,)."""
+        return self._displaced(k, self._mean(k) + self._lag)
+
+    def end(self, k: int) -> tuple[Array, Array]:
+        """Return where the path leads to from instant k, if the base moves as predicted."""
+        mean = self._mean(k)
+        position, quaternion = self._displaced(k, mean)
+        turn = quaternion_from_rotvec(mean[3:])
+        way = self._path.position[-1] - self._path.position[k]
+        ahead = attitude_error(self._path.quaternion[k], self._path.quaternion[-1])
+        return (
+            position + matrix_from_quaternion(turn) @ way,
+            quaternion_multiply(quaternion, quaternion_from_rotvec(ahead)),
+        )
+
+    def expected_end(self, k: int) -> tuple[Array, Array]:
+        """Return where the path leads to with the estimated errors of masses: (3,) and (4,)."""
+        position, quaternion = self.end(k)
+        more = self._of_masses(k, -1)
+        turn = quaternion_from_rotvec(more[3:])
+        return position + more[:3], quaternion_multiply(turn, quaternion)
+
+    def _displaced(self, k: int, deviation: Array) -> tuple[Array, Array]:
+        turn = quaternion_from_rotvec(deviation[3:])
+        position = self._path.position[k] + deviation[:3]
+        return position, quaternion_multiply(turn, self._path.quaternion[k])
+
+    def _of_masses(self, begin: int, end: int) -> Array:
+        """Return the change of the deviation (6,) between instants by errors of masses."""
+        return np.asarray((self._sensitivity[end] - self._sensitivity[begin]) @ self._masses.errors)
+
+    def _mean(self, k: int) -> Array:
+        if not self._recent:
+            return np.zeros(6)
+        return np.asarray(np.mean([d + self._of_masses(i, k) for i, d in self._recent], axis=0))
+
+
+class PathSensitivity:
+    """Derivatives of a base path by P parameters: relative errors of masses and inertias.
+
+    The first P / 2 are those of the masses of the bodies, the others those of their inertia
+    tensors.
+
+    Parameters
+    ----------
+    robot
+        The model by which the path is predicted.
+    """
+
+    def __init__(self, robot: SpaceRobot) -> None:
+        self._robot = robot
+        self.count = 2 * len(robot.description.bodies)
+
+    @cached_property
+    def _model(self) -> tuple[ca.Function, Array]:
+        """A function of shape and inertial arguments, and the arguments (k, 1 + P) of variants.
+
+        The function returns the angular velocity of the base per joint rate (3 n,) and the centre
+        of mass (3,), both in base components. The variants are the model itself, then the model
+        with each parameter changed by a small step.
+        """
+        robot, bodies = self._robot, self.count // 2
+        factors = 1 + np.vstack([np.zeros(self.count), _STEP * np.eye(self.count)])
+        weighing = robot.inertial.scaled(factors[:, :bodies], factors[:, bodies:])
+        model, arguments = robot.symbolic_model(weighing)
+        q, p = ca.SX.sym("q", robot.n), ca.SX.sym("p", arguments.shape[1])
+        connection = ca.reshape(model.function("connection", compile=False)(q, p), 6, robot.n)
+        center = model.function("center_of_mass", compile=False)(q, p)
+        return ca.Function("model", [q, p], [ca.vec(-connection[3:, :]), center]), arguments.T
+
+    def _derivatives(self, shapes: Array) -> tuple[Array, Array]:
+        """Return derivatives by the parameters, for shapes (M, n), in base components.
+
+        They are those of the turn by each joint (M, n, 3, P) and of the centre of mass (M, 3, P).
+        """
+        model, arguments = self._model
+        variants = arguments.shape[1]
+        of_all = model.map(len(shapes) * variants)(
+            np.repeat(shapes, variants, axis=0).T, np.tile(arguments, len(shapes))
+        )
+        turns, centers = (np.asarray(each).T.reshape(len(shapes), variants, -1) for each in of_all)
+        by_turn, by_center = (
+            (each[:, 1:] - each[:, :1]).transpose(0, 2, 1) / _STEP for each in (turns, centers)
+        )
+        return by_turn.reshape(len(shapes), self._robot.n, 3, self.count), by_center
+
+    def along(self, schedule: GaitSchedule) -> Array:
+        """Return the derivatives (K, 6, P) of the K poses of a schedule's predicted path.
+
+        The first three components are those of the position, m, the others those of the attitude
+        (rotation vector, rad), all in W. The derivatives of the first pose are zero, because it is
+        measured.
+        """
+        path = schedule.path
+        knots = len(path.time)
+        ticks = (path.time / schedule.control_period).round().astype(int)
+        shapes = schedule.positions[ticks]
+        R_WB = np.array([matrix_from_quaternion(each) for each in path.quaternion])
+        # The model changes little from shape to shape: it is evaluated for some of them, and
+        # interpolated in between.
+        instants: Array = np.arange(knots, dtype=float)
+        called = np.unique(np.linspace(0, knots - 1, _SHAPES).round().astype(int))
+        turns, centers = self._derivatives(shapes[called])
+        by_joint = _interpolated(instants[:-1] + 0.5, called, turns)
+        in_base = np.einsum("kjap,kj->kap", by_joint, np.diff(shapes, axis=0))
+        steps = (R_WB[:-1] + R_WB[1:]) / 2 @ in_base
+        turned = np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
+        # The centre of mass C of the system stays where it is: r_WB = r_WC - R_WB r_BC_B.
+        r_BC_W = [R @ self._robot.center_of_mass(q) for R, q in zip(R_WB, shapes, strict=True)]
+        arms = np.array([hat(each) for each in r_BC_W])
+        moved = arms @ turned - R_WB @ _interpolated(instants, called, centers)
+        return np.concatenate([moved - moved[0], turned], axis=1)
+
+
+def _interpolated(at: Array, known: Array, values: Array) -> Array:
+    """Return values at instants, linearly between those (M, ...) at M known instants."""
+    place = np.interp(at, known, np.arange(len(known)))
+    before = np.clip(place.astype(int), 0, max(len(known) - 2, 0))
+    share = (place - before).reshape(-1, *[1] * (values.ndim - 1))
+    after = np.minimum(before + 1, len(known) - 1)
+    return np.asarray((1 - share) * values[before] + share * values[after])
+
+
+class MassEstimate:
+    """Estimate of the relative errors of masses and inertias (P,), from deviations of base paths.
+
+    The first pose of each path is measured with an error. So each path has an unknown constant
+    offset, which is eliminated from the normal equations. Deviations that only implausible errors
+    explain (a sensor that fails, say) do not count: the estimate is zero, and their path is
+    forgotten.
+
+    Parameters
+    ----------
+    count
+        P, the number of parameters.
+    """
+
+    def __init__(self, count: int) -> None:
+        # Information of the prior and of all earlier paths: matrix and vector.
+        self._information = (_NOISE / _SPREAD) ** 2 * np.eye(count)
+        self._vector = np.zeros(count)
+        self._errors: Array | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        count = len(self._vector)
+        self._poses = 0
+        self._sum_J, self._sum_y = np.zeros((6, count)), np.zeros(6)
+        self._squares, self._products = np.zeros((count, count)), np.zeros(count)
+        self._errors = None
+
+    def next_path(self) -> None:
+        """Begin with another path; the information of the earlier ones is kept."""
+        if self.errors.any():
+            self._information, self._vector = self._normal_equations()
+        self._begin()
+
+    def add(self, sensitivity: Array, deviation: Array) -> None:
+        """Add the deviation (6,) of a pose, where the path has the sensitivity (6, P)."""
+        self._poses += 1
+        self._sum_J += sensitivity
+        self._sum_y += deviation
+        self._squares += sensitivity.T @ sensitivity
+        self._products += sensitivity.T @ deviation
+        self._errors = None
+
+    @property
+    def errors(self) -> Array:
+        """The relative errors (P,) of masses, then of inertias."""
+        if self._errors is None:
+            errors = np.asarray(np.linalg.solve(*self._normal_equations()))
+            plausible = np.abs(errors).max(initial=0.0) <= _LARGEST
+            self._errors = errors if plausible else np.zeros_like(errors)
+        return self._errors
+
+    def _normal_equations(self) -> tuple[Array, Array]:
+        """Return their matrix and right side, without the part that a constant offset explains."""
+        n = max(self._poses, 1)
+        squares = self._squares - self._sum_J.T @ self._sum_J / n
+        products = self._products - self._sum_J.T @ self._sum_y / n
+        return self._information + squares, self._vector + products
