@@ -1,7 +1,9 @@
-"""Forward kinematics of the tree in base components, symbolic (paper 4, section II).
+"""Forward kinematics of the tree in base components, symbolic and numeric (paper 4, section II).
 
 The base frame B is the frame of the root link. All vectors here are expressed in B, which makes
-every quantity a function of the shape q alone.
+every quantity a function of the shape q alone. :func:`tree_kinematics` builds the equations that
+are compiled; :class:`ForwardKinematics` compiles nothing and gives the poses of the links to
+whatever draws a robot or publishes its frames.
 """
 
 from __future__ import annotations
@@ -9,10 +11,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
 from spacerobot_ros.model.body_weights import BodyWeights, DescribedWeights
-from spacerobot_ros.model.description import Array, JointKind, Pose, RobotDescription
-from spacerobot_ros.model.rotations import quaternion_from_matrix
+from spacerobot_ros.model.description import (
+    Array,
+    Joint,
+    JointKind,
+    Mimic,
+    Pose,
+    RobotDescription,
+)
+from spacerobot_ros.model.rotations import matrices_from_quaternions, quaternion_from_matrix
+from spacerobot_ros.model.rotations import quaternion_multiply as numeric_multiply
 from spacerobot_ros.model.symbolic_rotations import matrix_about_axis, quaternion_multiply
 
 
@@ -188,3 +199,108 @@ def link_quaternion(description: RobotDescription, link: str, q: ca.SX) -> ca.SX
 
 def _constant(R: Array) -> ca.DM:
     return ca.sparsify(ca.DM(quaternion_from_matrix(R)))
+
+
+# -- numeric ------------------------------------------------------------------------------------
+
+Frames = tuple[tuple[str, str], ...]
+"""Names of the parent link and the child link of joints."""
+
+
+def joints_outward(robot: RobotDescription) -> list[Joint]:
+    """Return all joints, fixed ones too, each after the joint that carries its parent link."""
+    above = {joint.child: joint for joint in robot.joints}
+    # The links of ``frames`` are in topological order.
+    return [above[link] for link in robot.frames if link in above]
+
+
+class ForwardKinematics:
+    """Poses of the links of a robot from the positions of its joints.
+
+    Transforms are positions (m) and quaternions (x, y, z, w) side by side: (k, 7). A quaternion
+    turns by half the angle of its joint: it is continuous over several turns.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+
+    Attributes
+    ----------
+    links
+        Names of the links, the base link first, each after its parent.
+    moving, fixed
+        Parent and child of the joints that move, and of those that do not.
+    transforms, fixed_transforms
+        The poses of the same children in their parents: (k, 7), which :meth:`update` changes in
+        place, and (m, 7).
+    """
+
+    def __init__(self, robot: RobotDescription) -> None:
+        names = list(robot.joint_names)
+        moving = [joint for joint in robot.joints if joint.kind is not JointKind.FIXED]
+        fixed = [joint for joint in robot.joints if joint.kind is JointKind.FIXED]
+        self.moving: Frames = tuple((joint.parent, joint.child) for joint in moving)
+        self.fixed: Frames = tuple((joint.parent, joint.child) for joint in fixed)
+        self.fixed_transforms = np.array([_at_zero(joint) for joint in fixed]).reshape(-1, 7)
+        self.transforms = np.array([_at_zero(joint) for joint in moving]).reshape(-1, 7)
+        follows = [joint.mimic or Mimic(joint.name, 1.0, 0.0) for joint in moving]
+        self._index = np.array([names.index(each.joint) for each in follows], dtype=int)
+        self._factor = np.array([each.multiplier for each in follows])
+        self._offset = np.array([each.offset for each in follows])
+        slides = np.array([joint.kind is JointKind.PRISMATIC for joint in moving], dtype=bool)
+        axes = np.array([joint.axis for joint in moving]).reshape(-1, 3)
+        turned = np.array([joint.origin.R @ joint.axis for joint in moving]).reshape(-1, 3)
+        self._position = self.transforms[:, :3].copy()
+        self._direction = np.where(slides[:, None], turned, 0.0)
+        self._half = np.where(slides, 0.0, 0.5)
+        self._cosine_part = self.transforms[:, 3:].copy()
+        about = np.hstack([axes, np.zeros((len(moving), 1))])
+        self._sine_part = numeric_multiply(self._cosine_part, about).reshape(-1, 4)
+        self.links = tuple(robot.frames)
+        rows = {joint.child: row for row, joint in enumerate([*moving, *fixed])}
+        self._tree = [
+            (self.links.index(joint.parent), rows[joint.child]) for joint in joints_outward(robot)
+        ]
+
+    def update(self, q: Array) -> None:
+        """Write the transforms at positions (n,) of the joints, m or rad."""
+        self._write(self.transforms, q)
+
+    def transforms_at(self, q: Array) -> Array:
+        """Return the transforms (..., k, 7) at positions (..., n) of the joints, m or rad."""
+        transforms = np.empty((*q.shape[:-1], *self.transforms.shape))
+        self._write(transforms, q)
+        return transforms
+
+    def _write(self, transforms: Array, q: Array) -> None:
+        moved = self._factor * q[..., self._index] + self._offset
+        half = self._half * moved
+        transforms[..., :3] = self._position + moved[..., None] * self._direction
+        transforms[..., 3:] = (
+            np.cos(half)[..., None] * self._cosine_part + np.sin(half)[..., None] * self._sine_part
+        )
+
+    def link_poses(self, q: Array) -> tuple[Array, Array]:
+        """Return ``R_BL`` (..., L, 3, 3) and ``r_BL_B`` (..., L, 3), m, of all :attr:`links`.
+
+        Parameters
+        ----------
+        q
+            Positions (..., n) of the joints, m or rad.
+        """
+        many = q.shape[:-1]
+        fixed = np.broadcast_to(self.fixed_transforms, (*many, *self.fixed_transforms.shape))
+        steps = np.concatenate([self.transforms_at(q), fixed], axis=-2)
+        steps_R = matrices_from_quaternions(steps[..., 3:])
+        R, r = np.zeros((*many, len(self.links), 3, 3)), np.zeros((*many, len(self.links), 3))
+        R[..., 0, :, :] = np.eye(3)
+        for link, (parent, row) in enumerate(self._tree, start=1):
+            R[..., link, :, :] = R[..., parent, :, :] @ steps_R[..., row, :, :]
+            step = R[..., parent, :, :] @ steps[..., row, :3, None]
+            r[..., link, :] = r[..., parent, :] + step[..., 0]
+        return R, r
+
+
+def _at_zero(joint: Joint) -> Array:
+    return np.concatenate([joint.origin.r, quaternion_from_matrix(joint.origin.R)])

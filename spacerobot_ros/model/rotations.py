@@ -51,6 +51,11 @@ def matrix_from_quaternion(quaternion: npt.ArrayLike) -> Array:
     )
 
 
+def matrices_from_quaternions(quaternions: Array) -> Array:
+    """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
+    return np.moveaxis(matrix_from_quaternion(np.moveaxis(quaternions, -1, 0)), (0, 1), (-2, -1))
+
+
 def quaternion_multiply(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
     """Return the product of two quaternions (x, y, z, w): the rotation b followed by a.
 

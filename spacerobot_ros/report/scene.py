@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.model.description import Array, JointKind, Pose, RobotDescription, Shape
+from spacerobot_ros.model.kinematics import joints_outward
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
-    quaternion_from_matrix,
-    quaternion_multiply,
 )
 from spacerobot_ros.model.visuals import Visual, solid_mesh, visuals_of
 from spacerobot_ros.report.figures import FAINT, GHOST, PALETTE
@@ -316,7 +315,7 @@ def scene_of(flight: Flight) -> Scene | str:
     commands += _lines(flight)
     ghosts = _ghosts(flight, drawn.robot, radius)
     commands += ghosts
-    commands.append(_motion(flight, drawn.robot, frames.indices))
+    commands.append(_motion(flight, drawn, frames.indices))
     return Scene(commands, _parts(flight), _caption(flight, frames, radius, bool(ghosts)))
 
 
@@ -391,13 +390,9 @@ def _grid(center: Array, radius: float, spacing: float, flat: bool) -> Array:
 def _link_paths(robot: RobotDescription) -> dict[str, str]:
     """Place of every link in the viewer's tree, which is the tree of the URDF."""
     paths = {robot.base_link: ROBOT}
-    pending = list(robot.joints)
-    while pending:
-        ready = [joint for joint in pending if joint.parent in paths]
-        pending = [joint for joint in pending if joint.parent not in paths]
-        for joint in ready:
-            name = joint.child.replace("/", "\N{DIVISION SLASH}")
-            paths[joint.child] = f"{paths[joint.parent]}/link {name}"
+    for joint in joints_outward(robot):
+        name = joint.child.replace("/", "\N{DIVISION SLASH}")
+        paths[joint.child] = f"{paths[joint.parent]}/link {name}"
     return paths
 
 
@@ -432,21 +427,17 @@ def _ball(link: str, body: int, radius: float) -> Visual:
     return Visual(link, body, shape, solid_mesh(shape))
 
 
-def _motion(flight: Flight, robot: RobotDescription, indices: Indices) -> Command:
+def _motion(flight: Flight, drawn: SolidRobot, indices: Indices) -> Command:
     """The animation: position and quaternion of the base, and of every link that a joint moves."""
-    time, paths = flight.position.time[indices], _link_paths(robot)
+    time, paths = flight.position.time[indices], _link_paths(drawn.robot)
     base = {"position": flight.position.values[indices], "quaternion": flight.quaternion[indices]}
     clips = [clip(ROBOT, time, base)]
-    G, offsets = robot.coupling
-    positions = flight.joints[indices] @ G.T + offsets
-    for joint, q in zip(robot.moving_joints, positions.T, strict=True):
-        R, r = joint.origin.R, joint.origin.r
-        if joint.kind is JointKind.PRISMATIC:
-            moved = {"position": r + np.outer(q, R @ joint.axis)}
-        else:
-            turns = np.column_stack([np.outer(np.sin(q / 2), joint.axis), np.cos(q / 2)])
-            at_zero = quaternion_from_matrix(R)
-            moved = {"quaternion": quaternion_multiply(at_zero, turns)}
+    transforms = drawn.kinematics.transforms_at(flight.joints[indices])
+    places = {child: i for i, (_, child) in enumerate(drawn.kinematics.moving)}
+    for joint in drawn.robot.moving_joints:
+        poses = transforms[:, places[joint.child]]
+        slides = joint.kind is JointKind.PRISMATIC
+        moved = {"position": poses[:, :3]} if slides else {"quaternion": poses[:, 3:]}
         clips.append(clip(paths[joint.child], time, moved))
     return set_animation(clips)
 

@@ -7,13 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import numpy.typing as npt
 from matplotlib.colors import to_rgb
 
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
-from spacerobot_ros.model.kinematics import tree_kinematics
+from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.visuals import Visual, visuals_of
 from spacerobot_ros.report.figures import colour
@@ -211,18 +210,12 @@ class SolidRobot:
     def __init__(self, robot: RobotDescription, meshes: Mapping[str, TriangleMesh]) -> None:
         self.robot = robot
         self._visuals = visuals_of(robot, meshes, _FACES)
-        kinematics = tree_kinematics(robot)
-        frames = [kinematics.frame(link.name) for link in robot.links]
-        poses = [x for R, r, _ in frames for x in (R, r)]
-        self._evaluate = ca.Function("poses", [kinematics.q], poses)
+        self.kinematics = ForwardKinematics(robot)
 
     def link_poses(self, q: Array, base: Pose) -> dict[str, Pose]:
         """Poses of all links in the world, at joint positions ``q`` (n,) and a pose of the base."""
-        values = [np.array(value) for value in self._evaluate.call([ca.DM(q)])]
-        return {
-            link.name: base @ Pose(R, r.ravel())
-            for link, R, r in zip(self.robot.links, values[::2], values[1::2], strict=True)
-        }
+        poses = zip(self.kinematics.links, *self.kinematics.link_poses(q), strict=True)
+        return {link: base @ Pose(R, r) for link, R, r in poses}
 
     def at(self, q: Array, base: Pose) -> Solids:
         """Return the robot at joint positions ``q`` (n,), its base at a pose in the world.

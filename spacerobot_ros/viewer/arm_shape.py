@@ -9,9 +9,9 @@ import math
 
 import numpy as np
 
-from spacerobot_ros.model.description import Array, Joint, JointKind, RobotDescription
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import (
-    matrix_about_axis,
     matrix_from_quaternion,
     quaternion_from_matrix,
     rotvec_from_quaternion,
@@ -31,41 +31,6 @@ _RADIAN = 0.5
 """The distance that an error of one radian counts as much as, m."""
 
 
-class Chain:
-    """The joints from the base of a robot to a link.
-
-    Parameters
-    ----------
-    robot, link
-        The robot, and the link at the end of the chain.
-    """
-
-    def __init__(self, robot: RobotDescription, link: str) -> None:
-        above = {joint.child: joint for joint in robot.joints}
-        G, b = robot.coupling
-        rows = {joint.name: row for row, joint in enumerate(robot.moving_joints)}
-        self._parts: list[tuple[Joint, Array, float]] = []
-        none = np.zeros(len(robot.joint_names))
-        while link in above:
-            joint = above[link]
-            row = rows.get(joint.name)
-            part = (joint, none, 0.0) if row is None else (joint, G[row], float(b[row]))
-            self._parts.insert(0, part)
-            link = joint.parent
-
-    def end(self, q: Array) -> tuple[Array, Array]:
-        """Return attitude (3, 3) and position (3,) of its end in the base, at a shape (n,)."""
-        R, r = np.eye(3), np.zeros(3)
-        for joint, factors, offset in self._parts:
-            r = r + R @ joint.origin.r
-            R = R @ joint.origin.R
-            if joint.kind is JointKind.PRISMATIC:
-                r = r + R @ ((factors @ q + offset) * joint.axis)
-            elif joint.kind is not JointKind.FIXED:
-                R = R @ matrix_about_axis(joint.axis, float(factors @ q + offset))
-        return R, r
-
-
 def arm_shape(
     robot: RobotDescription, link: str, base: Goal, tool: Goal, q: Array
 ) -> tuple[Array, float, float]:
@@ -77,15 +42,16 @@ def arm_shape(
     # Imported where it is used: scipy.optimize loads slowly.
     from scipy.optimize import least_squares
 
-    chain = Chain(robot, link)
+    kinematics = ForwardKinematics(robot)
+    end = kinematics.links.index(link)
     R_WB = matrix_from_quaternion(base.quaternion)
     wanted_r = R_WB.T @ (tool.position - base.position)
     wanted_R = R_WB.T @ matrix_from_quaternion(tool.quaternion)
 
     def error(shape: Array) -> Array:
-        R, r = chain.end(shape)
-        turn = rotvec_from_quaternion(quaternion_from_matrix(R.T @ wanted_R))
-        return np.concatenate([wanted_r - r, _RADIAN * turn])
+        R, r = kinematics.link_poses(shape)
+        turn = rotvec_from_quaternion(quaternion_from_matrix(R[end].T @ wanted_R))
+        return np.concatenate([wanted_r - r[end], _RADIAN * turn])
 
     lower = np.where(np.isfinite(robot.limits("lower")), robot.limits("lower"), -math.pi)
     upper = np.where(np.isfinite(robot.limits("upper")), robot.limits("upper"), math.pi)

@@ -156,7 +156,7 @@ class GoalEditor:
         if shape is None:
             wanted = self._final.wanted
             shape = q if wanted is None else wanted
-            self._ghost.bend(shape)
+            self._ghost.set_joint_positions(shape)
         self._ghost.base.visible = not self._is_there(pose, q, shape)
 
     def _is_there(self, pose: Array, q: Array, shape: Array) -> bool:
@@ -232,7 +232,7 @@ class GoalEditor:
         if self._ghost is not None:
             self._ghost.paint(COLORS[check.verdict])
             if check.shape is not None:
-                self._ghost.bend(check.shape)
+                self._ghost.set_joint_positions(check.shape)
 
     # -- what users change ----------------------------------------------------------------------
 

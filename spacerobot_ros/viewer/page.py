@@ -201,7 +201,7 @@ class Page:
                 self._aim(client.camera)
         drawing.base.visible = True
         drawing.place(measured.pose)
-        drawing.bend(measured.q)
+        drawing.set_joint_positions(measured.q)
         if not self._editor.placed and state.replay is None:
             self._editor.place(measured.pose, None, measured.q, self._now)
         self._editor.robot_is_at(measured.pose, measured.q)

@@ -14,7 +14,7 @@ import numpy as np
 from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.errors import MeshError
 from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
-from spacerobot_ros.model.link_transforms import LinkTransforms
+from spacerobot_ros.model.kinematics import ForwardKinematics, joints_outward
 from spacerobot_ros.model.meshes import shape_mesh
 from spacerobot_ros.model.visuals import solid_mesh
 
@@ -81,19 +81,19 @@ class RobotDrawing:
         on_note: Callable[[str], None] = lambda sentence: None,
     ) -> None:
         self._scene, self._path, self._color, self._on_note = scene, path, color, on_note
-        self._transforms = LinkTransforms(robot)
+        self._kinematics = kinematics = ForwardKinematics(robot)
         self.base = scene.add_frame(path, show_axes=False)
         paths = self._paths(robot)
         frames: dict[str, Any] = {}
         for pairs, poses in (
-            (self._transforms.moving, self._transforms.poses),
-            (self._transforms.fixed, self._transforms.fixed_poses),
+            (kinematics.moving, kinematics.transforms),
+            (kinematics.fixed, kinematics.fixed_transforms),
         ):
             for (_, child), pose in zip(pairs, poses, strict=True):
                 frames[child] = scene.add_frame(
                     paths[child], show_axes=False, position=pose[:3], wxyz=wxyz(pose[3:])
                 )
-        self._moving = [frames[child] for _, child in self._transforms.moving]
+        self._moving = [frames[child] for _, child in kinematics.moving]
         self._solids: list[Any] = []
         for link in robot.links:
             for number, shape in enumerate(self._shapes(robot, link.name)):
@@ -102,13 +102,10 @@ class RobotDrawing:
                     self._solids.append(solid)
 
     def _paths(self, robot: RobotDescription) -> dict[str, str]:
-        """Return the node of every link."""
-        paths, pending = {robot.base_link: self._path}, list(robot.joints)
-        while pending:
-            ready = [joint for joint in pending if joint.parent in paths]
-            pending = [joint for joint in pending if joint.parent not in paths]
-            for joint in ready:
-                paths[joint.child] = f"{paths[joint.parent]}/link{len(paths)}"
+        """Return the path of the scene node of every link."""
+        paths = {robot.base_link: self._path}
+        for joint in joints_outward(robot):
+            paths[joint.child] = f"{paths[joint.parent]}/link{len(paths)}"
         return paths
 
     def _shapes(self, robot: RobotDescription, link: str) -> list[Shape]:
@@ -148,10 +145,10 @@ class RobotDrawing:
         self.base.position = pose[:3]
         self.base.wxyz = wxyz(pose[3:])
 
-    def bend(self, q: Array) -> None:
-        """Have the joints at positions (n,), m or rad."""
-        self._transforms.update(q)
-        for frame, pose in zip(self._moving, self._transforms.poses, strict=True):
+    def set_joint_positions(self, q: Array) -> None:
+        """Move the links to positions (n,) of the joints, m or rad."""
+        self._kinematics.update(q)
+        for frame, pose in zip(self._moving, self._kinematics.transforms, strict=True):
             frame.position = pose[:3]
             frame.wxyz = wxyz(pose[3:])
 
@@ -170,14 +167,9 @@ def _bar(end: Array) -> Shape | None:
 
 def reach_of(robot: RobotDescription) -> float:
     """Return a length that the whole robot fits into, from the origin of its base, m."""
-    at: dict[str, Array] = {robot.base_link: np.zeros(3)}
     farthest: dict[str, float] = {robot.base_link: 0.0}
-    pending = list(robot.joints)
-    while pending:
-        for joint in [each for each in pending if each.parent in at]:
-            pending.remove(joint)
-            farthest[joint.child] = farthest[joint.parent] + float(np.linalg.norm(joint.origin.r))
-            at[joint.child] = joint.origin.r
+    for joint in joints_outward(robot):
+        farthest[joint.child] = farthest[joint.parent] + float(np.linalg.norm(joint.origin.r))
     sizes = [
         farthest[link.name]
         + float(np.linalg.norm(shape.pose.r))

@@ -21,6 +21,7 @@ from support.oracles import (
 from support.random_robots import random_chain_urdf, random_robot_urdf
 
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.kinematics import ForwardKinematics
 
 SEEDS = range(10)
 
@@ -122,6 +123,18 @@ def test_link_poses(case: Case, engine: Oracle) -> None:
         R_expected, r_expected = engine.link_pose(link, case.motion.q)
         assert_agrees(R, R_expected)
         assert_agrees(r, r_expected)
+
+
+def test_link_poses_of_many_shapes_without_compilation(case: Case, engine: Oracle) -> None:
+    shapes = np.stack([case.motion.q, -0.7 * case.motion.q, np.zeros(case.robot.n)])
+    kinematics = ForwardKinematics(case.robot.description)
+    R, r = kinematics.link_poses(shapes.reshape(3, 1, -1))
+    assert set(kinematics.links) == set(case.robot.link_names)
+    for k, q in enumerate(shapes):
+        for i, link in enumerate(kinematics.links):
+            R_expected, r_expected = engine.link_pose(link, q)
+            assert_agrees(R[k, 0, i], R_expected)
+            assert_agrees(r[k, 0, i], r_expected)
 
 
 def test_link_jacobians(case: Case, engine: Oracle) -> None:

@@ -14,8 +14,7 @@ from support.random_robots import random_robot_urdf
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.composite_rigid_body import composites
 from spacerobot_ros.model.dynamics import barycentric_inertia
-from spacerobot_ros.model.kinematics import tree_kinematics
-from spacerobot_ros.model.link_transforms import LinkTransforms
+from spacerobot_ros.model.kinematics import ForwardKinematics, tree_kinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 
 SEEDS = range(5)
@@ -173,10 +172,13 @@ def test_a_locked_leader_locks_what_follows() -> None:
 
 
 def test_frames_of_links_follow(case: Coupled) -> None:
-    transforms = LinkTransforms(case.robot.description)
-    transforms.update(case.motion.q)
-    for (parent, child), pose in zip(transforms.moving, transforms.poses, strict=True):
+    kinematics = ForwardKinematics(case.robot.description)
+    kinematics.update(case.motion.q)
+    for (parent, child), pose in zip(kinematics.moving, kinematics.transforms, strict=True):
         R_p, r_p = case.engine.link_pose(parent, case.imposed.q)
         R_c, r_c = case.engine.link_pose(child, case.imposed.q)
         assert_agrees(pose[:3], R_p.T @ (r_c - r_p))
         assert_agrees(matrix_from_quaternion(pose[3:]), R_p.T @ R_c)
+    for link, R, r in zip(kinematics.links, *kinematics.link_poses(case.motion.q), strict=True):
+        assert_agrees(R, case.engine.link_pose(link, case.imposed.q)[0])
+        assert_agrees(r, case.engine.link_pose(link, case.imposed.q)[1])

@@ -19,7 +19,7 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag, type_hash
 from spacerobot_ros.bag.recorded_robot import columns
 from spacerobot_ros.bag.rosbag2 import _OWN_DEFINITIONS
-from spacerobot_ros.model.link_transforms import LinkTransforms
+from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
@@ -229,8 +229,8 @@ def test_a_goal_in_a_frame_of_the_robot_is_one_in_the_world(harness: Harness, fr
     flight.start()
     flight.ticks(2)
     base = np.array([*away, *turned])
-    links = LinkTransforms(load_robot(robot_file("sliding_masses")))
-    pose = base if frame != LINK else chained(base, links.poses[0])
+    links = ForwardKinematics(load_robot(robot_file("sliding_masses")))
+    pose = base if frame != LINK else chained(base, links.transforms[0])
     # The base where it is now, as it looks from the frame, and 3 cm ahead of that.
     there = np.linalg.inv(homogeneous(pose)) @ homogeneous(base)
     there[:3, 3] += 0.03 * there[:3, 0]

@@ -60,7 +60,7 @@ def test_links_are_drawn_where_pinocchio_has_them(server: Any, name: str) -> Non
         full[model.joints[model.getJointId(joint)].idx_q] = position
     pin.framesForwardKinematics(model, data, full)
     drawing.place(full[:7])
-    drawing.bend(q)
+    drawing.set_joint_positions(q)
     paths = drawing._paths(robot)
     for link in robot.links:
         expected = data.oMf[model.getFrameId(link.name)].homogeneous

@@ -19,7 +19,7 @@ from rclpy.serialization import deserialize_message
 
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.model.link_transforms import Frames, LinkTransforms
+from spacerobot_ros.model.kinematics import ForwardKinematics, Frames
 from spacerobot_ros.nodes.common.cdr import JointReader, TemplateReader
 from spacerobot_ros.nodes.common.messages import chained, message_class
 from spacerobot_ros.times import SECOND
@@ -109,7 +109,7 @@ class RobotTransforms:
     def __init__(
         self, description: RobotDescription, world_frame: str, prefix: str, *, links: bool
     ) -> None:
-        self._links = LinkTransforms(description) if links else None
+        self._links = ForwardKinematics(description) if links else None
         moving, fixed = ((), ()) if self._links is None else (self._links.moving, self._links.fixed)
         frames = ((world_frame, prefix + description.base_link), *_prefixed(moving, prefix))
         self._template = TransformTemplate(frames)
@@ -121,14 +121,14 @@ class RobotTransforms:
         self._poses[0] = pose
         if self._links is not None:
             self._links.update(q)
-            self._poses[1:] = self._links.poses
+            self._poses[1:] = self._links.transforms
         return self._template.serialised(time_ns, self._poses)
 
     def static_message(self, time_ns: int) -> bytes | None:
         """Return the message of the links that do not move in their parents, if there are any."""
         if self._links is None or not self._fixed:
             return None
-        return TransformTemplate(self._fixed).serialised(time_ns, self._links.fixed_poses)
+        return TransformTemplate(self._fixed).serialised(time_ns, self._links.fixed_transforms)
 
 
 def _prefixed(frames: Iterable[tuple[str, str]], prefix: str) -> Frames:
@@ -239,10 +239,10 @@ class KnownFrames:
 
 def robot_frames(description: RobotDescription, state: StateFrames) -> dict[str, tuple[str, Array]]:
     """Return, by name of a link, its parent and its pose (7,) in that, in a measured state."""
-    links, prefix = LinkTransforms(description), state.prefix
+    links, prefix = ForwardKinematics(description), state.prefix
     links.update(state.q)
     frames = {prefix + description.base_link: (state.world, state.pose)}
-    for names, poses in ((links.moving, links.poses), (links.fixed, links.fixed_poses)):
+    for names, poses in ((links.moving, links.transforms), (links.fixed, links.fixed_transforms)):
         for (parent, child), pose in zip(names, poses, strict=True):
             frames[prefix + child] = prefix + parent, pose
     return frames
