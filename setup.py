@@ -102,7 +102,6 @@ setup(
         "PyYAML",
         "rosbags",
         "scipy",
-        "urdf-parser-py",
         "xacro",
         "zstandard",
     ],

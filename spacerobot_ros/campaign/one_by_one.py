@@ -22,7 +22,7 @@ from spacerobot_ros.flight.lockstep import Robots, fly_scenario, require_flyable
 from spacerobot_ros.flight.recorded import recorded_flight
 from spacerobot_ros.flight.scenario import Scenario, scenario_text
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.robot_source import BelievedRobotConfig, RobotConfig, robot_of
+from spacerobot_ros.model.shared_parameters import BelievedRobotConfig, RobotConfig, robot_of
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.registry import build_method

@@ -42,7 +42,7 @@ from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.flight.state_synchroniser import Pairing, StateSynchroniser
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.model.robot_source import RobotConfig, robot_from_text, robot_of
+from spacerobot_ros.model.shared_parameters import RobotConfig, robot_from_text, robot_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig

@@ -24,8 +24,8 @@ algorithm, whose cost grows only linearly.
 among the states. The state is ``x = [q; quaternion_WB; qdot; p_W; L_W; r_WC_W]``, (2 n + 13,):
 shape, attitude (x, y, z, w), joint rates, total linear momentum (kg m/s), total angular momentum
 about the system's centre of mass (kg m^2/s), and position of that centre (m), the last three in W.
-The base's twist is no state: it follows from the momenta and the joint rates. What no thruster
-changes is therefore constant to the last bit, whatever the step:
+The base's twist is no state: it follows from the momenta and the joint rates. Momenta that no
+thruster changes are therefore constant to the last bit, whatever the step:
 
 * ``p_W_dot = R_WB f``, ``L_W_dot = R_WB (n + (r_origin - c) x f)``, ``r_WC_W_dot = p_W / M``;
 * ``K qddot = Q`` at the ``omega_WB_B`` that the momenta imply.
@@ -41,10 +41,10 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from spacerobot_ros.model.body_weights import rotational, symmetric
 from spacerobot_ros.model.compilation import dense_function
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import inertia_matrix
+from spacerobot_ros.model.inertial_parameters import rotational, symmetric
 from spacerobot_ros.model.kinematics import TreeKinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
 
@@ -104,7 +104,7 @@ class Factor:
 
 @dataclass(frozen=True)
 class Composites:
-    """The bodies beyond each joint taken as one, base components: see the module for the symbols.
+    """Composite rigid bodies outboard of each joint, base components; see the module for symbols.
 
     ``J[k]`` (3, 3) is the second moment of mass of body k about its own centre. ``S[j]`` (6,) is
     the motion of a unit rate of the joint that carries body j, ``P[j]`` (6,) the momentum of its
@@ -174,7 +174,7 @@ def composites(kin: TreeKinematics) -> Composites:
 
 @dataclass(frozen=True)
 class ShapeSystem:
-    """What the free base leaves of the inertia: see the module for the symbols.
+    """Inertia of the shape with the free base eliminated; see the module for the symbols.
 
     ``B[j]`` (6,) belongs to the joint that carries body j (zero for the base); ``D`` is the factor
     of the system's rotational inertia, ``K`` (n, n) the shape's inertia matrix.
@@ -221,10 +221,10 @@ def motion_forces(
     ``omega_WB_B`` (3,) and ``qdot`` (n,) demands while ``omega`` stays as it is, and ``qdot`` too
     or, where ``qddot`` (n,) is given, changes by that.
 
-    Recursive Newton-Euler (Featherstone, table 5.1). What turns with body k at ``omega_k`` and
-    ``alpha_k`` accelerates by ``A_k x``, ``A_k = hat(alpha_k) + hat(omega_k)^2``, relative to the
-    body's origin. The base's origin is taken as unaccelerated: what a common acceleration adds to
-    ``S_j' f_j``, ``B_j' f_0`` takes off in ``Q_j``.
+    Recursive Newton-Euler (Featherstone, table 5.1). A point x of body k, which turns at
+    ``omega_k`` and ``alpha_k``, accelerates by ``A_k x``, ``A_k = hat(alpha_k) + hat(omega_k)^2``,
+    relative to the body's origin. The base's origin is taken as unaccelerated: the terms of a
+    common acceleration in ``S_j' f_j`` and ``B_j' f_0`` cancel in ``Q_j``.
     """
     kin, qdot = parts.kin, parts.kin.spread(qdot)
     qddot = None if qddot is None else kin.spread(qddot)
@@ -266,7 +266,7 @@ def motion_forces(
 def shape_forces(
     system: ShapeSystem, omega: ca.SX, qdot: ca.SX, external: ca.SX, tau: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Return ``Q`` (n,) of ``K qddot = Q`` and the moment (3,) that is left to turn the base.
+    """Return ``Q`` (n,) of ``K qddot = Q`` and the remaining moment (3,) on the base.
 
     ``external`` (6,) is the moment (N m) over the force (N) from outside, base components, about
     the system's centre of mass; ``tau`` (n,) are the joint efforts (N or N m).
@@ -332,7 +332,7 @@ def composite_dynamics(
 
 
 def state_slices(n: int) -> tuple[slice, ...]:
-    """Return where ``q, quaternion_WB, qdot, p_W, L_W, r_WC_W`` are in the state."""
+    """Return the slices of ``q, quaternion_WB, qdot, p_W, L_W, r_WC_W`` in the state."""
     ends = [n, n + 4, 2 * n + 4, 2 * n + 7, 2 * n + 10, 2 * n + 13]
     return tuple(slice(a, b) for a, b in zip([0, *ends], ends, strict=False))
 
@@ -341,7 +341,7 @@ def shape_equations(kin: TreeKinematics) -> ca.Function:
     """Return the function ``(x, command) -> (K, Q)`` of ``K qddot = Q``."""
     x, command = _symbols(kin)
     system, _, _, Q = _equations(kin, x, command)
-    inputs = {"x": x, "command": command, **kin.weights.inputs}
+    inputs = {"x": x, "command": command, **kin.mass_properties.inputs}
     return dense_function("shape_equations", inputs, {"K": system.K, "Q": Q})
 
 
@@ -349,7 +349,7 @@ def state_rate(kin: TreeKinematics, *, holding: bool = False) -> ca.Function:
     """Return the function ``(x, command) -> x_dot``.
 
     With ``holding`` it takes a third argument ``free`` (n,): 1 for a joint that moves, 0 for one
-    that something holds at the rate it has.
+    that is held at its present rate.
     """
     x, command = _symbols(kin)
     free = ca.SX.sym("free", kin.n) if holding else ca.DM.ones(kin.n)
@@ -371,7 +371,7 @@ def state_rate(kin: TreeKinematics, *, holding: bool = False) -> ca.Function:
     inputs = {"x": x, "command": command}
     if holding:
         inputs["free"] = free
-    inputs |= kin.weights.inputs
+    inputs |= kin.mass_properties.inputs
     return dense_function("holding_rate" if holding else "flight_rate", inputs, {"x_dot": x_dot})
 
 

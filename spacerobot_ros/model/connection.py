@@ -57,7 +57,7 @@ def base_twist(
     With both zero it is ``-A(q) qdot``.
     """
     excess = L_B - inertia.D_q @ qdot
-    if kin.weights.inputs:
+    if kin.mass_properties.inputs:
         omega = Factor(inertia.D).solve(excess)
     else:
         omega = solve_positive_definite(inertia.D, excess)

@@ -1,7 +1,9 @@
-"""Masses, centres of mass and inertias of a robot's bodies as numbers that may differ.
+"""Masses, centres of mass and inertias of a robot's bodies.
 
-What a robot looks like and how its joints sit stays; what its bodies weigh is known to a few per
-cent. One robot, or a batch of robots that differ in these numbers alone.
+:class:`InertialParameters` are their numbers, of one robot or of a batch of robots that differ in
+these numbers alone. In expressions they are either constants (:class:`MassProperties`: fewest
+operations, one compilation for each set of numbers) or entries of an argument ``p``
+(:class:`SymbolicMassProperties`: one compilation for all sets).
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
@@ -16,22 +19,22 @@ from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.description import Array, Inertia, RobotDescription
 
 TRIANGLE_SLACK = 0.01
-"""Share by which rounded principal moments may break the triangle inequality."""
+"""Relative violation of the triangle inequality that rounded principal moments may have."""
 
 _ROUNDING = 1e-12
 
 PER_BODY = 10
-"""Numbers a body in :attr:`InertialParameters.vector`."""
+"""Numbers per body in :attr:`InertialParameters.vector`."""
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Where the six second moments of a body stand in their matrix."""
+"""Rows and columns of a body's six second moments in their matrix."""
 
 
 @dataclass(frozen=True)
 class InertialParameters:
-    """What the bodies of a robot weigh; ``bodies`` as :class:`RobotDescription` has them.
+    """Mass properties of the ``bodies`` of a :class:`RobotDescription`, of one robot or a batch.
 
-    Leading dimensions (...) make it a batch: none is one robot, (N,) are N robots.
+    Leading dimensions (...) are the batch: none is one robot, (N,) are N robots.
 
     Attributes
     ----------
@@ -46,7 +49,7 @@ class InertialParameters:
     Raises
     ------
     ValueError
-        The shapes of the three do not go together.
+        The shapes of the three arrays do not match.
     """
 
     masses: Array
@@ -58,12 +61,12 @@ class InertialParameters:
         if self.centers.shape != (*shape, 3) or self.inertias.shape != (*shape, 3, 3):
             raise ValueError(
                 f"masses {shape}, centers {self.centers.shape} and inertias "
-                f"{self.inertias.shape} do not go together"
+                f"{self.inertias.shape} do not match"
             )
 
     @classmethod
     def of(cls, robot: RobotDescription) -> InertialParameters:
-        """Return those of a described robot."""
+        """Return the inertial parameters of a robot description."""
         parts = [body.inertia for body in robot.bodies]
         return cls(
             np.array([part.mass for part in parts]),
@@ -92,10 +95,11 @@ class InertialParameters:
     def scaled(
         self, masses: npt.ArrayLike = 1.0, inertias: npt.ArrayLike | None = None
     ) -> InertialParameters:
-        """Return robots whose masses and inertias are multiplied by factors (..., B).
+        """Multiply masses and inertias by factors (..., B).
 
-        Without factors of their own the inertias go with the masses, as those of bodies of another
-        density do. Factors of shape (N, B), or (N, 1) for all bodies alike, make one robot a batch.
+        Inertias take the factors of the masses (another density) unless they are given factors of
+        their own. Factors of shape (N, B), or (N, 1) for all bodies alike, turn one robot into a
+        batch.
         """
         by_mass = np.asarray(masses, dtype=float)
         by_inertia = by_mass if inertias is None else np.asarray(inertias, dtype=float)
@@ -107,10 +111,7 @@ class InertialParameters:
         )
 
     def shifted(self, offsets: npt.ArrayLike) -> InertialParameters:
-        """Return robots whose centres of mass are moved by offsets (..., B, 3) in m.
-
-        The inertias about the centres stay.
-        """
+        """Move the centres of mass by offsets (..., B, 3), m; inertias about the centres stay."""
         centers = self.centers + np.asarray(offsets, dtype=float)
         shape = centers.shape[:-1]
         return InertialParameters(
@@ -120,7 +121,7 @@ class InertialParameters:
         )
 
     def with_payload(self, body: int, payload: Inertia) -> InertialParameters:
-        """Return one robot that carries a payload, given in the frame of a body, fixed to it."""
+        """Fix a payload, given in the frame of a body, to that body of one robot."""
         own = Inertia(float(self.masses[body]), self.centers[body], self.inertias[body])
         both = own + payload
         masses, centers, inertias = (
@@ -137,9 +138,9 @@ class InertialParameters:
 
     @property
     def vector(self) -> Array:
-        """All numbers in a row, (..., 10 B): what compiled functions take.
+        """All numbers in a row, (..., 10 B), as compiled functions take them.
 
-        Of each body its mass, its centre (3) and its second moments xx, yy, zz, xy, xz, yz.
+        For each body: mass, centre (3), second moments xx, yy, zz, xy, xz, yz.
         """
         moments = self.second_moments
         six = np.stack([moments[..., i, j] for i, j in PAIRS], axis=-1)
@@ -147,13 +148,13 @@ class InertialParameters:
         return rows.reshape(*self.masses.shape[:-1], -1)
 
     def require_physical(self, names: Sequence[str]) -> None:
-        """Refuse what no body weighs; ``names`` are those of the bodies.
+        """Check that masses and inertias are physical; ``names`` are those of the bodies.
 
         Raises
         ------
         RobotDescriptionError
-            A number is not finite, a mass negative or none where there was to be one, or
-            principal moments are negative or break the triangle inequality.
+            A number is not finite, a mass is negative, all masses are zero, or principal moments
+            are negative or break the triangle inequality.
         """
         finite = np.isfinite(self.vector).reshape(-1, len(names), PER_BODY).all(axis=(0, 2))
         if not finite.all():
@@ -167,7 +168,7 @@ class InertialParameters:
                 "must be positive."
             )
         if not masses.sum(axis=1).all():
-            raise RobotDescriptionError("All bodies of the robot together weigh nothing.")
+            raise RobotDescriptionError("The total mass of the robot is zero.")
         tensors = self.inertias.reshape(-1, len(names), 3, 3)
         low, middle, high = np.moveaxis(np.linalg.eigvalsh(tensors), -1, 0)
         slack = _ROUNDING * np.maximum(1.0, high)
@@ -181,10 +182,10 @@ class InertialParameters:
             )
 
     def described(self, robot: RobotDescription) -> RobotDescription:
-        """Return a robot that has these instead of its own; ``urdf`` stays what it was.
+        """Return a robot description with these inertial parameters; its ``urdf`` is not changed.
 
-        The first link of each body has what the body weighs, and the links that fixed joints weld
-        to it weigh nothing.
+        The first link of each body gets the mass properties of the body, the links that are welded
+        to it by fixed joints get none.
         """
         of_body = {
             body.name: Inertia(float(mass), center, inertia)
@@ -196,3 +197,116 @@ class InertialParameters:
             replace(link, inertia=of_body.get(link.name, Inertia())) for link in robot.links
         )
         return robot.with_links(links)
+
+
+class MassProperties:
+    """Mass properties of a robot description in expressions, as constants.
+
+    Attributes
+    ----------
+    masses, total
+        Of the bodies and of the robot, kg.
+    centers
+        Centres of mass (3,) in the frames of the bodies, m.
+    inputs
+        Symbols of the mass properties by name, as last arguments of functions: none for constants.
+    """
+
+    def __init__(self, robot: RobotDescription) -> None:
+        self._inertias = [body.inertia for body in robot.bodies]
+        self.masses: tuple[float | ca.SX, ...] = tuple(each.mass for each in self._inertias)
+        self.centers: tuple[ca.DM | ca.SX, ...] = tuple(
+            _constant(each.com) for each in self._inertias
+        )
+        self.total: float | ca.SX = robot.total_mass
+        self.inputs: dict[str, ca.SX] = {}
+
+    def inertia(self, k: int, R: ca.SX) -> ca.SX:
+        """Return the inertia (3, 3) of body k about its centre, turned by R, kg m^2."""
+        return R @ _constant(self._inertias[k].about_com) @ R.T
+
+    def second_moment(self, k: int, R: ca.SX) -> ca.SX:
+        """Return the second moment of mass ``tr(I)/2 1 - I`` (3, 3) of body k, turned by R, kg m^2.
+
+        Along principal axes ``u``: ``J = lambda 1 + sum (lambda_u - lambda) u u'``. With the middle
+        moment as ``lambda``, a body with an axis of symmetry needs that axis alone.
+        """
+        about = self._inertias[k].about_com
+        moments, axes = np.linalg.eigh(np.trace(about) / 2 * np.eye(3) - about)
+        J = moments[1] * ca.SX.eye(3)
+        for moment, axis in ((moments[0], axes[:, 0]), (moments[2], axes[:, 2])):
+            u = R @ _constant(axis)
+            J = J + symmetric(((moment - moments[1]) * u) @ u.T)
+        return J
+
+
+class SymbolicMassProperties(MassProperties):
+    """Mass properties as entries of a symbol ``p``.
+
+    Parameters
+    ----------
+    free
+        (10 B,) which entries of :attr:`.InertialParameters.vector` are in ``p``; the others are
+        zero.
+    """
+
+    def __init__(self, free: npt.NDArray[np.bool_]) -> None:
+        self.free = free
+        self._p = ca.SX.sym("p", int(np.count_nonzero(free)))
+        rows = ca.SX(len(free), 1)
+        for at, index in enumerate(np.flatnonzero(free).tolist()):
+            rows[index] = self._p[at]
+        bodies = ca.vertsplit(rows, PER_BODY)
+        self.masses = tuple(body[0] for body in bodies)
+        self.centers = tuple(body[1:4] for body in bodies)
+        self._moments = [body[4:] for body in bodies]
+        self.total = sum(self.masses[1:], self.masses[0])
+        self.inputs = {"p": self._p}
+
+    def inertia(self, k: int, R: ca.SX) -> ca.SX:
+        """Return the inertia (3, 3) of body k about its centre, turned by R, kg m^2."""
+        return rotational(self.second_moment(k, R))
+
+    def second_moment(self, k: int, R: ca.SX) -> ca.SX:
+        """Return the second moment of mass (3, 3) of body k, turned by R, kg m^2.
+
+        As with constants, with the columns of R as axes, and terms for the products of inertia.
+        """
+        xx, yy, zz, xy, xz, yz = ca.vertsplit(self._moments[k])
+        x, y, z = ca.horzsplit(R)
+        J = yy * ca.SX.eye(3) + symmetric(((xx - yy) * x) @ x.T + ((zz - yy) * z) @ z.T)
+        if xy.nnz() or xz.nnz():
+            beside = xy * y + xz * z
+            J = J + symmetric(x @ beside.T + beside @ x.T)
+        if yz.nnz():
+            J = J + symmetric(yz * (y @ z.T + z @ y.T))
+        return ca.sparsify(J)
+
+
+def free_entries(nominal: InertialParameters) -> npt.NDArray[np.bool_]:
+    """Return which entries (10 B,) of the vector may differ from zero for robots like this one.
+
+    All masses may. Entries of centres and products of inertia that are zero stay zero; principal
+    moments are all zero (a point mass) or all free.
+    """
+    rows = nominal.vector.reshape(-1, PER_BODY) != 0.0
+    rows[:, 0] = True
+    rows[:, 4:7] = rows[:, 4:7].any(axis=1, keepdims=True)
+    return np.asarray(rows.reshape(-1))
+
+
+def rotational(J: ca.SX) -> ca.SX:
+    """Return the rotational inertia ``tr(J) 1 - J`` of a second moment of mass."""
+    inertia = -J
+    for i in range(3):
+        inertia[i, i] = J[i - 2, i - 2] + J[i - 1, i - 1]
+    return inertia
+
+
+def symmetric(matrix: ca.SX) -> ca.SX:
+    """Return a symmetric matrix whose mirrored entries share one expression."""
+    return ca.tril2symm(ca.tril(matrix))
+
+
+def _constant(array: Array) -> ca.DM:
+    return ca.sparsify(ca.DM(array))

@@ -1,4 +1,4 @@
-"""Runge-Kutta 4 with what drives the motion held, as functions to build larger ones from."""
+"""Runge-Kutta 4 under held commands, as functions to compose larger ones from."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DEFAULT_INTEGRATION_STEP = 0.01
 
 
 def steps_in(control_period: float, integration_step: float) -> int:
-    """Return how many equal steps, none longer than ``integration_step`` s, make a control period.
+    """Return the least number of equal steps of at most ``integration_step`` s in a control period.
 
     Raises
     ------
@@ -33,11 +33,11 @@ def steps_in(control_period: float, integration_step: float) -> int:
 def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
     """Return one step ``(x, held arguments of rate, h) -> x`` of Runge-Kutta 4.
 
-    A last argument ``p`` of the rate (what the bodies weigh) stays the last, after ``h``.
+    A last argument ``p`` of the rate (mass properties) stays the last, after ``h``.
 
-    ``attitude`` is where the quaternion is in ``x``: it is integrated in R^4, and normalised after
-    the step. The four stages call one piece of code: written out four times it would be 6 % faster,
-    and take six times as long to compile.
+    ``attitude`` is the slice of the quaternion in ``x``: it is integrated in R^4 and normalised
+    after the step. The four stages call one piece of code: inlined it would be 6 % faster and take
+    six times as long to compile.
     """
     x, held = _arguments(rate)
     h = ca.MX.sym("h")
@@ -47,15 +47,15 @@ def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
     k4 = rate(x + h * k3, *held)
     x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     x_next[attitude] = x_next[attitude] / ca.norm_2(x_next[attitude])
-    weights = [held.pop()] if rate.name_in(rate.n_in() - 1) == "p" else []
-    inputs = [x, *held, h, *weights]
+    p = [held.pop()] if rate.name_in(rate.n_in() - 1) == "p" else []
+    inputs = [x, *held, h, *p]
     return ca.Function(rate.name().replace("rate", "step"), inputs, [x_next])
 
 
 def repeated(step: ca.Function, count: int) -> ca.Function:
     """Return ``step`` applied ``count`` times to its first argument, the others held.
 
-    Each half is one function called twice, so that the code grows with the logarithm of ``count``.
+    Each half is one function called twice: the code grows with the logarithm of ``count``.
     """
     if count == 1:
         return step
@@ -72,27 +72,27 @@ def attitude_step(locked_inertia: ca.Function) -> ca.Function:
 
     The reconstruction of the base's motion from the shape's, one held command at a time. Joint
     velocities are constant over the step (servos hold them), so the shape is exact; the position
-    follows from the centre of mass. What is integrated is the attitude alone:
+    follows from the centre of mass. Only the attitude is integrated:
     ``R_WB_dot = R_WB hat(omega)``, ``omega = D^-1 (R_WB' L_W - D_q qdot)`` (paper 1, eq. 3, with an
     angular momentum that need not be zero), as a quaternion in R^4, normalised.
 
-    ``locked_inertia`` is the function ``q -> (D, D_q)``; if it takes a second argument ``p`` (what
-    the bodies weigh), so does the step, as its last.
+    ``locked_inertia`` is the function ``q -> (D, D_q)``; if it takes a second argument ``p`` (mass
+    properties), so does the step, as its last.
     """
-    weights = [ca.SX.sym("p", locked_inertia.size1_in(1))] if locked_inertia.n_in() > 1 else []
+    p = [ca.SX.sym("p", locked_inertia.size1_in(1))] if locked_inertia.n_in() > 1 else []
     n = locked_inertia.size1_in(0)
     x = ca.SX.sym("x", n + 4)
     qdot, L_W, h = ca.SX.sym("qdot", n), ca.SX.sym("L_W", 3), ca.SX.sym("h")
     q, quaternion = x[:n], x[n:]
     # Start, middle and end of the step: the middle serves two of the four stages.
-    shapes = [locked_inertia(q + fraction * h * qdot, *weights) for fraction in (0.0, 0.5, 1.0)]
+    shapes = [locked_inertia(q + fraction * h * qdot, *p) for fraction in (0.0, 0.5, 1.0)]
 
     def rate(at: ca.SX, shape: tuple[ca.SX, ca.SX]) -> ca.SX:
         D, D_q = shape
         L_B = matrix_from_quaternion(at).T @ L_W
-        # Without roots and with a quarter of the divisions, to rounding the same: in vector
-        # registers these take most of the time. Recorded flights were flown by the other.
-        solve = Factor(D).solve if weights else partial(solve_positive_definite, D)
+        # The factor has no roots and a quarter of the divisions, which take most of the time in
+        # vector registers; it is equal up to rounding. Recorded flights used the other solver.
+        solve = Factor(D).solve if p else partial(solve_positive_definite, D)
         return quaternion_rate(at, solve(L_B - D_q @ qdot))
 
     k1 = rate(quaternion, shapes[0])
@@ -101,7 +101,7 @@ def attitude_step(locked_inertia: ca.Function) -> ca.Function:
     k4 = rate(quaternion + h * k3, shapes[2])
     turned = quaternion + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     x_next = ca.vertcat(q + h * qdot, turned / ca.norm_2(turned))
-    return ca.Function("attitude_step", [x, qdot, L_W, h, *weights], [ca.cse(x_next)])
+    return ca.Function("attitude_step", [x, qdot, L_W, h, *p], [ca.cse(x_next)])
 
 
 def _arguments(function: ca.Function) -> tuple[ca.MX, list[ca.MX]]:

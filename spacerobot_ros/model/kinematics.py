@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.model.body_weights import BodyWeights, DescribedWeights
 from spacerobot_ros.model.description import (
     Array,
     Joint,
@@ -22,6 +21,7 @@ from spacerobot_ros.model.description import (
     Pose,
     RobotDescription,
 )
+from spacerobot_ros.model.inertial_parameters import MassProperties
 from spacerobot_ros.model.rotations import matrices_from_quaternions, quaternion_from_matrix
 from spacerobot_ros.model.rotations import quaternion_multiply as numeric_multiply
 from spacerobot_ros.model.symbolic_rotations import matrix_about_axis, quaternion_multiply
@@ -29,13 +29,13 @@ from spacerobot_ros.model.symbolic_rotations import matrix_about_axis, quaternio
 
 @dataclass(frozen=True)
 class TreeKinematics:
-    """Where the bodies of a robot are, as functions of its shape q.
+    """Poses, centres of mass and inertias of the bodies as functions of the shape q.
 
     For body k, in base components: ``R[k]`` attitude ``R_BBk`` (paper 4: ``0T_k``), ``p[k]``
     origin, ``com[k]`` centre of mass, ``inertia[k]`` inertia about that centre, ``axis[k]`` the
     unit vector of the joint that carries it (None for the base). ``theta`` (m,) are the positions
     of the joints that carry ``bodies[1:]``: q, unless joints follow others (URDF's mimic).
-    ``weights`` says what the bodies weigh: the numbers of the robot, or symbols.
+    ``mass_properties`` of the bodies are constants or symbols.
     """
 
     robot: RobotDescription
@@ -47,7 +47,7 @@ class TreeKinematics:
     inertia: tuple[ca.SX, ...]
     axis: tuple[ca.SX | None, ...]
     r_BC_B: ca.SX
-    weights: BodyWeights
+    mass_properties: MassProperties
 
     @property
     def n(self) -> int:
@@ -60,11 +60,11 @@ class TreeKinematics:
         return len(self.robot.bodies) - 1
 
     def spread(self, rates: ca.SX) -> ca.SX:
-        """Return what rates (n, ...) of the coordinates are of the joints (m, ...): ``G rates``."""
+        """Return joint rates (m, ...) for coordinate rates (n, ...): ``G rates``."""
         return self._coupling @ rates if self.robot.coupled else rates
 
     def gather(self, forces: ca.SX) -> ca.SX:
-        """Return what forces (m, ...) along the joints are of the coordinates: ``G' forces``."""
+        """Return generalised forces (n, ...) of forces (m, ...) on the joints: ``G' forces``."""
         return self._coupling.T @ forces if self.robot.coupled else forces
 
     @property
@@ -73,27 +73,27 @@ class TreeKinematics:
 
     def mass(self, k: int) -> float | ca.SX:
         """Mass of body k, kg."""
-        return self.weights.masses[k]
+        return self.mass_properties.masses[k]
 
     @property
     def total_mass(self) -> float | ca.SX:
         """Mass of the system, kg."""
-        return self.weights.total
+        return self.mass_properties.total
 
     @property
     def per_mass(self) -> float | ca.SX:
         """One over the mass of the system, 1/kg."""
         # CasADi rewrites x * (1/d) as x/d; it leaves |1/d| as it is.
-        per: float | ca.SX = 1 / self.weights.total
+        per: float | ca.SX = 1 / self.mass_properties.total
         return per if isinstance(per, float) else ca.fabs(per)
 
     def center(self, k: int) -> ca.DM | ca.SX:
         """Centre of mass (3,) of body k in its own frame, m."""
-        return self.weights.centers[k]
+        return self.mass_properties.centers[k]
 
     def second_moment(self, k: int) -> ca.SX:
         """Return the second moment of mass (3, 3) of body k about its centre, base components."""
-        return self.weights.second_moment(k, self.R[k])
+        return self.mass_properties.second_moment(k, self.R[k])
 
     def parent(self, k: int) -> int:
         """Index of the body that body k moves on; -1 for the base."""
@@ -113,7 +113,7 @@ class TreeKinematics:
         return chain[::-1]
 
     def outboard(self, j: int) -> list[int]:
-        """Return the bodies that joint j carries, body j first."""
+        """Return the bodies outboard of joint j, body j first."""
         return [k for k in range(len(self.robot.bodies)) if j == 0 or j in self.ancestors(k)]
 
     def frame(self, link: str) -> tuple[ca.SX, ca.SX, int]:
@@ -123,7 +123,7 @@ class TreeKinematics:
         return R, r, body
 
     def angular_jacobian(self, k: int) -> ca.SX:
-        """Return ``0F_k`` (3, n): what the joint rates add to the angular velocity of k (eq. 6)."""
+        """Return ``0F_k`` (3, n), which maps joint rates to the angular velocity of k (eq. 6)."""
         F = ca.SX(3, self.moving)
         for j in self.ancestors(k):
             if self.is_revolute(j):
@@ -143,17 +143,19 @@ def joint_positions(robot: RobotDescription, q: ca.SX) -> ca.SX:
     return ca.sparsify(ca.DM(G)) @ q + ca.sparsify(ca.DM(b))
 
 
-def tree_kinematics(robot: RobotDescription, weights: BodyWeights | None = None) -> TreeKinematics:
+def tree_kinematics(
+    robot: RobotDescription, mass_properties: MassProperties | None = None
+) -> TreeKinematics:
     """Build the symbolic kinematics of a robot.
 
     Parameters
     ----------
     robot
         The robot.
-    weights
-        What its bodies weigh; None: the numbers of its description.
+    mass_properties
+        Mass properties of its bodies; None: the constants of its description.
     """
-    weights = weights or DescribedWeights(robot)
+    mass_properties = mass_properties or MassProperties(robot)
     q = ca.SX.sym("q", len(robot.joint_names))
     theta = joint_positions(robot, q)
     R: list[ca.SX] = [ca.SX.eye(3)]
@@ -173,12 +175,12 @@ def tree_kinematics(robot: RobotDescription, weights: BodyWeights | None = None)
         axis.append(direction)
     com, inertia = [], []
     for k in range(len(robot.bodies)):
-        com.append(p[k] + R[k] @ weights.centers[k])
-        inertia.append(weights.inertia(k, R[k]))
-    r_BC_B = sum((m * c for m, c in zip(weights.masses, com, strict=True)), ca.SX(3, 1))
-    r_BC_B = r_BC_B / weights.total
+        com.append(p[k] + R[k] @ mass_properties.centers[k])
+        inertia.append(mass_properties.inertia(k, R[k]))
+    r_BC_B = sum((m * c for m, c in zip(mass_properties.masses, com, strict=True)), ca.SX(3, 1))
+    r_BC_B = r_BC_B / mass_properties.total
     frames = tuple(R), tuple(p), tuple(com), tuple(inertia), tuple(axis)
-    return TreeKinematics(robot, q, theta, *frames, r_BC_B, weights)
+    return TreeKinematics(robot, q, theta, *frames, r_BC_B, mass_properties)
 
 
 def link_quaternion(description: RobotDescription, link: str, q: ca.SX) -> ca.SX:

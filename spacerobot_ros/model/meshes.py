@@ -20,13 +20,15 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote, urlparse
+from xml.sax.saxutils import unescape
 
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import MeshError
+from spacerobot_ros.errors import MeshError, SpaceRobotError
 from spacerobot_ros.model.description import Array, Pose, Shape
-from spacerobot_ros.model.urdf import mesh_file
+from spacerobot_ros.resources import share_directory
 
 _MOST_BYTES = 100_000_000
 _MOST_TRIANGLES = 2_000_000
@@ -40,6 +42,10 @@ _HEADER = 84
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 _VERTEX = re.compile(rb"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)\s*$", re.MULTILINE)
+
+_MESH_NAME = re.compile(
+    r"""(?P<before><mesh\b[^>]*?\bfilename\s*=\s*["'])(?P<file>[^"']+)(?P<after>["'])"""
+)
 
 _OF_TRIMESH = (".dae", ".glb", ".gltf", ".ply")
 
@@ -89,6 +95,68 @@ class TriangleMesh:
                 break
             coarse = TriangleMesh(mean, faces)
         return coarse
+
+
+def with_mesh_files(text: str, find: Callable[[str], Path | None]) -> str:
+    """Return a URDF text in which meshes are named by ``file://`` URIs.
+
+    Parameters
+    ----------
+    text
+        URDF.
+    find
+        Returns the file of a mesh by its name in the text; None: the name stays.
+    """
+
+    def absolute(match: re.Match[str]) -> str:
+        found = find(unescape(match["file"]))
+        if found is None:
+            return match[0]
+        return f"{match['before']}file://{quote(str(found))}{match['after']}"
+
+    return _MESH_NAME.sub(absolute, text)
+
+
+def mesh_beside(resource: str, folder: Path) -> Path | None:
+    """Return the file of a mesh beside the URDF in a folder; None: its URI is complete."""
+    scheme, mark, rest = resource.partition("://")
+    if not mark:
+        found = folder / resource
+        return found.resolve() if found.is_file() else None
+    if scheme != "package" or mesh_file(resource) is not None:
+        return None
+    package, _, inside = rest.partition("/")
+    for parent in (folder, *folder.parents):
+        if parent.name == package and (parent / inside).is_file():
+            return parent / inside
+    return None
+
+
+def mesh_file(resource: str) -> Path | None:
+    """Return the file of a mesh by its URI (``file://``, ``package://``) or path; None: not there.
+
+    Packages are looked for in the ROS environment; this package's own need none.
+    """
+    url = urlparse(resource)
+    if url.scheme == "package":
+        folder = _package(url.netloc)
+        path = None if folder is None else folder / unquote(url.path).lstrip("/")
+    elif url.scheme in ("file", ""):
+        path = Path(unquote(url.path))
+    else:
+        return None
+    return path if path is not None and path.is_file() else None
+
+
+def _package(name: str) -> Path | None:
+    if name == "spacerobot_ros":
+        return share_directory()
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        return Path(get_package_share_directory(name))
+    except (ImportError, LookupError, OSError, ValueError, SpaceRobotError):
+        return None
 
 
 def shape_mesh(shape: Shape, most: int = _MOST_TRIANGLES) -> TriangleMesh:

@@ -1,7 +1,7 @@
-"""The functions of a robot's model, by name: built when they are asked for, compiled once.
+"""Named functions of a robot's model, built on demand and compiled once.
 
-A model has the numbers of its robot in it, or takes what the bodies weigh as the last argument
-``p`` of all its functions: then one compilation serves every robot of the same build.
+The mass properties of a model are constants, or the last argument ``p`` of all its functions: then
+one compilation serves all robots that differ in mass properties alone.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.model.body_weights import SymbolicWeights, free_entries
 from spacerobot_ros.model.compilation import (
     compilation_settings,
     compiled,
@@ -42,7 +41,11 @@ from spacerobot_ros.model.dynamics import (
     generalised_forces,
     point_jacobian,
 )
-from spacerobot_ros.model.inertial_parameters import InertialParameters
+from spacerobot_ros.model.inertial_parameters import (
+    InertialParameters,
+    SymbolicMassProperties,
+    free_entries,
+)
 from spacerobot_ros.model.integration import attitude_step, repeated, runge_kutta_step
 from spacerobot_ros.model.kinematics import tree_kinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
@@ -55,23 +58,25 @@ class ModelFunctions:
     ----------
     robot
         The robot.
-    weights
-        Symbols of what its bodies weigh; None: its numbers.
+    mass_properties
+        Mass properties of its bodies as symbols; None: as constants.
     """
 
-    def __init__(self, robot: RobotDescription, weights: SymbolicWeights | None = None) -> None:
+    def __init__(
+        self, robot: RobotDescription, mass_properties: SymbolicMassProperties | None = None
+    ) -> None:
         self.n = len(robot.joint_names)
         self.link_names = tuple(link.name for link in robot.links)
-        self._kin = tree_kinematics(robot, weights)
+        self._kin = tree_kinematics(robot, mass_properties)
         self._inertia = composites(self._kin)
         self._symbolic: dict[str, ca.Function] = {}
         self._compiled: dict[tuple[str, ...], ca.Function] = {}
         self.derived: dict[Hashable, Any] = {}
-        """What others have built from the model and want to find again, by keys of theirs."""
+        """Cache of objects that other modules derive from the model, by their keys."""
 
     @classmethod
     def of(cls, robot: RobotDescription) -> ModelFunctions:
-        """Return those with the numbers of a robot, which all equal robots of a process share."""
+        """Return the model with a robot's constants; equal robots of a process share it."""
         return _of_equal(_Equal(hashlib.sha256(pickle.dumps(robot)).hexdigest(), robot))
 
     def function(self, name: str, *, compile: bool = True) -> ca.Function:
@@ -83,14 +88,13 @@ class ModelFunctions:
         if name not in self._symbolic:
             build = self._builders[kind]
             self._symbolic[name] = build(argument) if argument else build()
-        # Curvature is wide and asked for once in a plan: compiling it would take longer than all
-        # its calls.
+        # Curvature is large and evaluated once in a plan: compiling takes longer than all calls.
         if not compile or kind == "curvature":
             return self._symbolic[name]
         return self.composed(name, lambda: self._symbolic[name])
 
     def composed(self, name: str, build: Callable[[], ca.Function]) -> ca.Function:
-        """Return a function that is built from those of the model, compiled once for its name."""
+        """Return a function composed of those of the model, compiled once per name."""
         key = (name, *compilation_settings())
         if key not in self._compiled:
             self._compiled[key] = compiled(build())
@@ -98,13 +102,13 @@ class ModelFunctions:
 
     @property
     def total_mass(self) -> float:
-        """Mass of the system, kg, where it is a number."""
+        """Mass of the system, kg; the model has constants."""
         return float(self._kin.total_mass)
 
     @property
-    def weight_inputs(self) -> dict[str, ca.SX]:
-        """The symbol ``p`` by its name; empty where the model has numbers."""
-        return self._kin.weights.inputs
+    def mass_inputs(self) -> dict[str, ca.SX]:
+        """The symbol ``p`` by its name; empty: the model has constants."""
+        return self._kin.mass_properties.inputs
 
     @cached_property
     def equations_key(self) -> str:
@@ -159,8 +163,8 @@ class ModelFunctions:
         return connection(self._kin, self._inertia)
 
     def _dense(self, name: str, inputs: dict[str, ca.SX], outputs: dict[str, ca.SX]) -> ca.Function:
-        """Return a function of the model: what the bodies weigh, if symbols, is the last input."""
-        return dense_function(name, inputs | self._kin.weights.inputs, outputs)
+        """Return a function of the model; symbolic mass properties become its last input."""
+        return dense_function(name, inputs | self._kin.mass_properties.inputs, outputs)
 
     def _shape_function(self, name: str, *outputs: ca.SX) -> ca.Function:
         names = ["result"] if len(outputs) == 1 else [f"result_{i}" for i in range(len(outputs))]
@@ -176,7 +180,7 @@ class ModelFunctions:
         return self._dense("link_poses", {"q": self._kin.q}, {"R_BL": R, "r_BL_B": r})
 
     def _state(self, v: str, *, quaternion: bool = False) -> dict[str, ca.SX]:
-        """Return symbols of the shape and the velocities, by name; ``v`` names the first."""
+        """Return symbols of shape and velocities by name; ``v`` is the name of the linear one."""
         attitude = {"quaternion_WB": ca.SX.sym("quaternion", 4)} if quaternion else {}
         return {
             **attitude,
@@ -264,7 +268,10 @@ class ModelFunctions:
             "qdot": ca.MX.sym("qdot", self.n),
             "L_W": ca.MX.sym("L_W", 3),
             "h": ca.MX.sym("h"),
-            **{name: ca.MX.sym(name, p.numel()) for name, p in self._kin.weights.inputs.items()},
+            **{
+                name: ca.MX.sym(name, p.numel())
+                for name, p in self._kin.mass_properties.inputs.items()
+            },
         }
         x0, qdot, L_W, h, *p = inputs.values()
         x = repeated(step, count)(x0, qdot, L_W, h / count, *p)
@@ -273,16 +280,18 @@ class ModelFunctions:
         )
 
     def _total_mass(self) -> ca.Function:
-        return dense_function("total_mass", self._kin.weights.inputs, {"M": self._kin.total_mass})
+        return dense_function(
+            "total_mass", self._kin.mass_properties.inputs, {"M": self._kin.total_mass}
+        )
 
 
 _MOST_BUILDS = 8
-"""Builds of robots that are kept; the one used longest ago is dropped first."""
+"""Number of models in each cache; the least recently used is dropped first."""
 
 
 @dataclass(frozen=True)
 class _Equal:
-    """A robot by a hash of all that it is."""
+    """A robot identified by a hash of its whole description."""
 
     key: str
     robot: RobotDescription = field(compare=False)
@@ -294,17 +303,17 @@ def _of_equal(equal: _Equal) -> ModelFunctions:
 
 
 class Composition:
-    """A larger function that is being built from those of a model, in symbols of one kind.
+    """Composes larger functions from those of a model, in symbols of one kind (MX or SX).
 
-    It hands on what the bodies weigh: calls of the model's functions are written without ``p``, and
+    It passes the mass properties on: calls of the model's functions are written without ``p``, and
     :meth:`function` adds it as the last input.
     """
 
     def __init__(self, model: ModelFunctions, kind: type[ca.MX] | type[ca.SX]) -> None:
         self.n, self.link_names = model.n, model.link_names
         self._model = model
-        self.inputs = {name: kind.sym(name, p.numel()) for name, p in model.weight_inputs.items()}
-        """The symbol ``p`` by its name; empty where the model has numbers."""
+        self.inputs = {name: kind.sym(name, p.numel()) for name, p in model.mass_inputs.items()}
+        """The symbol ``p`` by its name; empty: the model has constants."""
 
     def __call__(self, name: str, *arguments: ca.MX | ca.SX | ca.DM) -> ca.MX | ca.SX:
         """Call a function of the model."""
@@ -324,10 +333,7 @@ class Composition:
 
 
 class SymbolicModels:
-    """The models of one build of robot that take what the bodies weigh as an argument.
-
-    All robots of a process that differ in masses, centres and inertias alone share one of these.
-    """
+    """Models with mass properties as an argument, shared by robots that differ in these alone."""
 
     def __init__(self, robot: RobotDescription, free: npt.NDArray[np.bool_]) -> None:
         self._robot, self._free = robot, free
@@ -335,7 +341,7 @@ class SymbolicModels:
 
     @classmethod
     def of(cls, robot: RobotDescription) -> SymbolicModels:
-        """Return those of a robot's build."""
+        """Return the models of all robots that differ from this one in mass properties alone."""
         free = free_entries(InertialParameters.of(robot))
         key = _build_key(robot, free)
         found = _builds.pop(key, None) or cls(robot, free)
@@ -345,16 +351,16 @@ class SymbolicModels:
         return found
 
     def model(self, parameters: InertialParameters) -> tuple[ModelFunctions, Array]:
-        """Return the model for robots that weigh this (..., B), and its argument ``p`` (..., k).
+        """Return the model for inertial parameters (..., B), and its argument ``p`` (..., k).
 
-        Mostly entries that are zero in the nominal robot are zero in all, and no argument. Where
-        one is not, every entry is an argument.
+        Entries that are zero in the nominal robot are usually zero in all, and left out of ``p``.
+        If one is not, all entries are in ``p``.
         """
         vector = parameters.vector
         usual = not vector[..., ~self._free].any()
         free = self._free if usual else np.ones_like(self._free)
         if usual not in self._models:
-            self._models[usual] = ModelFunctions(self._robot, SymbolicWeights(free))
+            self._models[usual] = ModelFunctions(self._robot, SymbolicMassProperties(free))
         return self._models[usual], np.ascontiguousarray(vector[..., free])
 
 
@@ -362,7 +368,7 @@ _builds: dict[str, SymbolicModels] = {}
 
 
 def _build_key(robot: RobotDescription, free: npt.NDArray[np.bool_]) -> str:
-    """Return a hash of everything but the numbers of what the bodies weigh."""
+    """Return a hash of a description without its mass properties."""
     bodies = [(body.name, body.joint, body.parent, body.origin) for body in robot.bodies]
     facts = (robot.name, bodies, robot.frames, [link.name for link in robot.links], free)
     return hashlib.sha256(pickle.dumps(facts)).hexdigest()

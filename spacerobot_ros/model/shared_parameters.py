@@ -1,17 +1,90 @@
-"""Parameters that several nodes have in common."""
+"""Parameters that several nodes share: robot and model, watchdog, goals and tolerances."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from spacerobot_ros.model.robot_source import BelievedRobotConfig
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.model_functions import SymbolicModels
+from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.parameters import parameter
+from spacerobot_ros.resources import robot_file
 from spacerobot_ros.times import SECOND
 
 
 @dataclass(frozen=True)
+class RobotConfig:
+    """The robot of a node."""
+
+    robot_description: str = parameter("", "URDF text of the robot; takes precedence over 'robot'")
+    robot: str = parameter(
+        "", "URDF file, or the name of a robot of this package (sliding_masses, ...)"
+    )
+
+    def believed(self, robot: RobotDescription) -> RobotDescription:
+        """Return the robot as the node with this configuration models it."""
+        return robot
+
+
+@dataclass(frozen=True)
+class BelievedRobotConfig(RobotConfig):
+    """The robot of flight software, whose model may differ from the plant's."""
+
+    model_error: float = parameter(
+        0.0, "largest relative error of masses and inertias", minimum=0.0, maximum=0.9
+    )
+    model_error_seed: int = parameter(0, "seed of the draw of these errors", minimum=0)
+
+    def believed(self, robot: RobotDescription) -> RobotDescription:
+        """Return the robot with masses and inertias off by up to ``model_error``."""
+        if self.model_error > 0.0:
+            return robot.with_model_error(self.model_error, self.model_error_seed)
+        return robot
+
+
+def robot_of(config: RobotConfig) -> SpaceRobot | None:
+    """Return the robot that a configuration names; None: it names none.
+
+    Raises
+    ------
+    ParameterError
+        There is no such file or robot.
+    RobotDescriptionError
+        Its URDF is refused.
+    """
+    if config.robot_description:
+        return robot_from_text(config.robot_description, config)
+    if not config.robot:
+        return None
+    try:
+        path = robot_file(config.robot)
+    except ParameterError as error:
+        raise ParameterError(f"Parameter 'robot' is '{config.robot}'. {error}") from None
+    return _believed(load_robot(path), config)
+
+
+def robot_from_text(text: str, config: RobotConfig) -> SpaceRobot:
+    """Return the robot of a URDF text, as the node with this configuration models it.
+
+    Raises
+    ------
+    RobotDescriptionError
+        The URDF is refused.
+    """
+    return _believed(parse_robot(text), config)
+
+
+def _believed(true: RobotDescription, config: RobotConfig) -> SpaceRobot:
+    believed = config.believed(true)
+    # Models with other mass properties share their compiled functions.
+    return SpaceRobot(believed, None if believed is true else SymbolicModels.of(true))
+
+
+@dataclass(frozen=True)
 class WatchdogConfig:
-    """When a node that another one depends on counts as silent."""
+    """Supervision of the heartbeats of other nodes."""
 
     watchdog_timeout: float = parameter(
         0.8,
@@ -24,7 +97,7 @@ class WatchdogConfig:
 
 @dataclass(frozen=True)
 class CommanderConfig(WatchdogConfig, BelievedRobotConfig):
-    """What the nodes that command a plant have in common: rate, goals, tolerances."""
+    """Parameters of the nodes that command a plant: rate, goals, tolerances."""
 
     tick_rate: float = parameter(
         20.0,
@@ -77,10 +150,12 @@ class CommanderConfig(WatchdogConfig, BelievedRobotConfig):
         False, "answer no states once a goal is decided: a lockstep plant stays at that tick"
     )
     watchdog_action: str = parameter(
-        "report", "what a silent plant leads to beside a report", choices=("report", "abort")
+        "report",
+        "reaction to a silent plant: report alone, or abort too",
+        choices=("report", "abort"),
     )
 
     @property
     def control_period(self) -> float:
-        """How long a command is held, a whole number of nanoseconds, s."""
+        """Duration for which a command is held, a whole number of nanoseconds, s."""
         return round(SECOND / self.tick_rate) / SECOND

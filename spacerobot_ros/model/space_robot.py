@@ -1,8 +1,8 @@
-"""The model of one robot: every equation the stack uses, compiled, behind plain methods.
+"""The model of one robot: its equations, compiled, as methods.
 
 Frames: world W, base link B. Vectors with suffix ``_B`` are in base components. The shape ``q``
-(n,) is ordered as ``joint_names``. Convenience methods return new arrays; what runs every period
-takes a :class:`BufferedFunction` from :meth:`SpaceRobot.buffered` and works in place.
+(n,) is ordered as ``joint_names``. The methods return new arrays; code that runs every control
+period takes a :class:`BufferedFunction` from :meth:`SpaceRobot.buffered` and works in place.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions, SymbolicModels
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 
-_STANDS = 1e-6
-"""Share of a joint in a motion without inertia that is none."""
+_NO_MOTION = 1e-6
+"""Component of a joint in a motion without inertia below which the joint does not take part."""
 
 
 class SpaceRobot:
-    """Equations of a free-floating robot, built once from its description.
+    """Model of a free-floating robot, built once from its description.
 
     Parameters
     ----------
     description
         The robot, as :func:`load_robot` or :func:`parse_robot` return it.
     build
-        The models of robots that differ in what their bodies weigh alone: what runs every period
-        takes that as an argument, and is compiled once for all of them. None: its numbers are
-        compiled in.
+        Models of all robots that differ in mass properties alone: :meth:`buffered` and
+        :meth:`composed` functions take these as an argument and are compiled once for all of them.
+        None: the mass properties are compiled in.
 
     Raises
     ------
@@ -72,12 +72,14 @@ class SpaceRobot:
     def with_inertial(self, parameters: InertialParameters) -> SpaceRobot:
         """Return the robot with other masses, centres of mass and inertias.
 
-        All such robots share their compiled functions. A robot with its own numbers is itself.
+        All such robots share their compiled functions. With its own numbers the robot returns
+        itself.
 
         Raises
         ------
         RobotDescriptionError
-            No robot weighs that.
+            A number is not finite, a mass is negative, all masses are zero, or an inertia is not
+            that of a body.
         """
         parameters.require_physical([body.name for body in self.description.bodies])
         if np.array_equal(parameters.vector, self.inertial.vector):
@@ -85,16 +87,16 @@ class SpaceRobot:
         return self.with_masses_of(parameters.described(self.description))
 
     def with_masses_of(self, description: RobotDescription) -> SpaceRobot:
-        """Return the robot as a description of the same build says that it weighs."""
+        """Return the robot with the mass properties of a description of the same structure."""
         return SpaceRobot(description, self._build)
 
     @cached_property
     def inertial(self) -> InertialParameters:
-        """What the bodies weigh."""
+        """Mass properties of the bodies."""
         return InertialParameters.of(self.description)
 
     def symbolic_model(self, parameters: InertialParameters) -> tuple[ModelFunctions, Array]:
-        """Return the model that serves robots that weigh this (..., B), and its argument."""
+        """Return the model for inertial parameters (..., B), and its argument ``p``."""
         return self._build.model(parameters)
 
     # -- quantities ---------------------------------------------------------------------------
@@ -145,9 +147,9 @@ class SpaceRobot:
         return self._call("forward_dynamics", q, v_cm_B, omega_WB_B, qdot, wrench_B, tau)[0]
 
     def joint_efforts(self, q: npt.ArrayLike, qdot: npt.ArrayLike, qddot: npt.ArrayLike) -> Array:
-        """Return the efforts (n,), N or N m, that move the shape so at zero momentum.
+        """Return the efforts (n,), N or N m, of a motion of the shape at zero momentum.
 
-        Nothing pushes the base, which moves as the momenta demand.
+        No wrench acts on the base, which moves as the momenta demand.
         """
         return self._call("joint_efforts", q, qdot, qddot)[0]
 
@@ -213,14 +215,14 @@ class SpaceRobot:
 
     def function(self, name: str, *, compile: bool = True) -> ca.Function:
         """Return a function of the model by name (see :class:`.ModelFunctions`), with this robot's
-        numbers in it.
+        mass properties as constants.
 
-        ``compile=False`` gives the symbolic function, to build larger ones from.
+        ``compile=False`` gives the symbolic function, to compose larger ones from.
         """
         return self._numbers.function(name, compile=compile)
 
     def buffered(self, name: str) -> BufferedFunction:
-        """Return a new buffered view of a function, for one caller's own use."""
+        """Return a function with input and output buffers of its own, for one caller."""
         return BufferedFunction(self._model.function(name), self._p)
 
     def velocity_step(self, substeps: int) -> BufferedFunction:
@@ -232,34 +234,33 @@ class SpaceRobot:
         return self.buffered(f"velocity_step:{substeps}")
 
     def composed(self, name: str, build: Callable[[Composition], ca.Function]) -> BufferedFunction:
-        """Return a new view of a function that ``build`` makes of the model's, in MX.
+        """Return a function that ``build`` composes of the model's, in MX, with its own buffers.
 
-        It is compiled once for its name, for all robots that differ in masses, centres and inertias
-        alone.
+        It is compiled once per name for all robots that differ in mass properties alone.
         """
         model = self._model
         function = model.composed(name, lambda: build(Composition(model, ca.MX)))
         return BufferedFunction(function, self._p)
 
     def expressions(self) -> Composition:
-        """Return the model's functions to build larger ones from, in SX; see :meth:`view`."""
+        """Return the model's functions to compose larger ones from, in SX; see :meth:`view`."""
         return Composition(self._model, ca.SX)
 
     def view(self, function: ca.Function) -> BufferedFunction:
-        """Return a new view of a function of :meth:`expressions`, compiled.
+        """Compile a function of :meth:`expressions`, and return it with its own buffers.
 
-        What the bodies weigh, where that is its last argument, is this robot's.
+        The argument ``p``, if it has one, is set to this robot's mass properties.
         """
         return BufferedFunction(compiled(function), self._p)
 
     @property
-    def weights(self) -> dict[str, Array]:
-        """What functions of :meth:`expressions` take as their last argument, by its name."""
+    def mass_arguments(self) -> dict[str, Array]:
+        """Last argument of functions of :meth:`expressions`, by its name; empty: none."""
         return {} if self._p is None else {"p": self._p}
 
     @property
     def equations_key(self) -> str:
-        """A hash of the equations at zero momentum: equal for robots that move alike."""
+        """Hash of the equations at zero momentum, equal for robots that move alike."""
         return self._numbers.equations_key
 
     @cached_property
@@ -274,7 +275,7 @@ class SpaceRobot:
 
     @cached_property
     def _numbers(self) -> ModelFunctions:
-        """The model with this robot's numbers in it."""
+        """The model with this robot's mass properties as constants."""
         return ModelFunctions.of(self.description)
 
     # -- helpers ------------------------------------------------------------------------------
@@ -285,7 +286,7 @@ class SpaceRobot:
         return self._buffers[name](*(np.asarray(a, dtype=float) for a in arguments))
 
     def _require_positive_inertia(self) -> None:
-        """Refuse a robot that can move without a mass moving, and say what lacks inertia."""
+        """Refuse a robot whose inertia matrix is singular; the message names the joint or link."""
         H = self._model.function("inertia_matrix", compile=False)
         p = [] if self._p is None else [self._p]
         middle = np.clip(np.zeros(self.n), self.lower, self.upper)
@@ -296,13 +297,13 @@ class SpaceRobot:
             return
         moved = np.abs(vectors[6:, 0])
         box = "an <inertia>, for a box of sides a, b, c ixx = m (b^2 + c^2) / 12 and so on"
-        if not moved.size or moved.max() < _STANDS:
+        if not moved.size or moved.max() < _NO_MOTION:
             mend = f"it turns without any mass moving. Give '{self.description.base_link}' {box}."
         else:
             joint = self.description.movable_joints[int(moved.argmax())]
             mend = (
-                f"its joint '{joint.name}' can move without any mass moving, as what it carries, "
-                f"or what carries it, has no inertia about its axis. Give '{joint.child}' and "
+                f"its joint '{joint.name}' can move without any mass moving, as the bodies on one "
+                f"side of it have no inertia about its axis. Give '{joint.child}' and "
                 f"'{joint.parent}' {box}, or make the joint fixed."
             )
         raise RobotDescriptionError(

@@ -1,4 +1,9 @@
-"""URDF text to :class:`RobotDescription`, refusing what cannot float, with a sentence."""
+"""URDF files and texts to :class:`.RobotDescription`.
+
+The form of the text is checked first (:func:`_checked_root`): every message names the element and
+its correction. Then links and joints are read, fixed joints are welded, and robots whose equations
+would be singular are refused.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +11,16 @@ import contextlib
 import io
 import math
 import re
-from collections.abc import Callable
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
-from urllib.parse import quote, unquote, urlparse
-from xml.etree import ElementTree
-from xml.sax.saxutils import unescape
+from typing import NoReturn
+from xml.etree.ElementTree import Element, ParseError, fromstring
 
 import numpy as np
-from urdf_parser_py.urdf import URDF
 
-from spacerobot_ros.errors import RobotDescriptionError, SpaceRobotError
+from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.description import (
     Array,
     Inertia,
@@ -32,19 +35,16 @@ from spacerobot_ros.model.description import (
     weld,
 )
 from spacerobot_ros.model.inertial_parameters import TRIANGLE_SLACK
+from spacerobot_ros.model.meshes import mesh_beside, with_mesh_files
 from spacerobot_ros.model.rotations import matrix_from_rpy
-from spacerobot_ros.model.urdf_form import urdf_root
-from spacerobot_ros.resources import share_directory, suggestion
+from spacerobot_ros.resources import suggestion
 
 _LARGEST = 1e12
-"""Larger numbers (kg, m, kg m^2) are slips, and their squares soon overflow."""
+"""Largest number (kg, m, kg m^2): larger ones are typing errors, and their squares overflow."""
 
 _MOST_LINKS = 200
 
 _XACRO = re.compile(r"<xacro:|\$\{")
-_MESH = re.compile(
-    r"""(?P<before><mesh\b[^>]*?\bfilename\s*=\s*["'])(?P<file>[^"']+)(?P<after>["'])"""
-)
 
 
 def load_robot(path: str | Path) -> RobotDescription:
@@ -71,13 +71,13 @@ def load_robot(path: str | Path) -> RobotDescription:
         text = _expanded(path)
     try:
         folder = path.resolve().parent
-        return parse_robot(with_mesh_files(text, lambda mesh: _mesh_beside(mesh, folder)))
+        return parse_robot(with_mesh_files(text, lambda mesh: mesh_beside(mesh, folder)))
     except RobotDescriptionError as error:
         raise RobotDescriptionError(f"{path}: {error}") from error
 
 
 def _expanded(path: Path) -> str:
-    """Return the URDF text that a xacro file stands for."""
+    """Return the URDF text that a xacro file expands to."""
     try:
         import xacro
     except ImportError:
@@ -85,7 +85,7 @@ def _expanded(path: Path) -> str:
             f"{path} is a xacro file, and the package xacro is not installed: `pip install xacro`, "
             f"or expand it where it is: `xacro {path.name} > {path.name.split('.')[0]}.urdf`."
         ) from None
-    # xacro reports on standard error where it was when it failed: the sentence says it.
+    # xacro reports on standard error where it was when it failed: the message says it.
     with contextlib.redirect_stderr(io.StringIO()):
         try:
             return str(xacro.process_file(str(path)).toxml())
@@ -94,68 +94,6 @@ def _expanded(path: Path) -> str:
             raise RobotDescriptionError(
                 f"The xacro file {path} cannot be expanded: {reason}."
             ) from error
-
-
-def with_mesh_files(text: str, find: Callable[[str], Path | None]) -> str:
-    """Return a URDF text in which meshes are named by their files.
-
-    Parameters
-    ----------
-    text
-        Of the URDF.
-    find
-        Returns the file of a mesh by what the text calls it; None: it keeps its name.
-    """
-
-    def absolute(match: re.Match[str]) -> str:
-        found = find(unescape(match["file"]))
-        if found is None:
-            return match[0]
-        return f"{match['before']}file://{quote(str(found))}{match['after']}"
-
-    return _MESH.sub(absolute, text)
-
-
-def _mesh_beside(resource: str, folder: Path) -> Path | None:
-    """Return the file of a mesh next to the URDF's folder, None where its URI says all."""
-    scheme, mark, rest = resource.partition("://")
-    if not mark:
-        found = folder / resource
-        return found.resolve() if found.is_file() else None
-    if scheme != "package" or mesh_file(resource) is not None:
-        return None
-    package, _, inside = rest.partition("/")
-    for parent in (folder, *folder.parents):
-        if parent.name == package and (parent / inside).is_file():
-            return parent / inside
-    return None
-
-
-def mesh_file(resource: str) -> Path | None:
-    """Return the file of a mesh by its URI (``file://``, ``package://``) or path; None: not there.
-
-    Packages are looked for in the ROS environment; this package's own need none.
-    """
-    url = urlparse(resource)
-    if url.scheme == "package":
-        folder = _package(url.netloc)
-        path = None if folder is None else folder / unquote(url.path).lstrip("/")
-    elif url.scheme in ("file", ""):
-        path = Path(unquote(url.path))
-    else:
-        return None
-    return path if path is not None and path.is_file() else None
-
-
-def _package(name: str) -> Path | None:
-    if name == "spacerobot_ros":
-        return share_directory()
-    try:
-        from ament_index_python.packages import get_package_share_directory
-
-        return Path(get_package_share_directory(name))
-    except (ImportError, LookupError, OSError, ValueError, SpaceRobotError):
-        return None
 
 
 def parse_robot(text: str) -> RobotDescription:
@@ -172,30 +110,27 @@ def parse_robot(text: str) -> RobotDescription:
             f"The robot description has more than {_MOST_LINKS} links: its equations would take "
             "hours to derive."
         )
-    tree = _parse_xml(text)
+    root = _checked_root(text)
     colours = {
-        material.name: tuple(material.color.rgba)
-        for material in tree.materials
-        if material.color is not None and material.color.rgba is not None
+        material.get("name", ""): _colour(color, f"material '{material.get('name', '')}'")
+        for material in root.findall("material")
+        if (color := material.find("color")) is not None
     }
-    links = {link.name: _link(link, colours) for link in tree.links}
-    joints = [_joint(joint, links) for joint in tree.joints]
-    for kind, names in (
-        ("link", [x.name for x in tree.links]),
-        ("joint", [x.name for x in joints]),
-    ):
+    for kind in ("link", "joint"):
+        names = [element.get("name", "") for element in root.findall(kind)]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise RobotDescriptionError(
                 f"The {kind} name '{twice[0]}' is used twice; names are unique."
             )
-    joints = _with_leaders(joints)
+    links = {link.name: link for link in (_link(each, colours) for each in root.findall("link"))}
+    joints = _with_leaders([_joint(each, links) for each in root.findall("joint")])
     bodies, frames = weld(links, joints)
     for number, body in enumerate(bodies):
         if flaw_of_inertia(body.inertia.about_com):
             _refuse_inertia([link for link in links.values() if frames[link.name][0] == number])
     description = RobotDescription(
-        name=tree.name or "robot",
+        name=root.get("name", ""),
         links=tuple(links.values()),
         joints=tuple(joints),
         bodies=tuple(bodies),
@@ -207,28 +142,20 @@ def parse_robot(text: str) -> RobotDescription:
     return description
 
 
-def _parse_xml(text: str) -> Any:
-    root = urdf_root(text, ("prismatic", "revolute", "continuous", "fixed"))
-    # The parser reports attributes it does not know on standard error; they are none of ours.
-    with contextlib.redirect_stderr(io.StringIO()):
-        try:
-            return URDF.from_xml_string(ElementTree.tostring(root))
-        except Exception as error:  # lxml, assertion, key, value and type errors, by what is broken
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise RobotDescriptionError(
-                f"The robot description is not valid URDF: {reason}."
-            ) from error
+# -- links ------------------------------------------------------------------------------------
 
 
-def _pose(origin: Any, where: str) -> Pose:
-    if origin is None:
-        return Pose()
-    r = _finite(origin.xyz if origin.xyz is not None else (0, 0, 0), f"the origin of {where}")
-    rpy = _finite(origin.rpy if origin.rpy is not None else (0, 0, 0), f"the origin of {where}")
-    return Pose(matrix_from_rpy(rpy), r)
+def _values(element: Element | None, name: str, default: str, where: str) -> Array:
+    """Return the numbers of an attribute; those of ``default`` if it or its element is missing."""
+    text = default if element is None else element.get(name, default)
+    return _finite([float(word) for word in text.split()], where)
 
 
-def _finite(values: Any, where: str) -> Array:
+def _number(element: Element | None, name: str, where: str) -> float:
+    return float(_finite(0.0 if element is None else float(element.get(name, "0")), where))
+
+
+def _finite(values: float | list[float], where: str) -> Array:
     array = np.array(values, dtype=float)
     if not np.all(np.isfinite(array)):
         raise RobotDescriptionError(f"A number in {where} is not finite: {array.tolist()}.")
@@ -239,34 +166,39 @@ def _finite(values: Any, where: str) -> Array:
     return array
 
 
-def _size(values: Any, where: str) -> tuple[float, ...]:
-    size = _finite(values, f"the geometry of {where}")
-    if size.min() < 0:
-        raise RobotDescriptionError(
-            f"A size in a <geometry> of {where} is negative: {size.tolist()}. Give lengths in m."
-        )
-    return tuple(size.tolist())
+def _pose(element: Element, where: str) -> Pose:
+    origin = element.find("origin")
+    if origin is None:
+        return Pose()
+    r = _values(origin, "xyz", "0 0 0", f"the origin of {where}")
+    return Pose(matrix_from_rpy(_values(origin, "rpy", "0 0 0", f"the origin of {where}")), r)
 
 
-def _link(link: Any, colours: dict[str, Any]) -> Link:
-    where = f"link '{link.name}'"
+def _link(link: Element, colours: dict[str, tuple[float, ...]]) -> Link:
+    name = link.get("name", "")
+    where = f"link '{name}'"
     inertia = Inertia()
-    if link.inertial is not None:
-        pose = _pose(link.inertial.origin, where)
-        mass = float(_finite(link.inertial.mass, where))
-        about = np.zeros((3, 3))
-        if link.inertial.inertia is not None:
-            about = _finite(link.inertial.inertia.to_matrix(), where)
+    if (inertial := link.find("inertial")) is not None:
+        pose = _pose(inertial, where)
+        mass = _number(inertial.find("mass"), "value", where)
+        moments = inertial.find("inertia")
+        about = np.array(
+            [
+                [_number(moments, f"i{''.join(sorted(row + column))}", where) for column in "xyz"]
+                for row in "xyz"
+            ]
+        )
         if mass < 0:
             raise RobotDescriptionError(f"The mass of {where} is negative ({mass} kg).")
         inertia = Inertia(mass, np.zeros(3), about).moved(pose)
-    return Link(link.name, inertia, tuple(_shapes(link, colours, where)))
+    shapes = tuple(_shape(visual, colours, where) for visual in link.findall("visual"))
+    return Link(name, inertia, shapes)
 
 
 def flaw_of_inertia(about: Array) -> str:
-    """Return what no body has of these moments of inertia (3, 3), kg m^2; empty if one may.
+    """Return the flaw of moments of inertia (3, 3), kg m^2, that no body can have; empty: none.
 
-    It is the end of a sentence that begins with whose inertia it is.
+    It completes a message that begins with the owner of the inertia.
     """
     low, middle, high = np.linalg.eigvalsh(about)
     if low < -1e-12 * max(1.0, float(np.abs(about).max())):
@@ -281,7 +213,7 @@ def flaw_of_inertia(about: Array) -> str:
 
 
 def _refuse_inertia(welded: list[Link]) -> NoReturn:
-    """Refuse a body whose inertia is impossible: that of its worst link, all welded together."""
+    """Refuse a body of impossible inertia; the message names the worst of its welded links."""
 
     def excess(link: Link) -> float:
         low, middle, high = np.linalg.eigvalsh(link.inertia.about_com)
@@ -293,81 +225,93 @@ def _refuse_inertia(welded: list[Link]) -> NoReturn:
     )
 
 
-def _shapes(link: Any, colours: dict[str, Any], where: str) -> list[Shape]:
-    shapes = []
-    for visual in link.visuals:
-        geometry = visual.geometry
-        kind = type(geometry).__name__.lower()
-        resource = ""
-        if kind == "box":
-            size = _size(geometry.size, where)
-        elif kind == "cylinder":
-            size = _size((geometry.radius, geometry.length), where)
-        elif kind == "sphere":
-            size = _size((geometry.radius,), where)
-        elif kind == "mesh":
-            # A negative scale mirrors.
-            scale = _finite(geometry.scale or (1.0, 1.0, 1.0), f"the scale of a mesh of {where}")
-            size = tuple(scale.tolist())
-            resource = str(geometry.filename)
-        else:
-            continue
-        rgba: Any = None
-        if visual.material is not None:
-            if visual.material.color is not None:
-                rgba = visual.material.color.rgba
-            rgba = rgba if rgba is not None else colours.get(visual.material.name)
-        colour = (
-            Shape.rgba if rgba is None else tuple(_finite(rgba, f"a color of {where}").tolist())
-        )
-        shapes.append(Shape(kind, size, _pose(visual.origin, where), colour, resource))
-    return shapes
+def _colour(color: Element, where: str) -> tuple[float, ...]:
+    return tuple(_values(color, "rgba", "", f"a color of {where}").tolist())
 
 
-def _joint(joint: Any, links: dict[str, Link]) -> Joint:
-    where = f"joint '{joint.name}'"
-    for role, name in (("parent", joint.parent), ("child", joint.child)):
-        if name not in links:
+def _shape(visual: Element, colours: dict[str, tuple[float, ...]], where: str) -> Shape:
+    geometry = visual.find("geometry")
+    assert geometry is not None
+    (form,) = geometry
+    attributes = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",)}
+    if form.tag == "mesh":
+        # A negative scale mirrors.
+        size = _values(form, "scale", "1 1 1", f"the scale of a mesh of {where}")
+    else:
+        numbers = " ".join(form.get(name, "") for name in attributes[form.tag]).split()
+        size = _finite([float(number) for number in numbers], f"the geometry of {where}")
+        if size.min() < 0:
             raise RobotDescriptionError(
-                f"The {role} of {where} is '{name}', but there is no such link."
-                f"{suggestion(name, links)}"
+                f"A size in a <geometry> of {where} is negative: {size.tolist()}. "
+                "Give lengths in m."
             )
-    kind = JointKind(joint.type)
-    axis = np.array([1.0, 0.0, 0.0])
-    if joint.axis is not None:
-        axis = _finite(joint.axis, where)
+    rgba: tuple[float, ...] = Shape.rgba
+    if (material := visual.find("material")) is not None:
+        color = material.find("color")
+        if color is not None:
+            rgba = _colour(color, where)
+        else:
+            rgba = colours.get(material.get("name", ""), rgba)
+    red, green, blue, opacity = rgba
+    return Shape(
+        form.tag,
+        tuple(size.tolist()),
+        _pose(visual, where),
+        (red, green, blue, opacity),
+        form.get("filename", "") if form.tag == "mesh" else "",
+    )
+
+
+# -- joints -----------------------------------------------------------------------------------
+
+
+def _joint(joint: Element, links: dict[str, Link]) -> Joint:
+    name = joint.get("name", "")
+    where = f"joint '{name}'"
+    ends = {}
+    for role in ("parent", "child"):
+        end = joint.find(role)
+        assert end is not None
+        ends[role] = end.get("link", "")
+        if ends[role] not in links:
+            raise RobotDescriptionError(
+                f"The {role} of {where} is '{ends[role]}', but there is no such link."
+                f"{suggestion(ends[role], links)}"
+            )
+    kind = JointKind(joint.get("type"))
+    axis = _values(joint.find("axis"), "xyz", "1 0 0", where)
     if kind is not JointKind.FIXED:
         norm = float(np.linalg.norm(axis))
         if norm < 1e-9:
             raise RobotDescriptionError(f"The axis of {where} is zero; give it a direction.")
         axis = axis / norm
     return Joint(
-        joint.name,
+        name,
         kind,
-        joint.parent,
-        joint.child,
-        _pose(joint.origin, where),
+        ends["parent"],
+        ends["child"],
+        _pose(joint, where),
         axis,
-        _limits(joint, kind, where),
-        None if kind is JointKind.FIXED else _mimic(joint, where),
+        _limits(joint.find("limit"), kind, where),
+        _mimic(joint.find("mimic"), where),
     )
 
 
-def _mimic(joint: Any, where: str) -> Mimic | None:
-    if joint.mimic is None:
+def _mimic(mimic: Element | None, where: str) -> Mimic | None:
+    if mimic is None:
         return None
-    given = (1.0 if joint.mimic.multiplier is None else joint.mimic.multiplier, joint.mimic.offset)
-    multiplier, offset = _finite([given[0], given[1] or 0.0], f"<mimic> of {where}")
+    leader = mimic.get("joint", "")
+    (multiplier,) = _values(mimic, "multiplier", "1", f"<mimic> of {where}")
+    (offset,) = _values(mimic, "offset", "0", f"<mimic> of {where}")
     if multiplier == 0:
         raise RobotDescriptionError(
-            f"The {where} mimics '{joint.mimic.joint}' with the multiplier 0: it does not move; "
-            "make it fixed."
+            f"The {where} mimics '{leader}' with the multiplier 0: it does not move; make it fixed."
         )
-    return Mimic(joint.mimic.joint, float(multiplier), float(offset))
+    return Mimic(leader, float(multiplier), float(offset))
 
 
 def _with_leaders(joints: list[Joint]) -> list[Joint]:
-    """Return the joints, each that follows another with the joint at the end of its chain."""
+    """Return the joints, with every chain of mimic joints resolved to its leading joint."""
     by_name = {joint.name: joint for joint in joints}
     found = []
     for joint in joints:
@@ -400,7 +344,7 @@ def _with_leaders(joints: list[Joint]) -> list[Joint]:
 
 
 def _require_common_range(robot: RobotDescription) -> None:
-    """Refuse joints whose followers leave them no range."""
+    """Refuse a joint whose limits and those of its mimic joints have no common range."""
     lower, upper = robot.limits("lower"), robot.limits("upper")
     for name, low, high in zip(robot.joint_names, lower, upper, strict=True):
         if low >= high:
@@ -410,19 +354,16 @@ def _require_common_range(robot: RobotDescription) -> None:
             )
 
 
-def _limits(joint: Any, kind: JointKind, where: str) -> JointLimits:
-    if kind is JointKind.FIXED:
-        return JointLimits()
-    limit = joint.limit
+def _limits(limit: Element | None, kind: JointKind, where: str) -> JointLimits:
     if limit is None:
-        if kind is JointKind.CONTINUOUS:
+        if kind in (JointKind.FIXED, JointKind.CONTINUOUS):
             return JointLimits()
         raise RobotDescriptionError(
             f"The {where} is {kind.value} and has no <limit>: "
             "give lower, upper, velocity and effort."
         )
     values = {
-        name: float(getattr(limit, name) or 0.0)
+        name: float(limit.get(name, "0")) or 0.0
         for name in ("lower", "upper", "velocity", "effort")
     }
     for name, value in values.items():
@@ -444,7 +385,7 @@ def _limits(joint: Any, kind: JointKind, where: str) -> JointLimits:
 
 
 def _require_mass(robot: RobotDescription) -> None:
-    """Refuse what would make the inertia matrix singular: parts that move without inertia."""
+    """Refuse moving parts without mass, which would make the inertia matrix singular."""
     base = robot.bodies[0].inertia
     if base.mass <= 0:
         raise RobotDescriptionError(
@@ -468,3 +409,209 @@ def _require_mass(robot: RobotDescription) -> None:
                 f"Joint '{body.joint.name}' moves link '{body.name}', which has no mass: "
                 "its motion would have no dynamics. Give it an <inertial> or make the joint fixed."
             )
+
+
+# -- form of the text -------------------------------------------------------------------------
+
+_OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model", "COLLADA": "a COLLADA file"}
+"""File formats by the root element."""
+
+_USED = {
+    "robot": ("link", "joint", "material"),
+    "link": ("inertial", "visual"),
+    "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
+    "material": ("color",),
+}
+"""Elements that are read, by their parent; all others are ignored."""
+
+_GEOMETRIES = ("box", "cylinder", "sphere", "mesh")
+
+
+@dataclass(frozen=True)
+class _Attribute:
+    """An attribute: count of its numbers (0: a text), meaning or unit, whether it is required."""
+
+    name: str
+    count: int
+    meaning: str
+    needed: bool = True
+
+
+_ORIGIN = (
+    _Attribute("xyz", 3, "m", needed=False),
+    _Attribute("rpy", 3, "rad: roll, pitch and yaw", needed=False),
+)
+
+_ATTRIBUTES = {
+    "origin": _ORIGIN,
+    "mass": (_Attribute("value", 1, "kg"),),
+    "inertia": tuple(
+        _Attribute(name, 1, "kg m^2") for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    ),
+    "parent": (_Attribute("link", 0, "the name of a link"),),
+    "child": (_Attribute("link", 0, "the name of a link"),),
+    "axis": (_Attribute("xyz", 3, "a direction"),),
+    "limit": (
+        _Attribute("velocity", 1, "m/s or rad/s"),
+        _Attribute("effort", 1, "N or N m"),
+        _Attribute("lower", 1, "m or rad", needed=False),
+        _Attribute("upper", 1, "m or rad", needed=False),
+    ),
+    "mimic": (
+        _Attribute("joint", 0, "the name of the joint that it follows"),
+        _Attribute("multiplier", 1, "its position over that of the other", needed=False),
+        _Attribute("offset", 1, "m or rad", needed=False),
+    ),
+    "box": (_Attribute("size", 3, "m"),),
+    "cylinder": (_Attribute("radius", 1, "m"), _Attribute("length", 1, "m")),
+    "sphere": (_Attribute("radius", 1, "m"),),
+    "mesh": (
+        _Attribute("filename", 0, "the file of the mesh"),
+        _Attribute("scale", 3, "factors along x, y and z", needed=False),
+    ),
+    "color": (_Attribute("rgba", 4, "red, green, blue and opacity, from 0 to 1"),),
+}
+
+_NEEDED = {
+    "inertial": {"mass": '<mass value="..."/> in kg'},
+    "visual": {"geometry": f"a <geometry> with one of {', '.join(_GEOMETRIES)}"},
+    "joint": {"parent": '<parent link="..."/>', "child": '<child link="..."/>'},
+}
+"""Required elements by their parent, and the text to write."""
+
+_JOINT_TYPES = tuple(kind.value for kind in JointKind)
+
+
+def _checked_root(text: str) -> Element:
+    """Return the root of a URDF text, reduced to the elements that are read (:data:`_USED`).
+
+    Raises
+    ------
+    RobotDescriptionError
+        The text is not XML or not URDF; an attribute or element is missing, given twice, or not a
+        number.
+    """
+    try:
+        root = fromstring(text)
+    except (ParseError, ValueError) as error:
+        raise RobotDescriptionError(
+            f"The robot description is not valid URDF: it is no XML ({error})."
+        ) from error
+    if root.tag != "robot":
+        raise RobotDescriptionError(_of_another_kind(root.tag))
+    for element in [root, *root.findall("link"), *root.findall("joint")]:
+        unused = {child.tag for child in element} - set(_USED[element.tag])
+        _leave_out(element, unused)
+    if not root.get("name"):
+        raise _MalformedError("the <robot> has no name", '<robot name="...">')
+    for kind in ("link", "joint"):
+        for number, element in enumerate(root.findall(kind), 1):
+            name = element.get("name", "")
+            if not name:
+                flaw = f"the {kind} number {number} has no name"
+                raise _MalformedError(flaw, f'<{kind} name="...">')
+            where = f"{kind} '{name}'"
+            if kind == "joint":
+                _require_type(element, where)
+                if element.get("type") == "fixed":
+                    _leave_out(element, ("axis", "limit", "mimic"))
+            _require(element, where)
+    for material in root.findall("material"):
+        _require(material, f"material '{material.get('name', '')}'")
+    return root
+
+
+def _leave_out(element: Element, tags: Collection[object]) -> None:
+    for child in list(element):
+        if child.tag in tags:
+            element.remove(child)
+
+
+class _MalformedError(RobotDescriptionError):
+    """A flaw of the form of a URDF, with the text to write instead."""
+
+    def __init__(self, flaw: str, remedy: str) -> None:
+        super().__init__(f"The robot description is not valid URDF: {flaw}; write {remedy}.")
+
+
+def _of_another_kind(tag: str) -> str:
+    namespace = re.fullmatch(r"\{(.*)\}robot", tag)
+    if namespace is not None:
+        return (
+            "The robot description is not valid URDF: its elements are in the namespace "
+            f"'{namespace[1]}'; remove xmlns=\"...\" from <robot>."
+        )
+    return (
+        f"The robot description is not valid URDF but {_OTHER_FORMATS.get(tag, 'something else')}: "
+        f"its root element is <{tag}>, and that of a URDF is <robot>. Export or convert it to URDF."
+    )
+
+
+def _require_type(joint: Element, where: str) -> None:
+    kind = joint.get("type")
+    if kind is None:
+        remedy = f'type="..." with one of {", ".join(_JOINT_TYPES)}'
+        raise _MalformedError(f"the {where} has no type", remedy)
+    if kind not in _JOINT_TYPES:
+        raise RobotDescriptionError(
+            f"The type of {where} is '{kind}'; a free-floating tree has "
+            f"{', '.join(_JOINT_TYPES[:-1])} and {_JOINT_TYPES[-1]} joints (the base floats by "
+            "itself)."
+        )
+
+
+def _require(element: Element, where: str) -> None:
+    """Check an element of a link, joint or material, and its children."""
+    if element.tag == "material":
+        _leave_out(element, {child.tag for child in element} - set(_USED["material"]))
+    owner = where if element.tag in ("link", "joint") else f"<{element.tag}> of {where}"
+    for child, remedy in _NEEDED.get(element.tag, {}).items():
+        if element.find(child) is None:
+            raise _MalformedError(f"the {owner} has no <{child}>", remedy)
+    for tag, count in Counter(child.tag for child in element).items():
+        if count > 1 and tag != "visual" and element.tag != "geometry":
+            raise _MalformedError(f"the {owner} has {count} elements <{tag}>", "one of them")
+    if element.tag == "geometry":
+        _require_geometry(element, where)
+    for attribute in _ATTRIBUTES.get(element.tag, ()):
+        _require_attribute(element, attribute, where)
+    for child_element in element:
+        _require(child_element, where)
+
+
+def _require_geometry(geometry: Element, where: str) -> None:
+    shapes = [each.tag for each in geometry]
+    remedy = f"one of {', '.join(f'<{name}>' for name in _GEOMETRIES)}"
+    if len(shapes) != 1:
+        raise _MalformedError(f"a <geometry> of {where} has {len(shapes)} shapes", remedy)
+    if shapes[0] not in _GEOMETRIES:
+        raise _MalformedError(f"a <geometry> of {where} is a <{shapes[0]}>", remedy)
+
+
+def _require_attribute(element: Element, attribute: _Attribute, where: str) -> None:
+    given = element.get(attribute.name)
+    count = attribute.count
+    numbers = {0: "", 1: "a number, "}.get(count, f"{count} numbers with blanks between them, ")
+    remedy = f'<{element.tag} {attribute.name}="..."/>: {numbers}{attribute.meaning}'
+    owner = f"the <{element.tag}> of {where}"
+    if given is None:
+        if attribute.needed:
+            raise _MalformedError(f"{owner} has no '{attribute.name}'", remedy)
+        return
+    if not count:
+        return
+    words = given.split()
+    wrong = next((word for word in words if not _is_number(word)), None)
+    if wrong is not None:
+        raise _MalformedError(f"'{attribute.name}' of {owner} has '{wrong}', no number", remedy)
+    if len(words) != count:
+        flaw = f"'{attribute.name}' of {owner} has {len(words)} numbers instead of {count}"
+        raise _MalformedError(flaw, remedy)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return "_" not in word

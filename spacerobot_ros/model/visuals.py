@@ -20,8 +20,15 @@ import numpy as np
 
 from spacerobot_ros.errors import MeshError
 from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
-from spacerobot_ros.model.meshes import TriangleMesh, joined, mesh_of_stl, shape_mesh, stl_of
-from spacerobot_ros.model.urdf import mesh_file, with_mesh_files
+from spacerobot_ros.model.meshes import (
+    TriangleMesh,
+    joined,
+    mesh_file,
+    mesh_of_stl,
+    shape_mesh,
+    stl_of,
+    with_mesh_files,
+)
 
 _AROUND = 24
 """Facets around a cylinder or sphere."""

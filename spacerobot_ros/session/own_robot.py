@@ -12,8 +12,9 @@ import numpy as np
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.meshes import mesh_file
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotvec_from_quaternion
-from spacerobot_ros.model.urdf import flaw_of_inertia, mesh_file
+from spacerobot_ros.model.urdf import flaw_of_inertia
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import Turning

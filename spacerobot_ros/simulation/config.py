@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from spacerobot_ros.model.robot_source import RobotConfig
-from spacerobot_ros.model.shared_parameters import WatchdogConfig
+from spacerobot_ros.model.shared_parameters import RobotConfig, WatchdogConfig
 from spacerobot_ros.parameters import group, parameter
 from spacerobot_ros.times import SECOND
 

@@ -349,8 +349,8 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     effort = ca.fmin(ca.fmax(command[:n], -robot.effort_limit), robot.effort_limit)
     realised = ca.vertcat(effort, command[n:])
     march = repeated(_watched_step(robot, model), substeps)
-    weights = list(model.inputs.values())
-    marched = march(ca.vertcat(state, _touching(robot, state)), realised, h / substeps, *weights)
+    p = list(model.inputs.values())
+    marched = march(ca.vertcat(state, _touching(robot, state)), realised, h / substeps, *p)
     next_state = marched[:-1]
 
     q, quaternion, qdot, p_W, L_W, r_WC_W = (next_state[part] for part in parts)

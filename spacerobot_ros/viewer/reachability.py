@@ -24,7 +24,7 @@ import numpy as np
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.robot_source import robot_from_text
+from spacerobot_ros.model.shared_parameters import robot_from_text
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured, declared
 from spacerobot_ros.planning import Goal, PoseError

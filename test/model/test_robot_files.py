@@ -8,7 +8,7 @@ import pytest
 
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot, load_robot
-from spacerobot_ros.model.urdf import mesh_file
+from spacerobot_ros.model.meshes import mesh_file
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.session.own_robot import remarks
 

@@ -146,7 +146,7 @@ def test_everything_that_is_imported_is_known_to_these_tests() -> None:
     needed = {
         *("ament_index_python", "casadi", "click", "lz4", "matplotlib", "mcap", "meshcat"),
         *("mujoco", "numpy", "pandas", "rosbags", "rosidl_parser", "rpyutils", "scipy"),
-        *("urdf_parser_py", "viser", "websockets", "xacro", "xarray", "yaml", "zstandard"),
+        *("viser", "websockets", "xacro", "xarray", "yaml", "zstandard"),
         *("collada", "dask", "distributed", "trimesh"),
     }
     others = {name.split(".")[0] for module in sources() for name in imports(module)} - known

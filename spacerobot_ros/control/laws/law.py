@@ -274,7 +274,7 @@ class ControlLaw(ABC):
         """What its function takes beside state, reference and gains in every flight; None: it
         depends on the flight.
         """
-        return {**self._inputs(), **self.robot.weights}
+        return {**self._inputs(), **self.robot.mass_arguments}
 
     def defined(self, results: Mapping[str, ca.SX]) -> ca.SX:
         """Return whether results of :attr:`function` are the command, without further thought."""

@@ -24,7 +24,7 @@ from spacerobot_ros.flight.plant_listener import Change, PlantListener, Stopped
 from spacerobot_ros.flight.state_synchroniser import StateSynchroniser
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.robot_source import robot_from_text, robot_of
+from spacerobot_ros.model.shared_parameters import robot_from_text, robot_of
 from spacerobot_ros.nodes.common.cdr import JointReader
 from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
 from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, STREAM, FlightNode

@@ -20,7 +20,7 @@ from std_srvs.srv import SetBool, Trigger
 from spacerobot_ros.bag.recorded_robot import last_state
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.robot_source import robot_of
+from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, described_robot
 from spacerobot_ros.nodes.common.process import run_node
