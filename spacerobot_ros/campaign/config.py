@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from spacerobot_ros.campaign.metrics import METRICS, is_metric, joint_names, metric_names
-from spacerobot_ros.campaign.targets import DrawnFlight, Target, targets_of
+from spacerobot_ros.campaign.targets import DrawnFlight, Target, description_of, targets_of
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.parameter_files import CONFIGS, number_in
 from spacerobot_ros.flight.scenario import Scenario, scenario_or_robot
+from spacerobot_ros.measures import METRICS, metric_names
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import suggestion
 
@@ -409,10 +409,9 @@ def _scipy(name: str) -> Any:
 
 
 def _criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Criterion, ...]:
-    found = []
+    found, known = [], metric_names(description_of(scenario).joint_names)
     for name, given in section.items():
-        if not is_metric(str(name), scenario):
-            known = metric_names(joint_names(scenario))
+        if str(name) not in known:
             raise ParameterError(
                 f"there is no metric '{name}'; there are {', '.join(METRICS)}, those of joints "
                 f"also for one.{suggestion(str(name), known)}"

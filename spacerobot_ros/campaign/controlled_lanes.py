@@ -20,16 +20,15 @@ from spacerobot_ros.campaign.draws import Draw
 from spacerobot_ros.campaign.one_by_one import node_robot, nominal_robots
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.control.controller import build_controller
-from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.arrays import Commands, FlightArrays, Outcome
 from spacerobot_ros.flight.scenario import Scenario
+from spacerobot_ros.measures import Measures, Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
-from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
 
@@ -42,9 +41,9 @@ _COMMON = (
 )
 """Parameters of the plant that may not."""
 
-_STATES = {
-    Decision.REACHED: (ControllerState.REACHED, Outcome.REACHED, "The goal is reached"),
-    Decision.FAILED: (ControllerState.FAILED, Outcome.FAILED, "The goal is not reached in time"),
+_OUTCOMES = {
+    Decision.REACHED: (Outcome.REACHED, "The goal is reached"),
+    Decision.FAILED: (Outcome.FAILED, "The goal is not reached in time"),
 }
 
 
@@ -93,13 +92,13 @@ def require_lane(campaign: Campaign, flight: DrawnFlight) -> None:
 
 def fly_controlled(
     campaign: Campaign, batch: Sequence[tuple[Draw, DrawnFlight]]
-) -> list[tuple[Draw, FlightArrays | str]]:
+) -> list[tuple[Draw, Measures | str]]:
     """Fly draws together, to the decisions about their goals.
 
     Returns
     -------
     list
-        Each draw with what its row needs of its flight, or with why another engine is to fly it.
+        Each draw with the measures of its flight, or the reason why another engine is to fly it.
 
     Raises
     ------
@@ -110,12 +109,12 @@ def fly_controlled(
     flights = _flights(campaign, [flight for _, flight in batch])
     result = fly_lanes(flights)
     taken = (time.perf_counter() - began) / len(batch)
-    found: list[tuple[Draw, FlightArrays | str]] = []
+    found: list[tuple[Draw, Measures | str]] = []
     for row, (draw, drawn) in enumerate(batch):
-        flight = _flight(result, row, drawn, flights)
-        if not isinstance(flight, str):
-            flight = replace(flight, wall_time=taken)
-        found.append((draw, flight))
+        measures = _measures(result, row, drawn, flights)
+        if not isinstance(measures, str):
+            measures = replace(measures, wall_time=taken)
+        found.append((draw, measures))
     return found
 
 
@@ -170,10 +169,10 @@ def _ticks(longest: float, period_ns: int) -> int:
     return tick
 
 
-def _flight(
+def _measures(
     result: BatchResult, row: int, drawn: DrawnFlight, flights: Flights
-) -> FlightArrays | str:
-    """Return what its row needs of a flight, or why it is not decided in lanes."""
+) -> Measures | str:
+    """Return the measures of a flight, or the reason why it is not decided in lanes."""
     decision = Decision(int(result.decision[row]))
     decided, period_ns = int(result.decided_tick[row]), drawn.scenario.plant.period_ns
     if row in result.failures:
@@ -183,68 +182,51 @@ def _flight(
     if decided == 0:
         return "ended at its first state"
     n, end = flights.robot.n, result.end_state[row]
+    q, pose = end[:n], end[2 * n : 2 * n + 7]
     duration = int(result.end_tick[row]) * period_ns / SECOND
-    statuses = [(0, ControllerStatus(ControllerState.TRACKING))]
     if decision is Decision.NONE:
-        outcome = Outcome.INTERRUPTED
-        sentence = f"Interrupted after {duration:.6g} s of simulated time."
+        outcome, flown = Outcome.INTERRUPTED, duration
+        message = f"Interrupted after {duration:.6g} s of simulated time."
     else:
-        state, outcome, clause = _STATES[decision]
+        outcome, clause = _OUTCOMES[decision]
         position, attitude, _ = result.decided_errors[row].tolist()
-        sentence = f"{clause}: {position:.3g} m, {attitude:.3g} rad from it."
-        statuses.append((decided * period_ns, ControllerStatus(state, sentence)))
-    force, torque = result.peak_wrench[row].tolist()
-    linear, angular = result.momentum_drift[row].tolist()
-    none = np.zeros(0, np.int64)
-    pose = end[2 * n : 2 * n + 7]
-    quantities = end_effector_at(flights.robot, drawn, end[:n], pose)
-    if flights.thrusters is not None:
-        quantities["propellant"] = result.propellant[row].reshape(1, 1)
-    return FlightArrays(
-        scenario=drawn.scenario,
-        robot=drawn.nominal,
+        message = f"{clause}: {position:.3g} m, {attitude:.3g} rad from it."
+        flown = decided * period_ns / SECOND
+    scenario = drawn.scenario
+    return Measures(
         outcome=outcome,
-        sentence=sentence,
-        control_period=flights.control_period,
-        time=np.array([0.0, duration]),
-        pose=pose[np.newaxis],
-        twist=end[2 * n + 7 : 2 * n + 13][np.newaxis],
-        # Rows with the extremes: metrics ask for no more.
-        q=np.vstack([result.lowest[row], result.highest[row], end[:n]]),
-        qdot=np.maximum(result.peak_rate[row], np.abs(flights.starts.qdot[row]))[np.newaxis],
-        effort=result.peak_effort[row][np.newaxis],
-        momentum=np.array([np.zeros(7), [linear, 0.0, 0.0, angular, 0.0, 0.0, 0.0]]),
-        quantities=quantities,
-        commands={
-            "joint_commands": Commands(none, np.zeros((0, n))),
-            "base_wrench": Commands(none, np.array([[force, 0.0, 0.0, torque, 0.0, 0.0]])),
-        },
-        statuses=tuple(statuses),
-        schedules=(),
-        events=(),
-        status=statuses[-1][1],
-        gait=None,
+        message=message,
+        duration=duration,
+        manoeuvre_time=flown,
+        error=PoseError.between(pose[:3], pose[3:], scenario.goal),
+        end_effector_error=end_effector_error(flights.robot, drawn, q, pose),
+        peak_rate=np.maximum(result.peak_rate[row], np.abs(flights.starts.qdot[row])),
+        peak_effort=result.peak_effort[row],
+        peak_wrench=result.peak_wrench[row],
+        lowest=np.minimum(result.lowest[row], q),
+        highest=np.maximum(result.highest[row], q),
+        momentum_drift=result.momentum_drift[row],
+        propellant=math.nan if flights.thrusters is None else float(result.propellant[row]),
         plan_time=0.0,
-        wall_time=math.nan,
     )
 
 
-def end_effector_at(
+def end_effector_error(
     robot: SpaceRobot, drawn: DrawnFlight, q: Array, pose: Array
-) -> dict[str, Array]:
-    """Return what a flight has of its end-effector, in one state: its pose (1, 7) in W, or nothing.
+) -> PoseError | None:
+    """Return the error of the end-effector to its goal; None without one of them.
 
     Parameters
     ----------
     robot, drawn
-        What is flown.
+        The robot and the flight.
     q, pose
         Joint positions (n,) and the pose (7,) of the base in W.
     """
+    goal = drawn.scenario.end_effector_goal
     link = robot.description.end_effector(drawn.scenario.plant.end_effector_frame)
-    if not link:
-        return {}
+    if goal is None or not link:
+        return None
     R_BE, r_BE_B = robot.link_pose(link, q)
     R_WB = matrix_from_quaternion(pose[3:])
-    placed = np.append(pose[:3] + R_WB @ r_BE_B, quaternion_from_matrix(R_WB @ R_BE))
-    return {"end_effector_pose": placed[np.newaxis]}
+    return PoseError.between(pose[:3] + R_WB @ r_BE_B, quaternion_from_matrix(R_WB @ R_BE), goal)

@@ -18,10 +18,11 @@ import yaml
 
 from spacerobot_ros.campaign.config import OF_ALL, Campaign, parse_campaign
 from spacerobot_ros.campaign.extras import needed
-from spacerobot_ros.campaign.metrics import joint_names, metric_names
 from spacerobot_ros.campaign.rows import Row
+from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import ParameterError, RecordingError
 from spacerobot_ros.flight.scenario import load_scenario, scenario_text
+from spacerobot_ros.measures import metric_names
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.resources import is_path
 from spacerobot_ros.version import __version__
@@ -298,7 +299,7 @@ def _schema(campaign: Campaign) -> Any:
     fields += [("outcome", text), ("reason", text)]
     for each in campaign.dispersions:
         fields.append((f"{DRAWN}{each.name}", text if each.target.text else real))
-    fields += [(name, real) for name in metric_names(joint_names(campaign.scenario))]
+    fields += [(name, real) for name in metric_names(description_of(campaign.scenario).joint_names)]
     fields += [("wall_time_s", real), ("plan_time_s", real), ("engine", text)]
     fields += [("fallback", text), ("versions", text)]
     return arrow.schema(fields)

@@ -7,7 +7,6 @@ not follow), the draw is flown again by the engine ``flights``: the rows are the
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +18,7 @@ from spacerobot_ros.batch.flights import BatchResult
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.controlled_lanes import (
     control_refusal,
-    end_effector_at,
+    end_effector_error,
     fly_controlled,
     require_lane,
 )
@@ -28,8 +27,8 @@ from spacerobot_ros.campaign.one_by_one import FlightsEngine, node_robot, robots
 from spacerobot_ros.campaign.rows import LANES, Fallback, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.arrays import Commands, FlightArrays, Outcome
 from spacerobot_ros.flight.lockstep import fly_scenario
+from spacerobot_ros.measures import Measures, Outcome, momentum_drift
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.parameters import values_of
@@ -144,11 +143,11 @@ class LanesEngine:
             except SpaceRobotError as error:  # Of one of them: each is flown by itself.
                 yield from (Fallback(draw, str(error)) for draw, _ in batch)
                 continue
-            for draw, flight_or_reason in flown:
-                if isinstance(flight_or_reason, str):
-                    yield Fallback(draw, flight_or_reason)
+            for draw, measures in flown:
+                if isinstance(measures, str):
+                    yield Fallback(draw, measures)
                 else:
-                    yield Row.of(campaign, draw, flight_or_reason, self.name)
+                    yield Row.of(campaign, draw, measures, self.name)
 
     def _tracked(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
@@ -197,14 +196,14 @@ class LanesEngine:
         result = fly_lanes(flights)
         taken = (time.perf_counter() - began) / len(batch)
         for row, planned in enumerate(batch):
-            flight = _flight(result, row, planned, flights, ends[row])
-            if isinstance(flight, str):
-                yield Fallback(planned.draw, flight)
-            elif flight.duration > campaign.longest:
+            measures = _measures(result, row, planned, flights, ends[row])
+            if isinstance(measures, str):
+                yield Fallback(planned.draw, measures)
+            elif measures.duration > campaign.longest:
                 yield Fallback(planned.draw, "took longer than the campaign allows")
             else:
-                made = Row.of(campaign, planned.draw, flight, self.name)
-                yield replace(made, wall_time=taken + planned.plan_time)
+                measures = replace(measures, wall_time=taken + planned.plan_time)
+                yield Row.of(campaign, planned.draw, measures, self.name)
 
 
 def _tracking_refusal(campaign: Campaign) -> str:
@@ -299,10 +298,12 @@ def _padded(positions: Array, ticks: int) -> Array:
     return np.vstack([positions, np.repeat(positions[-1:], missing, axis=0)])
 
 
-def _flight(
+def _measures(
     result: BatchResult, row: int, planned: _Planned, flights: Flights, end: int
-) -> FlightArrays | str:
-    """Return a flight whose goal is decided at the end of its schedule, or why it is not."""
+) -> Measures | str:
+    """Return the measures of a flight that is decided at the end of its schedule; else the reason
+    why it is not.
+    """
     if row in result.failures:
         return "was refused by the plant"
     if any(counts[row].any() for counts in result.limited.values()):
@@ -314,39 +315,30 @@ def _flight(
         return "had a joint that did not follow its schedule"
     error = PoseError.between(measured[:3], measured[3:], scenario.goal, q)
     left = remaining_error(error, schedule.controls)
-    outcome, sentence = Outcome.REACHED, f"The goal is reached: {left}."
+    outcome, message = Outcome.REACHED, f"The goal is reached: {left}."
     if not scenario.planner.tolerance.admits(error, schedule.controls):
         if scenario.planner.max_corrections:
             return "needed corrections"
         outcome = Outcome.FAILED
-        sentence = f"The goal is not reached: {left} after 0 correction(s)."
-    kept = slice(0, end + 1)
-    time = result.time[kept]
-    n = schedule.positions.shape[1]
-    # The shape is that of the schedule in every tick: its feedback had nothing to do.
-    status = replace(planned.gait, message=sentence)
-    return FlightArrays(
-        scenario=scenario,
-        robot=planned.flight.nominal,
+        message = f"The goal is not reached: {left} after 0 correction(s)."
+    pose = result.pose[row, end]
+    duration = float(result.time[end] - result.time[0])
+    return Measures(
         outcome=outcome,
-        sentence=sentence,
-        control_period=flights.control_period,
-        time=time,
-        pose=result.pose[row, kept],
-        twist=result.twist[row, kept],
-        q=schedule.positions,
-        qdot=result.peak_rate[row][np.newaxis],
-        effort=np.zeros((1, n)),
-        momentum=result.momentum[row, kept],
-        quantities=end_effector_at(
-            flights.robot, planned.flight, result.q[row, end], result.pose[row, end]
+        message=message,
+        duration=duration,
+        manoeuvre_time=duration,
+        error=PoseError.between(pose[:3], pose[3:], scenario.goal),
+        end_effector_error=end_effector_error(
+            flights.robot, planned.flight, result.q[row, end], pose
         ),
-        commands={"joint_commands": Commands(np.zeros(0, np.int64), np.zeros((0, n)))},
-        statuses=(),
-        schedules=(),
-        events=(),
-        status=status,
-        gait=planned.gait,
+        peak_rate=result.peak_rate[row],
+        peak_effort=np.zeros(flights.robot.n),
+        peak_wrench=np.zeros(2),
+        # The shape is that of the schedule in every tick: its feedback had nothing to do.
+        lowest=schedule.positions.min(axis=0),
+        highest=schedule.positions.max(axis=0),
+        momentum_drift=momentum_drift(result.momentum[row, : end + 1]),
+        corrections=planned.gait.corrections,
         plan_time=planned.plan_time,
-        wall_time=math.nan,
     )

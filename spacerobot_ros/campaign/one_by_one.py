@@ -17,10 +17,11 @@ from spacerobot_ros.campaign.draws import Draw, drawn_flight
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.targets import DrawnFlight, description_of
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.arrays import FlightArrays, Outcome
+from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import Robots, fly_scenario, require_flyable
-from spacerobot_ros.flight.recorded import recorded_flight
+from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.flight.scenario import Scenario, scenario_text
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.shared_parameters import BelievedRobotConfig, RobotConfig, robot_of
 from spacerobot_ros.planning.core.method import GaitMethod
@@ -47,14 +48,12 @@ class _OneByOneEngine(ABC):
                 flown = self.flown(campaign, drawn_flight(campaign, draw, common), stopped)
                 if stopped() and flown.outcome is Outcome.INTERRUPTED:
                     return
-                yield Row.of(campaign, draw, flown, self.name)
+                yield Row.of(campaign, draw, flown.measures, self.name)
             except Exception as error:  # It is a row, with its reason.
                 yield Row.failed(draw, error, self.name)
 
     @abstractmethod
-    def flown(
-        self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]
-    ) -> FlightArrays:
+    def flown(self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]) -> Flight:
         """Fly one draw.
 
         Raises
@@ -82,7 +81,7 @@ class FlightsEngine(_OneByOneEngine):
         campaign: Campaign,
         flight: DrawnFlight,
         stopped: Callable[[], bool] = lambda: False,
-    ) -> FlightArrays:
+    ) -> Flight:
         """Fly one draw.
 
         Raises
@@ -184,19 +183,17 @@ class RosEngine(_OneByOneEngine):
         """Return why not, as a clause."""
         return "it kills nodes on the way" if campaign.scenario.kills else ""
 
-    def flown(
-        self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]
-    ) -> FlightArrays:
+    def flown(self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]) -> Flight:
         """Fly one draw; see :meth:`FlightsEngine.flown`. It is not stopped on the way."""
         began = time.perf_counter()
         with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
             bag = Path(folder, "flight.mcap")
             scenario = flight.finished().scenario
             self._run(scenario, Path(folder, "draw.yaml"), bag, campaign.longest)
-            flown = recorded_flight(bag)
+            flown = read_run(bag)
         if flown.duration > campaign.longest:  # The stack looks five times a second of wall time.
-            sentence = f"Interrupted after {flown.duration:.6g} s of simulated time."
-            flown = replace(flown, outcome=Outcome.INTERRUPTED, sentence=sentence)
+            message = f"Interrupted after {flown.duration:.6g} s of simulated time."
+            flown = replace(flown, outcome=Outcome.INTERRUPTED, message=message)
         return replace(flown, wall_time=time.perf_counter() - began)
 
     def _run(self, scenario: Scenario, file: Path, bag: Path, longest: float) -> None:

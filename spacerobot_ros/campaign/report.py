@@ -20,7 +20,6 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from spacerobot_ros.campaign.config import Campaign, Criterion, meets
 from spacerobot_ros.campaign.dataset import DRAWN, Dataset
 from spacerobot_ros.campaign.draws import Draws
-from spacerobot_ros.campaign.metrics import METRICS
 from spacerobot_ros.campaign.statistics import (
     PERCENTILES,
     Influence,
@@ -30,6 +29,7 @@ from spacerobot_ros.campaign.statistics import (
     share,
     sobol_indices,
 )
+from spacerobot_ros.measures import METRICS
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.output_files import write_output
 from spacerobot_ros.report.figures import FAINT, INK, PALETTE, PictureFormat, drawing, picture_of

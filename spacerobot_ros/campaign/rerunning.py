@@ -12,8 +12,8 @@ from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.rows import LANES, Row
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.arrays import Outcome
-from spacerobot_ros.flight.recorded import recorded_flight
+from spacerobot_ros.flight.reading import read_run
+from spacerobot_ros.measures import Outcome
 
 TOLERANCE = 1e-9
 """Deviation that is no difference, absolute below 1 (SI units) and relative above."""
@@ -100,7 +100,7 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     draw = draws[number]
     scenario = drawn_flight(campaign, draw).finished().scenario
     run_scenario(scenario, bag, longest=campaign.longest)
-    row = Row.of(campaign, draw, recorded_flight(bag), "ros")
+    row = Row.of(campaign, draw, read_run(bag).measures, "ros")
     known = known_flight(dataset, campaign, number)
     if known is None:
         return Rerun(row, None, "", "", bag)

@@ -9,9 +9,9 @@ from typing import Protocol
 
 from spacerobot_ros.campaign.config import Campaign, passed
 from spacerobot_ros.campaign.draws import Draw
-from spacerobot_ros.campaign.metrics import measured
+from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.arrays import FlightArrays
+from spacerobot_ros.measures import Measures, metrics_of
 
 LANES = "lanes"
 """The engine that flies many at once."""
@@ -56,18 +56,18 @@ class Row:
     plan_time: float = math.nan
 
     @classmethod
-    def of(cls, campaign: Campaign, draw: Draw, flight: FlightArrays, engine: str) -> Row:
+    def of(cls, campaign: Campaign, draw: Draw, measures: Measures, engine: str) -> Row:
         """Return the row of a flight."""
-        metrics = measured(flight)
+        metrics = metrics_of(measures, description_of(campaign.scenario))
         return cls(
             draw=draw,
-            outcome=flight.outcome.value,
-            reason=flight.sentence,
+            outcome=measures.outcome.value,
+            reason=measures.message,
             metrics=metrics,
-            passed=passed(campaign.criteria, flight.outcome.value, metrics),
+            passed=passed(campaign.criteria, measures.outcome.value, metrics),
             engine=engine,
-            wall_time=flight.wall_time,
-            plan_time=flight.plan_time,
+            wall_time=measures.wall_time,
+            plan_time=measures.plan_time,
         )
 
     @classmethod

@@ -248,7 +248,7 @@ def goal_command(
         wanted = Goal.from_rotvec(pose[:3], rotvec)
     if rpy_deg:
         wanted = Goal.from_rpy(pose[:3], rpy_deg)
-    from spacerobot_ros.flight.arrays import Outcome
+    from spacerobot_ros.measures import Outcome
     from spacerobot_ros.session.live import send_goal
 
     outcome = send_goal(wanted, click.echo, namespace=namespace, timeout=timeout)

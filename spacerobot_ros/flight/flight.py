@@ -1,17 +1,35 @@
-"""A flight that was flown: its arrays, to look at, to put into tables and bags."""
+"""One flight: its arrays over time, the reports about it, and its measures.
+
+A flight is made by the loop without ROS (:mod:`~spacerobot_ros.flight.lockstep`) or by reading a
+bag (:mod:`~spacerobot_ros.flight.reading`). A bag need not hold everything: parts are optional.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from spacerobot_ros.commanding.goal_follower import Status
+from spacerobot_ros.control.status import ControllerStatus
+from spacerobot_ros.errors import PlanningError, RecordingError
 from spacerobot_ros.events import Event
-from spacerobot_ros.flight.arrays import Commands, FlightArrays, Outcome
+from spacerobot_ros.measures import (
+    Measures,
+    Outcome,
+    flown_time,
+    momentum_drift,
+    peak,
+    peak_wrench,
+)
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.planning import GaitSchedule
+from spacerobot_ros.model.rotations import rotvec_from_quaternion
+from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.actuators import FaultyPlant, thrusters_in
 from spacerobot_ros.simulation.commands import CommandValidator, Refusal
@@ -25,13 +43,348 @@ if TYPE_CHECKING:
 
     from spacerobot_ros.flight.scenario import Scenario
 
-
 _FIRST_CAPACITY = 1024
+
+_TRUE = ("pose", "twist", "q", "qdot", "effort", "momentum")
+"""Quantities that are attributes of a flight."""
+
+_WIDTHS = {
+    **dict.fromkeys(("pose", "momentum", "measured_pose", "end_effector_pose"), 7),
+    **dict.fromkeys(("twist", "measured_twist", "expected_momenta"), 6),
+}
+"""Numbers in a sample; those of other quantities are one for each joint."""
+
+_FOLLOWED = frozenset(("executing", "reached", "failed", "aborted"))
+"""States of a status whose goal is, or was, flown to."""
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Samples ``values`` (N, k) at ``time`` (N,), s."""
+
+    time: Array
+    values: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @classmethod
+    def none(cls, width: int) -> Signal:
+        """Return a signal without samples."""
+        return cls(np.empty(0), np.empty((0, width)))
+
+    @property
+    def width(self) -> int:
+        """Number of values in a sample."""
+        return int(self.values.shape[1])
+
+    def between(self, start: float, end: float) -> Signal:
+        """Return the samples from ``start`` to ``end``, both included."""
+        first, last = np.searchsorted(self.time, [start - 1e-9, end + 1e-9])
+        return Signal(self.time[first:last], self.values[first:last])
+
+    def since_first(self) -> Signal:
+        """Return the changes since the first sample."""
+        return Signal(self.time, self.values - self.values[:1])
+
+
+@dataclass(frozen=True)
+class Commands:
+    """The commands on one topic: ``tick`` (N,) that each answers, ``values`` (N, size)."""
+
+    tick: npt.NDArray[np.int64]
+    values: Array
+
+
+@dataclass(frozen=True)
+class SentGoal:
+    """A goal pose that was sent at ``time`` (s), and the id under which statuses report on it."""
+
+    time: float
+    goal: Goal
+    goal_id: str
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Flight(FlightArrays):
-    """A flight, from :func:`spacerobot_ros.fly` or from a bag."""
+class Flight:
+    """A flight, from :func:`spacerobot_ros.fly` or from a bag.
+
+    All arrays are copies; those of a missing part have no rows.
+
+    Attributes
+    ----------
+    scenario
+        The scenario that was flown.
+    robot
+        The robot of the plant; None where a bag holds no description of it.
+    joint_names
+        The joints, in the order of columns.
+    series
+        All quantities of the plant by name, each with its times (s). The true ones are ``pose``
+        (N, 7), position (m) and quaternion (x, y, z, w) of the base in the world; ``twist`` (N, 6),
+        its velocities in its own frame, m/s and rad/s; ``q``, ``qdot``, ``effort`` (N, n), joint
+        positions (m or rad), rates and actuator efforts; ``momentum`` (N, 7), linear (kg m/s) and
+        angular momentum (kg m^2/s) in the world and kinetic energy (J). For the others see
+        :attr:`quantities`.
+    commands
+        The commands by topic.
+    statuses
+        Statuses of the commanders, with the stamp of the state that they answered, ns.
+    events
+        Events of the nodes.
+    outcome, message
+        The end of the goal, and the same for people.
+    goal, end_effector_goal
+        The goals that count at the end; None: there is none.
+    goals, end_effector_goals
+        All goals that were sent.
+    schedules
+        The gaits that were flown, each with the stamp of its beginning, ns; none of a bag.
+    status, gait
+        The last status of the commander that decides, and the planner's when its first gait began.
+    plan_time, wall_time
+        Wall time of planning, and of the whole flight, s; NaN where it is not known.
+    refusals
+        Commands that were refused: time (s), topic, reason.
+    """
+
+    scenario: Scenario
+    robot: RobotDescription | None
+    joint_names: tuple[str, ...]
+    series: Mapping[str, Signal]
+    commands: Mapping[str, Commands]
+    statuses: tuple[tuple[int, Status], ...]
+    events: tuple[Event, ...]
+    outcome: Outcome
+    message: str
+    goal: Goal | None
+    end_effector_goal: Goal | None
+    goals: tuple[SentGoal, ...] = ()
+    end_effector_goals: tuple[SentGoal, ...] = ()
+    schedules: tuple[tuple[int, GaitSchedule], ...] = ()
+    status: Status | None = None
+    gait: PlannerStatus | None = None
+    plan_time: float = math.nan
+    wall_time: float = math.nan
+    refusals: tuple[tuple[float, str, Refusal], ...] = ()
+
+    # -- arrays -------------------------------------------------------------------------------
+
+    def signal(self, name: str) -> Signal:
+        """Return a quantity over time; without samples where the flight does not have it."""
+        found = self.series.get(name)
+        if found is not None:
+            return found
+        return Signal.none(_WIDTHS.get(name, len(self.joint_names)))
+
+    @property
+    def time(self) -> Array:
+        """(N,) times of the poses, s."""
+        return self.signal("pose").time
+
+    @property
+    def pose(self) -> Array:
+        """(N, 7) true positions (m) and quaternions (x, y, z, w) of the base in the world."""
+        return self.signal("pose").values
+
+    @property
+    def twist(self) -> Array:
+        """(N, 6) true velocities of the base in its own frame, m/s and rad/s."""
+        return self.signal("twist").values
+
+    @property
+    def q(self) -> Array:
+        """(N, n) true joint positions, m or rad."""
+        return self.signal("q").values
+
+    @property
+    def qdot(self) -> Array:
+        """(N, n) true joint rates, m/s or rad/s."""
+        return self.signal("qdot").values
+
+    @property
+    def effort(self) -> Array:
+        """(N, n) efforts of the joints' actuators, N or N m."""
+        return self.signal("effort").values
+
+    @property
+    def momentum(self) -> Array:
+        """(N, 7) linear (kg m/s) and angular momentum (kg m^2/s) in the world, energy (J)."""
+        return self.signal("momentum").values
+
+    @property
+    def quantities(self) -> dict[str, Array]:
+        """The other quantities, (N, size) each.
+
+        Names are those of :class:`~spacerobot_ros.simulation.sensors.ReportedState`:
+        measured states (only where sensors err), the end-effector, thrusters, expected momenta.
+        """
+        return {name: self.series[name].values for name in self.series if name not in _TRUE}
+
+    def required_robot(self) -> RobotDescription:
+        """Return the robot.
+
+        Raises
+        ------
+        RecordingError
+            The flight has no description of it.
+        """
+        if self.robot is None:
+            raise RecordingError(
+                f"The flight of '{self.scenario.name}' has no description of its robot."
+            )
+        return self.robot
+
+    @property
+    def control_period(self) -> float:
+        """Duration of a tick, s."""
+        return self.scenario.plant.control_period
+
+    # -- measures -----------------------------------------------------------------------------
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the goal was reached within tolerance, by the measured state."""
+        return self.outcome is Outcome.REACHED
+
+    @property
+    def sentence(self) -> str:
+        """Earlier name of :attr:`message`."""
+        return self.message
+
+    @property
+    def duration(self) -> float:
+        """Simulated time of the flight, s."""
+        return float(self.time[-1] - self.time[0]) if len(self.time) else 0.0
+
+    @property
+    def manoeuvre_time(self) -> float:
+        """Time flown for the goal, s, see :func:`~spacerobot_ros.measures.flown_time`; where no
+        status reports it, the duration of the flight.
+        """
+        reports = [(stamp_ns / SECOND, status) for stamp_ns, status in self.statuses]
+        last = self.status.manoeuvre_time_s if isinstance(self.status, PlannerStatus) else 0.0
+        end = float(self.time[-1]) if len(self.time) else 0.0
+        return flown_time(reports, end) or last or self.duration
+
+    @property
+    def corrections(self) -> int:
+        """New plans after the first that count as corrections."""
+        return self.status.corrections if isinstance(self.status, PlannerStatus) else 0
+
+    @property
+    def method(self) -> str:
+        """The gait method that was flown, or the control law."""
+        if self.gait is not None and self.gait.method:
+            return self.gait.method
+        scenario = self.scenario
+        plans = "planner" in scenario.commanders
+        return scenario.planner.method if plans else scenario.controller.law
+
+    @property
+    def error(self) -> PoseError | None:
+        """Error of the last true pose to the goal; None without one of them."""
+        return pose_error(self.signal("pose"), self.goal)
+
+    @property
+    def end_effector_error(self) -> PoseError | None:
+        """Error of the last pose of the end-effector to its goal; None without one of them."""
+        return pose_error(self.signal("end_effector_pose"), self.end_effector_goal)
+
+    @property
+    def propellant(self) -> float | None:
+        """Propellant used, kg; None without thrusters."""
+        used = self.signal("propellant")
+        return float(used.values[-1, 0]) if len(used) else None
+
+    @cached_property
+    def momentum_drift(self) -> Array:
+        """(2,) see :func:`~spacerobot_ros.measures.momentum_drift`; kg m/s and kg m^2/s."""
+        expected = self.series.get("expected_momenta")
+        return momentum_drift(self.momentum, None if expected is None else expected.values)
+
+    @cached_property
+    def measures(self) -> Measures:
+        """The measures of the flight, which has states."""
+        wrench = self.commands.get("base_wrench")
+        return Measures(
+            outcome=self.outcome,
+            message=self.message,
+            duration=self.duration,
+            manoeuvre_time=self.manoeuvre_time,
+            error=self.error,
+            end_effector_error=self.end_effector_error,
+            peak_rate=peak(self.qdot),
+            peak_effort=peak(self.effort),
+            peak_wrench=np.zeros(2) if wrench is None else peak_wrench(wrench.values),
+            lowest=self.q.min(axis=0),
+            highest=self.q.max(axis=0),
+            momentum_drift=self.momentum_drift,
+            corrections=self.corrections,
+            propellant=math.nan if self.propellant is None else self.propellant,
+            plan_time=self.plan_time,
+            wall_time=self.wall_time,
+        )
+
+    def __repr__(self) -> str:
+        error = self.error
+        left = "" if error is None else f", {error.distance:.3g} m and {error.angle:.3g} rad from "
+        return (
+            f"<Flight of {self.scenario.name} by {self.method}: {self.outcome.value} after "
+            f"{self.duration:.6g} s ({len(self.time) - 1} ticks, {self.corrections} "
+            f"correction(s)){left and f'{left}the goal'}. {self.message}>"
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Return the measures by the keys of ``spacerobot run --json``.
+
+        The flight has states and a goal.
+        """
+        goal, measures = self.goal, self.measures
+        assert goal is not None
+        assert measures.error is not None
+        linear, angular = measures.momentum_drift.tolist()
+        ticks, wall_time = len(self.time) - 1, self.wall_time
+        summary: dict[str, Any] = {
+            "scenario": self.scenario.name,
+            "method": self.method,
+            "goal": [*goal.position.tolist(), *goal.quaternion.tolist()],
+            "final_position_m": self.pose[-1, :3].tolist(),
+            "final_attitude_rotvec_rad": rotvec_from_quaternion(self.pose[-1, 3:]).tolist(),
+            "final_joint_positions": self.q[-1].tolist(),
+            "joint_names": list(self.joint_names),
+            "position_error_m": measures.error.distance,
+            "attitude_error_rad": measures.error.angle,
+            "sim_time_s": measures.duration,
+            "manoeuvre_time_s": measures.manoeuvre_time,
+            "plan_time_s": measures.plan_time,
+            "wall_time_s": wall_time,
+            "ticks": ticks,
+            "ticks_per_s": ticks / wall_time if wall_time else math.inf,
+            "real_time_factor": self.duration / wall_time if wall_time else math.inf,
+            "momentum_drift": max(linear, angular),
+            "linear_momentum_drift": linear,
+            "angular_momentum_drift": angular,
+            "peak_joint_velocities": measures.peak_rate.tolist(),
+            "corrections": measures.corrections,
+            "gait": {}
+            if self.gait is None
+            else {"duration_s": self.gait.duration_s, **self.gait.notes},
+            "state": self.outcome.value,
+            "message": self.message,
+            "succeeded": self.succeeded,
+        }
+        if measures.end_effector_error is not None:
+            end = self.signal("end_effector_pose").values[-1, :3]
+            summary["end_effector_final_position_m"] = end.tolist()
+            summary["end_effector_position_error_m"] = measures.end_effector_error.distance
+            if _turns_end_effector(self.status):
+                summary["end_effector_attitude_error_rad"] = measures.end_effector_error.angle
+        if self.propellant is not None:
+            summary["propellant_kg"] = self.propellant
+        return summary
+
+    # -- views and files ----------------------------------------------------------------------
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a table with a row a state, indexed by time (s).
@@ -46,7 +399,7 @@ class Flight(FlightArrays):
         return table(self)
 
     def plot(self) -> Any:
-        """Return a matplotlib figure: the base's pose and its goal, the joints, what drove them."""
+        """Return a matplotlib figure: pose of the base and its goal, joints, efforts or rates."""
         from spacerobot_ros.flight.views import figure
 
         return figure(self)
@@ -54,37 +407,89 @@ class Flight(FlightArrays):
     def animate(self, *, seconds: float = 8.0, frames: int = 80) -> Any:
         """Return the robot in motion as an HTML animation for a notebook.
 
-        ``seconds`` is how long it takes to watch, ``frames`` of how many pictures: at most 1000.
+        Parameters
+        ----------
+        seconds
+            Wall time of the animation.
+        frames
+            Number of pictures, at most 1000.
 
         Raises
         ------
         ParameterError
-            One of them is none.
+            A number is out of range.
+        SpaceRobotError
+            The flight has no description of its robot.
         """
         from spacerobot_ros.flight.views import animation
 
         return animation(self, seconds, frames)
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write a bag that ``spacerobot verify`` and ``spacerobot report`` take.
+        """Write a bag for ``spacerobot verify`` and ``spacerobot report``.
 
         Raises
         ------
         RecordingError
-            The file is there and is not to be replaced, or cannot be written.
+            The file exists and is not to be replaced, or cannot be written; or the flight has no
+            description of its robot.
         """
         from spacerobot_ros.flight.saved import save_flight
 
         save_flight(self, path, overwrite=overwrite)
 
 
+def pose_error(poses: Signal, goal: Goal | None) -> PoseError | None:
+    """Return the error of the last of some poses (N, 7) to a goal; None without one of them."""
+    if goal is None or not len(poses):
+        return None
+    return PoseError.between(poses.values[-1, :3], poses.values[-1, 3:], goal)
+
+
+def _turns_end_effector(status: Status | None) -> bool:
+    """Whether a controller turns the end-effector to an attitude."""
+    command = status.command if isinstance(status, ControllerStatus) else None
+    return command is not None and any(
+        label.startswith("end_effector.r") for label in command.errors
+    )
+
+
+def goal_of(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
+    """Return the goal of a status, as it was sent; None where the status names none."""
+    for sent in reversed(goals):
+        if status.goal_id and status.goal_id == sent.goal_id:
+            return sent.goal
+    named = status.goal if isinstance(status, PlannerStatus) else ()
+    try:
+        reported = Goal.checked(named[:3], named[3:])
+    except PlanningError:
+        return None
+    # Bags of earlier versions have no ids: the goal that was sent has more digits.
+    for sent in reversed(goals):
+        goal = sent.goal
+        same = np.allclose(goal.position, reported.position, rtol=1e-7, atol=1e-8)
+        if same and np.allclose(goal.quaternion, reported.quaternion, rtol=0.0, atol=1e-7):
+            return goal
+    return reported
+
+
+def goal_at_end(statuses: Iterable[Status], goals: Sequence[SentGoal]) -> Goal | None:
+    """Return the goal that was flown to last, or else the one that was sent last."""
+    for status in reversed(list(statuses)):
+        if status.state.value in _FOLLOWED:
+            goal = goal_of(status, goals)
+            if goal is not None:
+                return goal
+    return goals[-1].goal if goals else None
+
+
 class FlightLog:
-    """Collects the data of a :class:`Flight`.
+    """Collects the arrays of a :class:`Flight` tick by tick.
 
     Parameters
     ----------
     plant, reported, commands
-        What is flown.
+        The plant, the quantities that it reports, and its commands.
     period_ns
         Duration of a tick, ns.
     """
@@ -104,12 +509,13 @@ class FlightLog:
         self._period_ns = period_ns
         self._thrusters = thrusters_in(plant)
         self._propellant = np.zeros(1)
-        true = {"true_pose": plant.pose, "true_twist": plant.twist}
-        true |= {"true_q": plant.q, "true_qdot": plant.qdot}
-        sources = {**reported.quantities, **true}
-        if not reported.sensors.used:
-            # The same arrays.
-            sources = {name: x for name, x in sources.items() if not name.startswith("measured_")}
+        true = {"pose": plant.pose, "twist": plant.twist, "q": plant.q, "qdot": plant.qdot}
+        # What sensors without error measure are the true arrays.
+        unused = ("true_",) if reported.sensors.used else ("true_", "measured_")
+        sources = {
+            **{name: x for name, x in reported.quantities.items() if not name.startswith(unused)},
+            **true,
+        }
         if self._thrusters is not None:
             sources["propellant"] = self._propellant
         self._states = {name: _Rows(source.size) for name, source in sources.items()}
@@ -121,7 +527,7 @@ class FlightLog:
         self._sensors = reported.sensors
 
     def add_state(self, tick: int) -> None:
-        """Take the state that is reported now."""
+        """Add the present state."""
         if self._thrusters is not None:
             self._propellant[0] = self._thrusters.propellant
         for rows, source in self._sources:
@@ -130,7 +536,7 @@ class FlightLog:
             self._lost.append(tick)
 
     def add_command(self, topic: str, tick: int, values: Array) -> None:
-        """Take a command that is sent."""
+        """Add a command."""
         if topic not in self._commands:
             self._commands[topic] = _Rows(1), _Rows(len(values))
         ticks, rows = self._commands[topic]
@@ -143,7 +549,7 @@ class FlightLog:
         robot: RobotDescription,
         *,
         outcome: Outcome,
-        sentence: str,
+        message: str,
         status: Status | None,
         gait: PlannerStatus | None,
         plan_time: float,
@@ -151,31 +557,27 @@ class FlightLog:
     ) -> Flight:
         """Return the flight."""
         states = {name: rows.array() for name, rows in self._states.items()}
-        lost = np.zeros(len(states["pose"]), dtype=bool)
-        lost[self._lost] = True
-        states["pose_lost"] = lost[:, np.newaxis].astype(float)
-        for name in ("pose", "twist", "q", "qdot"):
-            states[name] = states.pop(f"true_{name}")
         count = len(states["pose"])
+        lost = np.zeros((count, 1))
+        lost[self._lost] = 1.0
+        states["pose_lost"] = lost
+        time: Array = np.arange(count) * self._period_ns / SECOND
         return Flight(
             scenario=scenario,
             robot=robot,
-            outcome=outcome,
-            sentence=sentence,
-            control_period=self._period_ns / SECOND,
-            time=np.arange(count) * self._period_ns / SECOND,
-            **{
-                name: states.pop(name)
-                for name in ("pose", "twist", "q", "qdot", "effort", "momentum")
-            },
-            quantities=states,
+            joint_names=tuple(robot.joint_names),
+            series={name: Signal(time, values) for name, values in states.items()},
             commands={
                 topic: Commands(ticks.array()[:, 0].astype(np.int64), rows.array())
                 for topic, (ticks, rows) in self._commands.items()
             },
             statuses=tuple(self.statuses),
-            schedules=tuple(self.schedules),
             events=tuple(self.events),
+            outcome=outcome,
+            message=message,
+            goal=scenario.goal,
+            end_effector_goal=scenario.end_effector_goal,
+            schedules=tuple(self.schedules),
             status=status,
             gait=gait,
             plan_time=plan_time,

@@ -35,11 +35,11 @@ from spacerobot_ros.control.state import Reference
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import CommandError, ParameterError, PlanningError, SpaceRobotError
 from spacerobot_ros.events import Event
-from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.flight import Flight, FlightLog
 from spacerobot_ros.flight.plant_listener import Change, PlantListener, Stopped
 from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.flight.state_synchroniser import Pairing, StateSynchroniser
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.shared_parameters import RobotConfig, robot_from_text, robot_of
@@ -432,11 +432,11 @@ class _LockstepFlight:
     def _result(self, wall_time: float, interrupted: str) -> Flight:
         decision = self._follower.decision
         outcome = Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value)
-        sentence = interrupted
+        message = interrupted
         if decision is not None:
-            sentence = decision.message
+            message = decision.message
         elif not interrupted and self._status is not None:
-            sentence = self._monitor.status.message or self._status.message
+            message = self._monitor.status.message or self._status.message
         plan_time = 0.0
         if self._planner is not None:
             plan_time = self._planner.executive.statistics.plan_time_s
@@ -444,7 +444,7 @@ class _LockstepFlight:
             self._scenario,
             self._robots.description or self._robots.plant.description,
             outcome=outcome,
-            sentence=sentence,
+            message=message,
             status=self._status,
             gait=self._follower.gait,
             plan_time=plan_time,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from spacerobot_ros.bag import LATCHED, BagWriter
 from spacerobot_ros.bag.making import MessageMaker
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.control.thrusters import find_thrusters
-from spacerobot_ros.flight.arrays import FlightArrays
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.visuals import carried_meshes
 from spacerobot_ros.planning import GaitSchedule, Goal
@@ -22,6 +21,9 @@ from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import SECOND, set_stamp
 from spacerobot_ros.topics import TOPICS, Topic, state_topics
 from spacerobot_ros.version import __version__
+
+if TYPE_CHECKING:
+    from spacerobot_ros.flight.flight import Flight
 
 
 @dataclass(frozen=True)
@@ -34,9 +36,7 @@ class _Stream:
     name: str = ""
 
 
-def save_flight(
-    flight: FlightArrays, path: str | os.PathLike[str], *, overwrite: bool = False
-) -> None:
+def save_flight(flight: Flight, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
     """Write a bag that ``spacerobot verify`` and ``spacerobot report`` take.
 
     Raises
@@ -45,16 +45,16 @@ def save_flight(
         The file is there and is not to be replaced, or cannot be written; a type of message is not
         installed.
     """
-    maker, scenario = MessageMaker(), flight.scenario
+    maker, scenario, robot = MessageMaker(), flight.scenario, flight.required_robot()
     streams = [*_states(flight, maker), *_others(flight, maker)]
     with BagWriter(path, overwrite=overwrite) as writer:
         writer.add_metadata("spacerobot", {"version": __version__})
         nodes = ["plant", *scenario.commanders]
         for title, values in scenario.records(nodes).items():
             writer.add_metadata(title, values)
-        urdf = flight.robot.urdf.encode()
+        urdf = robot.urdf.encode()
         writer.add_attachment("robot_description.urdf", urdf, "application/xml", 0)
-        for name, mesh in carried_meshes(flight.robot).items():
+        for name, mesh in carried_meshes(robot).items():
             writer.add_attachment(name, mesh, "model/stl", 0)
         entries = []
         for place, stream in enumerate(streams):
@@ -70,11 +70,11 @@ def save_flight(
             writer.write(channel, data, time, time)
 
 
-def _states(flight: FlightArrays, maker: MessageMaker) -> Iterator[_Stream]:
+def _states(flight: Flight, maker: MessageMaker) -> Iterator[_Stream]:
     """Yield the topics of the plant's state, in the order of their publication."""
     period = round(flight.control_period * SECOND)
     stamps: NDArray[np.int64] = np.arange(len(flight.time), dtype=np.int64) * period
-    config, robot = flight.scenario.plant, flight.robot
+    config, robot = flight.scenario.plant, flight.required_robot()
     quantities = _quantities(flight)
     thrusters: tuple[str, ...] = ()
     if "thruster_duty" in quantities:
@@ -112,7 +112,7 @@ def _states(flight: FlightArrays, maker: MessageMaker) -> Iterator[_Stream]:
         yield _Stream(topic, stamps[rows], maker.stamped(message, stamps[rows], chosen))
 
 
-def _quantities(flight: FlightArrays) -> dict[str, Array]:
+def _quantities(flight: Flight) -> dict[str, Array]:
     """Return all quantities by the names of the table of topics."""
     true = {"pose": flight.pose, "twist": flight.twist, "q": flight.q, "qdot": flight.qdot}
     found = {**flight.quantities, "effort": flight.effort, "momentum": flight.momentum}
@@ -124,11 +124,11 @@ def _quantities(flight: FlightArrays) -> dict[str, Array]:
     return {**found, "pose": flight.pose}
 
 
-def _others(flight: FlightArrays, maker: MessageMaker) -> Iterator[_Stream]:
+def _others(flight: Flight, maker: MessageMaker) -> Iterator[_Stream]:
     """Yield goals, commands, plans, statuses, events and the description of the robot."""
     scenario, zero = flight.scenario, np.zeros(1, dtype=np.int64)
     world = scenario.plant.world_frame
-    described = maker.made("std_msgs/msg/String", data=flight.robot.urdf)
+    described = maker.made("std_msgs/msg/String", data=flight.required_robot().urdf)
     yield _Stream(TOPICS["robot_description"], zero, [maker.serialised(described)])
     goals: list[tuple[str, Goal | None]] = [("goal_pose", scenario.goal)]
     goals.append(("end_effector/goal_pose", scenario.end_effector_goal))
@@ -163,14 +163,14 @@ def _others(flight: FlightArrays, maker: MessageMaker) -> Iterator[_Stream]:
     yield _Stream(TOPICS["events"], times, events)
 
 
-def _commands(flight: FlightArrays, maker: MessageMaker) -> Iterator[_Stream]:
+def _commands(flight: Flight, maker: MessageMaker) -> Iterator[_Stream]:
     period = round(flight.control_period * SECOND)
     velocity = flight.scenario.plant.actuation == "velocity"
     for name, commands in flight.commands.items():
         stamps = commands.tick * period
         message = maker.blank(TOPICS[name].type)
         if name == "base_wrench":
-            message.header.frame_id = flight.robot.base_link
+            message.header.frame_id = flight.required_robot().base_link
             columns = {"wrench.force.x": commands.values}
         else:
             message.name = list(flight.joint_names)
@@ -182,11 +182,12 @@ def _commands(flight: FlightArrays, maker: MessageMaker) -> Iterator[_Stream]:
             yield _Stream(TOPICS[name], stamps, maker.stamped(message, stamps, columns))
 
 
-def _plans(flight: FlightArrays, maker: MessageMaker, world: str) -> Iterator[_Stream]:
+def _plans(flight: Flight, maker: MessageMaker, world: str) -> Iterator[_Stream]:
     if not flight.schedules:
         return
     times = np.array([time for time, _ in flight.schedules], dtype=np.int64)
-    schedules = [_trajectory(maker, s, t, flight.robot.base_link) for t, s in flight.schedules]
+    frame = flight.required_robot().base_link
+    schedules = [_trajectory(maker, s, time, frame) for time, s in flight.schedules]
     paths = [_path(maker, schedule, time, world) for time, schedule in flight.schedules]
     yield _Stream(TOPICS["gait_schedule"], times, schedules)
     yield _Stream(TOPICS["planned_path"], times, paths)

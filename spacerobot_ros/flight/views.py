@@ -23,7 +23,7 @@ from spacerobot_ros.topics import TOPICS
 if TYPE_CHECKING:
     import pandas as pd
 
-    from spacerobot_ros.flight.arrays import FlightArrays
+    from spacerobot_ros.flight.flight import Flight
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _DASHES = ("-", "--", "-.", ":")
@@ -78,7 +78,7 @@ class Animation:
         write_output(Path(path), f'<!DOCTYPE html>\n<meta charset="utf-8">\n{self.html}\n')
 
 
-def table(flight: FlightArrays) -> pd.DataFrame:
+def table(flight: Flight) -> pd.DataFrame:
     """Return a table with a row a state, indexed by time (s).
 
     Raises
@@ -108,7 +108,7 @@ def table(flight: FlightArrays) -> pd.DataFrame:
     return pd.DataFrame(columns, index=pd.Index(flight.time, name="time"))
 
 
-def _labels(flight: FlightArrays) -> dict[str, tuple[str, ...]]:
+def _labels(flight: Flight) -> dict[str, tuple[str, ...]]:
     """Return what the numbers of the other quantities are called."""
     names: dict[str, tuple[str, ...]] = {"propellant": ("",), "pose_lost": ("",)}
     for part in ("measured_pose", "end_effector_pose"):
@@ -124,7 +124,7 @@ def _labels(flight: FlightArrays) -> dict[str, tuple[str, ...]]:
     return names
 
 
-def figure(flight: FlightArrays) -> Picture:
+def figure(flight: Flight) -> Picture:
     """Draw the pose of the base beside its goal, the joints, and what drove them."""
     efforts = flight.scenario.plant.actuation == "effort"
     wrench = flight.commands.get("base_wrench")
@@ -135,8 +135,10 @@ def figure(flight: FlightArrays) -> Picture:
     panels = made.subplots(rows, 1, sharex=True)
     time, goal = flight.time, flight.goal
     attitude = np.unwrap([rotvec_from_quaternion(o) for o in flight.pose[:, 3:]], axis=0)
-    target = rotvec_from_quaternion(goal.quaternion)
-    _lines(panels[0], time, flight.pose[:, :3], "xyz", "position, m", goal.position)
+    place = target = None
+    if goal is not None:
+        place, target = goal.position, rotvec_from_quaternion(goal.quaternion)
+    _lines(panels[0], time, flight.pose[:, :3], "xyz", "position, m", place)
     _lines(panels[1], time, attitude, "xyz", "rotation vector, rad", target)
     names = flight.joint_names
     _lines(panels[2], time, flight.q, names, "joints, m or rad")
@@ -149,7 +151,7 @@ def figure(flight: FlightArrays) -> Picture:
         at = wrench.tick * np.float64(flight.control_period)
         _lines(panels[4], at, norms, ("force, N", "torque, N m"), "thrust")
     panels[-1].set_xlabel("time, s")
-    made.suptitle(f"{flight.scenario.name}, {flight.method}: {flight.sentence}", fontsize=10)
+    made.suptitle(f"{flight.scenario.name}, {flight.method}: {flight.message}", fontsize=10)
     return made
 
 
@@ -167,7 +169,7 @@ def _lines(
         axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
 
-def animation(flight: FlightArrays, seconds: float, frames: int) -> Animation:
+def animation(flight: Flight, seconds: float, frames: int) -> Animation:
     """Draw the robot in motion: its joints as points, the links between them as lines."""
     from matplotlib.animation import FuncAnimation
 
@@ -176,10 +178,12 @@ def animation(flight: FlightArrays, seconds: float, frames: int) -> Animation:
     if not (isinstance(seconds, int | float) and 0 < seconds < math.inf):
         raise ParameterError(f"An animation lasts more than 0 s, and not {seconds!r}.")
     rows = np.unique(np.linspace(0, len(flight.time) - 1, frames).round().astype(int))
-    skeleton = _Skeleton(flight.robot)
+    skeleton = _Skeleton(flight.required_robot())
     shapes = np.array([skeleton.points(flight.pose[i], flight.q[i]) for i in rows])
-    goal = np.concatenate([flight.goal.position, flight.goal.quaternion])
-    ghost = skeleton.points(goal, flight.q[-1])
+    ghost = np.zeros((0, 3))
+    if flight.goal is not None:
+        goal = np.concatenate([flight.goal.position, flight.goal.quaternion])
+        ghost = skeleton.points(goal, flight.q[-1])
     made = Figure(figsize=(5.6, 5.0), dpi=72)
     FigureCanvasAgg(made)
     axes = made.add_subplot(projection="3d")
@@ -194,7 +198,7 @@ def animation(flight: FlightArrays, seconds: float, frames: int) -> Animation:
         ylabel="y, m",
         zlabel="z, m",
     )
-    for a, b in skeleton.links:
+    for a, b in skeleton.links if len(ghost) else ():
         axes.plot(*ghost[[a, b]].T, color=_GOAL, alpha=0.35, linewidth=3)
     axes.plot(*flight.pose[:, :3].T, color="#8a919c", linewidth=0.8)
     lines = [axes.plot([], [], [], color=_INK, linewidth=2.5)[0] for _ in skeleton.links]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,8 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from spacerobot_ros.bag import RecordedRobot
-from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.report.figures import INK, MUTED, PALETTE, inches, panel
 from spacerobot_ros.times import SECOND
@@ -125,30 +123,26 @@ def mark_of(kind: EventKind) -> dict[str, Any]:
     }
 
 
-def read_events(robot: RecordedRobot, began: float, *, stamped: bool) -> list[FlightEvent]:
-    """Return the events of a bag that are drawn; none of a bag without them.
+def drawn_events(
+    events: Iterable[tuple[int, str, Event]], began: float, *, stamped: bool
+) -> list[FlightEvent]:
+    """Return the events that are drawn.
 
     Parameters
     ----------
-    robot
-        The topics of the robot.
+    events
+        Events with their log times (ns) and nodes.
     began
         Time of the first state, s.
     stamped
         Whether that is a simulated time, as the events' own is; otherwise log times count.
     """
-    series = robot.get("events")
     found = []
-    for time_ns, message in series.messages() if series is not None else ():
-        values = {pair.key: pair.value for pair in message.values}
-        try:
-            event = Event.from_values(values, message.message)
-        except SpaceRobotError:
-            continue
+    for time_ns, node, event in events:
         time = event.time_s if stamped and event.time_s is not None else time_ns / SECOND
         # Not true of nan either.
         if event.kind in _MARKS and abs(time - began) < 1e12:
-            found.append(FlightEvent(time - began, message.name, event))
+            found.append(FlightEvent(time - began, node, event))
     return found
 
 

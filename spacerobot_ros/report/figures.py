@@ -25,8 +25,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.report.signals import Signal, envelope, simplified
+from spacerobot_ros.report.signals import envelope, simplified
 
 INK, MUTED, FAINT = "#1f2328", "#667085", "#c3c8d0"
 _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")

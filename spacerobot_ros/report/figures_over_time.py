@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.axes import Axes
 
+from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model.description import Joint
 from spacerobot_ros.model.rotations import (
     quaternion_inverse,
@@ -43,8 +44,8 @@ from spacerobot_ros.report.figures import (
     short,
     upper_edge,
 )
-from spacerobot_ros.report.flight import Flight, Target, joint_unit
-from spacerobot_ros.report.signals import Cycles, Indices, Signal, envelope
+from spacerobot_ros.report.flight import FlightReport, Target, joint_unit
+from spacerobot_ros.report.signals import Cycles, Indices, envelope
 
 SHOWN_CYCLES = 3
 """Cycles in a close-up."""
@@ -64,7 +65,7 @@ EVENTS = (
 )
 
 
-def draw_whole(axes: Axes, flight: Flight, group: TraceGroup, share: float = 1.0) -> bool:
+def draw_whole(axes: Axes, flight: FlightReport, group: TraceGroup, share: float = 1.0) -> bool:
     """Draw a group over the whole flight; return whether traces were summed up as bands."""
     if group.rows:
         return _draw_rows(axes, flight, group, share)
@@ -102,7 +103,7 @@ def draw_whole(axes: Axes, flight: Flight, group: TraceGroup, share: float = 1.0
 
 
 def time_figure(
-    flight: Flight, name: str, heading: str, what: str, groups: list[TraceGroup]
+    flight: FlightReport, name: str, heading: str, what: str, groups: list[TraceGroup]
 ) -> ReportFigure:
     """Return groups over time, one panel each, with close-ups where there are cycles.
 
@@ -153,7 +154,7 @@ def time_figure(
     return ReportFigure(name, heading, caption, figure, groups, aside)
 
 
-def _draw_rows(axes: Axes, flight: Flight, group: TraceGroup, share: float) -> bool:
+def _draw_rows(axes: Axes, flight: FlightReport, group: TraceGroup, share: float) -> bool:
     """Draw each trace as a band in a row of its own, the first on top."""
     columns = max(int(COLUMNS * share), 20)
     count, signal = len(group.names), group.signal
@@ -219,7 +220,7 @@ NO_STATES = "The bag holds no base poses (odom), so there is no picture of them.
 NO_JOINTS = "The bag holds no joint positions (joint_states)."
 
 
-def position_group(flight: Flight) -> TraceGroup:
+def position_group(flight: FlightReport) -> TraceGroup:
     """Return the base position and its goals."""
     goals = [
         (t.start, t.end, i, x)
@@ -230,7 +231,7 @@ def position_group(flight: Flight) -> TraceGroup:
     return TraceGroup(flight.position, ["x", "y", "z"], "base position", "m", PALETTE[:3], goals)
 
 
-def attitude_group(flight: Flight) -> TraceGroup:
+def attitude_group(flight: FlightReport) -> TraceGroup:
     """Return the base attitude as exponential coordinates, and its goals."""
     goals = [
         (t.start, t.end, i, x)
@@ -242,7 +243,7 @@ def attitude_group(flight: Flight) -> TraceGroup:
     )
 
 
-def shape_groups(flight: Flight) -> list[TraceGroup]:
+def shape_groups(flight: FlightReport) -> list[TraceGroup]:
     """Return the joint positions, those of one unit and at most six joints together."""
 
     def bounds(joint: Joint) -> list[float]:
@@ -253,7 +254,7 @@ def shape_groups(flight: Flight) -> list[TraceGroup]:
 
 
 def joint_groups(
-    flight: Flight,
+    flight: FlightReport,
     signal: Signal,
     label: str,
     units: dict[str, str],
@@ -297,7 +298,7 @@ def axis_groups(signal: Signal, parts: Sequence[tuple[str, str]]) -> list[TraceG
     ]
 
 
-def position_figure(flight: Flight) -> ReportFigure | str:
+def position_figure(flight: FlightReport) -> ReportFigure | str:
     """Base position against the goal."""
     if not len(flight.position):
         return NO_STATES
@@ -305,7 +306,7 @@ def position_figure(flight: Flight) -> ReportFigure | str:
     return time_figure(flight, "position", "Base position", what, [position_group(flight)])
 
 
-def pose_figure(flight: Flight) -> ReportFigure | str:
+def pose_figure(flight: FlightReport) -> ReportFigure | str:
     """Base position over base attitude, against the goal."""
     if not len(flight.position):
         return NO_STATES
@@ -314,7 +315,7 @@ def pose_figure(flight: Flight) -> ReportFigure | str:
     return time_figure(flight, "pose", "Base pose", what, groups)
 
 
-def attitude_figure(flight: Flight) -> ReportFigure | str:
+def attitude_figure(flight: FlightReport) -> ReportFigure | str:
     """Base attitude against the goal."""
     if not len(flight.attitude):
         return NO_STATES
@@ -327,20 +328,20 @@ def attitude_figure(flight: Flight) -> ReportFigure | str:
     return time_figure(flight, "attitude", "Base attitude", what, [attitude_group(flight)])
 
 
-def shape_figure(flight: Flight) -> ReportFigure | str:
+def shape_figure(flight: FlightReport) -> ReportFigure | str:
     """Joint positions, with the limits of the URDF that are in range."""
     if not len(flight.shape) or not flight.joint_names:
         return _no_joints(flight)
     return time_figure(flight, "shape", "Shape", "Joint positions", shape_groups(flight))
 
 
-def _no_joints(flight: Flight) -> str:
+def _no_joints(flight: FlightReport) -> str:
     """Return why there is no picture of the joints."""
     jointless = flight.robot is not None and not flight.robot.joint_names
     return "The robot has no joints." if jointless else NO_JOINTS
 
 
-def rates_figure(flight: Flight) -> ReportFigure | str:
+def rates_figure(flight: FlightReport) -> ReportFigure | str:
     """Joint velocities, one panel a joint."""
     if not flight.joint_names:
         return _no_joints(flight)
@@ -398,7 +399,7 @@ def rates_figure(flight: Flight) -> ReportFigure | str:
     return ReportFigure("velocities", "Joint velocities", caption, figure, groups, aside)
 
 
-def twist_figure(flight: Flight) -> ReportFigure | None:
+def twist_figure(flight: FlightReport) -> ReportFigure | None:
     """Velocity and angular velocity of the base link.
 
     None where it rests, and of a gait of many equal cycles: there it shakes.
@@ -425,7 +426,7 @@ _SMALLEST = 1e-9
 """Forces and torques that are rounding errors, N or N m."""
 
 
-def efforts_figure(flight: Flight) -> ReportFigure | None:
+def efforts_figure(flight: FlightReport) -> ReportFigure | None:
     """Commanded thruster wrench and joint efforts."""
 
     def bounds(joint: Joint) -> list[float]:
@@ -468,7 +469,7 @@ def window_of(signal: Signal) -> tuple[float, float] | None:
     return max(low, inner_low - 0.3 * span), min(high, inner_high + 0.3 * span)
 
 
-def thrusters_figure(flight: Flight) -> ReportFigure | None:
+def thrusters_figure(flight: FlightReport) -> ReportFigure | None:
     """When each thruster was on, and what that took."""
     names = flight.thruster_names
     if not len(flight.duty) or not flight.duty.values.any():
@@ -490,7 +491,7 @@ def thrusters_figure(flight: Flight) -> ReportFigure | None:
     return time_figure(flight, "thrusters", "Thruster firings", what, groups)
 
 
-def momentum_figure(flight: Flight) -> ReportFigure | str:
+def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     """Change of the total momenta, and the kinetic energy."""
     if not len(flight.momentum):
         return "The bag holds no momentum."
@@ -563,7 +564,7 @@ _SMALLEST_ERROR = 1e-12
 """Errors of sensors that are rounding errors, m or rad."""
 
 
-def errors_figure(flight: Flight) -> ReportFigure | None:
+def errors_figure(flight: FlightReport) -> ReportFigure | None:
     """Goal minus pose of base and end-effector, in the components under control."""
     if not flight.outputs and not flight.tool_goals:
         return None
@@ -606,7 +607,7 @@ def pose_errors(pose: Signal, targets: Sequence[Target]) -> Signal:
     return Signal(np.concatenate(times), np.concatenate(values))
 
 
-def sensors_figure(flight: Flight) -> ReportFigure | None:
+def sensors_figure(flight: FlightReport) -> ReportFigure | None:
     """How far measured poses and joints are from what they were; None where sensors do not err."""
     true = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
     pose, at = _at_the_same_times(flight.sensed_pose, true)

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model.description import Array, Pose
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.planning import PoseError
@@ -35,8 +36,8 @@ from spacerobot_ros.report.figures_over_time import (
     SHOWN_CYCLES,
     power_of_ten,
 )
-from spacerobot_ros.report.flight import Flight, joint_unit
-from spacerobot_ros.report.signals import Indices, Signal
+from spacerobot_ros.report.flight import FlightReport, joint_unit
+from spacerobot_ros.report.signals import Indices
 from spacerobot_ros.report.solids import Canvas, Solids, View
 
 PIXELS = 420
@@ -44,7 +45,7 @@ PIXELS = 420
 _INSTANTS = 6
 
 
-def configurations_figure(flight: Flight) -> ReportFigure | str:
+def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     """The robot at several instants from the first state to the last, and the goal."""
     if flight.drawn is None:
         return flight.not_drawn
@@ -77,12 +78,12 @@ def configurations_figure(flight: Flight) -> ReportFigure | str:
     return ReportFigure("configurations", "Configurations", caption, figure)
 
 
-def view_of(flight: Flight) -> View:
+def view_of(flight: FlightReport) -> View:
     """Return the direction to look from: above where all moves in a plane."""
     return View(-90.0, 90.0) if flight.flat else View()
 
 
-def _instants(flight: Flight) -> list[int]:
+def _instants(flight: FlightReport) -> list[int]:
     """Up to six recorded states, about as much motion from one to the next.
 
     Where a gait ends with equal cycles, three are spread over what comes before, and three over the
@@ -135,7 +136,7 @@ def draw_robot(axes: Axes, solids: Solids, points: Array, view: View) -> None:
     axes.text(x - length / 2, y + 0.015 * across, f"{length:g} m", color=MUTED, ha="center")
 
 
-def draw_goal_and_path(axes: Axes, flight: Flight, view: View) -> list[Line2D]:
+def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Line2D]:
     """Draw the ghost of the base at the goal and the path of the base; return legend entries."""
     keys = []
     path = flight.position.values
@@ -168,7 +169,7 @@ _OTHERS = (PALETTE[0], PALETTE[2], PALETTE[5], *PALETTE[6:])
 """Colors of the flights, this one first."""
 
 
-def path_figure(flight: Flight, beside: Sequence[Flight] = ()) -> ReportFigure | str:
+def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> ReportFigure | str:
     """The path of the base in three views, with that of the end-effector and of other flights."""
     if not len(flight.position):
         return NO_STATES
@@ -237,7 +238,7 @@ def _square(axes: Axes, middle: Array, half: float) -> None:
 _LOOP_JOINTS = 3
 
 
-def loops_figure(flight: Flight) -> ReportFigure | str:
+def loops_figure(flight: FlightReport) -> ReportFigure | str:
     """Joint positions against each other, for the first three joints in pairs."""
     names = flight.joint_names[:_LOOP_JOINTS]
     if len(names) < 2:
@@ -321,7 +322,7 @@ _FEWEST = 4
 _DECADE = 10.0
 
 
-def cycles_figure(flight: Flight) -> ReportFigure | None:
+def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     """Attitude, and the remaining angle to the goal, at the end of each loop in shape space.
 
     None where the shape does not come round again and again.

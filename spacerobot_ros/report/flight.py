@@ -1,8 +1,7 @@
-"""One flight, as a bag holds it: whatever is there, and nothing that is not."""
+"""A flight as a report shows it: its signals since its first state, its goals, its robot."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -11,46 +10,55 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.control.status import CommandReport, ControllerStatus, tracking_time
-from spacerobot_ros.control.thrusters import IN_URDF, find_thrusters
-from spacerobot_ros.errors import PlanningError, SpaceRobotError
-from spacerobot_ros.flight.scenario import Published
+from spacerobot_ros.control.status import CommandReport, ControllerStatus
+from spacerobot_ros.flight.flight import Flight, SentGoal, Signal, goal_of, pose_error
+from spacerobot_ros.flight.reading import (
+    WRENCH,
+    FlightBag,
+    impulse,
+    namespaces,
+    open_flight_bag,
+    read_flight,
+)
+from spacerobot_ros.flight.scenario import COMMANDERS, Published
+from spacerobot_ros.measures import flown_time
 from spacerobot_ros.model import RobotDescription
 from spacerobot_ros.model.description import Array, Joint, JointKind, Pose
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
+from spacerobot_ros.model.visuals import meshes_in
 from spacerobot_ros.planning import METHODS, Goal, PoseError
-from spacerobot_ros.planning.execution.status import (
-    PlannerState,
-    PlannerStatus,
-    manoeuvre_time,
-    time_to_end,
-)
-from spacerobot_ros.report.events import FlightEvent
-from spacerobot_ros.report.signals import Cycles, Signal, find_cycles, nearest_rotvec
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
+from spacerobot_ros.report.events import FlightEvent, drawn_events
+from spacerobot_ros.report.signals import Cycles, find_cycles, nearest_rotvec, rotvecs
 from spacerobot_ros.report.solids import SolidRobot
-
-_FOLLOWED = frozenset(("executing", "reached", "failed", "aborted"))
-"""States in which the goal of a status is, or was, the one to fly to."""
+from spacerobot_ros.times import SECOND
 
 
 @dataclass(frozen=True)
 class Status:
-    """What planner or controller reported.
+    """A report of the planner or the controller.
 
     Attributes
     ----------
     time
-        When, s.
-    sentence
-        For people.
-    report
-        The same for programs; None where it is no status of this package.
+        Time of the report, s.
+    content
+        The report; of another package its message alone.
     """
 
     time: float
-    sentence: str
-    report: PlannerStatus | ControllerStatus | None
+    content: PlannerStatus | ControllerStatus | str
+
+    @property
+    def report(self) -> PlannerStatus | ControllerStatus | None:
+        """The report for programs; None where it is no status of this package."""
+        return None if isinstance(self.content, str) else self.content
+
+    @property
+    def sentence(self) -> str:
+        """The report for people."""
+        return self.content if isinstance(self.content, str) else self.content.message
 
     @property
     def state(self) -> str:
@@ -61,16 +69,6 @@ class Status:
     def executing(self) -> bool:
         """Whether a schedule begins."""
         return self.state == PlannerState.EXECUTING.value
-
-    @property
-    def goal_id(self) -> str:
-        """Id of the goal that the status is about; empty where it is not known."""
-        return self.report.goal_id if self.report is not None else ""
-
-    @property
-    def goal(self) -> tuple[float, ...]:
-        """Position and quaternion (7,) of that goal with 9 digits; empty where not reported."""
-        return self.report.goal if isinstance(self.report, PlannerStatus) else ()
 
     @property
     def method(self) -> str:
@@ -100,15 +98,6 @@ class Status:
 
 
 @dataclass(frozen=True)
-class SentGoal:
-    """A goal pose that was sent at ``time`` (s), and the id under which statuses report on it."""
-
-    time: float
-    goal: Goal
-    goal_id: str
-
-
-@dataclass(frozen=True)
 class Target:
     """A goal and when it was flown to, ``start`` to ``end`` in s."""
 
@@ -118,81 +107,186 @@ class Target:
 
 
 @dataclass(frozen=True)
-class Flight:
-    """What a bag holds of a flight, times in s since the first state; missing signals are empty.
+class FlightReport:
+    """A flight as a report shows it, times in s since its first state; missing signals are empty.
 
     Attributes
     ----------
-    file_name, message_count, metadata, robot, joint_names
-        About the bag, and the robot in it.
-    position, quaternion, attitude
-        Pose of the base link in the world: (N, 3) m, (N, 4) and exponential coordinates (N, 3).
-        This and what follows is as it was, and not as sensors that err have measured it.
-    twist
-        Velocity and angular velocity of the base link in its frame (N, 6), m/s and rad/s.
-    shape, rates, efforts
-        Positions, velocities and commanded efforts of the joints (N, n), SI units.
-    momentum
-        Momenta and kinetic energy (N, 7), without the momenta that thrusters have put in.
-    tool
-        Pose of the end-effector in the world (N, 7).
-    wrench
-        Force and torque that were commanded of the thrusters, in the base link (N, 6), N and N m.
-    duty, thrust, thruster_names
-        For what part of each tick each thruster was on (N, m), its mean force in it (N, m), N, and
-        their names.
-    statuses
-        What the planner reported, or else the controller.
-    sent, tool_goals
-        The goals of base and end-effector.
-    planned
-        Planned positions of the base (K, 3), one array a schedule.
+    bag, flight
+        The bag, and the flight that was read from it.
+    position, quaternion
+        True pose of the base link in the world: (N, 3) m, and (N, 4).
     events
-        Changes of state of the nodes; none in bags of earlier versions.
+        The events that figures show; none in bags of earlier versions.
     meshes
         Triangles of the meshes that the bag carries, by their URIs.
-    sensed_pose, sensed_shape
-        Pose of the base link (M, 7) and joint positions (M, n) as measured while sensors err; empty
-        where they do not.
-    namespace, other_robots
-        Of the robot's topics, such as ``/robot_1``; those of other robots in the bag.
     """
 
-    file_name: str
-    message_count: int
-    metadata: dict[str, dict[str, str]]
-    robot: RobotDescription | None
-    joint_names: list[str]
+    bag: FlightBag
+    flight: Flight
     position: Signal
     quaternion: Array
-    attitude: Signal
-    shape: Signal
-    twist: Signal
-    rates: Signal
-    momentum: Signal
-    tool: Signal
-    wrench: Signal
-    efforts: Signal
-    duty: Signal
-    thrust: Signal
-    thruster_names: list[str]
-    statuses: list[Status]
-    sent: list[SentGoal]
-    tool_goals: list[SentGoal]
-    planned: list[Array]
     events: list[FlightEvent] = field(default_factory=list)
     meshes: dict[str, TriangleMesh] = field(default_factory=dict)
-    sensed_pose: Signal = field(default_factory=lambda: Signal.none(7))
-    sensed_shape: Signal = field(default_factory=lambda: Signal.none(0))
-    namespace: str = ""
-    other_robots: Sequence[str] = ()
 
-    # -- what it is called --------------------------------------------------------------------
+    @classmethod
+    def of(cls, bag: FlightBag) -> FlightReport:
+        """Read a bag.
+
+        Raises
+        ------
+        RecordingError
+            A message is damaged.
+        """
+        flight = read_flight(bag)
+        base = _since(flight.signal("pose"), bag.began)
+        return cls(
+            bag=bag,
+            flight=flight,
+            position=Signal(base.time, base.values[:, :3]),
+            quaternion=base.values[:, 3:],
+            events=drawn_events(bag.events(), bag.began, stamped=bag.stamped),
+            meshes=meshes_in(flight.robot, bag.parts[0].bag.attachments) if flight.robot else {},
+        )
+
+    # -- signals ------------------------------------------------------------------------------
+
+    def signal(self, name: str) -> Signal:
+        """Return a quantity of the flight over the time since its first state."""
+        return _since(self.flight.signal(name), self.bag.began)
+
+    @cached_property
+    def attitude(self) -> Signal:
+        """Attitude of the base as exponential coordinates (N, 3), rad, beyond half turns."""
+        return Signal(self.position.time, rotvecs(self.quaternion))
+
+    @cached_property
+    def shape(self) -> Signal:
+        """True positions of the joints (N, n), m or rad."""
+        return self.signal("q")
+
+    @cached_property
+    def rates(self) -> Signal:
+        """True velocities of the joints (N, n), m/s or rad/s."""
+        return self.signal("qdot")
+
+    @property
+    def twist(self) -> Signal:
+        """True velocities of the base link in its frame (N, 6), m/s and rad/s."""
+        return self.signal("twist")
+
+    @cached_property
+    def momentum(self) -> Signal:
+        """Momenta and energy (N, 7), without the momenta that the thrusters have put in."""
+        balance, expected = self.signal("momentum"), self.signal("expected_momenta")
+        if len(expected) != len(balance) or not len(balance):
+            return balance
+        values = balance.values.copy()
+        values[:, :6] -= expected.values - expected.values[0]
+        return Signal(balance.time, values)
+
+    @cached_property
+    def tool(self) -> Signal:
+        """Pose of the end-effector in the world (N, 7)."""
+        return self.signal("end_effector_pose")
+
+    @property
+    def wrench(self) -> Signal:
+        """Commanded force (N) and torque (N m) of the thrusters, in the base link (N, 6)."""
+        wrench = self.bag.signal("base_wrench", WRENCH, 6)
+        return _since(wrench, self.bag.began)
+
+    @property
+    def efforts(self) -> Signal:
+        """Commanded efforts of the joints (N, n), by the names of the states."""
+        names = self.joint_names
+        # Commands of velocities hold no efforts, and reading them takes a while.
+        velocity = self.parameter("plant", "actuation") == "velocity"
+        given = [] if velocity else self.bag.names("joint_commands")
+        if not given or sorted(given) != sorted(names):
+            return Signal.none(len(names))
+        efforts = _since(self.bag.signal("joint_commands", ["effort"], len(names)), self.bag.began)
+        return Signal(efforts.time, efforts.values[:, [given.index(name) for name in names]])
+
+    @property
+    def duty(self) -> Signal:
+        """Share of each tick for which each thruster was on (N, m)."""
+        return self.signal("thruster_duty")
+
+    @property
+    def thrust(self) -> Signal:
+        """Mean force of each thruster in each tick (N, m), N."""
+        return self.signal("thruster_force")
+
+    @cached_property
+    def thruster_names(self) -> list[str]:
+        """Names of the thrusters."""
+        return self.bag.names("thrusters")
+
+    @property
+    def sensed_pose(self) -> Signal:
+        """Pose of the base link as measured while sensors err (M, 7)."""
+        return self.signal("measured_pose")
+
+    @property
+    def sensed_shape(self) -> Signal:
+        """Joint positions as measured while sensors err (M, n)."""
+        return self.signal("measured_q")
+
+    @cached_property
+    def planned(self) -> list[Array]:
+        """Planned positions of the base (K, 3), m, one array a schedule."""
+        return [
+            np.array([[getattr(p.pose.position, x) for x in "xyz"] for p in message.poses]).reshape(
+                -1, 3
+            )
+            for _, message in self.bag.messages("planned_path")
+        ]
+
+    # -- the bag and the robot ----------------------------------------------------------------
+
+    @property
+    def file_name(self) -> str:
+        """Name of the bag."""
+        return self.bag.path.name
+
+    @property
+    def namespace(self) -> str:
+        """Namespace of the robot's topics, such as ``/robot_1``."""
+        return self.bag.namespace
+
+    @property
+    def other_robots(self) -> list[str]:
+        """Namespaces of the other robots in the bag."""
+        others = namespaces(self.bag.parts[0].bag)
+        return [name or "/" for name in others if name != self.bag.namespace]
+
+    @property
+    def message_count(self) -> int:
+        """Number of messages in the bag."""
+        return self.bag.message_count
+
+    @property
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Metadata records of the bag."""
+        return self.bag.metadata
+
+    @property
+    def robot(self) -> RobotDescription | None:
+        """The robot; None where the bag has no description of it."""
+        return self.flight.robot
+
+    @cached_property
+    def joint_names(self) -> list[str]:
+        """The joints, in the order of columns."""
+        return self.bag.names("joint_states")
+
+    # -- names --------------------------------------------------------------------
 
     @property
     def scenario(self) -> str:
         """Name of the scenario, or of the bag."""
-        return self.metadata.get("scenario", {}).get("name", "") or Path(self.file_name).stem
+        return self.flight.scenario.name
 
     @property
     def label(self) -> str:
@@ -201,8 +295,8 @@ class Flight:
 
     @property
     def description(self) -> str:
-        """What the scenario says of itself."""
-        return self.metadata.get("scenario", {}).get("description", "")
+        """Description of the scenario."""
+        return self.flight.scenario.description
 
     @property
     def method(self) -> str:
@@ -217,34 +311,33 @@ class Flight:
 
     def parameter(self, node: str, name: str) -> Any:
         """Return a parameter of a node; None if the bag does not hold it."""
-        try:
-            return json.loads(self.metadata.get(f"parameters/{node}", {})[name])
-        except (KeyError, ValueError, RecursionError):
-            return None
+        return self.flight.scenario.in_file.get(node, {}).get(name)
 
-    @cached_property
-    def published(self) -> list[Published]:
+    @property
+    def published(self) -> tuple[Published, ...]:
         """Published figures of the scenario."""
-        try:
-            rows = json.loads(self.metadata.get("scenario", {}).get("published", "[]"))
-            return [
-                Published(str(r["quantity"]), [float(x) for x in r["printed"]], str(r["note"]))
-                for r in rows
-            ]
-        except (KeyError, TypeError, ValueError, RecursionError):
-            return []
+        return self.flight.scenario.published
 
-    # -- what happened ------------------------------------------------------------------------
+    # -- reports and goals ------------------------------------------------------------------------
 
     @property
     def end(self) -> float:
         """Time of the last sample or status, s."""
-        times = [float(s.time[-1]) for s in self._signals if len(s)]
+        signals = (self.position, self.shape, self.momentum)
+        times = [float(signal.time[-1]) for signal in signals if len(signal)]
         return max([0.0, *times, *(status.time for status in self.statuses)])
 
-    @property
-    def _signals(self) -> tuple[Signal, ...]:
-        return self.position, self.shape, self.momentum
+    @cached_property
+    def statuses(self) -> list[Status]:
+        """Statuses of the planner, or else of the controller."""
+        for commander in COMMANDERS:
+            found = [
+                Status(time_ns / SECOND - self.bag.began, status)
+                for time_ns, status in self.bag.statuses(commander)
+            ]
+            if found:
+                return found
+        return []
 
     @property
     def executing(self) -> list[Status]:
@@ -259,22 +352,31 @@ class Flight:
     @cached_property
     def targets(self) -> list[Target]:
         """Goals of the schedules; without any schedule, the goals that were sent."""
-        found = [(s.time, goal) for s in self.executing if (goal := self._goal_of(s))]
-        return self._each_until_the_next(found or [(sent.time, sent.goal) for sent in self.sent])
+        sent = self.flight.goals
+        found = [
+            (status.time, goal)
+            for status in self.executing
+            if status.report is not None and (goal := goal_of(status.report, sent))
+        ]
+        return self._each_until_the_next(found or self._sent(sent))
 
     @property
     def goal(self) -> Goal | None:
-        """The goal that counts at the end: the one flown to last, or else the one sent last."""
-        for status in reversed(self.statuses):
-            goal = self._goal_of(status)
-            if status.state in _FOLLOWED and goal is not None:
-                return goal
-        return self.sent[-1].goal if self.sent else None
+        """The goal that counts at the end."""
+        return self.flight.goal
+
+    @property
+    def tool_goals(self) -> tuple[SentGoal, ...]:
+        """Goals of the end-effector."""
+        return self.flight.end_effector_goals
 
     @property
     def tool_targets(self) -> list[Target]:
         """Goals of the end-effector, each until the next."""
-        return self._each_until_the_next([(sent.time, sent.goal) for sent in self.tool_goals])
+        return self._each_until_the_next(self._sent(self.tool_goals))
+
+    def _sent(self, goals: Sequence[SentGoal]) -> list[tuple[float, Goal]]:
+        return [(sent.time - self.bag.began, sent.goal) for sent in goals]
 
     def _each_until_the_next(self, goals: list[tuple[float, Goal]]) -> list[Target]:
         ends = [*(time for time, _ in goals), self.end][1:]
@@ -282,11 +384,8 @@ class Flight:
 
     @property
     def tool_error(self) -> PoseError | None:
-        """Remaining error of the last pose of the end-effector to its last goal."""
-        if not self.tool_goals or not len(self.tool):
-            return None
-        last = self.tool.values[-1]
-        return PoseError.between(last[:3], last[3:], self.tool_goals[-1].goal)
+        """Error of the last pose of the end-effector to its last goal."""
+        return self.flight.end_effector_error
 
     @property
     def position_counts(self) -> bool:
@@ -306,18 +405,13 @@ class Flight:
 
     @property
     def final_error(self) -> PoseError | None:
-        """Remaining error of the last pose to the goal."""
-        if self.goal is None or not len(self.position):
-            return None
-        return PoseError.between(self.position.values[-1], self.quaternion[-1], self.goal)
+        """Error of the last pose to the goal."""
+        return self.flight.error
 
     @property
     def sensed_error(self) -> PoseError | None:
-        """Remaining error of the last measured pose to the goal, where sensors err."""
-        if self.goal is None or not len(self.sensed_pose):
-            return None
-        last = self.sensed_pose.values[-1]
-        return PoseError.between(last[:3], last[3:], self.goal)
+        """Error of the last measured pose to the goal, where sensors err."""
+        return pose_error(self.sensed_pose, self.goal)
 
     def goal_rotvec(self, goal: Goal) -> Array:
         """Attitude of a goal (3,), rad, with the number of turns nearest to the last attitude."""
@@ -326,29 +420,20 @@ class Flight:
 
     @property
     def manoeuvre_time(self) -> float | None:
-        """Duration of the schedules for the last goal that were flown, s, as
-        :func:`~spacerobot_ros.planning.execution.status.manoeuvre_time` has it; of a controller,
-        from the first state that it flew to the end that it named.
-        """
-        if not self.executing:
-            return tracking_time(
-                (status.time, status.report.state)
-                for status in self.statuses
-                if isinstance(status.report, ControllerStatus)
-            )
-        return manoeuvre_time(self._planner_reports, self.end)
+        """Time flown for the last goal, s, see :func:`~spacerobot_ros.measures.flown_time`."""
+        return flown_time(self._reports, self.end)
 
     @property
     def time_to_end(self) -> float | None:
-        """Time from the first schedule for the last goal to its end, s, with what was waited in
-        between; None where no schedule was flown.
+        """Time from the first schedule for the last goal to its end, s, with the waits in between;
+        None where no schedule was flown.
         """
-        return time_to_end(self._planner_reports, self.end)
+        planned = [(time, each) for time, each in self._reports if isinstance(each, PlannerStatus)]
+        return time_to_end(planned, self.end)
 
     @property
-    def _planner_reports(self) -> list[tuple[float, PlannerStatus]]:
-        reports = ((s.time, s.report) for s in self.statuses)
-        return [(time, report) for time, report in reports if isinstance(report, PlannerStatus)]
+    def _reports(self) -> list[tuple[float, PlannerStatus | ControllerStatus]]:
+        return [(s.time, s.report) for s in self.statuses if s.report is not None]
 
     @cached_property
     def drawn(self) -> SolidRobot | None:
@@ -434,61 +519,47 @@ class Flight:
         """Time from one recorded pose to the next, s; 0 with one or none."""
         return float(np.median(np.diff(self.position.time))) if len(self.position) > 1 else 0.0
 
-    def drift(self, first: int) -> float:
-        """Largest change of linear (``first`` 0) or angular (3) momentum, SI."""
-        part = self.momentum.values[:, first : first + 3]
-        return float(np.nanmax(np.linalg.norm(part - part[0], axis=1)))
+    @property
+    def drift(self) -> tuple[float, float]:
+        """Largest changes of linear and angular momentum without thrust, kg m/s and kg m^2/s."""
+        linear, angular = self.flight.momentum_drift.tolist()
+        return linear, angular
 
     @cached_property
     def impulse(self) -> Signal:
         """Impulse that all thrusters together have given (N, 1), N s."""
-        return self._summed(np.ones(len(self.thruster_names)))
+        return impulse(self.thrust, np.ones(self.thrust.width))
 
-    @cached_property
+    @property
     def propellant(self) -> Signal | None:
-        """Propellant that the thrusters have taken (N, 1), kg; None where their specific impulses
+        """Propellant that the thrusters have used (N, 1), kg; None where their specific impulses
         are not in the bag.
         """
-        if self.robot is None or self.parameter("plant", "thrusters") != IN_URDF:
-            return None
-        try:
-            table = find_thrusters(IN_URDF, self.robot)
-        except SpaceRobotError:
-            return None
-        if list(table.names) != self.thruster_names:
-            return None
-        return self._summed(table.mass_flow / table.force)
-
-    def _summed(self, weights: Array) -> Signal:
-        """Return the sum over time and thrusters of their forces, each times its weight."""
-        ticks = np.diff(self.thrust.time, prepend=self.thrust.time[:1])
-        total = np.cumsum(ticks * (self.thrust.values @ weights))
-        return Signal(self.thrust.time, total[:, np.newaxis])
+        return self.signal("propellant") if "propellant" in self.flight.series else None
 
     def joint(self, name: str) -> Joint | None:
         """The joint of that name in the robot description."""
         joints = self.robot.movable_joints if self.robot is not None else ()
         return next((joint for joint in joints if joint.name == name), None)
 
-    def _goal_of(self, status: Status) -> Goal | None:
-        """Return the goal of a status, as it was sent."""
-        for sent in reversed(self.sent):
-            if status.goal_id and status.goal_id == sent.goal_id:
-                return sent.goal
-        try:
-            named = Goal.checked(status.goal[:3], status.goal[3:])
-        except PlanningError:
-            return None
-        # Bags of earlier versions have no ids: the goal that was sent has more digits.
-        for sent in reversed(self.sent):
-            goal = sent.goal
-            same = np.allclose(goal.position, named.position, rtol=1e-7, atol=1e-8)
-            if same and np.allclose(goal.quaternion, named.quaternion, rtol=0.0, atol=1e-7):
-                return goal
-        return named
+
+def _since(signal: Signal, start: float) -> Signal:
+    """Return a signal over the time since ``start``, s."""
+    return Signal(signal.time - start, signal.values)
 
 
-def joint_unit(flight: Flight, name: str) -> str:
+def read_report(path: Path, namespace: str | None = None) -> FlightReport:
+    """Read a bag for a report; see :func:`~spacerobot_ros.flight.reading.open_flight_bag`.
+
+    Raises
+    ------
+    RecordingError
+        There is no such bag or robot, or it is damaged.
+    """
+    return FlightReport.of(open_flight_bag(path, namespace))
+
+
+def joint_unit(flight: FlightReport, name: str) -> str:
     """Return m or rad; without a robot description, that it is one of them."""
     joint = flight.joint(name)
     if joint is None:

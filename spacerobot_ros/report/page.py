@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.events import EventKind
+from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.report.events import FlightEvent, mark_of
 from spacerobot_ros.report.figures import ReportFigure, TraceGroup
-from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.flight import FlightReport
 from spacerobot_ros.report.page_parts import (
     PagePart,
     facts,
@@ -22,7 +23,7 @@ from spacerobot_ros.report.page_parts import (
     table,
     tiles,
 )
-from spacerobot_ros.report.signals import Signal, simplified
+from spacerobot_ros.report.signals import simplified
 from spacerobot_ros.report.tables import (
     Table,
     headline,
@@ -54,10 +55,10 @@ Figures = Sequence[ReportFigure | str | None]
 
 
 def page(
-    flight: Flight,
+    flight: FlightReport,
     player: PagePart,
     figures: Figures,
-    beside: Sequence[Flight] = (),
+    beside: Sequence[FlightReport] = (),
 ) -> str:
     """Return the whole page; flights ``beside`` this one get a row in a table."""
     charts, controls = charts_of(flight, figures), PagePart(programs=(package_file("page.js"),))
@@ -85,7 +86,7 @@ def page(
     return html_page(title, body, _footer(flight), (player, charts, controls))
 
 
-def _facts(flight: Flight) -> str:
+def _facts(flight: FlightReport) -> str:
     found = []
     if flight.method:
         found.append(f"method {flight.method}")
@@ -100,7 +101,7 @@ def _facts(flight: Flight) -> str:
     return facts(found)
 
 
-def _outcome(flight: Flight) -> str:
+def _outcome(flight: FlightReport) -> str:
     if not flight.statuses:
         return (
             '<p class="outcome">The bag holds no status of a planner or a controller '
@@ -114,13 +115,13 @@ def _outcome(flight: Flight) -> str:
     return f'<p class="outcome {escape(last.state)}">{state}{escape(sentence)}</p>'
 
 
-def _runs(flight: Flight, beside: Sequence[Flight]) -> list[str]:
+def _runs(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str]:
     if not beside:
         return []
     return ["<h2>Runs side by side</h2>", _table("runs", runs_table([flight, *beside]))]
 
 
-def _numbers(flight: Flight) -> list[str]:
+def _numbers(flight: FlightReport) -> list[str]:
     result, joints = result_table(flight), joint_table(flight)
     parts = ["<h2>Numbers of the run</h2>"]
     if flight.goal is None:
@@ -132,7 +133,7 @@ def _numbers(flight: Flight) -> list[str]:
     return parts
 
 
-def _published(flight: Flight) -> list[str]:
+def _published(flight: FlightReport) -> list[str]:
     found = published_table(flight)
     if found is None:
         return []
@@ -185,7 +186,7 @@ def _events(events: Sequence[FlightEvent]) -> list[str]:
     return ["<h2>What happened</h2>", shown]
 
 
-def _parameters(flight: Flight) -> list[str]:
+def _parameters(flight: FlightReport) -> list[str]:
     nodes = {
         name.partition("/")[2]: values
         for name, values in flight.metadata.items()
@@ -205,7 +206,7 @@ def _parameters(flight: Flight) -> list[str]:
     return parts
 
 
-def _footer(flight: Flight) -> str:
+def _footer(flight: FlightReport) -> str:
     version = flight.metadata.get("spacerobot", {}).get("version", "")
     by = f", recorded by spacerobot_ros {version}" if version else ""
     return f"Made from the bag {flight.file_name} alone: {flight.message_count} messages{by}."
@@ -214,7 +215,7 @@ def _footer(flight: Flight) -> str:
 # -- charts -------------------------------------------------------------------------------------
 
 
-def charts_of(flight: Flight, figures: Figures) -> PagePart:
+def charts_of(flight: FlightReport, figures: Figures) -> PagePart:
     """Return the charts of all figures over time.
 
     The element of a figure names its charts by their numbers, in ``data-charts``
@@ -236,7 +237,7 @@ def charts_of(flight: Flight, figures: Figures) -> PagePart:
     )
 
 
-def _chart_events(flight: Flight) -> list[dict[str, Any]]:
+def _chart_events(flight: FlightReport) -> list[dict[str, Any]]:
     """Return the events of a flight; the last of several of one kind and time counts them."""
     found = []
     together: dict[tuple[float, EventKind], list[str]] = {}

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model.description import Array, JointKind, Pose, RobotDescription, Shape
 from spacerobot_ros.model.kinematics import joints_outward
 from spacerobot_ros.model.meshes import TriangleMesh
@@ -22,9 +23,9 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.model.visuals import Visual, solid_mesh, visuals_of
 from spacerobot_ros.report.figures import FAINT, GHOST, PALETTE
-from spacerobot_ros.report.flight import Flight, Target
+from spacerobot_ros.report.flight import FlightReport, Target
 from spacerobot_ros.report.page_parts import PagePart, package_file
-from spacerobot_ros.report.signals import Cycles, Indices, Signal, simplified
+from spacerobot_ros.report.signals import Cycles, Indices, simplified
 from spacerobot_ros.report.solids import EDGE, SolidRobot, body_color
 
 Command = dict[str, Any]
@@ -303,7 +304,7 @@ _AXES = ("#d55e00", "#009e73", "#0072b2")
 WORLD, ROBOT = "/flight", "/flight/robot"
 
 
-def scene_of(flight: Flight) -> Scene | str:
+def scene_of(flight: FlightReport) -> Scene | str:
     """Return the scene of a flight, or one sentence on why there is none."""
     drawn = flight.drawn
     if drawn is None:
@@ -319,7 +320,7 @@ def scene_of(flight: Flight) -> Scene | str:
     return Scene(commands, _parts(flight), _caption(flight, frames, radius, bool(ghosts)))
 
 
-def _extent(flight: Flight, drawn: SolidRobot) -> tuple[Array, float]:
+def _extent(flight: FlightReport, drawn: SolidRobot) -> tuple[Array, float]:
     """Center and radius of what is to be seen."""
     clouds = [flight.position.values, flight.tool.values[:, :3]]
     for index in flight.samples(12):
@@ -331,7 +332,7 @@ def _extent(flight: Flight, drawn: SolidRobot) -> tuple[Array, float]:
     return (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-3)
 
 
-def _visible(flight: Flight, radius: float) -> Signal:
+def _visible(flight: FlightReport, radius: float) -> Signal:
     """All that moves in the picture (N, k), in tolerances."""
     assert flight.robot is not None
     columns = [flight.position.values / (_POSITION_TOLERANCE * radius)]
@@ -427,7 +428,7 @@ def _ball(link: str, body: int, radius: float) -> Visual:
     return Visual(link, body, shape, solid_mesh(shape))
 
 
-def _motion(flight: Flight, drawn: SolidRobot, indices: Indices) -> Command:
+def _motion(flight: FlightReport, drawn: SolidRobot, indices: Indices) -> Command:
     """The animation: position and quaternion of the base, and of every link that a joint moves."""
     time, paths = flight.position.time[indices], _link_paths(drawn.robot)
     base = {"position": flight.position.values[indices], "quaternion": flight.quaternion[indices]}
@@ -442,7 +443,7 @@ def _motion(flight: Flight, drawn: SolidRobot, indices: Indices) -> Command:
     return set_animation(clips)
 
 
-def _lines(flight: Flight) -> list[Command]:
+def _lines(flight: FlightReport) -> list[Command]:
     """Paths of base and end-effector, and the path of the base that was planned."""
     lines = [("path of the base", flight.position.values, PALETTE[0])]
     if len(flight.tool):
@@ -456,7 +457,7 @@ def _lines(flight: Flight) -> list[Command]:
     return commands
 
 
-def _ghosts(flight: Flight, robot: RobotDescription, radius: float) -> list[Command]:
+def _ghosts(flight: FlightReport, robot: RobotDescription, radius: float) -> list[Command]:
     """The base at its last goal and a mark at the end-effector's."""
     commands: list[Command] = []
     if flight.goal is not None and flight.controls("base"):
@@ -481,7 +482,7 @@ def _ghosts(flight: Flight, robot: RobotDescription, radius: float) -> list[Comm
     return commands
 
 
-def _aim(flight: Flight) -> Array:
+def _aim(flight: FlightReport) -> Array:
     """Where the ghost of the base stands: at its goal; where the base ends if only its attitude
     was asked for.
     """
@@ -489,7 +490,7 @@ def _aim(flight: Flight) -> Array:
     return flight.goal.position if flight.position_counts else flight.position.values[-1]
 
 
-def _parts(flight: Flight) -> list[tuple[str, float, float]]:
+def _parts(flight: FlightReport) -> list[tuple[str, float, float]]:
     end = float(flight.position.time[-1])
     parts = [("whole flight", 0.0, end)]
     cycles = flight.cycles
@@ -502,7 +503,7 @@ def _parts(flight: Flight) -> list[tuple[str, float, float]]:
     return parts
 
 
-def _caption(flight: Flight, frames: KeyFrames, radius: float, ghosts: bool) -> str:
+def _caption(flight: FlightReport, frames: KeyFrames, radius: float, ghosts: bool) -> str:
     text = (
         "The robot from the shapes of its URDF, each moving link in the color of its joint in the "
         "figures below; lines are the paths of the base (blue)"

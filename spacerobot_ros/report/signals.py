@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvecs_from_quaternions
 
@@ -20,36 +21,6 @@ _STRETCHES = 64
 
 _LONGEST_LOOK = 1 << 14
 """Samples at the end of a gait in which a period is looked for."""
-
-
-@dataclass(frozen=True)
-class Signal:
-    """Samples ``values`` (N, k) at ``time`` (N,) in s since the start of the flight."""
-
-    time: Array
-    values: Array
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    @classmethod
-    def none(cls, width: int) -> Signal:
-        """Return a signal without samples."""
-        return cls(np.empty(0), np.empty((0, width)))
-
-    @property
-    def width(self) -> int:
-        """Number of values in a sample."""
-        return int(self.values.shape[1])
-
-    def between(self, start: float, end: float) -> Signal:
-        """Return the samples from ``start`` to ``end``, both included."""
-        first, last = np.searchsorted(self.time, [start - 1e-9, end + 1e-9])
-        return Signal(self.time[first:last], self.values[first:last])
-
-    def since_first(self) -> Signal:
-        """Return what has changed since the first sample."""
-        return Signal(self.time, self.values - self.values[:1])
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from spacerobot_ros.flight.scenario import Published
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning import PoseError
-from spacerobot_ros.report.flight import Flight, joint_unit
+from spacerobot_ros.report.flight import FlightReport, joint_unit
 
 _ABSENT = "–"
 _TICKS = 1.5
@@ -27,7 +27,7 @@ class Table:
     numeric: tuple[int, ...] = ()
 
 
-def headline(flight: Flight) -> list[tuple[str, str, str]]:
+def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
     """Label, value and a note for each of the numbers that stand on top."""
     rows: list[tuple[str, str, str]] = []
     error, tool, sensed = flight.final_error, flight.tool_error, flight.sensed_error
@@ -47,15 +47,15 @@ def headline(flight: Flight) -> list[tuple[str, str, str]]:
     if flight.method:
         rows.append(("Method", flight.method, ""))
     if len(flight.momentum):
-        drift = f"{flight.drift(0):.1e} kg m/s"
-        rows.append(("Momentum drift", drift, f"angular {flight.drift(3):.1e} kg m²/s"))
+        linear, angular = flight.drift
+        rows.append(("Momentum drift", f"{linear:.1e} kg m/s", f"angular {angular:.1e} kg m²/s"))
     if len(flight.position) > 1:
         time = flight.position.time
         rows.append(("Recorded", f"{len(time) - 1} ticks", f"{time[-1] - time[0]:.6g} s"))
     return rows
 
 
-def runs_table(flights: Sequence[Flight]) -> Table:
+def runs_table(flights: Sequence[FlightReport]) -> Table:
     """What several flights came to, a row each: the numbers on top that any of them has."""
     found = [{label: value for label, value, _ in headline(flight)} for flight in flights]
     labels = list(dict.fromkeys(label for values in found for label in values))
@@ -66,7 +66,7 @@ def runs_table(flights: Sequence[Flight]) -> Table:
     return Table(("Bag", *labels), rows)
 
 
-def result_table(flight: Flight) -> Table:
+def result_table(flight: FlightReport) -> Table:
     """Goal, end, errors, times and momentum drift: the rows that the bag has numbers for."""
     rows: list[tuple[str, ...]] = []
     goal, error = flight.goal, flight.final_error
@@ -97,12 +97,13 @@ def result_table(flight: Flight) -> Table:
     if len(flight.position):
         rows.append(("Recorded", _recorded(flight)))
     if len(flight.momentum):
-        drifts = f"{flight.drift(0):.3g} kg m/s, angular {flight.drift(3):.3g} kg m²/s"
-        rows.append(("Momentum drift", f"linear {drifts}"))
+        linear, angular = flight.drift
+        drifts = f"linear {linear:.3g} kg m/s, angular {angular:.3g} kg m²/s"
+        rows.append(("Momentum drift", drifts))
     return Table(("Quantity", "Value"), rows)
 
 
-def _tool_rows(flight: Flight, error: PoseError) -> list[tuple[str, ...]]:
+def _tool_rows(flight: FlightReport, error: PoseError) -> list[tuple[str, ...]]:
     goal, last = flight.tool_goals[-1].goal, flight.tool.values[-1]
     rows: list[tuple[str, ...]] = [
         ("End-effector goal", f"({_vector(goal.position)}) m"),
@@ -115,7 +116,7 @@ def _tool_rows(flight: Flight, error: PoseError) -> list[tuple[str, ...]]:
     return rows
 
 
-def joint_table(flight: Flight) -> Table | None:
+def joint_table(flight: FlightReport) -> Table | None:
     """First and last shape and the peak velocities, beside the limits of the URDF."""
     if not flight.joint_names or not len(flight.shape):
         return None
@@ -143,7 +144,7 @@ def joint_table(flight: Flight) -> Table | None:
     return Table(tuple(head), rows, (3, 4, 5, 6, 7, 8))
 
 
-def published_table(flight: Flight) -> Table | None:
+def published_table(flight: FlightReport) -> Table | None:
     """Published figures beside those of this flight; None if the scenario has none."""
     if not flight.published:
         return None
@@ -160,7 +161,7 @@ def published_table(flight: Flight) -> Table | None:
     return Table(("Quantity", "Printed", "Measured", "Source", "Note"), rows)
 
 
-def _measured(flight: Flight, row: Published) -> tuple[list[float], str]:
+def _measured(flight: FlightReport, row: Published) -> tuple[list[float], str]:
     """The figure of this flight that a published one stands for, and where it comes from."""
     figures: dict[str, Iterable[float]] = {}
     if len(flight.position):
@@ -201,17 +202,17 @@ def _attitude(rotvec: Iterable[float]) -> str:
     return f"rotation vector ({_vector(rotvec)}) rad, {angle:.3f}° in all"
 
 
-def _tolerance(flight: Flight, what: str, unit: str) -> str:
+def _tolerance(flight: FlightReport, what: str, unit: str) -> str:
     value = flight.parameter("planner", f"{what}_tolerance")
     return f" (tolerance {value:.4g} {unit})" if isinstance(value, float | int) else ""
 
 
-def _schedules(flight: Flight) -> str:
+def _schedules(flight: FlightReport) -> str:
     count = len(flight.executing)
     return f", {count} schedules in the whole flight" if count > 1 else ""
 
 
-def _to_end(flight: Flight) -> str:
+def _to_end(flight: FlightReport) -> str:
     """Return the time to the end where it is not that of the schedules."""
     whole, flown = flight.time_to_end, flight.manoeuvre_time
     if whole is None or flown is None or abs(whole - flown) < _TICKS * flight.tick:
@@ -219,7 +220,7 @@ def _to_end(flight: Flight) -> str:
     return f"{whole:.6g} s from the first schedule to the end"
 
 
-def _recorded(flight: Flight) -> str:
+def _recorded(flight: FlightReport) -> str:
     time = flight.position.time
     if len(time) < 2:
         return "1 state"

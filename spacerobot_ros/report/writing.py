@@ -48,9 +48,8 @@ from spacerobot_ros.report.figures_space import (
     path_figure,
     view_of,
 )
-from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.page import page
-from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.report.scene import player_of, scene_of
 from spacerobot_ros.resources import suggestion
 
@@ -63,7 +62,7 @@ _PICTURE_WIDTH = 1000
 _ROBOT_WIDTH = 3.9
 """Of the robot in the picture, inches."""
 
-FIGURES: dict[str, Callable[[Flight], ReportFigure | str | None]] = {
+FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
     "robot": configurations_figure,
     "pose": pose_figure,
     "position": position_figure,
@@ -113,8 +112,8 @@ def write_report(
     SpaceRobotError
         There is no such bag or robot, one is damaged, or the file cannot be written.
     """
-    flight = read_flight(bag, namespace)
-    others = [read_flight(other) for other in beside]
+    flight = read_report(bag, namespace)
+    others = [read_report(other) for other in beside]
     with drawing():
         figures = [*(draw(flight) for draw in _REPORTED), path_figure(flight, others)]
         text = page(flight, player_of(scene_of(flight)), figures, others)
@@ -175,7 +174,7 @@ def write_figures(
         raise SpaceRobotError(
             f"Figures are a folder with a file for each, which is not called '{folder.name}'."
         )
-    flight = read_flight(bag, namespace)
+    flight = read_report(bag, namespace)
     if not events:
         flight = replace(flight, events=[])
     made: dict[str, Path | str] = {}
@@ -212,14 +211,14 @@ def write_picture(bag: Path, picture: Path, *, namespace: str | None = None) -> 
         There is no such bag, it is damaged or holds no base poses, or the file cannot be written.
     """
     format = PictureFormat.of(picture)
-    flight = read_flight(bag, namespace)
+    flight = read_report(bag, namespace)
     if not len(flight.position):
         raise SpaceRobotError(NO_STATES)
     with drawing():
         write_output(picture, picture_of(_overview(flight), format, _PICTURE_WIDTH))
 
 
-def _overview(flight: Flight) -> Figure:
+def _overview(flight: FlightReport) -> Figure:
     """Base pose and shape over time, beside the robot where it can be drawn."""
     groups = [position_group(flight), attitude_group(flight)]
     if len(flight.shape):

@@ -12,8 +12,8 @@ from rclpy.experimental import EventsExecutor
 from rosgraph_msgs.msg import Clock
 
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.scenario import Scenario
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.run import make_stack, ros

@@ -19,7 +19,7 @@ from std_msgs.msg import Header
 
 from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower, Status
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.arrays import Outcome
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal

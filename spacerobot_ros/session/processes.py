@@ -24,8 +24,8 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.scenario import COMMANDERS, Kill, Scenario
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.common.connections import Connections, unconnected

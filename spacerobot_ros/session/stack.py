@@ -19,8 +19,8 @@ from rclpy.validate_namespace import validate_namespace
 
 from spacerobot_ros.bag import free_name
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.scenario import Scenario
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.nodes import (
     NODE_TYPES,
     FlightNode,

@@ -12,14 +12,14 @@ from support.campaigns import campaign, flown
 
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.events import EventKind
-from spacerobot_ros.flight.arrays import FlightArrays
+from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model import SpaceRobot
 
 ROBOT = description_of(load_scenario("faults/stuck_slider"))
 BODIES = [body.name for body in ROBOT.bodies]
 
-Check = Callable[[FlightArrays, dict[str, Any]], None]
+Check = Callable[[Flight, dict[str, Any]], None]
 
 COAST = {"plant.linear_momentum": [3.0, 0.0, 0.0], "planner.max_corrections": 0}
 SPIN = {"plant.angular_momentum": [0.0, 0.0, 0.2], "planner.max_corrections": 0}
@@ -41,13 +41,13 @@ def centres() -> np.ndarray:
 MASSES = np.array([body.inertia.mass for body in ROBOT.bodies])
 
 
-def mass_from_momentum(flight: FlightArrays, drawn: dict[str, Any]) -> None:
+def mass_from_momentum(flight: Flight, drawn: dict[str, Any]) -> None:
     """At rest all bodies move alike: p = m v."""
     mass = 3.0 / flight.twist[0, 0]
     assert mass == pytest.approx(factors("mass", drawn) @ MASSES, rel=1e-12)
 
 
-def inertia_from_angular_momentum(flight: FlightArrays, drawn: dict[str, Any]) -> None:
+def inertia_from_angular_momentum(flight: Flight, drawn: dict[str, Any]) -> None:
     """At rest the robot spins as one body: L = I omega, of which the third row is known."""
     r = centres() - MASSES @ centres() / MASSES.sum()
     tensor = np.zeros((3, 3))
@@ -57,7 +57,7 @@ def inertia_from_angular_momentum(flight: FlightArrays, drawn: dict[str, Any]) -
     np.testing.assert_allclose(tensor @ flight.twist[0, 3:], [0, 0, 0.2], atol=1e-13)
 
 
-def centre_of_mass_from_spin(flight: FlightArrays, drawn: dict[str, Any]) -> None:
+def centre_of_mass_from_spin(flight: Flight, drawn: dict[str, Any]) -> None:
     """The base's origin goes round the centre of mass: v = -omega x r_BC."""
     offsets = [[drawn.get(f"com.{name}.{axis}", 0.0) for axis in "xyz"] for name in BODIES]
     r_BC = MASSES @ (centres() + np.array(offsets)) / MASSES.sum()
@@ -65,7 +65,7 @@ def centre_of_mass_from_spin(flight: FlightArrays, drawn: dict[str, Any]) -> Non
     np.testing.assert_allclose(v, -np.cross(omega, r_BC), atol=1e-14)
 
 
-def noise_from_statistics(flight: FlightArrays, drawn: dict[str, Any]) -> None:
+def noise_from_statistics(flight: Flight, drawn: dict[str, Any]) -> None:
     errors = flight.quantities["measured_pose"][:, :3] - flight.pose[:, :3]
     sigma = drawn["plant.sensors.position_noise"]
     # Of 200 numbers and more the standard deviation is known to 5 %.
@@ -74,14 +74,15 @@ def noise_from_statistics(flight: FlightArrays, drawn: dict[str, Any]) -> None:
     assert abs(errors.mean()) < 0.3 * sigma
 
 
-def bias_from_the_mean(flight: FlightArrays, drawn: dict[str, Any]) -> None:
+def bias_from_the_mean(flight: Flight, drawn: dict[str, Any]) -> None:
     errors = flight.quantities.get("measured_pose", flight.pose) - flight.pose
     assert errors[:, 1].mean() == pytest.approx(drawn["plant.sensors.position_bias[1]"], rel=1e-9)
     assert not errors[:, 0].any()
 
 
-def goal_from_the_end(flight: FlightArrays, drawn: dict[str, Any]) -> None:
+def goal_from_the_end(flight: Flight, drawn: dict[str, Any]) -> None:
     nominal = load_scenario("faults/stuck_slider").goal
+    assert flight.goal is not None
     moved = flight.goal.position - nominal.position
     np.testing.assert_allclose(moved, [0, 0, drawn["goal.position.z"]], atol=1e-15)
     assert flight.succeeded
@@ -90,26 +91,26 @@ def goal_from_the_end(flight: FlightArrays, drawn: dict[str, Any]) -> None:
     assert abs(error) < abs(drawn["goal.position.z"]) / 3
 
 
-def goal_attitude_from_the_end(flight: FlightArrays, drawn: dict[str, Any]) -> None:
+def goal_attitude_from_the_end(flight: Flight, drawn: dict[str, Any]) -> None:
     nominal = Rotation.from_quat(load_scenario("faults/stuck_slider").goal.quaternion)
     turned = Rotation.from_rotvec([drawn["goal.rotvec.x"], 0.0, 0.0])
     left = (nominal * turned).inv() * Rotation.from_quat(flight.pose[-1, 3:])
     assert left.magnitude() < drawn["goal.rotvec.x"] / 3
 
 
-def start_from_the_first_state(flight: FlightArrays, drawn: dict[str, Any]) -> None:
+def start_from_the_first_state(flight: Flight, drawn: dict[str, Any]) -> None:
     assert flight.pose[0, 0] == drawn["initial.position.x"]
     rotvec = Rotation.from_quat(flight.pose[0, 3:]).as_rotvec()
     np.testing.assert_allclose(rotvec, [0, drawn["initial.rotvec.y"], 0], atol=1e-15)
     assert flight.q[0, 1] == pytest.approx(drawn["initial.joints.slider_2"], abs=1e-15)
 
 
-def momentum_from_the_first_state(flight: FlightArrays, drawn: dict[str, Any]) -> None:
+def momentum_from_the_first_state(flight: Flight, drawn: dict[str, Any]) -> None:
     given = drawn["plant.linear_momentum[1]"]
     assert flight.momentum[0, 1] == pytest.approx(given, rel=1e-9)
 
 
-def fault_from_when_a_joint_sticks(flight: FlightArrays, drawn: dict[str, Any]) -> None:
+def fault_from_when_a_joint_sticks(flight: Flight, drawn: dict[str, Any]) -> None:
     (begins,) = [e.time_s for e in flight.events if e.kind is EventKind.FAULT_INJECTED]
     at = drawn["faults[0].at"]
     assert begins is not None

@@ -445,7 +445,7 @@ def test_the_lines_of_a_salvage(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_only_a_goal_that_is_reached_is_exit_0(
     monkeypatch: pytest.MonkeyPatch, outcome: str, code: int
 ) -> None:
-    from spacerobot_ros.flight.arrays import Outcome
+    from spacerobot_ros.measures import Outcome
     from spacerobot_ros.session import live
 
     sent: list[Any] = []

@@ -16,6 +16,7 @@ from support.sentences import assert_one_sentence
 import spacerobot_ros
 from spacerobot_ros import fly, load_scenario, plan, read_bag
 from spacerobot_ros.errors import GoalError, ParameterError, RecordingError
+from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import robot_file
@@ -100,6 +101,7 @@ def test_goals_of_a_plan_are_given_as_those_of_a_flight_are() -> None:
     np.testing.assert_array_equal(shaped.goal.joint_positions, shape)
     flight = fly(model, at, rotvec=turn, method="lie_bracket", parameters=QUICK)
     assert flight.succeeded
+    assert flight.goal is not None
     assert flight.goal.position.tolist() == list(at)
     np.testing.assert_allclose(flight.goal.quaternion, quaternion, atol=1e-15)
 
@@ -178,8 +180,10 @@ def test_an_animation_shows_every_frame(tmp_path: Path) -> None:
 def test_every_joint_of_a_plot_is_told_from_the_others() -> None:
     flight = fly("faults/stuck_slider", parameters=QUICK)
     robot = load_robot(robot_file("quadruped"))
-    joints = np.zeros((len(flight.time), 12))
-    panels = replace(flight, robot=robot, q=joints, qdot=joints, effort=joints).plot().axes
+    joints = Signal(flight.time, np.zeros((len(flight.time), 12)))
+    series = {**flight.series, **dict.fromkeys(("q", "qdot", "effort"), joints)}
+    names = tuple(robot.joint_names)
+    panels = replace(flight, robot=robot, joint_names=names, series=series).plot().axes
     assert len(panels) > 2
     for panel in panels[2:]:
         looks = [(line.get_color(), line.get_linestyle()) for line in panel.get_lines()]

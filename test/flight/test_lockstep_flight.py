@@ -10,11 +10,11 @@ import pytest
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError, RecordingError
-from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
-from spacerobot_ros.flight.recorded import recorded_flight, recorded_scenario
+from spacerobot_ros.flight.reading import read_run, recorded_scenario
 from spacerobot_ros.flight.scenario import Scenario, load_scenario
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.session.run import run_scenario
 from spacerobot_ros.verification.comparison import verify_bag
 
@@ -58,7 +58,7 @@ def assert_same(flight: Flight, other: Flight, tolerance: float = 0.0) -> None:
 @pytest.mark.parametrize("bag", BAGS)
 def test_reference_bags_are_flown_again_without_ros(bag: Path) -> None:
     """They were flown through the nodes. Plans may differ in the last digits between machines."""
-    flight, recorded = fly_scenario(recorded_scenario(read_bag(bag))), recorded_flight(bag)
+    flight, recorded = fly_scenario(recorded_scenario(read_bag(bag))), read_run(bag)
     assert len(recorded.time) > 50
     assert_same(flight, recorded, 1e-9)
 
@@ -96,7 +96,7 @@ def test_a_flight_is_the_one_through_the_nodes(
     """To the last bit: plans, corrections, lost poses, noise, faults, stuck joints."""
     scenario = load_scenario(name).with_settings(settings)
     run_scenario(scenario, tmp_path / "ros.mcap")
-    through_ros, flight = recorded_flight(tmp_path / "ros.mcap"), fly_scenario(scenario)
+    through_ros, flight = read_run(tmp_path / "ros.mcap"), fly_scenario(scenario)
     assert flight.outcome is outcome
     assert_same(flight, through_ros)
     assert flight.sentence == through_ros.sentence
@@ -118,7 +118,7 @@ def test_what_is_saved_is_verified_and_read_back(tmp_path: Path) -> None:
     verified = verify_bag(tmp_path / "saved.mcap")
     assert verified.difference is None
     assert verified.ticks == len(flight.time) - 1
-    read = recorded_flight(tmp_path / "saved.mcap")
+    read = read_run(tmp_path / "saved.mcap")
     assert_same(flight, read)
     assert [e.sentence for e in read.events] == [e.sentence for e in flight.events]
     with pytest.raises(RecordingError, match="exists"):

@@ -29,6 +29,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("commanding",),  # commanders without ROS: of flights, and of nodes
         ("batch",),
         ("viewer",),
+        ("measures",),  # of flights, lanes and the page
         ("bag", "simulation"),
         ("control",),  # above planning, whose goals it takes
         ("planning",),
@@ -84,10 +85,19 @@ def sources() -> dict[str, Path]:
 
 
 @cache
-def imports(module: str) -> tuple[str, ...]:
-    """Return the modules that a module imports anywhere in its text."""
+def imports(module: str, *, types: bool = True) -> tuple[str, ...]:
+    """Return the modules that a module imports anywhere in its text.
+
+    ``types``: also those that are imported for type checkers alone.
+    """
     tree = ast.parse(sources()[module].read_text(encoding="utf-8"))
+    if not types:
+        tree.body = [node for node in tree.body if not _for_types(node)]
     return tuple(each for node in ast.walk(tree) for each in _named(node))
+
+
+def _for_types(node: ast.stmt) -> bool:
+    return isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
 
 
 def _named(node: ast.AST) -> Iterator[str]:
@@ -160,7 +170,7 @@ def test_modules_do_not_import_each_other_in_a_circle() -> None:
         assert module not in path, " -> ".join((*path, module))
         if module in finished or module not in sources():
             return
-        for other in imports(module):
+        for other in imports(module, types=False):
             if not other.endswith("__init__"):
                 visit(other, (*path, module))
         finished.add(module)

@@ -13,7 +13,7 @@ from support.chromium import Browser, browser, chromium
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.scenario import load_scenario, scenario_names
 from spacerobot_ros.report import write_report
-from spacerobot_ros.report.reading import read_flight
+from spacerobot_ros.report.flight import read_report
 from spacerobot_ros.session.run import run_scenario
 
 pytestmark = [
@@ -63,7 +63,7 @@ def test_the_report_shows_what_happened(name: str, tmp_path: Path, window: Brows
     print(f"{name}: {spent:.1f} s of CPU, {size / 1e6:.2f} MB")
     assert spent < LONGEST
     assert size < LARGEST
-    flight = read_flight(bag)
+    flight = read_report(bag)
     # Terminal, JSON and report say the same.
     assert flight.manoeuvre_time == pytest.approx(summary["manoeuvre_time_s"], abs=1e-6)
     error = flight.final_error

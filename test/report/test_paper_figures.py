@@ -15,10 +15,10 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.report import write_figures, write_picture
 from spacerobot_ros.report.figures import PictureFormat
 from spacerobot_ros.report.figures_over_time import window_of
-from spacerobot_ros.report.signals import Signal
 
 MAGIC = {"png": b"\x89PNG", "pdf": b"%PDF-", "svg": b"<?xml"}
 

@@ -36,7 +36,7 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.report import figures_space, write_picture, write_report
 from spacerobot_ros.report.figures import ReportFigure, drawing
 from spacerobot_ros.report.figures_over_time import shape_figure
-from spacerobot_ros.report.reading import read_flight
+from spacerobot_ros.report.flight import read_report
 
 FIGURES = [
     "configurations",
@@ -199,7 +199,7 @@ def test_the_same_bag_makes_the_same_report(folder: Path, flown: Page) -> None:
 def test_dense_traces_become_bands_and_say_so(tmp_path: Path) -> None:
     bag = tell(tmp_path / "flight.mcap", Story(cyclic_shapes(cycles=70)))
     with drawing():
-        figure = shape_figure(read_flight(bag))
+        figure = shape_figure(read_report(bag))
     assert isinstance(figure, ReportFigure)
     assert "the smallest and the largest value in each slice of time" in figure.caption
     assert len(figure.svg) < 250_000
@@ -386,5 +386,5 @@ def test_leaves_the_style_of_others_alone(folder: Path, flown: Page) -> None:
     before = dict(mpl.rcParams)
     assert flown.figures
     with drawing():
-        assert isinstance(shape_figure(read_flight(folder / "flight.mcap")), ReportFigure)
+        assert isinstance(shape_figure(read_report(folder / "flight.mcap")), ReportFigure)
     assert dict(mpl.rcParams) == before

@@ -14,14 +14,14 @@ from support.chromium import Browser, browser, chromium
 from support.flight_bags import FINAL, GOAL, Story, cyclic_shapes, tell, urdf_of
 from support.html_page import leave_blank
 
+from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
 from spacerobot_ros.model.visuals import solid_mesh
 from spacerobot_ros.report import scene, write_report
-from spacerobot_ros.report.flight import Flight
-from spacerobot_ros.report.reading import read_flight
+from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.scene import Command, Scene, key_frames, scene_of
-from spacerobot_ros.report.signals import Cycles, Signal
+from spacerobot_ros.report.signals import Cycles
 
 N = 6
 
@@ -39,8 +39,8 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def flight(bag: Path) -> Flight:
-    return read_flight(bag)
+def flight(bag: Path) -> FlightReport:
+    return read_report(bag)
 
 
 def test_key_frames_follow_a_slow_motion() -> None:
@@ -87,7 +87,7 @@ def test_fast_cycles_are_shown_at_one_phase() -> None:
     np.testing.assert_allclose(line[inside], 0.1 * drift[inside], atol=5.0)
 
 
-def test_links_are_where_pinocchio_has_them(flight: Flight) -> None:
+def test_links_are_where_pinocchio_has_them(flight: FlightReport) -> None:
     scene = scene_of(flight)
     assert isinstance(scene, Scene)
     tree = Tree(scene.commands)
@@ -143,7 +143,7 @@ class Tree:
 
 def test_a_gait_can_be_looked_at_in_parts(tmp_path: Path) -> None:
     shapes = cyclic_shapes(slide=100, cycles=40)
-    scene = scene_of(read_flight(tell(tmp_path / "flight.mcap", Story(shapes))))
+    scene = scene_of(read_report(tell(tmp_path / "flight.mcap", Story(shapes))))
     assert isinstance(scene, Scene)
     names = [name for name, _, _ in scene.parts]
     assert names == ["whole flight", "first 5 s", "first 3 cycles", "last 3 cycles"]
@@ -154,7 +154,7 @@ def test_a_gait_can_be_looked_at_in_parts(tmp_path: Path) -> None:
 def test_meshes_that_a_bag_carries_are_drawn(tmp_path: Path) -> None:
     mesh = solid_mesh(Shape("box", (1.0, 2.0, 3.0), Pose()))
     told = tell(tmp_path / "flight.mcap", Story(wander(20)))
-    bare = read_flight(told)
+    bare = read_report(told)
     assert "Meshes are not drawn." in bare.missing_meshes
     carried = replace(bare, meshes={"package://robot/dish.stl": mesh})
     assert carried.missing_meshes == ""

@@ -12,12 +12,11 @@ from support.chromium import Browser, browser, chromium
 from support.flight_bags import GOAL, TICK, Story, goal_value, tell
 from support.html_page import leave_blank
 
+from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.report import scene, write_report
 from spacerobot_ros.report.figures_over_time import shape_figure
-from spacerobot_ros.report.flight import Flight
+from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.page import charts_of, thinned
-from spacerobot_ros.report.reading import read_flight
-from spacerobot_ros.report.signals import Signal
 
 with_browser = pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with")
 
@@ -48,8 +47,8 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def flight(bag: Path) -> Flight:
-    return read_flight(bag)
+def flight(bag: Path) -> FlightReport:
+    return read_report(bag)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +72,7 @@ def chart(window: Browser, number: int, expression: str) -> Any:
 
 
 @with_browser
-def test_charts_have_the_numbers_of_the_bag(window: Browser, flight: Flight) -> None:
+def test_charts_have_the_numbers_of_the_bag(window: Browser, flight: FlightReport) -> None:
     assert window.evaluate("flightCharts.charts.length") == 9
     assert window.evaluate("document.querySelectorAll('figure.live').length") == 5
     assert window.evaluate("getComputedStyle(document.querySelector('.live .scroll')).display") == (
@@ -98,7 +97,7 @@ def test_events_of_one_kind_at_once_are_counted(tmp_path: Path) -> None:
     ]
     events += [(1.0, {"event": "stuck_joint", "time": "1", "joints": "j"})]
     story = Story(np.zeros((60, 3)), events=sorted(events, key=lambda event: event[0]))
-    flight = read_flight(tell(tmp_path / "faults.mcap", story))
+    flight = read_report(tell(tmp_path / "faults.mcap", story))
     figure = shape_figure(flight)
     data = charts_of(flight, [figure]).data["charts"]["events"]
     assert [event["text"] for event in data] == [

@@ -13,8 +13,7 @@ from support.flight_bags import GOAL, TICK, Story, goal_value, still, tell
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.report import figures_over_time
 from spacerobot_ros.report.events import _MARKS
-from spacerobot_ros.report.flight import Flight
-from spacerobot_ros.report.reading import read_flight
+from spacerobot_ros.report.flight import FlightReport, read_report
 
 EVENTS = [
     (0.05, {"event": "goal_accepted", "time": "0.05"}),
@@ -63,7 +62,7 @@ def lanes(figure: Figure) -> list[Any]:
 
 
 def test_events_have_the_time_that_their_node_gave(tmp_path: Path) -> None:
-    flight = read_flight(story(tmp_path))
+    flight = read_report(story(tmp_path))
     found = {each.event.kind.value: each.time for each in flight.events}
     assert found == pytest.approx(TIMES)
     assert {each.node for each in flight.events} == {"/node"}
@@ -80,9 +79,9 @@ def test_events_have_the_time_that_their_node_gave(tmp_path: Path) -> None:
     ],
 )
 def test_a_lane_below_every_time_axis_has_every_event(
-    tmp_path: Path, draw: Callable[[Flight], Any]
+    tmp_path: Path, draw: Callable[[FlightReport], Any]
 ) -> None:
-    made = draw(read_flight(story(tmp_path)))
+    made = draw(read_report(story(tmp_path)))
     assert "Below the time axis" in made.caption
     figure = made.figure
     timed = [axes for axes in figure.axes if axes.get_xlabel() == "time (s)"]
@@ -100,7 +99,7 @@ def test_a_lane_below_every_time_axis_has_every_event(
 
 @pytest.mark.parametrize("events", [[], EVENTS[7:]])
 def test_a_bag_without_events_has_no_lane(tmp_path: Path, events: list[Any]) -> None:
-    made = figures_over_time.position_figure(read_flight(story(tmp_path, events)))
+    made = figures_over_time.position_figure(read_report(story(tmp_path, events)))
     assert not isinstance(made, str)
     assert "Below the time axis" not in made.caption
     assert not lanes(made.figure)

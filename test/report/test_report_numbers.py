@@ -33,10 +33,9 @@ from spacerobot_ros.report.figures_over_time import (
     shape_groups,
     thrusters_figure,
 )
-from spacerobot_ros.report.flight import Flight, joint_unit
+from spacerobot_ros.report.flight import FlightReport, joint_unit, read_report
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.page_parts import PagePart
-from spacerobot_ros.report.reading import read_flight
 from spacerobot_ros.report.tables import (
     headline,
     joint_table,
@@ -87,7 +86,7 @@ FLOWN = (
 )
 
 
-def flight(path: Path, statuses: Any = FLOWN, **options: Any) -> Flight:
+def flight(path: Path, statuses: Any = FLOWN, **options: Any) -> FlightReport:
     """Write four states 0.5 s apart from 5 s on; the base ends 0.3 rad and (0.3, 0, -0.4) m off.
 
     Joints go from (0.125, -0.5) to (-0.625, 1.75), their largest rates are 0.2 and -0.4; momenta
@@ -118,10 +117,10 @@ def flight(path: Path, statuses: Any = FLOWN, **options: Any) -> Flight:
             say("/joint_states", joint_states(time, names, shape, list(rates)), time)
             say("/momentum", array(1 + 3 * swing, 4 * swing, 0, 0, 0, 2 - 6 * swing, 0.5), time)
             more(say, time, k)
-    return read_flight(path / name)
+    return read_report(path / name)
 
 
-def rows_of(found: Flight) -> dict[str, str]:
+def rows_of(found: FlightReport) -> dict[str, str]:
     return {row[0]: row[1] for row in result_table(found).rows}
 
 
@@ -381,8 +380,8 @@ def test_momenta_that_thrusters_put_in_are_no_drift(tmp_path: Path) -> None:
         say("/momentum_expected", expected, time)
 
     found = flight(tmp_path, more=more)
-    assert found.drift(0) < 1e-15
-    assert found.drift(3) == pytest.approx(1e-3)
+    assert found.drift[0] < 1e-15
+    assert found.drift[1] == pytest.approx(1e-3)
 
 
 # -- what is drawn ----------------------------------------------------------------------------
@@ -565,7 +564,7 @@ def test_whatever_a_bag_holds_is_text_on_the_page(tmp_path: Path) -> None:
 
 def test_propellant_is_what_the_plant_counted() -> None:
     bag = read_bag(share_directory() / "bags" / "servicer_thrusters.mcap")
-    found = read_flight(bag.path)
+    found = read_report(bag.path)
     counted = {
         time_ns / 1e9: float(pair.value)
         for time_ns, message in bag["diagnostics"].messages()
@@ -588,7 +587,7 @@ def test_propellant_is_what_the_plant_counted() -> None:
 
 
 def test_a_flight_that_was_not_measured_at_its_end_is_drawn(tmp_path: Path) -> None:
-    whole = read_flight(tell(tmp_path / "a.mcap", Story(cyclic_shapes())))
+    whole = read_report(tell(tmp_path / "a.mcap", Story(cyclic_shapes())))
     assert whole.cycles is not None
     early = whole.position.between(0.0, 0.5 * whole.end)
     cut = replace(whole, position=early, quaternion=whole.quaternion[: len(early)])

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from support.flight_bags import TICK, cyclic_shapes, rates_of
 
+from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.report.figures_space import _instants, _signed_area
-from spacerobot_ros.report.signals import Cycles, Signal, envelope, find_cycles, rotvecs
+from spacerobot_ros.report.signals import Cycles, envelope, find_cycles, rotvecs
 from spacerobot_ros.report.solids import Canvas, Edge, Face, View
 
 

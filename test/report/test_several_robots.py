@@ -14,7 +14,7 @@ from support.made_bags import pose as pose_at
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.report.reading import read_flight
+from spacerobot_ros.report.flight import read_report
 from spacerobot_ros.report.tables import result_table
 
 JOINTS = {"/fleet/a": 1, "/fleet/b": 3}
@@ -46,7 +46,7 @@ def bag(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("name", JOINTS)
 def test_the_robot_that_is_named_is_the_one_that_is_shown(name: str, bag: Path) -> None:
     for given in (name, name.strip("/")):
-        flight = read_flight(bag, given)
+        flight = read_report(bag, given)
         assert flight.robot_name == f"robot_{JOINTS[name]}"
         assert len(flight.joint_names) == JOINTS[name]
         (other,) = flight.other_robots
@@ -54,7 +54,7 @@ def test_the_robot_that_is_named_is_the_one_that_is_shown(name: str, bag: Path) 
         distance = 1 + list(JOINTS).index(name)
         row = ("Position error", f"{distance} m (tolerance {TOLERANCES[name]} m)")
         assert row in result_table(flight).rows
-    assert read_flight(bag).namespace == "/fleet/a"
+    assert read_report(bag).namespace == "/fleet/a"
 
 
 def test_the_page_says_which_robot_it_shows_and_which_it_does_not(
@@ -95,7 +95,7 @@ def test_joints_are_known_by_their_names_and_not_by_their_places(
             position = [numbers[name] + time for name in names]
             velocity = [10.0 * numbers[name] for name in names]
             say("/joint_states", joint_states(time, names, position, velocity), time)
-    flight = read_flight(path)
+    flight = read_report(path)
     assert flight.joint_names == ["a", "b", "c"]
     times = [0.0, 0.5, 1.5, 2.5, 3.0, 4.0]
     assert flight.shape.time.tolist() == times

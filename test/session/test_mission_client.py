@@ -14,7 +14,7 @@ from support.ros_harness import LATCHED, Harness, Probe
 
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.arrays import Outcome
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.session.mission_client import MissionClient

@@ -14,8 +14,8 @@ import rclpy
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.arrays import Outcome
 from spacerobot_ros.flight.scenario import load_scenario
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.session.stack import InProcessStack, checked_namespace
 from spacerobot_ros.verification.comparison import verify_bag
 

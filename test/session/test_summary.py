@@ -7,20 +7,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from support.made_bags import array, joint_states, made_bag, odometry, pose
 
 from spacerobot_ros.bag import BagWriter, iterate_raw
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
-from spacerobot_ros.flight.arrays import Outcome
+from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.flight.scenario import Scenario, load_scenario
+from spacerobot_ros.measures import Outcome
+from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatistics,
     PlannerStatus,
 )
+from spacerobot_ros.resources import share_directory
 from spacerobot_ros.session import run
 
 HALF = math.sin(0.05), math.cos(0.05)
@@ -60,7 +64,8 @@ def summary(path: Path, wall_time: float = 0.5, **options: Any) -> dict[str, Any
     scenario = options.pop("scenario", load_scenario("sliding_masses").with_goal(_pose(GOAL)))
     more = options.pop("more", lambda say, time, k: None)
     true, diagnosed = options.pop("true", False), options.pop("diagnosed", True)
-    with made_bag(path) as (_, say):
+    with made_bag(path) as (bag, say):
+        bag.add_attachment("robot_description.urdf", options.pop("urdf", b""), "application/xml", 0)
         for k, rates in enumerate(RATES):
             time = 2.0 + 0.25 * k
             where = odometry(time, 0.7, 2.0, 3.4 * (k == 3), 0.0, HALF[0], 0.0, HALF[1], *STILL)
@@ -153,27 +158,36 @@ def test_momenta_that_thrusters_have_put_in_are_no_drift(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_the_end_effector_and_the_propellant(tmp_path: Path, turned: bool) -> None:
+    urdf = (share_directory() / "urdf" / "servicer.urdf").read_bytes()
+    table = find_thrusters("urdf", parse_robot(urdf.decode()))
+
     def more(say: Any, time: float, k: int) -> None:
         say("/end_effector_pose", pose(time, 0.0, 3.0 + k, 4.0, *(0.0, 0.0), *HALF), time)
+        # The last diagnostics come before the end.
         status = DiagnosticStatus(values=[KeyValue(key="propellant_kg", value=f"{0.25 * k}")])
-        # The last one that says something counts.
-        others = DiagnosticStatus(values=[KeyValue(key="pulses", value="9")])
-        say("/diagnostics", DiagnosticArray(status=[status] if k < 3 else [others]), time)
+        say("/diagnostics", DiagnosticArray(status=[status] if k < 2 else []), time)
+        force = [2.0 * k * (i == 3) + 1.0 * k * (i == 5) for i in range(len(table.names))]
+        thrusters = joint_states(time, list(table.names), [0.0] * len(force), [0.0] * len(force))
+        thrusters.effort = force
+        say("/thrusters", thrusters, time)
 
     label = "end_effector.rx" if turned else "end_effector.x"
     command = CommandReport("a_law", False, 1.0, 0.0, 0.0, 0.0, 0.0, {label: 0.1, "base.rx": 1.0})
     status = ControllerStatus(ControllerState.REACHED, "Reached.", command=command)
-    scenario = load_scenario("servicer").with_goal(_pose(GOAL))
+    scenario = load_scenario("servicer_thrusters").with_goal(_pose(GOAL))
     goal = Goal.checked([0.0, 6.0, 3.0], [0.0, 0.0, 0.0, 1.0])
     scenario = replace(scenario, end_effector_goal=goal)
     client = Client(status=status)
-    found = summary(tmp_path / "a.mcap", scenario=scenario, more=more, client=client)
+    found = summary(tmp_path / "a.mcap", scenario=scenario, more=more, client=client, urdf=urdf)
     assert found["end_effector_final_position_m"] == [0.0, 6.0, 4.0]
     assert found["end_effector_position_error_m"] == pytest.approx(1.0)
     assert ("end_effector_attitude_error_rad" in found) == turned
     if turned:
         assert found["end_effector_attitude_error_rad"] == pytest.approx(0.1)
-    assert found["propellant_kg"] == 0.5
+    # Forces of 1, 2 and 3 times 2 N and 1 N, for 0.25 s each, over g0 times specific impulse.
+    impulse = 0.25 * (1 + 2 + 3) * np.array([2.0, 1.0])
+    used = float((impulse / (9.80665 * table.isp[[3, 5]])).sum())
+    assert found["propellant_kg"] == pytest.approx(used, rel=1e-12)
     assert found["method"] == scenario.controller.law
     # Without schedules the manoeuvre is the flight.
     assert found["manoeuvre_time_s"] == 0.75

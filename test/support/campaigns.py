@@ -7,7 +7,7 @@ from typing import Any
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
-from spacerobot_ros.flight.arrays import FlightArrays
+from spacerobot_ros.flight.flight import Flight
 
 SHORT = {
     "scenario": "faults/stuck_slider",
@@ -26,7 +26,7 @@ def campaign(**given: Any) -> Campaign:
     return parse_campaign("short", section(**given))
 
 
-def flown(made: Campaign, number: int = 0) -> tuple[FlightArrays, dict[str, Any]]:
+def flown(made: Campaign, number: int = 0) -> tuple[Flight, dict[str, Any]]:
     """Fly one draw; return the flight and what was drawn."""
     draw = Draws(made)[number]
     return FlightsEngine().flown(made, drawn_flight(made, draw)), dict(draw.values)

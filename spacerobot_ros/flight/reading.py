@@ -1,0 +1,572 @@
+"""Reads a flight from its bag: all that the bag holds, and nothing that it does not.
+
+:func:`read_flight` reads any bag, of whatever stack; :func:`read_run` one of ``spacerobot run``,
+which must be complete.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from spacerobot_ros.bag import Bag, RecordedRobot, TopicSeries, read_bag
+from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower, Status
+from spacerobot_ros.control.thrusters import IN_URDF, find_thrusters
+from spacerobot_ros.errors import (
+    PlanningError,
+    RecordingError,
+    RobotDescriptionError,
+    SpaceRobotError,
+)
+from spacerobot_ros.events import Event
+from spacerobot_ros.flight.flight import Commands, Flight, SentGoal, Signal, goal_at_end
+from spacerobot_ros.flight.parameter_files import CONFIGS
+from spacerobot_ros.flight.scenario import COMMANDERS, Published, Scenario
+from spacerobot_ros.measures import Outcome
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.urdf import parse_robot
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.goal_file import GoalIds
+from spacerobot_ros.times import SECOND
+from spacerobot_ros.topics import TOPICS, StateField
+
+_SAME_CLOCK = 1.0
+"""Stamps this near to the log times, in s, come from the same clock."""
+
+_COMMANDS = ("joint_commands", "base_wrench", "joint_reference")
+
+WRENCH = TOPICS["base_wrench_realised"].state[0].columns
+"""Paths of force and torque in a message of a wrench."""
+
+T = TypeVar("T")
+
+
+class _Lazy(Mapping[str, T]):
+    """A mapping whose values are made when they are first asked for."""
+
+    def __init__(self, makers: Mapping[str, Callable[[], T]]) -> None:
+        self._makers = makers
+        self._made: dict[str, T] = {}
+
+    def __getitem__(self, key: str) -> T:
+        if key not in self._made:
+            self._made[key] = self._makers[key]()
+        return self._made[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._makers)
+
+    def __len__(self) -> int:
+        return len(self._makers)
+
+
+class FlightBag:
+    """The topics of one robot in a bag as signals over time.
+
+    Times are stamps (s), or log times where stamps are of another clock.
+
+    Parameters
+    ----------
+    bags
+        The files of the bag in order; one, unless the recording was split.
+    namespace
+        Namespace of the robot's topics, such as ``/robot_1``; empty for none.
+    """
+
+    def __init__(self, bags: Sequence[Bag], namespace: str = "") -> None:
+        self.path = bags[0].path
+        self.namespace = namespace
+        self.parts = [RecordedRobot(bag, namespace) for bag in bags]
+        states = [s for name in ("odom", "joint_states", "momentum") for s in self.all(name)[:1]]
+        self.stamped = all(abs(s.stamp[0] - s.time[0]) < _SAME_CLOCK for s in states)
+        self.began = min((self._times(s)[0] for s in states), default=bags[0].start_time)
+        """Time of the first state, s."""
+
+    def all(self, name: str) -> list[TopicSeries]:
+        """Return a topic in the files that have messages of it."""
+        return [series for part in self.parts if (series := part.get(name)) is not None]
+
+    def messages(self, name: str) -> Iterator[tuple[int, Any]]:
+        """Go through the messages of a topic, each with its log time in ns."""
+        for series in self.all(name):
+            yield from series.messages()
+
+    def names(self, topic: str) -> list[str]:
+        """Return the names in the first joint states of a topic; none where it is missing."""
+        return next((found for part in self.parts if (found := part.names(topic))), [])
+
+    @property
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Metadata records of the bag, see :attr:`RecordedRobot.metadata`."""
+        return self.parts[0].metadata
+
+    @property
+    def message_count(self) -> int:
+        """Number of messages on all topics."""
+        return sum(part.bag.message_count() for part in self.parts)
+
+    @property
+    def description(self) -> RobotDescription | None:
+        """The first readable description of the robot; None where there is none."""
+        for part in self.parts:
+            for text in part.bag.robot_descriptions(self.namespace):
+                try:
+                    return parse_robot(text.decode())
+                except (RobotDescriptionError, UnicodeDecodeError):
+                    continue
+        return None
+
+    # -- signals ------------------------------------------------------------------------------
+
+    def signal(self, name: str, fields: Sequence[str], width: int) -> Signal:
+        """Return numbers of a topic over time, without messages that lack one of them.
+
+        Parameters
+        ----------
+        name
+            The topic.
+        fields
+            Paths of numbers, or of one array; joints and thrusters are put into the order of their
+            names in the first message.
+        width
+            Number of columns.
+        """
+        found = [Signal.none(width)]
+        for series in self.all(name):
+            values = series.table(fields, width)
+            if TOPICS[name].type == TOPICS["joint_states"].type:
+                values = _by_name(values, series, self.names(name))
+            whole = np.isfinite(values).all(axis=1)
+            found.append(Signal(self._times(series)[whole], values[whole]))
+        time: Array = np.concatenate([each.time for each in found])
+        order = np.argsort(time, kind="stable")
+        return Signal(time[order], np.concatenate([each.values for each in found])[order])
+
+    def quantity(self, name: str, field: StateField) -> Signal:
+        """Return the numbers of a field of a state topic over time."""
+        width = len(field.members) or len(field.entries) or len(self.names(name))
+        return self.signal(name, field.columns, width)
+
+    def truth(self, name: str, number: int) -> Signal:
+        """Return a field of ``odom`` or ``joint_states`` as with perfect sensors.
+
+        That is ``<name>_true``, which a plant publishes while its sensors err, and ``name`` before
+        that begins.
+        """
+        measured = self.quantity(name, TOPICS[name].state[number])
+        true = self.quantity(f"{name}_true", TOPICS[f"{name}_true"].state[number])
+        if not len(true):
+            return measured
+        before = measured.time < true.time[0]
+        return Signal(
+            np.concatenate([measured.time[before], true.time]),
+            np.concatenate([measured.values[before], true.values]),
+        )
+
+    def sensed(self, name: str, number: int) -> Signal:
+        """Return a field of ``odom`` or ``joint_states`` from the time on when sensors err."""
+        began = self._times(self.all(f"{name}_true")[0])[0]
+        return self.quantity(name, TOPICS[name].state[number]).between(began, math.inf)
+
+    def series(self) -> Mapping[str, Signal]:
+        """Return all quantities of :attr:`Flight.series` that the bag has."""
+        makers: dict[str, Callable[[], Signal]] = {}
+        erring = bool(self.all("odom_true"))
+        for name, quantities in {
+            "odom": ("pose", "twist"),
+            "joint_states": ("q", "qdot", "effort"),
+        }.items():
+            for number, quantity in enumerate(quantities):
+                if self.all(name) or self.all(f"{name}_true"):
+                    makers[quantity] = partial(self.truth, name, number)
+                if erring and quantity != "effort" and self.all(f"{name}_true"):
+                    makers[f"measured_{quantity}"] = partial(self.sensed, name, number)
+        for name in (
+            *("momentum", "end_effector_pose", "momentum_expected"),
+            *("base_wrench_realised", "thrusters"),
+        ):
+            for field in TOPICS[name].state if self.all(name) else ():
+                makers[field.quantity] = partial(self.quantity, name, field)
+        return _Lazy(makers)
+
+    def _times(self, series: TopicSeries) -> Array:
+        return series.stamp if self.stamped else series.time
+
+    # -- reports ------------------------------------------------------------------------------
+
+    def statuses(self, commander: str) -> Iterator[tuple[int, Status | str]]:
+        """Go through the statuses of a commander, each with its log time in ns.
+
+        A status of another package is its message alone.
+        """
+        topic, read = STATUS_TOPICS[commander]
+        for time_ns, message in self.messages(topic):
+            try:
+                yield time_ns, read(_values(message), message.message)
+            except SpaceRobotError:
+                yield time_ns, str(message.message)
+
+    def events(self) -> Iterator[tuple[int, str, Event]]:
+        """Go through the events with their log times (ns) and nodes."""
+        for time_ns, message in self.messages("events"):
+            try:
+                level = int.from_bytes(bytes([message.level]), "little")
+                event = Event.from_values(_values(message), message.message, level)
+            except SpaceRobotError:
+                continue  # Of a later version.
+            yield time_ns, message.name, event
+
+    def goals(self, topic: str) -> tuple[SentGoal, ...]:
+        """Return the goal poses that are poses in the frame of the odometry."""
+        odom = next(self.messages("odom"), None)
+        world = odom[1].header.frame_id if odom is not None else ""
+        goals, ids = [], GoalIds()
+        for time_ns, message in self.messages(topic):
+            stamp = message.header.stamp
+            goal_id = ids.of(stamp.sec, stamp.nanosec)
+            p, o = message.pose.position, message.pose.orientation
+            try:
+                goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w])
+            except PlanningError:
+                continue
+            if not world or message.header.frame_id in ("", world):
+                goals.append(SentGoal(time_ns / SECOND, goal, goal_id))
+        return tuple(goals)
+
+    def commands(self, scenario: Scenario) -> Mapping[str, Commands]:
+        """Return the commands by topic."""
+        n = len(self.names("joint_states"))
+
+        def read(name: str) -> Commands:
+            config = scenario.plant
+            fields, width = (WRENCH, 6) if name == "base_wrench" else (["velocity"], n)
+            if name == "joint_commands" and config.actuation != "velocity":
+                fields = ["effort"]
+            each = self.all(name)
+            return Commands(
+                np.concatenate([series.stamp_ns // config.period_ns for series in each]),
+                np.concatenate([series.table(fields, width) for series in each]),
+            )
+
+        return _Lazy({name: partial(read, name) for name in _COMMANDS if self.all(name)})
+
+
+def _by_name(values: Array, series: TopicSeries, names: list[str]) -> Array:
+    """Return numbers (N, n) of joints in the order of ``names``; nan of those that lack one."""
+    if series.constant("name"):
+        return values
+    made = np.full_like(values, np.nan)
+    for row, given in enumerate(series.field("name")):
+        if sorted(given) == sorted(names):
+            made[row] = values[row, [given.index(name) for name in names]]
+    return made
+
+
+def _values(message: Any) -> dict[str, str]:
+    return {pair.key: pair.value for pair in message.values}
+
+
+# -- any bag ----------------------------------------------------------------------------------
+
+
+def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) -> FlightBag:
+    """Open a bag.
+
+    Parameters
+    ----------
+    path
+        The bag; where there is no such file, the parts ``NAME_0``, ``NAME_1``, ... of it.
+    namespace
+        Namespace of the robot's topics, with or without the slash before it; None: the first in
+        alphabetical order of those that the bag has an ``odom`` of.
+
+    Raises
+    ------
+    RecordingError
+        There is no such bag or robot, or it is damaged.
+    """
+    bags = [read_bag(part) for part in _files(Path(path))]
+    prefixes = sorted({name for bag in bags for name in namespaces(bag)})
+    chosen = prefixes[0] if prefixes else ""
+    if namespace is not None:
+        chosen = f"/{namespace.strip('/')}".rstrip("/")
+        if chosen not in prefixes:
+            known = ", ".join(name or "/" for name in prefixes) or "no robot"
+            raise RecordingError(
+                f"The bag {bags[0].path} has no robot in the namespace '{namespace}': it has "
+                f"{known}."
+            )
+    return FlightBag(bags, chosen)
+
+
+def namespaces(bag: Bag) -> list[str]:
+    """Return the namespaces that a bag has an ``odom`` in, in alphabetical order."""
+    return sorted(
+        topic.rpartition("/")[0]
+        for topic, kind in bag.topics.items()
+        if topic.endswith("/odom") and kind == TOPICS["odom"].type
+    )
+
+
+def _files(path: Path) -> list[Path]:
+    """Return the files of a bag in order: one, or ``NAME_0``, ``NAME_1``, ... if it was split."""
+    if path.exists():
+        return [path]
+    parts: list[Path] = []
+    while (part := path.with_name(f"{path.stem}_{len(parts)}{path.suffix}")).exists():
+        parts.append(part)
+    return parts or [path]
+
+
+def read_flight(bag: FlightBag) -> Flight:
+    """Return all of a flight that its bag holds, whatever that is.
+
+    Arrays are read when they are first asked for.
+
+    Raises
+    ------
+    RecordingError
+        A message is damaged.
+    """
+    description, names = bag.description, bag.names("joint_states")
+    if not names and description is not None:
+        names = list(description.joint_names)
+    scenario = _scenario(bag)
+    statuses = {name: _read_statuses(bag, name) for name in COMMANDERS}
+    decider = next((name for name in COMMANDERS if statuses[name]), COMMANDERS[0])
+    goals, tool_goals = bag.goals("goal_pose"), bag.goals("end_effector/goal_pose")
+    reports = [status for _, status in statuses[decider]]
+    # Bags of version 0.1 have no ids.
+    follower, status = GoalFollower(goals[-1].goal_id if goals else "", unnamed=True), None
+    for status in reports:
+        if follower.take(status):
+            break
+    decision = follower.decision
+    flight = Flight(
+        scenario=scenario,
+        robot=description,
+        joint_names=tuple(names),
+        series=bag.series(),
+        commands=bag.commands(scenario),
+        statuses=tuple(sorted((s for each in statuses.values() for s in each), key=lambda s: s[0])),
+        events=tuple(event for _, _, event in bag.events()),
+        outcome=Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value),
+        message=status.message if status is not None else "",
+        goal=goal_at_end(reports, goals),
+        end_effector_goal=tool_goals[-1].goal if tool_goals else None,
+        goals=goals,
+        end_effector_goals=tool_goals,
+        status=status,
+        gait=follower.gait,
+    )
+    # A table of thrusters that is a file of its own is not looked for: a bag may name any file.
+    in_urdf = scenario.in_file.get("plant", {}).get("thrusters") == IN_URDF
+    return with_propellant(flight, IN_URDF, bag.names("thrusters")) if in_urdf else flight
+
+
+def require_states(bag: FlightBag, flight: Flight) -> None:
+    """Refuse a bag without poses, joint states or momenta.
+
+    Raises
+    ------
+    RecordingError
+        It lacks one of them.
+    """
+    for topic, quantity in (("odom", "pose"), ("joint_states", "q"), ("momentum", "momentum")):
+        if not len(flight.signal(quantity)):
+            raise RecordingError(f"The bag {bag.path} holds no state: nothing is on /{topic}.")
+
+
+def with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Flight:
+    """Return a flight with the quantity ``propellant`` (N, 1), kg, summed over its thrusts.
+
+    Parameters
+    ----------
+    flight
+        A flight; one without thrusters, or with that quantity, is returned as it is.
+    thrusters
+        Source of their table, as in the plant's parameters.
+    names
+        Names of the thrusters in the flight; with others than those of the table it has no
+        propellant.
+    """
+    robot, series = flight.robot, flight.series
+    if robot is None or "thruster_force" not in series or "propellant" in series:
+        return flight
+    try:
+        table = find_thrusters(thrusters, robot)
+    except SpaceRobotError:
+        return flight
+    if list(table.names) != list(names):
+        return flight
+
+    def used() -> Signal:
+        return impulse(flight.signal("thruster_force"), table.mass_flow / table.force)
+
+    makers = {name: partial(series.__getitem__, name) for name in series}
+    return replace(flight, series=_Lazy({**makers, "propellant": used}))
+
+
+def impulse(thrust: Signal, weights: Array) -> Signal:
+    """Return the sum over time (N, 1) of thrusts (N, m), N, each times its weight (m,)."""
+    ticks = np.diff(thrust.time, prepend=thrust.time[:1])
+    total = np.cumsum(ticks * (thrust.values @ weights))
+    return Signal(thrust.time, total[:, np.newaxis])
+
+
+def _read_statuses(bag: FlightBag, commander: str) -> list[tuple[int, Status]]:
+    return [(time, s) for time, s in bag.statuses(commander) if not isinstance(s, str)]
+
+
+def _scenario(bag: FlightBag) -> Scenario:
+    """Return as much of the scenario of a flight as its bag says."""
+    metadata = bag.metadata
+    about = metadata.get("scenario", {})
+    nodes = {
+        node: {name: _json(text) for name, text in metadata[f"parameters/{node}"].items()}
+        for node in CONFIGS
+        if f"parameters/{node}" in metadata
+    }
+    published: tuple[Published, ...] = ()
+    rows = _json(about.get("published", "[]"))
+    with suppress(KeyError, TypeError, ValueError):
+        published = tuple(
+            Published(str(r["quantity"]), [float(x) for x in r["printed"]], str(r["note"]))
+            for r in rows
+        )
+    return Scenario(
+        name=about.get("name", "") or bag.path.stem,
+        path=bag.path,
+        description=about.get("description", ""),
+        goal=Goal.checked([0, 0, 0], [0, 0, 0, 1]),
+        end_effector_goal=None,
+        commanders=tuple(name for name in COMMANDERS if name in nodes) or COMMANDERS[:1],
+        published=published,
+        published_method="",
+        kills=(),
+        in_file=nodes,
+        overrides={},
+        has_goal=False,
+    )
+
+
+def _json(text: str) -> Any:
+    """Return a value that was written as JSON; None where it cannot be read."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+
+
+# -- a bag of spacerobot run ------------------------------------------------------------------
+
+
+def recorded_scenario(bag: Bag) -> Scenario:
+    """Return the scenario of a flight: parameters, goals and robot as its bag has them.
+
+    Raises
+    ------
+    RecordingError
+        The bag does not say what was flown.
+    """
+    robot = RecordedRobot(bag)
+    about = bag.metadata.get("scenario", {})
+    nodes = {
+        node: bag.metadata[f"parameters/{node}"]
+        for node in CONFIGS
+        if f"parameters/{node}" in bag.metadata
+    }
+    if "plant" not in nodes or "goal_position" not in about:
+        raise RecordingError(
+            f"The bag {bag.path} does not say what was flown: bags of 'spacerobot run' hold the "
+            "goal and all parameters."
+        )
+    try:
+        values = {
+            node: {name: json.loads(text) for name, text in texts.items()}
+            for node, texts in nodes.items()
+        }
+        urdf = robot.urdf
+        if urdf is not None:
+            for given in values.values():
+                if "robot" in given and given["robot"] in ("", values["plant"]["robot"]):
+                    given["robot_description"] = urdf.decode()
+        shapes = robot.get("goal_joint_states")
+        goal = _goal(about, "goal")
+        assert goal is not None
+        if shapes is not None:
+            first = next(shapes.messages())[1]
+            if len(first.position):  # Without any, the shape was free.
+                goal = Goal(goal.position, goal.quaternion, np.array(first.position))
+        end_effector_goal = _goal(about, "end_effector_goal")
+    except (ValueError, KeyError, RecursionError) as error:
+        raise RecordingError(
+            f"The scenario in the bag {bag.path} cannot be read: {error!r}."
+        ) from error
+    return Scenario(
+        name=about.get("name", bag.path.stem),
+        path=bag.path,
+        description=about.get("description", ""),
+        goal=goal,
+        end_effector_goal=end_effector_goal,
+        commanders=tuple(name for name in COMMANDERS if name in values),
+        published=(),
+        published_method="",
+        kills=(),
+        in_file=values,
+        overrides={},
+    )
+
+
+def _goal(about: Mapping[str, str], name: str) -> Goal | None:
+    """Return a goal exactly as it was sent."""
+    if f"{name}_position" not in about:
+        return None
+    position, quaternion = (
+        np.array([float(word) for word in about[f"{name}_{part}"].split()])
+        for part in ("position", "orientation")
+    )
+    return Goal(position, quaternion)
+
+
+def read_run(path: str | os.PathLike[str]) -> Flight:
+    """Return the flight in a bag of ``spacerobot run``, with the same arrays as without ROS.
+
+    Raises
+    ------
+    RecordingError
+        There is no such bag, it is damaged, or it holds no complete flight in lockstep.
+    SpaceRobotError
+        Its robot is refused.
+    """
+    bag = open_flight_bag(path)
+    scenario = recorded_scenario(bag.parts[0].bag)
+    urdf = bag.parts[0].urdf
+    if urdf is None:
+        raise RecordingError(f"The bag {bag.path} holds no description of its robot.")
+    robot = scenario.plant.believed(parse_robot(urdf.decode(errors="replace")))
+    flight = replace(
+        read_flight(bag),
+        scenario=scenario,
+        robot=robot,
+        goal=scenario.goal,
+        end_effector_goal=scenario.end_effector_goal,
+    )
+    require_states(bag, flight)
+    if len(flight.pose) != len(flight.q):
+        raise RecordingError(
+            f"The bag {bag.path} has {len(flight.pose)} poses of the base and {len(flight.q)} "
+            "states of the joints: its flight is not whole."
+        )
+    if not flight.goals:
+        raise RecordingError(f"The bag {bag.path} holds no goal pose.")
+    return with_propellant(flight, scenario.plant.thrusters, bag.names("thrusters"))

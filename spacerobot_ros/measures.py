@@ -1,0 +1,276 @@
+"""The measures of a flight: numbers of the flight as a whole, each defined once.
+
+Campaigns, the summary of ``spacerobot run``, reports and the live page show them. A
+:class:`~spacerobot_ros.flight.flight.Flight` computes them from its arrays over time; SIMD lanes,
+which keep extremes and the last state alone, return them directly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from spacerobot_ros.control.status import ControllerStatus, tracking_time
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.planning.core.goal import PoseError
+from spacerobot_ros.planning.execution.status import PlannerStatus, manoeuvre_time
+
+
+class Outcome(str, Enum):
+    """The end of a goal; all values but the last are those of ``state`` in a status."""
+
+    REACHED = "reached"
+    FAILED = "failed"
+    REFUSED = "refused"
+    ABORTED = "aborted"
+    INTERRUPTED = "interrupted"
+    """The flight ended before the goal was decided."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measures:
+    """The measures of one flight; poses, joints and momenta are the true ones.
+
+    Attributes
+    ----------
+    outcome, message
+        The end of the goal, and the same for people.
+    duration
+        Simulated time, s.
+    manoeuvre_time
+        Duration of the schedules that were flown for the goal, or of the tracking by a controller,
+        s; see :func:`flown_time`.
+    error, end_effector_error
+        Error of the last pose of the base and of the end-effector to their goals; None without a
+        goal or a pose.
+    peak_rate, peak_effort
+        (n,) largest absolute rates (m/s or rad/s) and actuator efforts (N or N m) of the joints.
+    peak_wrench
+        (2,) largest norms of the commanded force (N) and torque (N m) on the base.
+    lowest, highest
+        (n,) ranges of the joint positions, m or rad.
+    momentum_drift
+        (2,) see :func:`momentum_drift`, kg m/s and kg m^2/s.
+    corrections
+        Plans after the first that count as corrections.
+    propellant
+        Propellant used by the thrusters, kg; NaN without thrusters.
+    plan_time, wall_time
+        Wall time of planning and of the whole flight, s; NaN where it is not known.
+    """
+
+    outcome: Outcome
+    message: str
+    duration: float
+    manoeuvre_time: float
+    error: PoseError | None
+    end_effector_error: PoseError | None
+    peak_rate: Array
+    peak_effort: Array
+    peak_wrench: Array
+    lowest: Array
+    highest: Array
+    momentum_drift: Array
+    corrections: int = 0
+    propellant: float = math.nan
+    plan_time: float = math.nan
+    wall_time: float = math.nan
+
+
+def momentum_change(momenta: Array, reference: Array) -> Array:
+    """Return the norms (..., 2) of the differences of linear and of angular momenta.
+
+    Parameters
+    ----------
+    momenta, reference
+        (..., 6) linear (kg m/s) over angular momentum (kg m^2/s).
+    """
+    difference = momenta - reference
+    return np.asarray(np.linalg.norm(difference.reshape(*difference.shape[:-1], 2, 3), axis=-1))
+
+
+def momentum_drift(momenta: Array, expected: Array | None = None) -> Array:
+    """Return the largest change (2,) of linear and angular momentum that thrust does not explain.
+
+    That is ``max |m(t) - m(0)|`` over the flight, with the momenta ``m`` less those that the
+    thrusters have put in.
+
+    Parameters
+    ----------
+    momenta
+        (N, 6) or more columns, the momenta first: kg m/s and kg m^2/s.
+    expected
+        (N, 6) momenta at the start and those that the thrusters have put in since; None, or of
+        another number of rows: no thrust.
+    """
+    m = momenta[:, :6]
+    if expected is not None and len(expected) == len(m):
+        m = m - expected
+    m = m[np.isfinite(m).all(axis=1)]
+    return momentum_change(m, m[0]).max(axis=0) if len(m) else np.full(2, np.nan)
+
+
+def peak(values: Array) -> Array:
+    """Return the largest absolute value (k,) of each column of values (N, k); 0 without rows."""
+    return np.asarray(np.abs(values).max(axis=0, initial=0.0))
+
+
+def peak_wrench(wrenches: Array) -> Array:
+    """Return the largest norms (2,) of force and torque of wrenches (N, 6); 0 without any."""
+    return peak(np.linalg.norm(wrenches.reshape(-1, 2, 3), axis=2))
+
+
+def flown_time(
+    statuses: Iterable[tuple[float, PlannerStatus | ControllerStatus]], end: float
+) -> float | None:
+    """Return the time, s, that was flown for the last goal.
+
+    With a planner it is the duration of the schedules that were flown
+    (:func:`~spacerobot_ros.planning.execution.status.manoeuvre_time`); otherwise the time from the
+    first state that a controller tracked to the end of its last goal.
+
+    Parameters
+    ----------
+    statuses
+        Time (s) and status, in order of time.
+    end
+        End of the flight, s.
+
+    Returns
+    -------
+    float | None
+        None where neither is reported.
+    """
+    given = list(statuses)
+    planned = [(time, each) for time, each in given if isinstance(each, PlannerStatus)]
+    if planned:
+        end = max(end, planned[-1][0])
+    tracked = ((time, each.state) for time, each in given if isinstance(each, ControllerStatus))
+    return manoeuvre_time(planned, end) or tracking_time(tracked)
+
+
+# -- the measures by name ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A measure as a column of numbers.
+
+    Attributes
+    ----------
+    unit, description
+        For people.
+    of
+        Function of the measures and the robot: a number, NaN where a flight has none; or a number
+        for each joint.
+    by_joint
+        Whether ``<name>.<joint>`` is the number of a joint, and the name itself the worst of all.
+    least
+        Whether the smallest number is the worst.
+    """
+
+    unit: str
+    description: str
+    of: Callable[[Measures, RobotDescription], float | Array]
+    by_joint: bool = False
+    least: bool = False
+
+
+def _part(error: PoseError | None, part: str) -> float:
+    return math.nan if error is None else float(getattr(error, part))
+
+
+def _joint_margin(measures: Measures, robot: RobotDescription) -> Array:
+    lower, upper = robot.limits("lower"), robot.limits("upper")
+    return np.minimum(measures.lowest - lower, upper - measures.highest)
+
+
+def _margin(limited: str, limit: str, values: Callable[[Measures], Array]) -> Metric:
+    return Metric(
+        "",
+        f"unused share of the {limited} limit of a joint",
+        lambda measures, robot: 1.0 - values(measures) / robot.limits(limit),
+        by_joint=True,
+        least=True,
+    )
+
+
+METRICS: dict[str, Metric] = {
+    "position_error_m": Metric(
+        "m",
+        "distance of the last true position of the base from the goal",
+        lambda m, _: _part(m.error, "distance"),
+    ),
+    "attitude_error_rad": Metric(
+        "rad",
+        "angle between the last true attitude of the base and the goal",
+        lambda m, _: _part(m.error, "angle"),
+    ),
+    "end_effector_position_error_m": Metric(
+        "m", "likewise, of the end-effector", lambda m, _: _part(m.end_effector_error, "distance")
+    ),
+    "end_effector_attitude_error_rad": Metric(
+        "rad", "likewise, of the end-effector", lambda m, _: _part(m.end_effector_error, "angle")
+    ),
+    "duration_s": Metric("s", "simulated time of the flight", lambda m, _: m.duration),
+    "manoeuvre_time_s": Metric("s", "duration of all schedules", lambda m, _: m.manoeuvre_time),
+    "corrections": Metric("", "plans after the first", lambda m, _: float(m.corrections)),
+    "propellant_kg": Metric("kg", "propellant of the thrusters", lambda m, _: m.propellant),
+    "peak_rate": Metric(
+        "m/s or rad/s", "largest rate of a joint", lambda m, _: m.peak_rate, by_joint=True
+    ),
+    "peak_effort": Metric(
+        "N or N m", "largest effort of a joint", lambda m, _: m.peak_effort, by_joint=True
+    ),
+    "peak_force_N": Metric(
+        "N", "largest force commanded of the thrusters", lambda m, _: float(m.peak_wrench[0])
+    ),
+    "peak_torque_Nm": Metric(
+        "N m", "largest torque likewise", lambda m, _: float(m.peak_wrench[1])
+    ),
+    "joint_margin": Metric(
+        "m or rad",
+        "least distance of a joint from its ends",
+        _joint_margin,
+        by_joint=True,
+        least=True,
+    ),
+    "rate_margin": _margin("rate", "velocity", lambda m: m.peak_rate),
+    "effort_margin": _margin("effort", "effort", lambda m: m.peak_effort),
+    "momentum_drift": Metric(
+        "kg m/s, kg m^2/s",
+        "largest change of a momentum that thrust does not explain",
+        lambda m, _: float(m.momentum_drift.max()),
+    ),
+}
+"""Every metric by its name."""
+
+
+def metrics_of(measures: Measures, robot: RobotDescription) -> dict[str, float]:
+    """Return every metric of a flight by name, those of joints too; NaN where it has none."""
+    found: dict[str, float] = {}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for name, metric in METRICS.items():
+            value = metric.of(measures, robot)
+            if not metric.by_joint:
+                found[name] = float(value)
+                continue
+            each = np.asarray(value, dtype=float)
+            worst = each.min if metric.least else each.max
+            found[name] = float(worst()) if each.size else math.nan
+            for joint, number in zip(robot.joint_names, each.tolist(), strict=True):
+                found[f"{name}.{joint}"] = number
+    return found
+
+
+def metric_names(joints: Sequence[str]) -> list[str]:
+    """Return the names that :func:`metrics_of` gives for a robot with these joints, in order."""
+    names: list[str] = []
+    for name, metric in METRICS.items():
+        names.append(name)
+        names += [f"{name}.{joint}" for joint in joints] if metric.by_joint else []
+    return names
