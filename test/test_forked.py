@@ -5,14 +5,13 @@ from __future__ import annotations
 import gc
 import importlib.util
 import sys
-from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
+from types import ModuleType
 from typing import Any
 
 import pytest
-from support.forked import NotExchangedError, can_be_exchanged, exchange
+from support.forked import NotExchangedError, can_be_exchanged, exchange, live_functions
 
 TEXT = """\
 from dataclasses import dataclass, field
@@ -68,11 +67,7 @@ def module(tmp_path: Path) -> Iterator[Any]:
 def put_in(module: ModuleType, before: str, after: str) -> None:
     assert TEXT.count(before) == 1
     path = str(module.__file__)
-    live: dict[CodeType, list[FunctionType]] = defaultdict(list)
-    for thing in gc.get_objects():
-        if type(thing) is FunctionType and thing.__code__.co_filename == path:
-            live[thing.__code__].append(thing)
-    exchange(TEXT, TEXT.replace(before, after), path, live)
+    exchange(TEXT, TEXT.replace(before, after), path, live_functions()[path])
 
 
 def test_bodies_of_functions_are_exchanged_for_who_holds_them_already(module: Any) -> None:
@@ -87,6 +82,18 @@ def test_bodies_of_functions_are_exchanged_for_who_holds_them_already(module: An
     assert near(value, -1.5)
     put_in(module, "return 2 * x", "return 3 * x")
     assert module.twice(2) == 6
+
+
+def test_functions_that_are_no_garbage_any_more_are_found_too(module: Any) -> None:
+    gc.freeze()  # As conftest.py does with all that was collected.
+    put_in(module, "x + by < LIMIT", "x + by <= LIMIT")
+    assert module.below(3)
+
+
+def test_a_difference_that_reaches_no_live_function_needs_an_import(module: Any) -> None:
+    changed = TEXT.replace("x + by < LIMIT", "x + by <= LIMIT")
+    with pytest.raises(NotExchangedError, match="alive"):
+        exchange(TEXT, changed, str(module.__file__), {})
 
 
 def test_defaults_and_constants_are_exchanged(module: Any) -> None:

@@ -61,16 +61,28 @@ ENDED = "-"
 """The line of the log after each test that came to its end."""
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtestloop(session: pytest.Session) -> bool:
-    jobs, answers = (int(n) for n in os.environ.pop("SPACEROBOT_FORK_PIPES").split())
-    items = {item.nodeid: item for item in session.items}
-    live: dict[str, dict[CodeType, list[FunctionType]]] = defaultdict(lambda: defaultdict(list))
+Live = dict[str, dict[CodeType, list[FunctionType]]]
+"""Functions by the file and the code that they have."""
+
+
+def live_functions() -> Live:
+    """Return all functions there are; take note of those that remember results."""
+    live: Live = defaultdict(lambda: defaultdict(list))
+    # Objects that conftest.py has taken out of the garbage collection are not listed otherwise.
+    gc.unfreeze()
     for thing in gc.get_objects():
         if type(thing) is FunctionType:
             live[thing.__code__.co_filename][thing.__code__].append(thing)
         elif isinstance(thing, _CACHED) and thing.__module__.startswith("spacerobot_ros."):
             _caches.append(thing)
+    return live
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop(session: pytest.Session) -> bool:
+    jobs, answers = (int(n) for n in os.environ.pop("SPACEROBOT_FORK_PIPES").split())
+    items = {item.nodeid: item for item in session.items}
+    live = live_functions()
     gc.freeze()
     os.write(answers, b"ready\n")
     with os.fdopen(jobs) as lines:
@@ -90,7 +102,7 @@ def _run(
     session: pytest.Session,
     items: dict[str, pytest.Item],
     job: dict[str, Any],
-    live: dict[str, dict[CodeType, list[FunctionType]]],
+    live: Live,
 ) -> None:
     """Run the tests of a job until one fails, and end the process."""
     global _log
@@ -178,7 +190,8 @@ def exchange(
     Raises
     ------
     NotExchangedError
-        They differ in more than bodies of functions, defaults and constants.
+        They differ in more than bodies of functions, defaults and constants, or none of the functions
+        is known to be alive.
     """
     pairs = _differing_code(before, after, path)
     if pairs is None:
@@ -186,6 +199,8 @@ def exchange(
         for module in modules:
             _Definitions(module, before, after, path).exchange()
         return
+    if pairs and not any(live.get(old) for old, _ in pairs):
+        raise NotExchangedError("no function that differs is alive")
     for old, new in pairs:
         for function in live.get(old, ()):
             function.__code__ = new
