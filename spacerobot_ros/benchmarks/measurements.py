@@ -218,7 +218,7 @@ def plans(
     to ``library`` other goals.
     """
     from spacerobot_ros.planning.methods.optimal.method import OptimalGait
-    from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
+    from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions
 
     robot, chosen_case = SpaceRobot.from_file(urdf), CASES[case]
     chosen = {**chosen_case.options, **options, "cache": 0}
@@ -261,7 +261,7 @@ def first_plan(urdf: str) -> dict[str, float]:
     there, ``cpu_s``; that of the same plan again, ``plan_cpu_s``.
     """
     from spacerobot_ros.planning.methods.optimal.method import OptimalGait
-    from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
+    from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions
 
     robot = SpaceRobot.from_file(urdf)
     method = OptimalGait(robot, _PERIOD, options=OptimalOptions(cache=0))

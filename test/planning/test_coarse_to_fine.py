@@ -20,10 +20,10 @@ from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     MultipleShooting,
     StopRule,
 )
-from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
+    OptimalOptions,
     PathConstraints,
     Trajectory,
 )

@@ -16,8 +16,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, RobotState, plan
 from spacerobot_ros.planning.methods.optimal import multiple_shooting, search
-from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
-from spacerobot_ros.planning.methods.optimal.problem import PathConstraints
+from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions, PathConstraints
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
 from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages, program
 

@@ -29,11 +29,12 @@ from spacerobot_ros.planning import (
     plan,
 )
 from spacerobot_ros.planning.core.controllability import shape_box
-from spacerobot_ros.planning.core.reach import CenterReach
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
-from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
-from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
-from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
+from spacerobot_ros.planning.methods.optimal.goal_specification import (
+    CenterReach,
+    GoalSpecification,
+)
+from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, OptimalOptions
 
 Array = npt.NDArray[np.float64]
 

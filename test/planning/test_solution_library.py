@@ -14,7 +14,7 @@ from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, plan
-from spacerobot_ros.planning.methods.optimal.library import SolutionLibrary
+from spacerobot_ros.planning.methods.optimal.initial_guesses import SolutionLibrary
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions, MotionLimits
 
 QUICK = {"cache": 0, "intervals": 20, "answers": 2}

@@ -31,9 +31,8 @@ from spacerobot_ros.planning.core.controllability import brackets_anywhere
 from spacerobot_ros.planning.core.goal import Controlled, PoseError
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
+from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes, straight_motion
 from spacerobot_ros.planning.methods.nominal_shape import PLANES, NominalChoice, NominalShape
-from spacerobot_ros.planning.methods.straight_legs import straight_motion
 
 _TRIALS = 6
 """A cycle that would not bring the base nearer is tried this often, each time half as large."""

@@ -32,7 +32,7 @@ from spacerobot_ros.planning.core.controllability import tilted_goal
 from spacerobot_ros.planning.core.goal import Controlled, PoseError
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
+from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes, straight_motion
 from spacerobot_ros.planning.methods.geometric_phase import (
     PhasePlane,
     PlanarPhase,
@@ -41,7 +41,6 @@ from spacerobot_ros.planning.methods.geometric_phase import (
     planar_axis,
     square_corners,
 )
-from spacerobot_ros.planning.methods.straight_legs import straight_motion
 
 _WORTHWHILE = 0.1
 """A missing turn below this share of the tolerance is left as it is."""

@@ -27,6 +27,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import attitude_error, matrix_from_quaternion
 from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
 from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -96,7 +97,7 @@ class CommandHolder:
     """Turns trajectories of one robot into held commands."""
 
     def __init__(self, model: ManoeuvreModel) -> None:
-        robot = model.robot
+        self._robot = robot = model.robot
         self._prediction = model.prediction
         self._period = model.control_period
         self._axes, self._efforts = model.axes, model.efforts
@@ -108,20 +109,26 @@ class CommandHolder:
         self,
         trajectory: Trajectory,
         boundary: BoundaryConditions,
-        final: Array,
         limits: MotionLimits,
         *,
-        fewest_ticks: int = 1,
         fixed: bool = False,
         before: Array | float = 0.0,
     ) -> HeldCommands | None:
-        """Return the commands of a trajectory that end in ``final`` (n,) and the goal attitude.
+        """Return the commands of a trajectory that end in the shape and attitude of the goal.
 
         They take the trajectory's time, rounded up to ticks, or as much longer as it takes to keep
         the limits (``fixed``: not longer); None where that is not found. Where the boundary
-        conditions leave the last shape free, some end near ``final`` only.
+        conditions leave the last shape free, it is the trajectory's, or one near to it. ``before``
+        are the velocities (n,) that are held until then.
         """
-        ticks = max(fewest_ticks, math.ceil(trajectory.duration / self._period - _ROUNDING))
+        final = boundary.final
+        if final is None:
+            final = np.clip(trajectory.shapes[-1], limits.lower, limits.upper)
+        if boundary.center is not None:
+            final = nearest_for_center(self._robot, limits, final, boundary.center)
+        if final is None:
+            return None
+        ticks = max(1, math.ceil(trajectory.duration / self._period - _ROUNDING))
         most = ticks if fixed else max(_COARSE, math.ceil(_LONGEST_STRETCH * ticks) + 4)
         free = boundary.final is None and boundary.center is None
         for _ in range(_MOST_STRETCHES):

@@ -38,23 +38,26 @@ from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
 from spacerobot_ros.planning.methods.optimal.held_commands import ManoeuvreModel
-from spacerobot_ros.planning.methods.optimal.in_motion import MotionBudget, MotionSearch
-from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
-from spacerobot_ros.planning.methods.optimal.library import (
+from spacerobot_ros.planning.methods.optimal.initial_guesses import (
     SolutionLibrary,
     library_file,
     library_key,
     load_library,
 )
-from spacerobot_ros.planning.methods.optimal.options import OptimalOptions
+from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     CandidateError,
     MotionLimits,
+    OptimalOptions,
     PathConstraints,
     per_joint,
 )
-from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch, SearchBudget
+from spacerobot_ros.planning.methods.optimal.search import (
+    ManoeuvreSearch,
+    MotionSearch,
+    SearchBudget,
+)
 from spacerobot_ros.private_files import Cache
 from spacerobot_ros.version import __version__
 
@@ -230,12 +233,11 @@ class OptimalGait(GaitMethod):
         if again and duration > 0:
             # The same manoeuvre goes on, and is to be over when it was.
             duration = (len(motion.remaining) - 1) * self.control_period
-        budget = MotionBudget(
-            duration,
-            chosen.longest,
+        budget = replace(
+            self._budget(correction=False),
+            duration=duration,
             starts=1 if again else min(chosen.starts, _STARTS_IN_MOTION),
             solutions=1 if again else chosen.answers,
-            iterations=chosen.iterations,
         )
         found = self._motion_search.search(
             boundary,
@@ -246,7 +248,7 @@ class OptimalGait(GaitMethod):
             motion,
             cancellation,
         )
-        notes: Notes = {"starts": float(found.starts), "durations": list(found.durations)}
+        notes: Notes = {"starts": float(found.starts), "durations": list(found.solutions)}
         return self._schedule(
             request.state, request.goal, found.held.positions, notes, motion.velocity
         )
