@@ -6,6 +6,18 @@ from enum import Enum
 _LONGEST_SENTENCE = 2000
 
 
+def printable(text: str) -> str:
+    """Return a text of unknown origin in one line and without control characters.
+
+    Terminals act on control characters: texts from topics and bags pass through here before they
+    are shown or logged.
+    """
+    line = " ".join(text.splitlines())
+    if line.isprintable():
+        return line
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
+
+
 class SpaceRobotError(Exception):
     """Base of every error this package raises on purpose, with one sentence for the user.
 
@@ -13,12 +25,10 @@ class SpaceRobotError(Exception):
     """
 
     def __init__(self, sentence: str = "") -> None:
-        line = " ".join(str(sentence).splitlines())
+        line = printable(str(sentence))
         if len(line) > _LONGEST_SENTENCE:
             half = _LONGEST_SENTENCE // 2
             line = f"{line[:half]} ... {line[-half:]}"
-        if not line.isprintable():
-            line = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
         super().__init__(line)
 
 

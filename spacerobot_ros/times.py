@@ -18,6 +18,9 @@ HEADER_STAMP = slice(4, 12)
 
 _TIME = struct.Struct("<iI")
 
+unpack_stamp = struct.Struct(f"<{HEADER_STAMP.start}xiI").unpack_from
+"""Returns seconds and nanoseconds of the time at the beginning of a serialised message."""
+
 
 def stamp_bytes(time_ns: int) -> bytes:
     """Return a time as a serialised builtin_interfaces/Time.
@@ -35,15 +38,9 @@ def stamp_bytes(time_ns: int) -> bytes:
         ) from None
 
 
-def read_stamp_ns(raw: bytes, offset: int = HEADER_STAMP.start) -> int:
-    """Return the time at ``offset`` in a serialised message as it stands there, ns."""
-    seconds, nanoseconds = _TIME.unpack_from(raw, offset)
-    return int(seconds * SECOND + nanoseconds)
-
-
 def first_time_ns(raw: bytes) -> int:
     """Return the time at the beginning of a serialised message, limited to 0 ... LATEST_NS, ns."""
-    seconds, nanoseconds = _TIME.unpack_from(raw, HEADER_STAMP.start)
+    seconds, nanoseconds = unpack_stamp(raw)
     time_ns: int = seconds * SECOND + nanoseconds
     # Once for every message: three comparisons take less time than min and max.
     return time_ns if 0 <= time_ns <= LATEST_NS else 0 if time_ns < 0 else LATEST_NS

@@ -4,10 +4,11 @@ from spacerobot_ros.bag.playback import Playback, ReplayMessage, ReplayTopic, Ti
 from spacerobot_ros.bag.reader import Bag, iterate_raw, read_bag
 from spacerobot_ros.bag.recorded_robot import RecordedRobot
 from spacerobot_ros.bag.recording import Recording, RecordingState
-from spacerobot_ros.bag.rosbag2 import LATCHED, QosProfile, message_definition, type_hash
+from spacerobot_ros.bag.rosbag2 import LATCHED, QosProfile
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.bag.writer import BagWriter, free_name
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.messages.definitions import message_definition, type_hash
 
 __all__ = [
     "LATCHED",

@@ -15,7 +15,6 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata
 from numpy.typing import NDArray
 
-from spacerobot_ros.bag.definitions import MessageTypes
 from spacerobot_ros.bag.export import to_pandas, to_xarray
 from spacerobot_ros.bag.mcap_reading import (
     RawMessage,
@@ -29,6 +28,7 @@ from spacerobot_ros.bag.rosbag2 import QosProfile
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.bag.tables import TopicTable, table_of
 from spacerobot_ros.errors import RecordingError, RobotDescriptionError
+from spacerobot_ros.messages.definitions import MessageTypes
 from spacerobot_ros.resources import suggestion
 from spacerobot_ros.times import SECOND
 

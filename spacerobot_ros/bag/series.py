@@ -1,20 +1,14 @@
-"""One topic of a bag as time series.
-
-Most topics repeat one layout: the same frame names, the same number of joints. There a field lies
-at the same place in every message, and a whole column of it is one slice of a matrix of bytes, some
-hundred times faster than decoding every message to pick one number from each.
-"""
+"""One topic of a bag as time series."""
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterator, KeysView, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,31 +16,11 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.messages.definitions import Fields
+from spacerobot_ros.messages.layout import DTYPES, Columns, columns_of, widened
 from spacerobot_ros.times import SECOND
 
-Fields: TypeAlias = dict[str, tuple[Any, list[tuple[str, Any]]]]
-"""Type name -> constants and fields, as ``rosbags`` parses a definition."""
-
-_DTYPES = {
-    "bool": np.dtype("?"),
-    "byte": np.dtype("u1"),
-    "char": np.dtype("u1"),
-    "int8": np.dtype("i1"),
-    "uint8": np.dtype("u1"),
-    "int16": np.dtype("<i2"),
-    "uint16": np.dtype("<u2"),
-    "int32": np.dtype("<i4"),
-    "uint32": np.dtype("<u4"),
-    "int64": np.dtype("<i8"),
-    "uint64": np.dtype("<u8"),
-    "float32": np.dtype("<f4"),
-    "float64": np.dtype("<f8"),
-}
-"""The numbers of a message as they are serialised."""
-
 _HEADER = (Nodetype.NAME, "std_msgs/msg/Header")
-_HEADER_SIZE = 4
-_LITTLE_ENDIAN_CDR = b"\x00\x01"
 
 _DAMAGE = (SerdeError, ValueError, IndexError, OverflowError, TypeError, struct.error)
 """What decoding a damaged message raises."""
@@ -231,7 +205,7 @@ class TopicSeries:
 
     @cached_property
     def _columns(self) -> Columns | None:
-        return columns(self._data, self.type_name, self._fields)
+        return columns_of(self._data, self.type_name, self._fields)
 
     def _require_decodable(self) -> None:
         """Refuse to make objects of much more than the file is large."""
@@ -271,8 +245,8 @@ class TopicSeries:
             if is_array:
                 kind, detail = detail[0]
             type_name = detail if kind == Nodetype.NAME else None
-            dtype = _DTYPES.get(detail[0]) if kind == Nodetype.BASE else None
-        return None if dtype is None else _widened(dtype), is_array, in_list, type_name
+            dtype = DTYPES.get(detail[0]) if kind == Nodetype.BASE else None
+        return None if dtype is None else widened(dtype), is_array, in_list, type_name
 
 
 def _matrix(values: Any, width: int) -> NDArray[np.float64]:
@@ -289,163 +263,3 @@ def _values(value: Any, path: Sequence[str]) -> Any:
             return [_values(element, path[depth:]) for element in value]
         value = getattr(value, name)
     return value
-
-
-def _widened(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type of a column of ``dtype`` for callers: one that does not soon overflow."""
-    if dtype.kind == "f":
-        return np.dtype(np.float64)
-    if dtype.kind in "iu" and dtype.itemsize < 8:
-        return np.dtype(np.int64)
-    return dtype.newbyteorder("=")
-
-
-@dataclass(frozen=True)
-class _Leaf:
-    """Where a field lies in every message; no ``dtype`` for a string, shape () for one number."""
-
-    offset: int
-    size: int
-    dtype: np.dtype[Any] | None
-    shape: tuple[int, ...]
-
-
-class Columns:
-    """The fields that lie at a fixed place in all of some messages."""
-
-    def __init__(
-        self, matrix: NDArray[np.uint8], leaves: dict[str, _Leaf], texts: dict[str, slice]
-    ) -> None:
-        self._matrix = matrix
-        self._leaves = leaves
-        self._texts = texts
-
-    @property
-    def paths(self) -> KeysView[str]:
-        """The fields, such as ``pose.pose.position.x``."""
-        return self._leaves.keys()
-
-    def constant(self, path: str) -> bool:
-        """Whether a list of texts has the same bytes in all messages."""
-        part = self._texts.get(path)
-        return part is not None and bool((self._matrix[:, part] == self._matrix[0, part]).all())
-
-    def __getitem__(self, path: str) -> NDArray[Any] | list[str]:
-        leaf = self._leaves[path]
-        rows = np.ascontiguousarray(self._matrix[:, leaf.offset : leaf.offset + leaf.size])
-        if leaf.dtype is None:
-            return [row.tobytes().decode() for row in rows]
-        column = rows.reshape(-1).view(leaf.dtype).reshape(len(rows), *leaf.shape)
-        return column.astype(_widened(leaf.dtype))
-
-
-def columns(messages: Sequence[bytes], type_name: str, fields: Fields) -> Columns | None:
-    """Return the fields that lie at the same place in every message of one type.
-
-    They are those outside of lists of messages and of strings; None if the layouts differ.
-    """
-    if not messages or len(set(map(len, messages))) != 1:
-        return None
-    layout = _Layout(messages[0], fields)
-    try:
-        layout.walk(type_name, "")
-    except (IndexError, KeyError):
-        return None
-    matrix = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
-    if layout.position > matrix.shape[1] or messages[0][:2] != _LITTLE_ENDIAN_CDR:
-        return None
-    fixed = [slice(0, 2), *(slice(start, start + 4) for start in layout.lengths)]
-    if any((matrix[:, part] != matrix[0, part]).any() for part in fixed):
-        return None
-    return Columns(matrix, layout.leaves, layout.texts)
-
-
-class _Layout:
-    """Walks through one message: where its fields and the lengths in it lie."""
-
-    def __init__(self, message: bytes, fields: Fields) -> None:
-        self.position = _HEADER_SIZE
-        self.lengths: list[int] = []
-        self.leaves: dict[str, _Leaf] = {}
-        self.texts: dict[str, slice] = {}
-        self._message = message
-        self._fields = fields
-
-    def walk(self, type_name: str, prefix: str | None) -> None:
-        """Go through a message; ``prefix`` is its path and a dot, None inside of a list."""
-        for name, (kind, detail) in self._fields[type_name][1]:
-            path = None if prefix is None else prefix + name
-            if kind == Nodetype.BASE:
-                self._value(detail[0], path)
-            elif kind == Nodetype.NAME:
-                self.walk(detail, None if path is None else f"{path}.")
-            else:
-                element, count = detail
-                self._elements(
-                    element, self._length() if kind == Nodetype.SEQUENCE else count, path
-                )
-
-    def _elements(self, element: tuple[Any, Any], count: int, path: str | None) -> None:
-        kind, detail = element
-        if kind == Nodetype.BASE and detail[0] != "string":
-            self._numbers(_DTYPES[detail[0]], path, (count,))
-            return
-        begin = self.position
-        for _ in range(count):
-            if kind == Nodetype.NAME:
-                self.walk(detail, None)
-            else:
-                self._value(detail[0], None)
-        if kind == Nodetype.BASE and path is not None:
-            self.texts[path] = slice(begin, self.position)
-
-    def _value(self, base: str, path: str | None) -> None:
-        if base != "string":
-            self._numbers(_DTYPES[base], path, ())
-            return
-        length = self._length()
-        if path is not None:
-            # The serialised string ends with a zero.
-            self.leaves[path] = _Leaf(self.position, max(length - 1, 0), None, ())
-        self._advance(length)
-
-    def _numbers(self, dtype: np.dtype[Any], path: str | None, shape: tuple[int, ...]) -> None:
-        size = dtype.itemsize * math.prod(shape)
-        if size:
-            self._align(dtype.itemsize)
-        if path is not None:
-            self.leaves[path] = _Leaf(self.position, size, dtype, shape)
-        self._advance(size)
-
-    def _advance(self, size: int) -> None:
-        self.position += size
-        if self.position > len(self._message):
-            # Or a count of 4e9 messages in a list would be believed.
-            raise IndexError("the message ends before its fields")
-
-    def _length(self) -> int:
-        self._align(4)
-        self.lengths.append(self.position)
-        word = self._message[self.position : self.position + 4]
-        if len(word) < 4:
-            raise IndexError("the message ends inside of a length")
-        self.position += 4
-        return int.from_bytes(word, "little")
-
-    def _align(self, size: int) -> None:
-        # Counted from the end of the header.
-        self.position += -(self.position - _HEADER_SIZE) % size
-
-
-def places(message: bytes, type_name: str, fields: Fields) -> dict[str, slice]:
-    """Return where the fields of one serialised message are, outside of lists of messages.
-
-    Raises
-    ------
-    IndexError
-        The message ends before its fields.
-    """
-    layout = _Layout(message, fields)
-    layout.walk(type_name, "")
-    leaves = layout.leaves.items()
-    return {path: slice(leaf.offset, leaf.offset + leaf.size) for path, leaf in leaves}

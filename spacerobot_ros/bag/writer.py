@@ -15,14 +15,9 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 
 from spacerobot_ros.bag.mcap_file import BagExistsError, McapFile, encode
-from spacerobot_ros.bag.rosbag2 import (
-    QosProfile,
-    RecordedTopic,
-    message_definition,
-    metadata_record,
-    type_hash,
-)
+from spacerobot_ros.bag.rosbag2 import QosProfile, RecordedTopic, metadata_record
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.messages.definitions import message_definition, type_hash
 
 _MESSAGE_HEADER = struct.Struct("<BQHIQQ")
 """Opcode, length of the rest, channel, sequence, log time, publish time."""

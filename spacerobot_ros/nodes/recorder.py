@@ -16,25 +16,33 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.experimental import EventsExecutor
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import String
 
-from spacerobot_ros.bag import BagWriter, QosProfile, Recording, RecordingState
+from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, Recording, RecordingState
 from spacerobot_ros.bag.config import RecorderConfig
-from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.errors import (
+    CommandError,
+    ParameterError,
+    RecordingError,
+    RobotDescriptionError,
+    SpaceRobotError,
+)
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status, message_class
-from spacerobot_ros.nodes.common.node import STREAM, FlightNode
-from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.common.recorded_transforms import RecordedTransforms
-from spacerobot_ros.nodes.common.remote_parameters import RemoteParameters
-from spacerobot_ros.nodes.common.streams import RawInput, RawStream, Take
-from spacerobot_ros.nodes.common.transforms import (
+from spacerobot_ros.messages.readers import read_text
+from spacerobot_ros.messages.transforms import (
     STATIC_TRANSFORMS,
     TRANSFORM_TYPE,
     TRANSFORMS,
+    RobotTransforms,
+    StateFrames,
 )
+from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.urdf import parse_robot
+from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status, message_class
+from spacerobot_ros.nodes.common.node import STREAM, FlightNode
+from spacerobot_ros.nodes.common.process import run_node
+from spacerobot_ros.nodes.common.remote_parameters import RemoteParameters
+from spacerobot_ros.nodes.common.streams import RawInput, RawStream, Take
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns, set_stamp
 from spacerobot_ros.topics import NOT_RECORDED
@@ -48,6 +56,7 @@ _SHARED = ("/diagnostics", TRANSFORMS, STATIC_TRANSFORMS)
 
 _DESCRIPTION = "robot_description"
 
+TEXT = "std_msgs/msg/String"
 _CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
 _COMMON_NODES = {
@@ -117,7 +126,7 @@ class RecorderNode(FlightNode):
         frames = tuple(map(self.resolve_topic_name, (TRANSFORMS, STATIC_TRANSFORMS)))
         self._listeners: dict[str, Take] = {}
         if config.tf_period and self._is_chosen(frames[0], TRANSFORM_TYPE):
-            self._listeners = RecordedTransforms(
+            self._listeners = _RecordedTransforms(
                 self.recording,
                 config.tf_period,
                 (frames[0], frames[1]),
@@ -396,6 +405,96 @@ class RecorderNode(FlightNode):
         self._diagnostics.publish(array)
 
 
+class _RecordedTransforms:
+    """Writes the frames of one robot by its recorded topics.
+
+    A state is taken when its odom and its joint_states are there, whichever comes first; so the
+    transforms have the stamps of states.
+
+    Parameters
+    ----------
+    recording
+        Where they go.
+    period
+        Bag time between two of them, s.
+    topics
+        Names of /tf and /tf_static in the bag.
+    is_published
+        Returns whether a node publishes /tf: its messages are recorded, and none are written here.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        period: float,
+        topics: tuple[str, str],
+        is_published: Callable[[], bool],
+    ) -> None:
+        self._recording, self._topics, self._is_published = recording, topics, is_published
+        self._period_ns = round(period * SECOND)
+        self._odom, self._joint_states = b"", b""
+        self._last_ns, self._next_ns = 0, 0
+        self._description: RobotDescription | None = None
+        self._state: StateFrames | None = None
+        self._frames: RobotTransforms | None = None
+        self._channel = -1
+
+    def listeners(self, odom: str, joint_states: str, description: str) -> dict[str, Take]:
+        """Return the callback of every message of these topics."""
+        return {
+            odom: self._on_odom,
+            joint_states: self._on_joint_states,
+            description: self._on_description,
+        }
+
+    def _on_odom(self, raw: bytes) -> None:
+        self._odom = raw
+        if raw[HEADER_STAMP] == self._joint_states[HEADER_STAMP]:
+            self._take_state(first_time_ns(raw))
+
+    def _on_joint_states(self, raw: bytes) -> None:
+        self._joint_states = raw
+        if raw[HEADER_STAMP] == self._odom[HEADER_STAMP]:
+            self._take_state(first_time_ns(raw))
+
+    def _on_description(self, raw: bytes) -> None:
+        try:
+            description = parse_robot(read_text(raw, TEXT, "data"))
+        except (RobotDescriptionError, CommandError):
+            return  # Nothing is known of such a robot.
+        self._description, self._frames = description, None
+        self._state = StateFrames(description)
+
+    def _take_state(self, time_ns: int) -> None:
+        """Write the transforms if the period is over, or time has gone back."""
+        state = self._state
+        if self._last_ns <= time_ns < self._next_ns or state is None:
+            return
+        if not self._recording.running or self._is_published():
+            return
+        try:
+            state.accept(self._odom, self._joint_states)
+            self._write(state, time_ns)
+        except (CommandError, RecordingError):
+            return  # Of another robot; a disk that refuses is reported by whatever is next.
+        self._last_ns, self._next_ns = time_ns, time_ns + self._period_ns
+
+    def _write(self, state: StateFrames, time_ns: int) -> None:
+        recording = self._recording
+        if self._frames is None:
+            assert self._description is not None
+            self._frames = RobotTransforms(self._description, state.world, state.prefix, links=True)
+            self._channel = recording.writer.add_topic(
+                self._topics[0], TRANSFORM_TYPE, QosProfile(depth=100)
+            )
+            static = self._frames.static_message(time_ns)
+            if static is not None:
+                channel = recording.writer.add_topic(self._topics[1], TRANSFORM_TYPE, LATCHED)
+                recording.record(channel, static, time_ns)
+        message = self._frames.message(time_ns, state.pose, state.q)
+        recording.record(self._channel, message, time_ns)
+
+
 class _StreamTaps:
     """Listens to the streams of nodes of this process, where these carry all of a topic."""
 
@@ -472,7 +571,7 @@ def _take(
 
     def on_description(raw: bytes) -> None:
         if urdf_name not in recording.attached:
-            urdf = deserialize_message(raw, String).data.encode()
+            urdf = read_text(raw, TEXT, "data").encode()
             recording.attach_robot(urdf_name, urdf)
         record(channel, raw)
 

@@ -20,7 +20,6 @@ from mcap.writer import MCAP0_MAGIC
 from rosbags.interfaces import Nodetype
 
 from spacerobot_ros.bag import RecordingError, read_bag
-from spacerobot_ros.bag.definitions import MessageTypes, _Sizes
 from spacerobot_ros.bag.mcap_reading import _check_entries
 from spacerobot_ros.bag.mcap_records import (
     LIMIT_VARIABLE,
@@ -30,6 +29,7 @@ from spacerobot_ros.bag.mcap_records import (
     records_in,
     unpacked,
 )
+from spacerobot_ros.messages.definitions import MessageTypes, _Sizes
 
 
 def record(opcode: int, body: bytes, claims: int | None = None) -> bytes:

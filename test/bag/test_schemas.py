@@ -11,7 +11,7 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from spacerobot_ros.bag import RecordingError, message_definition, type_hash
-from spacerobot_ros.bag.definitions import MessageTypes, _known
+from spacerobot_ros.messages.definitions import MessageTypes, _known
 
 TYPES = [
     "diagnostic_msgs/msg/DiagnosticArray",

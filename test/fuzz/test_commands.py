@@ -11,8 +11,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from support.fuzzing import NUMBERS, TEXTS, damaged, fuzz
 
+from spacerobot_ros.messages.readers import CommandReader
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.nodes.plant.command_messages import CommandReader
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Reason

@@ -9,21 +9,22 @@ from typing import Any
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path
+from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from support.ros_harness import nanoseconds
 from visualization_msgs.msg import Marker
 
 from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.messages.builders import path_message
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion
-from spacerobot_ros.nodes.common.messages import goal_of, shape_marker, shape_of
-from spacerobot_ros.nodes.planner.messages import goal_markers, path_message, status_message
+from spacerobot_ros.nodes.common.messages import goal_markers, goal_of, shape_marker, shape_of
 from spacerobot_ros.nodes.plant.diagnostics import PlantReport, timing_status
 from spacerobot_ros.nodes.plant.publisher import LinkMarkers
 from spacerobot_ros.planning import BasePath, Goal
-from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
@@ -88,7 +89,7 @@ def test_the_goal_is_a_ghost_and_the_path_a_line() -> None:
 
 
 def test_a_path_begins_at_its_start() -> None:
-    message = path_message(PATH, 7_900_000_000, "map")
+    message = deserialize_message(path_message(PATH, 7_900_000_000, "map"), Path)
     assert (message.header.frame_id, nanoseconds(message.header.stamp)) == ("map", 7_900_000_000)
     times = [nanoseconds(pose.header.stamp) for pose in message.poses]
     assert times == [7_900_000_000, 8_400_000_000, 10_150_000_000]
@@ -96,19 +97,6 @@ def test_a_path_begins_at_its_start() -> None:
     for k, stamped in enumerate(message.poses):
         expected = [*PATH.position[k], *PATH.quaternion[k]]
         assert numbers(stamped.pose) == pytest.approx(expected)
-
-
-def test_a_status_has_its_level() -> None:
-    for state, level in (
-        (PlannerState.REACHED, b"\0"),
-        (PlannerState.ABORTED, b"\1"),
-        (PlannerState.REFUSED, b"\2"),
-    ):
-        message = status_message(PlannerStatus(state, "Words.", goal_id="1.5"), "/a/planner")
-        assert (message.level, message.message, message.name) == (level, "Words.", "/a/planner")
-        assert {"state": state.value, "goal_id": "1.5"}.items() <= {
-            pair.key: pair.value for pair in message.values
-        }.items()
 
 
 def test_a_goal_pose_is_taken_in_its_frame() -> None:

@@ -18,13 +18,13 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag, type_hash
 from spacerobot_ros.bag.recorded_robot import columns
-from spacerobot_ros.bag.rosbag2 import _OWN_DEFINITIONS
+from spacerobot_ros.messages.definitions import _OWN_DEFINITIONS
+from spacerobot_ros.messages.transforms import TRANSFORM_TYPE, TransformTemplate
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
-from spacerobot_ros.nodes.common.messages import chained
-from spacerobot_ros.nodes.common.transforms import TRANSFORM_TYPE, KnownFrames, TransformTemplate
+from spacerobot_ros.nodes.common.messages import KnownFrames, chained
 from spacerobot_ros.resources import resource_names, robot_file
 
 TOLERANCE = 1e-12

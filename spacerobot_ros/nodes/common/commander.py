@@ -22,14 +22,14 @@ from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.flight.plant_listener import Change, PlantListener, Stopped
 from spacerobot_ros.flight.state_synchroniser import StateSynchroniser
+from spacerobot_ros.messages.readers import JointReader
+from spacerobot_ros.messages.transforms import StateFrames, robot_frames
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.shared_parameters import robot_from_text, robot_of
-from spacerobot_ros.nodes.common.cdr import JointReader
-from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
+from spacerobot_ros.nodes.common.messages import KnownFrames, diagnostic_name, diagnostic_status
 from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.state_times import StateTimes
-from spacerobot_ros.nodes.common.transforms import KnownFrames, StateFrames, robot_frames
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.simulation.status import PlantStatus

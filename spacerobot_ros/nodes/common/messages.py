@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import importlib
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import Point, PoseStamped, TransformStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
-from visualization_msgs.msg import Marker
+from visualization_msgs.msg import Marker, MarkerArray
 
-from spacerobot_ros.bag import message_definition
 from spacerobot_ros.errors import PlanningError, RecordingError, SpaceRobotError
+from spacerobot_ros.messages.definitions import message_definition
+from spacerobot_ros.messages.transforms import STATIC_TRANSFORMS, TRANSFORM_TYPE, TRANSFORMS
 from spacerobot_ros.model.description import Array, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_multiply
-from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning import BasePath, Goal
 
 _KINDS = {
     "box": Marker.CUBE,
@@ -24,6 +28,11 @@ _KINDS = {
     "sphere": Marker.SPHERE,
     "mesh": Marker.MESH_RESOURCE,
 }
+_LISTENED = 200
+"""Messages of /tf that are kept: some seconds of a robot with several publishers."""
+
+_LISTENED_STATIC = 100
+_LONGEST_CHAIN = 1000
 
 
 def message_class(type_name: str) -> Any:
@@ -78,6 +87,29 @@ def shape_marker(shape: Shape, frame: str, namespace: str, number: int) -> Marke
     marker.color.r, marker.color.g, marker.color.b, marker.color.a = (float(x) for x in shape.rgba)
     marker.mesh_resource = shape.resource
     return marker
+
+
+def goal_markers(
+    goal: Goal, path: BasePath, base_shapes: Sequence[Shape], frame: str
+) -> MarkerArray:
+    """Return the base as a ghost at the goal, and the planned path of the base as a line."""
+    markers: list[Marker] = []
+    for shape in base_shapes:
+        marker = shape_marker(shape, frame, "goal", len(markers))
+        marker.color.a = 0.25
+        marker.pose.position.x, marker.pose.position.y, marker.pose.position.z = (
+            goal.position.tolist()
+        )
+        o = marker.pose.orientation
+        o.x, o.y, o.z, o.w = goal.quaternion.tolist()
+        markers.append(marker)
+    line = Marker(ns="planned_path", id=len(markers), type=Marker.LINE_STRIP, action=Marker.ADD)
+    line.header.frame_id = frame
+    line.scale.x = 0.005
+    line.color.r, line.color.g, line.color.b, line.color.a = 0.95, 0.6, 0.1, 1.0
+    line.pose.orientation.w = 1.0
+    line.points = [Point(x=x, y=y, z=z) for x, y, z in path.position.tolist()]
+    return MarkerArray(markers=[*markers, line])
 
 
 def goal_of(
@@ -142,3 +174,77 @@ def shape_of(message: JointState, joint_names: Sequence[str]) -> Array:
     if not np.all(np.isfinite(list(values.values()))):
         raise PlanningError("The goal shape is refused: a position is not finite.")
     return np.array([values[name] for name in joint_names])
+
+
+def transform_class() -> Any | None:
+    """Return the class of TFMessage, or None where its package is not installed."""
+    try:
+        return message_class(TRANSFORM_TYPE)
+    except SpaceRobotError:
+        return None
+
+
+class KnownFrames:
+    """The frames that a node knows: those of its robot's state, and those of /tf where it is there.
+
+    Messages of /tf are kept as they are received, and read when a frame is asked for.
+
+    Parameters
+    ----------
+    node
+        Whose they are.
+    """
+
+    def __init__(self, node: Any) -> None:
+        self._recent: deque[bytes] = deque(maxlen=_LISTENED)
+        self._static: deque[bytes] = deque(maxlen=_LISTENED_STATIC)
+        self._kind = transform_class()
+        if self._kind is None:
+            return
+        reliable = ReliabilityPolicy.RELIABLE
+        latched = QoSProfile(
+            depth=_LISTENED_STATIC,
+            reliability=reliable,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL,
+        )
+        stream = QoSProfile(depth=100, reliability=reliable)
+        for topic, kept, qos in (
+            (TRANSFORMS, self._recent, stream),
+            (STATIC_TRANSFORMS, self._static, latched),
+        ):
+            node.create_subscription(self._kind, topic, kept.append, qos, raw=True)
+
+    def pose(self, frame: str, world: str, own: dict[str, tuple[str, Array]]) -> Array | None:
+        """Return the pose (7,) of a frame in the world, by the latest that is known of it.
+
+        ``own`` goes before what /tf says: by frame its parent and its pose in that. None: nothing
+        connects the two.
+        """
+        parents = {**self._heard(), **own}
+        pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+        for _ in range(_LONGEST_CHAIN):  # Frames may be connected in a circle.
+            if frame == world:
+                return pose
+            if frame not in parents:
+                return None
+            frame, step = parents[frame]
+            pose = chained(step, pose)
+        return None
+
+    def _heard(self) -> dict[str, tuple[str, Array]]:
+        received: dict[str, tuple[str, Array]] = {}
+        for raw in (*self._static, *self._recent):
+            try:
+                transforms: Sequence[TransformStamped] = deserialize_message(
+                    raw, self._kind
+                ).transforms
+            except RuntimeError:
+                continue  # Bytes that are no such message.
+            for each in transforms:
+                r, o = each.transform.translation, each.transform.rotation
+                pose = np.array([r.x, r.y, r.z, o.x, o.y, o.z, o.w])
+                length = float(np.linalg.norm(pose[3:]))
+                if np.all(np.isfinite(pose)) and length > 0.5:
+                    pose[3:] /= length
+                    received[each.child_frame_id] = each.header.frame_id, pose
+        return received

@@ -9,11 +9,19 @@ from typing import Any
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 
-from spacerobot_ros.nodes.common.cdr import raw_publish
-
 Take = Callable[[bytes], None]
 
 _TWO_PARAMETERS = inspect.signature(lambda message, information: None)
+
+
+def raw_publish(publisher: Publisher) -> Take:
+    """Return the function that publishes serialised messages.
+
+    ``publisher.publish`` does the same after taking its handle and looking at the type, which
+    costs as much again as the publication; the handle lives as long as the publisher.
+    """
+    function: Take = publisher.handle.publish_raw
+    return function
 
 
 class RawStream:

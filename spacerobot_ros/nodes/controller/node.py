@@ -22,9 +22,17 @@ from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.plant_listener import Change, Stopped
 from spacerobot_ros.flight.state_synchroniser import CONTRADICTION, Pairing, StateSynchroniser
+from spacerobot_ros.messages.layout import encode
+from spacerobot_ros.messages.readers import (
+    ODOMETRY,
+    WRENCH,
+    JointReader,
+    MessageTemplate,
+    TemplateReader,
+    joint_template,
+)
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.nodes.common.cdr import JointReader, MessageTemplate, TemplateReader
 from spacerobot_ros.nodes.common.commander import CommanderNode
 from spacerobot_ros.nodes.common.messages import diagnostic_status, goal_of, goal_sentence
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
@@ -125,15 +133,11 @@ class CoordinatedControlNode(CommanderNode):
         self._references = JointReader(robot.joint_names, ["position", "velocity"])
         self._held_velocities = HeldVelocityReference(self.config.control_period)
         self._effort, self._wrench = np.zeros(robot.n), np.zeros(6)
-        names, zeros = list(robot.joint_names), [0.0] * robot.n
-        self._joint_message = MessageTemplate(
-            JointState(name=names, position=zeros, velocity=zeros, effort=zeros)
-        )
+        self._joint_message = joint_template(robot.joint_names)
         if robot.n:
             self._joint_message.feed("effort", self._effort)
-        wrench = WrenchStamped()
-        wrench.header.frame_id = robot.base_link
-        self._wrench_message = MessageTemplate(wrench)
+        header = {"frame_id": robot.base_link}
+        self._wrench_message = MessageTemplate(WRENCH, encode(WRENCH, {"header": header}))
         self._wrench_message.feed("wrench.force.x", self._wrench)
         waiting, self._waiting = self._waiting, {}
         for key, goal in waiting.items():
@@ -318,11 +322,11 @@ class CoordinatedControlNode(CommanderNode):
 _POSE, _TWIST = "pose.pose.position.x", "twist.twist.linear.x"
 
 
-def _odometry_reader() -> TemplateReader[Odometry]:
-    return TemplateReader(Odometry, lambda _: {_POSE: 7, _TWIST: 6})
+def _odometry_reader() -> TemplateReader:
+    return TemplateReader(ODOMETRY, {_POSE: 7, _TWIST: 6})
 
 
-def _pose_and_twist(reader: TemplateReader[Odometry], raw: bytes) -> tuple[Array, Array]:
+def _pose_and_twist(reader: TemplateReader, raw: bytes) -> tuple[Array, Array]:
     reader.accept(raw)
     return reader.floats(_POSE), reader.floats(_TWIST)
 

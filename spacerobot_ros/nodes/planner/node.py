@@ -19,20 +19,20 @@ from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.events import Event
 from spacerobot_ros.flight.plant_listener import Change, Stopped
 from spacerobot_ros.flight.state_synchroniser import CONTRADICTION, Pairing, StateSynchroniser
+from spacerobot_ros.messages.builders import path_message, trajectory_message
+from spacerobot_ros.messages.readers import StateReader, joint_template
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.commander import CommanderNode
-from spacerobot_ros.nodes.common.messages import goal_of, goal_sentence, shape_of
+from spacerobot_ros.nodes.common.messages import (
+    diagnostic_status,
+    goal_markers,
+    goal_of,
+    goal_sentence,
+    shape_of,
+)
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.planner.messages import (
-    StateReader,
-    goal_markers,
-    path_message,
-    serialised_trajectory,
-    setpoint_template,
-    status_message,
-)
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive, Transition
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
@@ -146,7 +146,10 @@ class PlannerNode(CommanderNode):
         self._measured = StateReader(robot.joint_names)
         self._joint_reader = self._measured.shape_reader
         self._plant_reported()
-        self._setpoint = setpoint_template(robot.joint_names, executive.setpoint)
+        self._setpoint = joint_template(robot.joint_names)
+        if robot.n:
+            self._setpoint.feed("position", executive.setpoint.position)
+            self._setpoint.feed("velocity", executive.setpoint.velocity)
         if self._waiting is not None:
             executive.propose(self._waiting)
             self._waiting = None
@@ -324,7 +327,8 @@ class PlannerNode(CommanderNode):
 
     def _publish_status(self, status: PlannerStatus) -> None:
         """Publish a status, and an event where it decides a goal, and log its sentence."""
-        self._said = status_message(status, self.get_fully_qualified_name())
+        name, level = self.get_fully_qualified_name(), bytes([status.state.level])
+        self._said = diagnostic_status(name, level, status.message, status.to_values())
         self._status_topic.publish(self._said)
         event = decision_event(status)
         if event is not None:
@@ -351,7 +355,7 @@ class PlannerNode(CommanderNode):
         schedule, stamp, frame = start.schedule, start.stamp_ns, self.config.world_frame
         assert self._robot is not None
         base = self._robot.description
-        self._schedule_topic.publish(serialised_trajectory(schedule, stamp, base.base_link))
+        self._schedule_topic.publish(trajectory_message(schedule, stamp, base.base_link))
         self._path_topic.publish(path_message(schedule.path, stamp, frame))
         shapes = base.links[0].shapes
         self._markers_topic.publish(goal_markers(schedule.goal, schedule.path, shapes, frame))

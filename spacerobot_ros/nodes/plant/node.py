@@ -19,14 +19,14 @@ from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.bag.recorded_robot import last_state
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.messages.readers import CommandReader
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.shared_parameters import robot_of
-from spacerobot_ros.nodes.common.messages import diagnostic_status
+from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.streams import RawInput
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
-from spacerobot_ros.nodes.plant.command_messages import CommandReader
 from spacerobot_ros.nodes.plant.diagnostics import PlantReport
 from spacerobot_ros.nodes.plant.publisher import (
     LinkMarkers,
@@ -41,6 +41,7 @@ from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
 from spacerobot_ros.simulation.time_modes import Lockstep, RealTime
 from spacerobot_ros.times import SECOND
+from spacerobot_ros.topics import TOPICS
 
 _LOOK_PERIOD = 0.1
 """How often a plant looks for new subscribers and commanders, wall s."""
@@ -156,7 +157,7 @@ class PlantNode(FlightNode):
         for source in self._commands.sources:
             reader = CommandReader(source, robot, config.frame_prefix)
             self.take_raw(
-                reader.message_type,
+                message_class(TOPICS[source.topic].type),
                 source.topic,
                 partial(self._on_command, reader),
                 # In lockstep the first command of a tick counts, of whichever publisher.

@@ -5,30 +5,27 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
+from rclpy.serialization import serialize_message
+from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
+from spacerobot_ros.messages.builders import state_message
+from spacerobot_ros.messages.readers import MessageTemplate
+from spacerobot_ros.messages.transforms import STATIC_TRANSFORMS, TRANSFORMS, RobotTransforms
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Pose
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
-from spacerobot_ros.nodes.common.cdr import MessageTemplate
-from spacerobot_ros.nodes.common.messages import message_class, shape_marker
+from spacerobot_ros.nodes.common.messages import message_class, shape_marker, transform_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.streams import RawOutput
-from spacerobot_ros.nodes.common.transforms import (
-    STATIC_TRANSFORMS,
-    TRANSFORMS,
-    RobotTransforms,
-    transform_class,
-)
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.times import stamp_bytes
 from spacerobot_ros.topics import TOPICS, Topic
+
+MARKERS = "visualization_msgs/msg/MarkerArray"
 
 _PATIENCE = 0.5
 """Longest wait for readers, wall s."""
@@ -121,25 +118,9 @@ class StatePublisher:
 
     def _template(self, topic: Topic) -> MessageTemplate:
         """Return the message of a topic, fed with the quantities that it carries."""
-        message = message_class(topic.type)()
-        names = list(self._state.names(topic))
-        if topic.state and hasattr(message, "header"):
-            message.header.frame_id = self._base if topic.frame == "base" else self._world
-        for field in topic.state:
-            if not field.members:
-                setattr(message, field.path, [0.0] * len(field.entries or names))
-        match message:
-            case Odometry():
-                message.child_frame_id = self._base
-            case JointState():
-                message.name = names
-            case Float64MultiArray():
-                words = topic.state[0].entries
-                dimension = MultiArrayDimension(
-                    label=" ".join(words), size=len(words), stride=len(words)
-                )
-                message.layout.dim = [dimension]
-        template = MessageTemplate(message)
+        names = self._state.names(topic)
+        prototype = state_message(topic, names, self._world, self._base)
+        template = MessageTemplate(topic.type, prototype)
         if topic.name == "odom" and self._state.sensors.used:
             template.feed("pose.covariance", self._state.sensors.pose_covariance)
             template.feed("twist.covariance", self._state.sensors.twist_covariance)
@@ -201,7 +182,7 @@ class LinkMarkers:
                 markers.append(shape_marker(shape, world_frame, link.name, len(markers)))
                 self._poses.append((index, shape.pose))
         self._publisher: Any = node.create_publisher(MarkerArray, "markers", STREAM)
-        self._template = MessageTemplate(MarkerArray(markers=markers))
+        self._template = MessageTemplate(MARKERS, serialize_message(MarkerArray(markers=markers)))
         self._targets = [
             self._template.floats(f"markers[{i}].pose.position.x", 7) for i in range(len(markers))
         ]

@@ -15,7 +15,7 @@ from support.random_messages import few
 from trajectory_msgs.msg import JointTrajectory
 
 from spacerobot_ros.bag import message_definition
-from spacerobot_ros.nodes.planner.messages import serialised_trajectory
+from spacerobot_ros.messages.builders import trajectory_message
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
 
 
@@ -64,7 +64,7 @@ THREE = schedule_of(("slider_1", "slider_2", "slider_3"), np.arange(12.0).reshap
 def test_a_schedule_is_serialised_as_rclpy_would(
     schedule: GaitSchedule, stamp_ns: int, frame: str
 ) -> None:
-    raw = serialised_trajectory(schedule, stamp_ns, frame)
+    raw = trajectory_message(schedule, stamp_ns, frame)
     message = deserialize_message(raw, JointTrajectory)
     check_trajectory(message, schedule, stamp_ns, frame)
 
@@ -75,7 +75,7 @@ def test_a_schedule_is_serialised_as_rclpy_would(
 def test_other_readers_take_a_serialised_schedule(
     schedule: GaitSchedule, stamp_ns: int, frame: str
 ) -> None:
-    raw = serialised_trajectory(schedule, stamp_ns, frame)
+    raw = trajectory_message(schedule, stamp_ns, frame)
     kind = "trajectory_msgs/msg/JointTrajectory"
     by_rosbags = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(raw, kind)
     check_trajectory(by_rosbags, schedule, stamp_ns, frame)
@@ -89,7 +89,7 @@ def test_a_long_schedule_is_whole() -> None:
     # The gait of paper 1 has 98,001 points.
     rng = np.random.default_rng(4)
     schedule = schedule_of(("slider_1", "slider_2", "slider_3"), rng.normal(size=(98_001, 3)), 0.05)
-    raw = serialised_trajectory(schedule, 50_000_000, "base_link")
+    raw = trajectory_message(schedule, 50_000_000, "base_link")
     kind = "trajectory_msgs/msg/JointTrajectory"
     message: Any = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(raw, kind)
     assert len(message.points) == 98_001

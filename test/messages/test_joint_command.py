@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from spacerobot_ros.errors import CommandError
-from spacerobot_ros.nodes.common.cdr import JointReader
+from spacerobot_ros.messages.readers import JointReader
 
 JOINTS = ("slider_1", "elbow", "slider_3")
 few = settings(derandomize=True, deadline=None, max_examples=30)

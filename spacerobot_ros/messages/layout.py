@@ -1,0 +1,431 @@
+"""Places of fields in serialised messages: little-endian CDR, as ROS 2 exchanges it.
+
+Most topics repeat one layout: the same frame names, the same number of joints. Then a field has the
+same place in every message: it can be patched or read in place, and a column of it over many
+messages is a slice of one matrix of bytes, some hundred times faster than decoding each message.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import KeysView, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
+
+from spacerobot_ros.messages.definitions import Fields, fields_of
+from spacerobot_ros.times import SECOND
+
+DTYPES = {
+    "bool": np.dtype("?"),
+    "byte": np.dtype("u1"),
+    "char": np.dtype("u1"),
+    "int8": np.dtype("i1"),
+    "uint8": np.dtype("u1"),
+    "int16": np.dtype("<i2"),
+    "uint16": np.dtype("<u2"),
+    "int32": np.dtype("<i4"),
+    "uint32": np.dtype("<u4"),
+    "int64": np.dtype("<i8"),
+    "uint64": np.dtype("<u8"),
+    "float32": np.dtype("<f4"),
+    "float64": np.dtype("<f8"),
+}
+"""Number types of messages as they are serialised."""
+
+ENCAPSULATION = 4
+"""Bytes before the fields; alignment counts from their end."""
+
+BIG_ENDIAN, LITTLE_ENDIAN = b"\x00\x00", b"\x00\x01"
+"""First two bytes of a message in CDR of either byte order."""
+
+_TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+
+
+class TooLongError(Exception):
+    """A list of texts or messages has more elements than the reader of its layout allows."""
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """Place of a number, an array of numbers or a text in a message.
+
+    Attributes
+    ----------
+    offset, size
+        First byte and number of bytes; of a text without the zero at its end.
+    dtype
+        Type of the numbers; None for a text.
+    shape
+        ``()`` for one number or text, ``(k,)`` for an array.
+    """
+
+    offset: int
+    size: int
+    dtype: np.dtype[Any] | None
+    shape: tuple[int, ...]
+
+
+class Layout:
+    """Places of the fields of one serialised message.
+
+    Another message of the type has the same layout if its size and its bytes in ``lengths`` are
+    equal, and the same texts if those in ``fixed`` are.
+
+    Parameters
+    ----------
+    message
+        The serialised message, little-endian.
+    type_name
+        Such as ``nav_msgs/msg/Odometry``.
+    fields
+        The definitions of the type and of all types in it; by default those installed.
+    elements
+        Whether fields inside of lists get paths, such as ``markers[2].pose.position.x``.
+    longest
+        Largest number of texts or messages in a list.
+
+    Attributes
+    ----------
+    leaves
+        Fields by their paths, such as ``pose.pose.position.x``.
+    counts
+        Number of texts or messages in each list.
+    starts
+        First byte behind the length of each such list.
+    texts
+        Span of each list of texts.
+    ends
+        First byte behind each element of such a list, with ``elements``.
+    lengths
+        First bytes of the lengths (uint32) of texts and lists.
+    fixed
+        Spans of these lengths and of all texts, in the order of the message.
+    end
+        First byte behind the last field.
+
+    Raises
+    ------
+    IndexError
+        The message ends before its fields.
+    TooLongError
+        A list has more than ``longest`` texts or messages; ``leaves`` has the fields before it.
+    """
+
+    def __init__(
+        self,
+        message: bytes | bytearray,
+        type_name: str,
+        fields: Fields | None = None,
+        *,
+        elements: bool = False,
+        longest: float = math.inf,
+    ) -> None:
+        self.leaves: dict[str, Leaf] = {}
+        self.counts: dict[str, int] = {}
+        self.starts: dict[str, int] = {}
+        self.texts: dict[str, slice] = {}
+        self.ends: dict[str, int] = {}
+        self.lengths: list[int] = []
+        self.fixed: list[tuple[int, int]] = []
+        self.end = ENCAPSULATION
+        self._message, self._elements, self._longest = message, elements, longest
+        self._fields = fields_of(type_name) if fields is None else fields
+
+    def walk(self, type_name: str, prefix: str | None = "") -> Layout:
+        """Go through the fields of a type; ``prefix`` is None where they get no paths."""
+        for name, (kind, detail) in self._fields[type_name][1]:
+            path = None if prefix is None else prefix + name
+            if kind == Nodetype.BASE:
+                self._value(detail[0], path)
+            elif kind == Nodetype.NAME:
+                self.walk(detail, None if path is None else f"{path}.")
+            else:
+                element, count = detail
+                self._list(element, self._length() if kind == Nodetype.SEQUENCE else count, path)
+        return self
+
+    def _list(self, element: tuple[Any, Any], count: int, path: str | None) -> None:
+        kind, detail = element
+        if kind == Nodetype.BASE and detail[0] != "string":
+            self._numbers(DTYPES[detail[0]], path, (count,))
+            return
+        if count > self._longest:
+            raise TooLongError(f"it has a list of {count} entries, more than {self._longest:.0f}")
+        begin, inner = self.end, None
+        for i in range(count):
+            if self._elements and path is not None:
+                inner = f"{path}[{i}]"
+            if kind == Nodetype.NAME:
+                self.walk(detail, None if inner is None else f"{inner}.")
+            else:
+                self._value(detail[0], inner)
+            if inner is not None:
+                self.ends[inner] = self.end
+        if path is not None:
+            self.counts[path], self.starts[path] = count, begin
+            if kind == Nodetype.BASE:
+                self.texts[path] = slice(begin, self.end)
+
+    def _value(self, base: str, path: str | None) -> None:
+        if base != "string":
+            self._numbers(DTYPES[base], path, ())
+            return
+        length = self._length()
+        self.fixed.append((self.end, self.end + length))
+        if path is not None:
+            # The serialised string ends with a zero.
+            self.leaves[path] = Leaf(self.end, max(length - 1, 0), None, ())
+        self._advance(length)
+
+    def _numbers(self, dtype: np.dtype[Any], path: str | None, shape: tuple[int, ...]) -> None:
+        size = dtype.itemsize * math.prod(shape)
+        if size:
+            self._align(dtype.itemsize)
+        if path is not None:
+            self.leaves[path] = Leaf(self.end, size, dtype, shape)
+        self._advance(size)
+
+    def _advance(self, size: int) -> None:
+        self.end += size
+        if self.end > len(self._message):
+            # Or a count of 4e9 messages in a list would be believed.
+            raise IndexError("the message ends before its fields")
+
+    def _length(self) -> int:
+        self._align(4)
+        word = self._message[self.end : self.end + 4]
+        if len(word) < 4:
+            raise IndexError("the message ends inside of a length")
+        self.lengths.append(self.end)
+        self.fixed.append((self.end, self.end + 4))
+        self.end += 4
+        return int.from_bytes(word, "little")
+
+    def _align(self, size: int) -> None:
+        self.end += -(self.end - ENCAPSULATION) % size
+
+
+def layout_of(
+    message: bytes | bytearray,
+    type_name: str,
+    fields: Fields | None = None,
+    *,
+    elements: bool = False,
+) -> Layout:
+    """Return the layout of one message; parameters and errors as of :class:`Layout`."""
+    return Layout(message, type_name, fields, elements=elements).walk(type_name)
+
+
+# -- making messages --------------------------------------------------------------------------
+
+
+def encode(type_name: str, values: Mapping[str, Any] | None = None) -> bytes:
+    """Return a message as ROS 2 serialises it.
+
+    Parameters
+    ----------
+    type_name
+        Such as ``sensor_msgs/msg/JointState``.
+    values
+        Fields by name: numbers, texts, arrays, mappings for messages, and lists of them; for a
+        time or duration also whole nanoseconds. The other fields are zero or empty.
+
+    Raises
+    ------
+    KeyError
+        The type has no such field.
+    RecordingError
+        The type is not installed.
+    """
+    buffer = bytearray(LITTLE_ENDIAN + bytes(ENCAPSULATION - len(LITTLE_ENDIAN)))
+    _encode(buffer, fields_of(type_name), type_name, values or {})
+    return bytes(buffer)
+
+
+def _encode(buffer: bytearray, fields: Fields, type_name: str, values: Any) -> None:
+    if type_name in _TIMES and isinstance(values, int):
+        values = dict(zip(("sec", "nanosec"), divmod(values, SECOND), strict=True))
+    own = fields[type_name][1]
+    unknown = values.keys() - {name for name, _ in own}
+    if unknown:
+        raise KeyError(f"{type_name} has no field {min(unknown)}")
+    for name, node in own:
+        _encode_field(buffer, fields, node, values.get(name))
+
+
+def _encode_field(buffer: bytearray, fields: Fields, node: Any, value: Any) -> None:
+    kind, detail = node
+    if kind == Nodetype.NAME:
+        _encode(buffer, fields, detail, {} if value is None else value)
+    elif kind == Nodetype.BASE:
+        _encode_number_or_text(buffer, detail[0], value)
+    else:
+        element, count = detail
+        numbers = element[0] == Nodetype.BASE and element[1][0] != "string"
+        if kind == Nodetype.SEQUENCE:
+            count = 0 if value is None else len(value)
+            _append(buffer, np.uint32(count).tobytes(), 4)
+        if numbers:
+            dtype = DTYPES[element[1][0]]
+            data = np.zeros(count, dtype) if value is None else np.asarray(value, dtype)
+            if data.shape != (count,):
+                raise ValueError(f"{count} numbers are wanted, not {data.shape}")
+            _append(buffer, data.tobytes(), dtype.itemsize)
+        else:
+            for each in [None] * count if value is None else value:
+                _encode_field(buffer, fields, element, each)
+
+
+def _encode_number_or_text(buffer: bytearray, base: str, value: Any) -> None:
+    if base == "string":
+        text = ("" if value is None else value).encode() + b"\0"
+        _append(buffer, np.uint32(len(text)).tobytes() + text, 4)
+    else:
+        dtype = DTYPES[base]
+        _append(buffer, np.array(value or 0, dtype).tobytes(), dtype.itemsize)
+
+
+def _append(buffer: bytearray, data: bytes, alignment: int) -> None:
+    if data:
+        buffer += bytes(-(len(buffer) - ENCAPSULATION) % alignment) + data
+
+
+def encode_list(
+    type_name: str,
+    values: Mapping[str, Any],
+    name: str,
+    element: Mapping[str, Any],
+    columns: Mapping[str, NDArray[Any]],
+) -> bytes:
+    """Return a message with a list of many messages of one layout.
+
+    Parameters
+    ----------
+    type_name, values
+        The message without its list, as for :func:`encode`.
+    name
+        Field of the list.
+    element
+        Values that all elements have in common; arrays have their final lengths.
+    columns
+        Numbers (N, size), a row for each element, by the path at which they begin in an element.
+    """
+    count = len(next(iter(columns.values())))
+    if not count:
+        return encode(type_name, values)
+    # Three elements show the layout: the first may be padded differently, all others are alike.
+    raw = encode(type_name, {**values, name: [element] * 3})
+    layout = layout_of(raw, type_name, elements=True)
+    first, second, third = (layout.ends[f"{name}[{i}]"] for i in range(3))
+    head = bytearray(raw[:first])
+    struct.pack_into("<I", head, layout.starts[name] - 4, count)
+    rows = np.tile(np.frombuffer(raw[second:third], np.uint8), (count - 1, 1))
+    for path, column in columns.items():
+        data = np.ascontiguousarray(column).view(np.uint8).reshape(count, -1)
+        size = data.shape[1]
+        begin = layout.leaves[f"{name}[0].{path}"].offset
+        head[begin : begin + size] = data[0].tobytes()
+        begin = layout.leaves[f"{name}[2].{path}"].offset - second
+        rows[:, begin : begin + size] = data[1:]
+    return bytes(head) + rows.tobytes() + raw[third:]
+
+
+def stamped_copies(
+    prototype: bytes,
+    type_name: str,
+    stamps_ns: NDArray[np.int64],
+    columns: Mapping[str, NDArray[np.float64]],
+) -> list[bytes]:
+    """Return copies of a message with other numbers.
+
+    Parameters
+    ----------
+    prototype, type_name
+        The message, every list of which has its final length.
+    stamps_ns
+        (N,) stamps of the headers, or of a clock, ns; a message without either has none.
+    columns
+        Numbers (N, size) by the path at which they begin.
+    """
+    leaves = layout_of(prototype, type_name).leaves
+    table = np.tile(np.frombuffer(prototype, np.uint8), (len(stamps_ns), 1))
+    for path in ("header.stamp.sec", "clock.sec"):
+        if path in leaves:
+            begin = leaves[path].offset
+            table[:, begin : begin + 8] = times_of(stamps_ns).view(np.uint8)
+    for path, values in columns.items():
+        data = np.ascontiguousarray(values, dtype="<f8").view(np.uint8)
+        begin = leaves[path].offset
+        table[:, begin : begin + data.shape[1]] = data
+    return [row.tobytes() for row in table]
+
+
+def times_of(times_ns: NDArray[np.int64]) -> NDArray[np.uint32]:
+    """Return times (N,) in ns as seconds and nanoseconds (N, 2) of stamps."""
+    return np.stack([times_ns // SECOND, times_ns % SECOND], axis=1).astype("<u4")
+
+
+# -- reading columns --------------------------------------------------------------------------
+
+
+class Columns:
+    """Fields that have a fixed place in all of some messages, as arrays over the messages."""
+
+    def __init__(
+        self, matrix: NDArray[np.uint8], leaves: dict[str, Leaf], texts: dict[str, slice]
+    ) -> None:
+        self._matrix = matrix
+        self._leaves = leaves
+        self._texts = texts
+
+    @property
+    def paths(self) -> KeysView[str]:
+        """The fields, such as ``pose.pose.position.x``."""
+        return self._leaves.keys()
+
+    def constant(self, path: str) -> bool:
+        """Whether a list of texts has the same bytes in all messages."""
+        part = self._texts.get(path)
+        return part is not None and bool((self._matrix[:, part] == self._matrix[0, part]).all())
+
+    def __getitem__(self, path: str) -> NDArray[Any] | list[str]:
+        leaf = self._leaves[path]
+        rows = np.ascontiguousarray(self._matrix[:, leaf.offset : leaf.offset + leaf.size])
+        if leaf.dtype is None:
+            return [row.tobytes().decode() for row in rows]
+        column = rows.reshape(-1).view(leaf.dtype).reshape(len(rows), *leaf.shape)
+        return column.astype(widened(leaf.dtype))
+
+
+def widened(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of a column of ``dtype``, in which sums do not soon overflow."""
+    if dtype.kind == "f":
+        return np.dtype(np.float64)
+    if dtype.kind in "iu" and dtype.itemsize < 8:
+        return np.dtype(np.int64)
+    return dtype.newbyteorder("=")
+
+
+def columns_of(messages: Sequence[bytes], type_name: str, fields: Fields) -> Columns | None:
+    """Return the fields that have the same place in every message of one type.
+
+    They are those outside of lists of messages and of texts; None if the layouts differ.
+    """
+    if not messages or len(set(map(len, messages))) != 1:
+        return None
+    try:
+        layout = layout_of(messages[0], type_name, fields)
+    except (IndexError, KeyError):
+        return None
+    matrix = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
+    if messages[0][:2] != LITTLE_ENDIAN:
+        return None
+    fixed = [slice(0, 2), *(slice(start, start + 4) for start in layout.lengths)]
+    if any((matrix[:, part] != matrix[0, part]).any() for part in fixed):
+        return None
+    return Columns(matrix, layout.leaves, layout.texts)

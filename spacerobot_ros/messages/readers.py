@@ -1,0 +1,474 @@
+"""Readers and writers of serialised messages that repeat one layout: numbers in place.
+
+rclpy spends most of a tick turning Python objects into bytes and back. A state message has the
+same layout every tick, so it is serialised once and its numbers are written into the bytes; a
+command is read the same way. The reader learns a new layout where a message has another one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.errors import CommandError
+from spacerobot_ros.messages.definitions import MessageTypes, fields_of, message_definition
+from spacerobot_ros.messages.layout import (
+    BIG_ENDIAN,
+    LITTLE_ENDIAN,
+    Layout,
+    TooLongError,
+    encode,
+    layout_of,
+)
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.execution.state_average import BaseMeasurement
+from spacerobot_ros.simulation.commands import (
+    CommandSource,
+    CommandValidator,
+    Refusal,
+    joint_order,
+    require_frame,
+    require_values,
+)
+from spacerobot_ros.times import HEADER_STAMP, LATEST_NS, SECOND, unpack_stamp
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+ODOMETRY = "nav_msgs/msg/Odometry"
+WRENCH = "geometry_msgs/msg/WrenchStamped"
+
+_LARGEST_ALIGNMENT = 8
+_LONGEST = 10_000
+"""Texts in a list that are read, against a faulty publisher: a million of them take a second."""
+
+_ROOM = 4096
+"""Bytes for the header of a message of joints, and for a writer that packs it differently."""
+
+Quantity = Literal["position", "velocity", "effort"]
+"""The numbers of a JointState."""
+
+
+class UnreadableError(CommandError):
+    """Bytes that are no message of their type; the clause says of which."""
+
+
+def read_text(raw: bytes, type_name: str, path: str) -> str:
+    """Return a text of one serialised message.
+
+    Raises
+    ------
+    UnreadableError
+        The bytes are no message of the type.
+    """
+    try:
+        leaf = layout_of(raw, type_name).leaves[path]
+    except IndexError as error:
+        raise UnreadableError(f"its bytes are no {type_name.rpartition('/')[2]}") from error
+    return raw[leaf.offset : leaf.offset + leaf.size].decode(errors="replace")
+
+
+class MessageTemplate:
+    """A message serialised once, whose numbers are then written in place.
+
+    Parameters
+    ----------
+    type_name
+        Such as ``nav_msgs/msg/Odometry``.
+    prototype
+        The serialised message; every list has its final length and every text its final content.
+    """
+
+    def __init__(self, type_name: str, prototype: bytes) -> None:
+        self._buffer = bytearray(prototype)
+        self._leaves = layout_of(prototype, type_name, elements=True).leaves
+        self._feeds: list[tuple[slice, memoryview]] = []
+        self._times = [
+            slice(leaf.offset, leaf.offset + 8)
+            for path, leaf in self._leaves.items()
+            if path in ("header.stamp.sec", "clock.sec") or path.endswith(".header.stamp.sec")
+        ]
+
+    def floats(self, path: str, count: int) -> Array:
+        """Return a writable view of the ``count`` float64 values from ``path`` on."""
+        return np.frombuffer(self._buffer, np.float64, count, self._leaves[path].offset)
+
+    def feed(self, path: str, source: Array) -> None:
+        """Copy ``source``, a contiguous array that stays in place, to ``path`` in every message."""
+        start = self._leaves[path].offset
+        self._feeds.append((slice(start, start + source.nbytes), source.data.cast("B")))
+
+    def serialised(self, stamp: bytes) -> bytes:
+        """Return the message as it is now, with ``stamp`` (:func:`stamp_bytes`) in every header."""
+        buffer = self._buffer
+        for place, source in self._feeds:
+            buffer[place] = source
+        for place in self._times:
+            buffer[place] = stamp
+        return bytes(buffer)
+
+
+def joint_template(joint_names: Sequence[str]) -> MessageTemplate:
+    """Return the template of a JointState with all quantities of some joints, zero."""
+    zeros = np.zeros(len(joint_names))
+    values = {"name": joint_names, "position": zeros, "velocity": zeros, "effort": zeros}
+    return MessageTemplate(JOINT_STATE, encode(JOINT_STATE, values))
+
+
+class TemplateReader:
+    """Reads float arrays and the stamp of serialised messages that repeat one layout.
+
+    Parameters
+    ----------
+    type_name
+        Type of the messages, which begin with a header.
+    spans
+        Paths to read, and how many float64 follow each: ``{"pose.pose.position.x": 7}``; None for
+        an array of any length.
+    largest
+        Messages of another layout that are longer are refused unread, bytes.
+    """
+
+    def __init__(
+        self, type_name: str, spans: Mapping[str, int | None], largest: float = math.inf
+    ) -> None:
+        self._type_name, self._spans, self._largest = type_name, spans, largest
+        self._fields = fields_of(type_name)
+        self._size = -1
+        self._raw = bytes(2)  # Of no message.
+        self._fixed: list[tuple[slice, bytes]] = []
+        self._stretches: list[tuple[slice, bytes]] = []
+        self._reads: dict[str, tuple[int, int]] = {}
+        self._layout: Layout | None = None
+        self.changes = 0
+        """How often the layout has changed."""
+
+    def accept(self, raw: bytes) -> None:
+        """Make ``raw`` the message to read from.
+
+        Raises
+        ------
+        UnreadableError
+            The bytes are not a message of the type; the message before stays.
+        """
+        if raw is self._raw:
+            return
+        if len(raw) == self._size:
+            # One writer repeats its padding too: a few whole stretches are compared first.
+            for place, text in self._stretches:
+                if raw[place] != text:
+                    break
+            else:
+                self._raw = raw
+                return
+            if all(raw[place] == text for place, text in self._fixed):
+                self._raw = raw
+                self._remember_stretches(raw)
+                return
+        self._learn(raw)
+
+    def floats(self, path: str) -> Array:
+        """Return a read-only view of the values at ``path``."""
+        offset, count = self._reads[path]
+        return np.frombuffer(self._raw, np.float64, count, offset)
+
+    def place(self, path: str) -> slice:
+        """Return where the bytes of the values at ``path`` are in messages of this layout."""
+        offset, count = self._reads[path]
+        return slice(offset, offset + 8 * count)
+
+    def count(self, path: str) -> int:
+        """Return the number of values at ``path`` in messages of this layout."""
+        return self._reads[path][1] if path in self._reads else 0
+
+    def text(self, path: str) -> str:
+        """Return a text of messages of this layout."""
+        assert self._layout is not None
+        leaf = self._layout.leaves[path]
+        return self._raw[leaf.offset : leaf.offset + leaf.size].decode(errors="replace")
+
+    def texts(self, path: str) -> list[str]:
+        """Return a list of texts of messages of this layout."""
+        assert self._layout is not None
+        return [self.text(f"{path}[{i}]") for i in range(self._layout.counts[path])]
+
+    def has(self, path: str) -> bool:
+        """Whether the accepted message has values at ``path``."""
+        return path in self._reads
+
+    @property
+    def stamp_ns(self) -> int:
+        """Header stamp of the accepted message, ns."""
+        seconds, nanoseconds = unpack_stamp(self._raw)
+        return int(seconds * SECOND + nanoseconds)
+
+    def _remember_stretches(self, raw: bytes) -> None:
+        """Keep the fixed spans joined where only padding can lie between them."""
+        stretches: list[slice] = []
+        for place, _ in self._fixed:
+            if stretches and place.start - stretches[-1].stop < _LARGEST_ALIGNMENT:
+                place = slice(stretches.pop().start, place.stop)
+            stretches.append(place)
+        self._stretches = [(place, raw[place]) for place in stretches]
+
+    def _learn(self, raw: bytes) -> None:
+        if len(raw) > self._largest:
+            raise UnreadableError(
+                f"it has {len(raw)} bytes, of which at most {self._largest} can be meant"
+            )
+        name = self._type_name
+        layout = Layout(raw, name, self._fields, elements=True, longest=_LONGEST)
+        try:
+            if raw[:2] == BIG_ENDIAN:
+                raw = _little_endian(raw, name)
+                layout = Layout(raw, name, self._fields, elements=True, longest=_LONGEST)
+            if raw[:2] != LITTLE_ENDIAN:
+                raise IndexError("it is not in CDR")
+            layout.walk(name)
+        except IndexError as error:
+            short = name.rpartition("/")[2]
+            raise UnreadableError(f"its bytes are no {short}") from error
+        except TooLongError as error:
+            # Its stamp can be read; the bytes themselves would count as accepted.
+            self._raw, self._size = raw[: HEADER_STAMP.stop], -1
+            raise CommandError(str(error)) from error
+        self._raw, self._size, self._layout = raw, len(raw), layout
+        fixed = [(0, len(LITTLE_ENDIAN)), *layout.fixed]
+        self._fixed = [(slice(a, b), raw[a:b]) for a, b in fixed]
+        self._reads = {}
+        for path, wanted in self._spans.items():
+            leaf = layout.leaves[path]
+            count = leaf.shape[0] if wanted is None else wanted
+            if count:
+                self._reads[path] = leaf.offset, count
+        self._remember_stretches(raw)
+        self.changes += 1
+
+
+def _little_endian(raw: bytes, type_name: str) -> bytes:
+    """Return a message of another byte order as this machine's clients serialise it.
+
+    Raises
+    ------
+    IndexError
+        It is no message of the type.
+    """
+    types = MessageTypes()
+    decode = types.decoder(type_name, message_definition(type_name).encode())
+    try:
+        return bytes(types.serialise(decode(raw)))
+    except Exception as error:  # Generated code has no errors of its own.
+        raise IndexError(str(error)) from error
+
+
+class JointReader:
+    """Takes one quantity of JointState messages into the order of the model's joints.
+
+    Joints that a message does not name are left out (zero).
+
+    Parameters
+    ----------
+    joint_names
+        The model's joints.
+    quantities
+        What to read; the first is required in every message.
+    complete
+        Whether every joint must be named, as in a measured state.
+    """
+
+    def __init__(
+        self,
+        joint_names: Sequence[str],
+        quantities: Sequence[Quantity],
+        *,
+        complete: bool = False,
+    ) -> None:
+        self._complete, self._joints, self._quantities = complete, list(joint_names), quantities
+        largest = math.inf
+        if complete:
+            # Of each joint a name with its length and three numbers.
+            largest = _ROOM + 2 * sum(len(name.encode()) + 32 for name in joint_names)
+        self._reader = TemplateReader(JOINT_STATE, dict.fromkeys(quantities), largest)
+        self._changes = 0
+        self._problem = ""
+        self._required: bytes | None = None
+        """The last message that was accepted: the same bytes are often received again."""
+        self._order: npt.NDArray[np.intp] | None = None
+        self._copies: list[tuple[memoryview, slice]] = []
+        self.values = {name: np.zeros(len(joint_names)) for name in quantities}
+
+    def accept(self, raw: bytes) -> int:
+        """Read a message into ``values`` and return its stamp in ns.
+
+        Raises
+        ------
+        CommandError
+            A joint is unknown or named twice, or a length is wrong; of a measured state, its
+            stamp is beyond what that of an answer can carry.
+        """
+        self.require(raw)
+        stamp = self._reader.stamp_ns
+        if stamp > LATEST_NS and self._complete:
+            raise UnreadableError(f"no answer can carry its stamp of {stamp / SECOND:.10g} s")
+        for target, place in self._copies:
+            target[:] = raw[place]
+        if self._order is not None:
+            for name, values in self.values.items():
+                if self._reader.has(name):
+                    values[self._order] = self._reader.floats(name)
+        return stamp
+
+    def require(self, raw: bytes) -> None:
+        """Refuse a message that :meth:`accept` would refuse; ``values`` stay.
+
+        Raises
+        ------
+        CommandError
+            As :meth:`accept` does.
+        """
+        if raw is self._required:
+            return
+        self._required = None
+        self._reader.accept(raw)
+        if self._reader.changes != self._changes:
+            self._changes = self._reader.changes
+            self._check()
+        if self._problem:
+            raise CommandError(self._problem)
+        self._required = raw
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the last message given to :meth:`accept`, refused or not, ns."""
+        return self._reader.stamp_ns
+
+    def _check(self) -> None:
+        """Check names and lengths, once for every layout."""
+        names = self._reader.texts("name")
+        self._problem, self._order, self._copies = "", None, []
+        try:
+            order = joint_order(self._joints, names, complete=self._complete)
+            for i, quantity in enumerate(self._quantities):
+                count = self._reader.count(quantity)
+                if count or i == 0:
+                    require_values(names, quantity, count)
+        except CommandError as error:
+            self._problem = str(error)
+            return
+        for values in self.values.values():
+            values[:] = 0.0
+        # Joints in the model's order, as the stack's own nodes send them, are copied as bytes.
+        if names == self._joints:
+            self._copies = [
+                (values.data.cast("B"), self._reader.place(name))
+                for name, values in self.values.items()
+                if self._reader.has(name)
+            ]
+        else:
+            self._order = order
+
+
+class StateReader:
+    """The :class:`~spacerobot_ros.planning.execution.state_average.MeasuredState` of raw messages.
+
+    Everything but the positions of the joints is read only where it is needed.
+
+    Parameters
+    ----------
+    joint_names
+        The robot's joints.
+    """
+
+    def __init__(self, joint_names: Sequence[str]) -> None:
+        self.stamp_ns = 0
+        self.base_error: CommandError | None = None
+        """Why the last :meth:`base` could not be read."""
+        self.shape_reader = JointReader(joint_names, ["position"], complete=True)
+        self._joints = JointReader(joint_names, ["position", "velocity"], complete=True)
+        self._odom = TemplateReader(
+            ODOMETRY, {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
+        )
+        self.q = self.shape_reader.values["position"]
+
+    def accept(self, joint_states: bytes, odom: bytes | None) -> None:
+        """Make this the measured state; ``odom`` is of the same stamp, or None.
+
+        Raises
+        ------
+        CommandError
+            The joints are not those of the robot; the state before stays.
+        """
+        self.stamp_ns = self.shape_reader.accept(joint_states)
+        self._joints_raw, self._odom_raw = joint_states, odom
+
+    def base(self) -> BaseMeasurement | None:
+        """Return pose and twist of the base and the rates of the joints, None without odom."""
+        if self._odom_raw is None:
+            return None
+        try:
+            self._odom.accept(self._odom_raw)
+            self._joints.accept(self._joints_raw)
+        except CommandError as error:
+            self.base_error = error
+            return None
+        return BaseMeasurement(
+            self._odom.floats("pose.pose.position.x"),
+            self._odom.floats("twist.twist.linear.x"),
+            self._joints.values["velocity"],
+        )
+
+
+class CommandReader:
+    """Reads the messages of one source and offers them to the validator.
+
+    Parameters
+    ----------
+    source
+        Where the commands come from.
+    robot
+        The model.
+    frame_prefix
+        Which the name of the base link may have in commands.
+    """
+
+    def __init__(self, source: CommandSource, robot: SpaceRobot, frame_prefix: str = "") -> None:
+        self.source = source
+        self._reader: JointReader | _WrenchReader
+        if source.quantity == "wrench":
+            self._reader = _WrenchReader(robot.base_link, frame_prefix)
+            self._values = self._reader.values
+        else:
+            self._reader = JointReader(robot.joint_names, [source.quantity])
+            self._values = self._reader.values[source.quantity]
+
+    def offer(self, commands: CommandValidator, raw: bytes, now_ns: int) -> Refusal | None:
+        """Offer a message to the validator; return why it is refused, if it is."""
+        try:
+            stamp = self._reader.accept(raw)
+        except UnreadableError as error:
+            return commands.unreadable(self.source, error, now_ns)
+        except CommandError as error:
+            return commands.offer(self.source, self._reader.stamp_ns, error, now_ns)
+        return commands.offer(self.source, stamp, self._values, now_ns)
+
+
+class _WrenchReader:
+    """Reads force over torque (6,) into ``values``; their frame must be that of the base link."""
+
+    def __init__(self, base_link: str, frame_prefix: str) -> None:
+        self.values: Array = np.zeros(6)
+        self._base_link, self._prefix = base_link, frame_prefix
+        self._reader = TemplateReader(WRENCH, {"wrench.force.x": 6})
+
+    def accept(self, raw: bytes) -> int:
+        self._reader.accept(raw)
+        require_frame(self._reader.text("header.frame_id"), self._base_link, self._prefix)
+        self.values[:] = self._reader.floats("wrench.force.x")
+        return self._reader.stamp_ns
+
+    @property
+    def stamp_ns(self) -> int:
+        return self._reader.stamp_ns

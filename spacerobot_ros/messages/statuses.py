@@ -1,0 +1,63 @@
+"""Statuses and events as messages: diagnostic_msgs/DiagnosticStatus from and to plain values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from spacerobot_ros.errors import printable
+from spacerobot_ros.messages.layout import encode
+
+STATUS = "diagnostic_msgs/msg/DiagnosticStatus"
+
+
+@dataclass(frozen=True)
+class StatusRecord:
+    """The content of a DiagnosticStatus.
+
+    Attributes
+    ----------
+    name
+        The node, or a part of it.
+    level
+        0 OK, 1 WARN, 2 ERROR, 3 STALE.
+    message
+        One sentence for people.
+    values
+        Values as texts by their keys.
+    hardware_id
+        The robot, the bag, or the role of the node.
+    """
+
+    name: str
+    level: int
+    message: str
+    values: Mapping[str, str] = field(default_factory=dict)
+    hardware_id: str = ""
+
+    def encoded(self) -> bytes:
+        """Return the serialised message."""
+        pairs = [{"key": key, "value": value} for key, value in self.values.items()]
+        fields = {"level": self.level, "name": self.name, "message": self.message}
+        return encode(STATUS, {**fields, "hardware_id": self.hardware_id, "values": pairs})
+
+
+def key_values(pairs: Iterable[Any]) -> dict[str, str]:
+    """Return diagnostic_msgs/KeyValue messages as a dictionary, printable."""
+    return {printable(pair.key): printable(pair.value) for pair in pairs}
+
+
+def read_status(message: Any) -> StatusRecord:
+    """Return the content of a received or recorded DiagnosticStatus, printable.
+
+    Anybody may have published it; a later pair replaces an earlier one of the same key.
+    """
+    level = message.level if isinstance(message.level, int) else message.level[0]
+    return StatusRecord(
+        name=printable(message.name),
+        level=level,
+        message=printable(message.message),
+        values=key_values(message.values),
+        hardware_id=printable(message.hardware_id),
+    )
