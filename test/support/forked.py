@@ -190,8 +190,8 @@ def exchange(
     Raises
     ------
     NotExchangedError
-        They differ in more than bodies of functions, defaults and constants, or none of the functions
-        is known to be alive.
+        They differ in more than bodies of functions, defaults and constants, or no function that
+        differs is known to be alive.
     """
     pairs = _differing_code(before, after, path)
     if pairs is None:
