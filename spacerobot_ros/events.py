@@ -63,7 +63,7 @@ class Event:
     ----------
     kind
         What has happened.
-    sentence
+    message
         The same for people.
     level
         Of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR.
@@ -76,7 +76,7 @@ class Event:
     """
 
     kind: EventKind
-    sentence: str
+    message: str
     level: int = 0
     time_s: float | None = None
     goal_id: str = ""
@@ -100,7 +100,7 @@ class Event:
         return values | dict(self.about)
 
     @classmethod
-    def from_values(cls, values: Mapping[str, str], sentence: str = "", level: int = 0) -> Event:
+    def from_values(cls, values: Mapping[str, str], message: str = "", level: int = 0) -> Event:
         """Return the event that :meth:`to_values` has turned into these pairs.
 
         Raises
@@ -115,4 +115,4 @@ class Event:
         except (KeyError, ValueError) as error:
             raise SpaceRobotError(f"This is no event of a flight: {error}.") from error
         given.pop("wall_time", None)
-        return cls(kind, sentence, level, time_s, given.pop("goal_id", ""), given)
+        return cls(kind, message, level, time_s, given.pop("goal_id", ""), given)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spacerobot_ros.bag.series import TopicSeries
+from spacerobot_ros.messages.statuses import key_values
 from spacerobot_ros.topics import TOPICS
 
 _KEY_VALUES = "diagnostic_msgs/msg/KeyValue"
@@ -201,7 +202,7 @@ def _fields(
 
 def _key_values(path: str, values: list[Any]) -> list[Field]:
     """Return a column of texts for each key of lists of keys and values."""
-    rows = [{pair.key: pair.value for pair in pairs} for pairs in values]
+    rows = [key_values(pairs) for pairs in values]
     keys = dict.fromkeys(key for row in rows for key in row)
     return [Field(f"{path}[{k}]", _objects([r.get(k, "") for r in rows]), ("",)) for k in keys]
 

@@ -25,6 +25,7 @@ from geometry_msgs.msg import PoseStamped
 from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.scenario import Scenario, load_scenario
+from spacerobot_ros.messages.statuses import key_values
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.nodes.common.node import STREAM
@@ -250,7 +251,7 @@ def _timing_reports(bag: Bag) -> Iterator[tuple[float, int, dict[str, str]]]:
     skipped = 0
     for time_ns, array in bag["/diagnostics"].messages():
         for status in array.status:
-            values = {pair.key: pair.value for pair in status.values}
+            values = key_values(status.values)
             skipped = int(values.get("deadlines_missed", skipped))
             if status.name.endswith(": timing"):
                 yield time_ns / SECOND, skipped, values

@@ -32,6 +32,7 @@ from spacerobot_ros.flight.flight import Commands, Flight, SentGoal, Signal, goa
 from spacerobot_ros.flight.parameter_files import CONFIGS
 from spacerobot_ros.flight.scenario import COMMANDERS, Published, Scenario
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
@@ -209,18 +210,19 @@ class FlightBag:
         A status of another package is its message alone.
         """
         topic, read = STATUS_TOPICS[commander]
-        for time_ns, message in self.messages(topic):
+        for time_ns, recorded in self.messages(topic):
+            message = read_status(recorded)
             try:
-                yield time_ns, read(_values(message), message.message)
+                yield time_ns, read(message.values, message.message)
             except SpaceRobotError:
-                yield time_ns, str(message.message)
+                yield time_ns, message.message
 
     def events(self) -> Iterator[tuple[int, str, Event]]:
         """Go through the events with their log times (ns) and nodes."""
-        for time_ns, message in self.messages("events"):
+        for time_ns, recorded in self.messages("events"):
+            message = read_status(recorded)
             try:
-                level = int.from_bytes(bytes([message.level]), "little")
-                event = Event.from_values(_values(message), message.message, level)
+                event = Event.from_values(message.values, message.message, message.level)
             except SpaceRobotError:
                 continue  # Of a later version.
             yield time_ns, message.name, event
@@ -269,10 +271,6 @@ def _by_name(values: Array, series: TopicSeries, names: list[str]) -> Array:
         if sorted(given) == sorted(names):
             made[row] = values[row, [given.index(name) for name in names]]
     return made
-
-
-def _values(message: Any) -> dict[str, str]:
-    return {pair.key: pair.value for pair in message.values}
 
 
 # -- any bag ----------------------------------------------------------------------------------

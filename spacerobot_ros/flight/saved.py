@@ -153,7 +153,7 @@ def _others(flight: Flight) -> Iterator[_Stream]:
             yield _Stream(TOPICS[name], times, messages)
     times = np.array([round((e.time_s or 0.0) * SECOND) for e in flight.events], dtype=np.int64)
     events = [
-        StatusRecord("", event.level, event.sentence, event.to_values(None)).encoded()
+        StatusRecord("", event.level, event.message, event.to_values(None)).encoded()
         for event in flight.events
     ]
     yield _Stream(TOPICS["events"], times, events)

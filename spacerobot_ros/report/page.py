@@ -174,7 +174,7 @@ def _events(events: Sequence[FlightEvent]) -> list[str]:
     if not events:
         return []
     rows = [
-        (f"{each.time:.6g}", each.text, each.event.sentence, each.node.strip("/"))
+        (f"{each.time:.6g}", each.text, each.event.message, each.node.strip("/"))
         for each in sorted(events, key=lambda each: each.time)
     ]
     more = len(rows) - _MAX_EVENT_ROWS
@@ -244,7 +244,7 @@ def _chart_events(flight: FlightReport) -> list[dict[str, Any]]:
     for each in sorted(flight.events, key=lambda each: each.time)[:_MAX_CHART_EVENTS]:
         sentences = together.setdefault((each.time, each.event.kind), [])
         text = f"{each.text} (+{len(sentences)})" if sentences else each.text
-        sentences.append(each.event.sentence)
+        sentences.append(each.event.message)
         shown = {"time": each.time, "sentence": " ".join(sentences), "text": text}
         found.append(shown | mark_of(each.event.kind))
     return found

@@ -20,6 +20,7 @@ from std_msgs.msg import Header
 from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower, Status
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal
@@ -205,8 +206,8 @@ class MissionClient:
         o.x, o.y, o.z, o.w = goal.quaternion.tolist()
         return message
 
-    def _on_status(self, message: DiagnosticStatus) -> None:
-        values = {pair.key: pair.value for pair in message.values}
-        self.status = self._read(values, message.message)
+    def _on_status(self, received: DiagnosticStatus) -> None:
+        message = read_status(received)
+        self.status = self._read(dict(message.values), message.message)
         if self._follower.take(self.status):
             self._end(Outcome(self.status.state.value))

@@ -64,4 +64,4 @@ def test_decisions_are_events(kind: type[PlannerStatus] | type[ControllerStatus]
         found = None if event is None else (event.kind, event.level)
         assert found == expected.get(state.value)
         if event is not None:
-            assert (event.sentence, event.goal_id) == ("So it is.", ID)
+            assert (event.message, event.goal_id) == ("So it is.", ID)

@@ -212,7 +212,7 @@ def test_a_flight_that_late_measurements_make_unstable_ends_at_rest() -> None:
     assert flight.executive.controller.coming_to_rest
     (aborted,) = [event for event in flight.events if event.kind is EventKind.GOAL_ABORTED]
     assert aborted.goal_id == "far"
-    assert aborted.sentence.startswith("Aborted: control is lost, ")
+    assert aborted.message.startswith("Aborted: control is lost, ")
     assert flight.fastest < 5.0
     assert energy(flight.plant) < 1e-3
 
@@ -289,7 +289,7 @@ def test_one_joint_that_is_too_fast_for_long_enough_ends_the_goal() -> None:
         "the robot is brought to rest."
     )
     (event,) = [event for event in loop.events if event.kind is EventKind.GOAL_ABORTED]
-    assert (event.goal_id, event.sentence) == ("g", loop.status.message)
+    assert (event.goal_id, event.message) == ("g", loop.status.message)
     loop.answer(10)
     assert [e.kind for e in loop.events].count(EventKind.GOAL_ABORTED) == 1, "it is lost once"
 

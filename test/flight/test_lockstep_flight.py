@@ -100,8 +100,8 @@ def test_a_flight_is_the_one_through_the_nodes(
     assert flight.outcome is outcome
     assert_same(flight, through_ros)
     assert flight.sentence == through_ros.sentence
-    told = [(event.kind, event.sentence) for event in flight.events if event.goal_id]
-    assert told == [(e.kind, e.sentence) for e in through_ros.events if e.goal_id]
+    told = [(event.kind, event.message) for event in flight.events if event.goal_id]
+    assert told == [(e.kind, e.message) for e in through_ros.events if e.goal_id]
 
 
 def chain(**settings: float) -> Scenario:
@@ -120,7 +120,7 @@ def test_what_is_saved_is_verified_and_read_back(tmp_path: Path) -> None:
     assert verified.ticks == len(flight.time) - 1
     read = read_run(tmp_path / "saved.mcap")
     assert_same(flight, read)
-    assert [e.sentence for e in read.events] == [e.sentence for e in flight.events]
+    assert [e.message for e in read.events] == [e.message for e in flight.events]
     with pytest.raises(RecordingError, match="exists"):
         flight.save(tmp_path / "saved.mcap")
 

@@ -164,7 +164,7 @@ def test_plan_and_execution_are_reported_with_the_duration_of_the_gait() -> None
     loop.propose(NEAR)
     status = loop.until(PlannerState.EXECUTING)
     assert status.message == "Executing a stub gait of 0.65 s."
-    reported = [output.sentence for output in loop.outputs if isinstance(output, Event)]
+    reported = [output.message for output in loop.outputs if isinstance(output, Event)]
     assert "The plan is a stub gait of 0.65 s." in reported
 
 

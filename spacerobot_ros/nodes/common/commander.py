@@ -23,6 +23,7 @@ from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.flight.plant_listener import Change, PlantListener, Stopped
 from spacerobot_ros.flight.state_synchroniser import StateSynchroniser
 from spacerobot_ros.messages.readers import JointReader
+from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.messages.transforms import StateFrames, robot_frames
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -322,10 +323,10 @@ class CommanderNode(FlightNode):
         set_stamp(array.header.stamp, times.now_ns)
         self._diagnostics.publish(array)
 
-    def _on_plant_status(self, message: DiagnosticStatus) -> None:
-        values = {pair.key: pair.value for pair in message.values}
+    def _on_plant_status(self, received: DiagnosticStatus) -> None:
+        message = read_status(received)
         try:
-            status = PlantStatus.from_values(values, message.message)
+            status = PlantStatus.from_values(message.values, message.message)
         except SpaceRobotError as error:
             self.get_logger().warning(f"plant/status: {error}", throttle_duration_sec=5.0)
             return

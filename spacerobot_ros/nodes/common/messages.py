@@ -15,7 +15,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from visualization_msgs.msg import Marker, MarkerArray
 
-from spacerobot_ros.errors import PlanningError, RecordingError, SpaceRobotError
+from spacerobot_ros.errors import PlanningError, RecordingError, SpaceRobotError, printable
 from spacerobot_ros.messages.definitions import message_definition
 from spacerobot_ros.messages.transforms import STATIC_TRANSFORMS, TRANSFORM_TYPE, TRANSFORMS
 from spacerobot_ros.model.description import Array, Shape
@@ -149,7 +149,8 @@ def goal_sentence(part: str, goal_id: str, message: PoseStamped, goal: Goal) -> 
     """Return one line about a goal that has come."""
     position = ", ".join(f"{x:.4g}" for x in goal.position)
     quaternion = ", ".join(f"{x:.4g}" for x in goal.quaternion)
-    given = f", given in '{message.header.frame_id}'" if message.header.frame_id else ""
+    frame = printable(message.header.frame_id)
+    given = f", given in '{frame}'" if frame else ""
     return f"Goal {goal_id} of the {part}: ({position}) m, ({quaternion}){given}."
 
 

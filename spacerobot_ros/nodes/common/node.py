@@ -212,7 +212,7 @@ class FlightNode(LifecycleNode):
             event = replace(event, time_s=self.simulated_time_s)
         values = event.to_values(time.time() if self.events_have_wall_time else None)
         name, level = self.get_fully_qualified_name(), bytes([event.level])
-        message = diagnostic_status(name, level, event.sentence, values)
+        message = diagnostic_status(name, level, event.message, values)
         self._event_stream.take(serialize_message(message))
 
     @property

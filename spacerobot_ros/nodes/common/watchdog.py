@@ -15,6 +15,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 
+from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
 
 TOPIC = "heartbeat"
@@ -221,8 +222,8 @@ class Liveness:
             self._node.destroy_timer(timer)
         self._timers.clear()
 
-    def _on_heartbeat(self, message: DiagnosticStatus) -> None:
-        watchdog = self._watchdog
+    def _on_heartbeat(self, received: DiagnosticStatus) -> None:
+        watchdog, message = self._watchdog, read_status(received)
         if watchdog is None or message.hardware_id not in self._watched:
             return
         if message.name == self._node.get_fully_qualified_name():

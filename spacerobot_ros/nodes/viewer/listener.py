@@ -28,6 +28,7 @@ from std_msgs.msg import Float64MultiArray
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.nodes.common.messages import goal_of
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
@@ -282,10 +283,10 @@ class Listener:
     def _status_taker(
         self, key: str, read: Callable[[dict[str, str], str], Any]
     ) -> Callable[[DiagnosticStatus], None]:
-        def take(message: DiagnosticStatus) -> None:
+        def take(received: DiagnosticStatus) -> None:
+            message = read_status(received)
             try:
-                values = {pair.key: pair.value for pair in message.values}
-                status = read(values, message.message)
+                status = read(dict(message.values), message.message)
             except SpaceRobotError:
                 return  # A status of some other node, which has other keys.
             self._statuses[key] = status

@@ -24,8 +24,9 @@ from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.control.thrusters import ThrusterTable, find_thrusters
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.errors import SpaceRobotError, printable
 from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.node import EVENTS, LATCHED, STREAM, FlightNode
@@ -301,13 +302,13 @@ class ViewerNode(FlightNode):
         if key in _ASKED:
             self._ask(key)
 
-    def _on_event(self, message: DiagnosticStatus) -> None:
+    def _on_event(self, received: DiagnosticStatus) -> None:
+        message = read_status(received)
         try:
-            values = {pair.key: pair.value for pair in message.values}
-            event = Event.from_values(values, message.message, message.level[0])
+            event = Event.from_values(message.values, message.message, message.level)
         except SpaceRobotError:
             return
-        self._page.note(Notice(event.sentence, event.level, event.time_s, message.name))
+        self._page.note(Notice(event.message, event.level, event.time_s, message.name))
         if event.kind in (EventKind.ACTIVATED, EventKind.NODE_BACK):
             for key, name in self._full_names.items():
                 if name == message.name and key in _ASKED:
@@ -320,7 +321,7 @@ class ViewerNode(FlightNode):
             return  # Of another stack.
         if message.level >= _WARNING and message.name != self.get_logger().name:
             level = 1 if message.level == _WARNING else 2
-            self._note(message.msg, level, message.name)
+            self._note(printable(message.msg), level, printable(message.name))
 
     def _on_change(self, message: ParameterEvent) -> None:
         for key in _ASKED:

@@ -250,7 +250,7 @@ class EventBook:
         if event.kind in self._DECISIONS and event.goal_id:
             if goal in self.decided:
                 was = self.decided[goal].value
-                self._report(f"{node}: goal {event.goal_id} was {was}: {event.sentence}")
+                self._report(f"{node}: goal {event.goal_id} was {was}: {event.message}")
             self.decided[goal] = event.kind
         if event.kind is EventKind.GOAL_ACCEPTED:
             if goal in self.accepted:
