@@ -17,7 +17,7 @@ from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
 from spacerobot_ros.control.laws.law import ControlLaw, Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import ActuatorLimits, MotionLimits, Saturated
-from spacerobot_ros.control.outputs import OutputSelection
+from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
 from spacerobot_ros.control.reference import PROFILES, Errors, ReferenceProfile, StepReference
 from spacerobot_ros.control.state import (
     Actuation,
@@ -78,7 +78,7 @@ class CoordinatedController:
         control_period: float,
         estimation_time: float,
     ) -> None:
-        self.law = law
+        self.law, self._kinds = law, law.outputs.selection.kinds
         self._limits, self._rates = limits, rates
         self._profile_type, self._motion = profile, motion
         self._control_period, self._estimation_time = control_period, estimation_time
@@ -235,10 +235,22 @@ class CoordinatedController:
     def errors(self) -> Errors:
         """Return the errors of the last command's outputs from the reference."""
         worst = {"position": 0.0, "attitude": 0.0, "joints": 0.0}
-        for label, error in zip(self.law.outputs.labels, self.law.error, strict=True):
-            kind = error_kind(label)
-            worst[kind] = max(worst[kind], abs(float(error)))
+        for kind, error in zip(self._kinds, self.law.error.tolist(), strict=True):
+            worst[kind] = max(worst[kind], abs(error))
         return Errors(**worst)
+
+    def distance_from_reference(self) -> OutputDistance:
+        """Return the distance of the last command's outputs from the reference."""
+        return self.law.outputs.selection.distance(self.law.error)
+
+    def distance_to_goal(self) -> OutputDistance:
+        """Return the distance of the last command's outputs from where the reference ends."""
+        return self.distance_between(self.law.state, self.goal)
+
+    def distance_between(self, state: ControlState, goal: Reference) -> OutputDistance:
+        """Return the distance of the outputs in a state from a goal for all of them."""
+        outputs = self.law.outputs
+        return outputs.selection.distance(outputs.errors(state, goal))
 
     def labelled_errors(self) -> Mapping[str, float]:
         """Return the error of each output by its label."""
@@ -255,10 +267,9 @@ class CoordinatedController:
         law, far = self.law, self._profile.distances()
         Kp, Kd = law.gain_diagonals
         reach = np.abs(law.error) + Kd / Kp * np.abs(law.error_rate)
-        kinds = [error_kind(label) for label in law.outputs.labels]
-        bounds = np.empty(len(kinds))
-        for kind in set(kinds):
-            of_kind = np.array([each == kind for each in kinds])
+        bounds = np.empty(len(self._kinds))
+        for kind in set(self._kinds):
+            of_kind = np.array([each == kind for each in self._kinds])
             largest = max(getattr(far, kind), float(reach[of_kind].max()))
             bounds[of_kind] = 2 * largest + getattr(margins, kind)
         return bounds
@@ -325,12 +336,6 @@ class CoordinatedController:
         # Forces between base and arm depend on the base's rotation alone; taken as none.
         state = ControlState(rest, np.array([0.0, 0.0, 0.0, 1.0]), rest, rest, q, qdot)
         return law.command(state, reference)
-
-
-def error_kind(label: str) -> str:
-    """Return which of :class:`Errors` the error of an output is."""
-    group, _, axis = label.partition(".")
-    return "joints" if group == "joint" else "attitude" if axis[0] == "r" else "position"
 
 
 def build_controller(robot: SpaceRobot, config: ControllerConfig) -> CoordinatedController:

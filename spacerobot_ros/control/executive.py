@@ -1,4 +1,4 @@
-"""The goals of coordinated control: accepted, pursued, reached or failed, aborted, saved."""
+"""The executive of coordinated control: goals accepted, pursued, decided, aborted and saved."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController, Mode
+from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.limits import Saturated
-from spacerobot_ros.control.reference import Errors
+from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.state import ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, PlanningError
@@ -23,7 +24,7 @@ END_EFFECTOR = "end_effector"
 """Key of the goal of the end-effector; that of the base is ``base``."""
 
 GOAL_KEYS = (BASE, END_EFFECTOR)
-"""What goal poses may be for."""
+"""Keys of goals: frames of the robot that goal poses are for."""
 
 
 class ControlExecutive:
@@ -36,9 +37,11 @@ class ControlExecutive:
     * ``TRACKING``: a goal is pursued. ``REACHED`` once all errors have stayed within the tolerances
       for the settling time after the reference has come to rest; ``FAILED`` if that does not happen
       within the time limit. Either way the robot goes on to hold the goal.
-    * ``ABORTED``: the goal was given up; the robot holds where it was at the next measured state.
-      Where control was lost (a joint is far beyond its rate against its motor, or the errors of a
-      goal grow instead of shrinking), the robot is brought to rest instead, wherever that is.
+    * ``ABORTED``: the goal was given up; the robot holds the pose of the next measured state. After
+      a loss of control (a joint is far beyond its rate against its motor, or the errors of a goal
+      grow instead of shrinking), the robot is brought to rest instead.
+
+    :class:`.GoalMonitor` decides about a goal.
 
     While the base is not measured, the reported state is ``ESTIMATING`` or ``STOPPED`` instead, and
     the state of the goal stays as it is. ``REFUSED`` is reported of a single goal and is no state.
@@ -55,7 +58,7 @@ class ControlExecutive:
     goal_file
         Where the present goals are saved for a controller that is restarted.
     warn
-        Called with a sentence where the goals cannot be saved.
+        Called with a message if the goals cannot be saved.
     report_event
         Called with every event of a goal.
     """
@@ -82,12 +85,12 @@ class ControlExecutive:
         self._time: float | None = None
         """Time of the last state, s."""
         self._hold_here = False
-        """Whether the robot is to hold where it is at the next measured state, without a goal."""
+        """Whether the robot holds the pose of the next measured state, without a goal."""
         self._begin_anew = False
         """Whether the goal is started again at the next measured state."""
         self.plant_blocked = False
-        """Whether the plant obeys no command, for the owner to set: what answers a state from
-        before it obeys again must not move the robot, so each answer holds it where it is."""
+        """Whether the plant ignores commands, set by the owner. Each command then holds the pose of
+        its state, so that none of them moves the robot when the plant obeys again."""
         self._abort_sentence = ""
         """The sentence of the status while the state is aborted."""
         self._pending: dict[str, IdentifiedGoal] = {}
@@ -95,14 +98,9 @@ class ControlExecutive:
         self._abort_requested = False
         self._goal_state = self._reported_state = ControllerState.HOLDING
         self._goal_id = ""
-        self._started = 0.0
-        """Time at which the goal was begun, s."""
-        self._within_since: float | None = None
-        """Time since which all errors are within the tolerances, s."""
+        self._monitor = GoalMonitor()
         self._error_bounds: Array | None = None
-        """Errors (m,) of the outputs within which the flight to the goal is sound."""
-        self._lost_rates = self._lost_errors = 0
-        """Consecutive states in which a joint was too fast, or an error too large."""
+        """Errors (m,) of the outputs beyond which control is lost."""
         self._guided = False
         """Whether the last command followed a reference from outside."""
         self._next_report = 0.0
@@ -201,7 +199,7 @@ class ControlExecutive:
         """
         pursued = self._goal_state is ControllerState.TRACKING
         if commanded_until_ns is not None:
-            if not pursued or commanded_until_ns < round(self._started * SECOND):
+            if not pursued or commanded_until_ns < round(self._monitor.started * SECOND):
                 return False
         elif not (pursued or self._pending):
             self._file.delete()
@@ -264,9 +262,10 @@ class ControlExecutive:
                 self._hold(time, measured)
             elif self._begin_anew:
                 self.controller.begin_anew(time, measured)
-                self._within_since = self._error_bounds = None
+                self._monitor.settle_anew()
+                self._error_bounds = None
             self._begin_anew = False
-            too_fast = self.controller.coming_to_rest and self._lost_rates
+            too_fast = self.controller.coming_to_rest and self._monitor.fast_states
             if self._pending and not too_fast:
                 self._begin(time, measured)
             self._watch_rates(qdot)
@@ -279,11 +278,12 @@ class ControlExecutive:
         if self.controller.mode is Mode.MEASURED and self._goal_state is ControllerState.TRACKING:
             self._watch_errors()
         if self.controller.mode is Mode.MEASURED and self._goal_state is ControllerState.TRACKING:
-            self._goal_state = self._outcome(time)
-            if self._goal_state.decided:
+            at_rest = self.controller.reference_at_rest(time)
+            errors = self.controller.errors()
+            decision = self._monitor.outcome(time, at_rest, errors, self._config)
+            if decision != Decision.NONE:
+                self._goal_state, kind = _DECIDED[Decision(int(decision))]
                 self._file.delete()
-                reached = self._goal_state is ControllerState.REACHED
-                kind = EventKind.GOAL_REACHED if reached else EventKind.GOAL_FAILED
                 self._decided(kind, self._sentence(self._goal_state), self._goal_state)
         state = self.state
         if (
@@ -300,33 +300,30 @@ class ControlExecutive:
     # -- control that is lost -----------------------------------------------------------------
 
     def _watch_rates(self, qdot: Array) -> None:
-        """Give up where a joint stays far beyond its rate: its motor does not master it."""
-        rates = self.controller.joint_rates
-        too_fast = self.controller.largest_rate_share(qdot) > LOST_RATE
-        self._lost_rates = self._lost_rates + 1 if too_fast else 0
-        if self._lost_rates < LOST_STATES or self._not_in_charge:
+        """Give up if a joint stays far beyond its rate: its motor does not master it."""
+        lost = self._monitor.rates_lost(self.controller.largest_rate_share(qdot))
+        if not lost or self._not_in_charge:
             return
+        rates = self.controller.joint_rates
         joint = int(np.argmax(np.abs(qdot) / rates))
         name = self.controller.law.robot.joint_names[joint]
         self._lose(f"joint '{name}' moves at {qdot[joint]:.3g}/s instead of {rates[joint]:.3g}/s")
 
     def _watch_errors(self) -> None:
-        """Give up where the errors of a goal grow far beyond what it asked for."""
+        """Give up if the errors grow far beyond the distance of the goal."""
         if self._not_in_charge:
             return
         if self._error_bounds is None:
             margins = self._config.error_margin
             self._error_bounds = self.controller.error_bounds(margins.as_errors())
         share = self.controller.law.largest_error_share(self._error_bounds)
-        self._lost_errors = self._lost_errors + 1 if share > 1.0 else 0
-        if self._lost_errors >= LOST_STATES:
-            errors = self.controller.errors()
-            away = f"{errors.position:.3g} m, {errors.attitude:.3g} rad"
+        if self._monitor.errors_lost(share):
+            away = self.controller.distance_from_reference()
             self._lose(f"the errors grow, the robot is {away} from the reference")
 
     @property
     def _not_in_charge(self) -> bool:
-        """Whether the robot's motion is nothing that goals of this controller lead to."""
+        """Whether the robot moves for another reason than the goals of this controller."""
         return bool(self._guided or self.plant_blocked or self.controller.coming_to_rest)
 
     def _lose(self, why: str) -> None:
@@ -340,9 +337,8 @@ class ControlExecutive:
     def _shift_time(self, seconds: float) -> None:
         """Continue the goal as if time had not jumped: the jump does not count as time flown."""
         self.controller.shift_time(seconds)
-        self._started += seconds
+        self._monitor.shift_time(seconds)
         self._next_report += seconds
-        self._within_since = None
 
     def _hold(self, time: float, state: ControlState) -> None:
         """Hold everything where it is, after an abort or when the plant obeys again."""
@@ -372,9 +368,8 @@ class ControlExecutive:
         sentence, goal_id = "The goal is accepted.", self._goal_id
         self._report_event(Event(EventKind.GOAL_ACCEPTED, sentence, goal_id=goal_id))
         self._goal_state = ControllerState.TRACKING
-        self._started = self._next_report = time
-        self._within_since = self._error_bounds = None
-        self._lost_errors = 0
+        self._monitor.begin(time)
+        self._next_report, self._error_bounds = time, None
         try:
             self._file.save(self._pursued())
         except ParameterError as error:
@@ -390,25 +385,6 @@ class ControlExecutive:
             for key, pose in poses.items()
             if pose is not None and getattr(selection, key)
         }
-
-    def _outcome(self, time: float) -> ControllerState:
-        """Return what has become of the goal that is pursued."""
-        config = self._config
-        within = self.controller.reference_at_rest(time) and _within(
-            self.controller.errors(), config
-        )
-        if not within:
-            self._within_since = None
-        elif self._within_since is None:
-            self._within_since = time
-        if (
-            self._within_since is not None
-            and time - self._within_since >= config.settle_time - _ROUNDING
-        ):
-            return ControllerState.REACHED
-        if config.time_limit and time - self._started >= config.time_limit - _ROUNDING:
-            return ControllerState.FAILED
-        return ControllerState.TRACKING
 
     def _latest_id(self) -> str:
         """Return the id of the goal that was accepted last."""
@@ -428,17 +404,15 @@ class ControlExecutive:
         self._report_event(Event(kind, sentence, state.level, goal_id=about))
 
     def _sentence(self, state: ControllerState) -> str:
-        errors = self.controller.errors()
-        remaining = f"{errors.position:.3g} m, {errors.attitude:.3g} rad"
         match state:
             case ControllerState.HOLDING:
-                return f"Holding; off by {remaining}."
+                away = self.controller.distance_from_reference()
+                return f"Holding; {away} from the reference."
             case ControllerState.TRACKING:
-                return f"Flying to the goal; {remaining} from the reference."
-            case ControllerState.REACHED:
-                return f"The goal is reached: {remaining} from it."
-            case ControllerState.FAILED:
-                return f"The goal is not reached in time: {remaining} from it."
+                away = self.controller.distance_from_reference()
+                return f"Flying to the goal; {away} from the reference."
+            case ControllerState.REACHED | ControllerState.FAILED:
+                return decided_message(state, self.controller.distance_to_goal())
             case ControllerState.ABORTED:
                 return self._abort_sentence
             case ControllerState.ESTIMATING:
@@ -447,28 +421,23 @@ class ControlExecutive:
             case ControllerState.STOPPED:
                 return "The base is not measured any more: thrusters off, joints brought to rest."
             case ControllerState.REFUSED:
-                raise ValueError("a refusal has a sentence of its own")
+                raise ValueError("a refusal has a message of its own")
 
 
-LOST_RATE = 1.5
-"""Ratio of a joint's rate to its largest rate beyond which control of it is lost."""
+def decided_message(state: ControllerState, distance: OutputDistance) -> str:
+    """Return the message about a goal that is reached or failed, at a distance from the goal."""
+    reached = state is ControllerState.REACHED
+    return f"The goal is {'reached' if reached else 'not reached in time'}: {distance} from it."
 
-LOST_STATES = 3
-"""Consecutive states beyond a bound after which control is lost: one may be a bad measurement."""
 
 _GAP, _GAP_PERIODS = 1.0, 10
 """Longest time between two states beyond which time has jumped: s, or control periods."""
 
-_ROUNDING = 1e-9
-"""By how much sums of control periods may be off a time, s."""
-
-
-def _within(errors: Errors, config: ControllerConfig) -> bool:
-    return (
-        errors.position <= config.position_tolerance
-        and errors.attitude <= config.attitude_tolerance
-        and errors.joints <= config.joint_tolerance
-    )
+_DECIDED = {
+    Decision.REACHED: (ControllerState.REACHED, EventKind.GOAL_REACHED),
+    Decision.FAILED: (ControllerState.FAILED, EventKind.GOAL_FAILED),
+}
+"""State and event of decisions, except for a loss of control, which is an abort."""
 
 
 def _command_report(controller: CoordinatedController, result: Saturated) -> CommandReport:

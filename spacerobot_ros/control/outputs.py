@@ -58,6 +58,33 @@ class OutputSelection:
     end_effector_link: str = ""
 
     @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kind of each output's error: ``position``, ``attitude`` or ``joints``."""
+        axes = (*self.base, *self.end_effector)
+        poses = ("attitude" if axis.startswith("r") else "position" for axis in axes)
+        return (*poses, *("joints" for _ in self.joints))
+
+    def distance(self, errors: Array) -> OutputDistance:
+        """Return the distance that errors (m,) of the outputs amount to."""
+        count = len(self.base)
+        joints = errors[count + len(self.end_effector) :]
+        poses = (self.base, errors), (self.end_effector, errors[count:])
+
+        def largest(rotations: bool) -> float:
+            sizes = [
+                float(np.linalg.norm(errors[: len(axes)][chosen]))
+                for axes, errors in poses
+                if any(chosen := [axis.startswith("r") is rotations for axis in axes])
+            ]
+            return max(sizes, default=math.nan)
+
+        return OutputDistance(
+            position=largest(rotations=False),
+            attitude=largest(rotations=True),
+            joints=float(np.abs(joints).max(initial=0.0)) if self.joints else math.nan,
+        )
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """A name for each output: ``base.x``, ``end_effector.rz``, ``joint.elbow``."""
         return (
@@ -67,7 +94,7 @@ class OutputSelection:
         )
 
     def require_valid(self, description: RobotDescription) -> None:
-        """Refuse what a robot does not have.
+        """Check that a robot has these outputs.
 
         Raises
         ------
@@ -89,6 +116,27 @@ class OutputSelection:
                 f"{count} outputs are selected; robot '{description.name}' has "
                 f"{freedom} degrees of freedom."
             )
+
+
+@dataclass(frozen=True)
+class OutputDistance:
+    """How far the outputs are from a reference; NaN for kinds that are not controlled.
+
+    ``position`` (m) and ``attitude`` (rad): distance and angle in the controlled axes, the larger
+    of base and end-effector; ``joints``: the largest error of a joint, m or rad.
+    """
+
+    position: float
+    attitude: float
+    joints: float
+
+    def __str__(self) -> str:
+        parts = (
+            (self.position, " m"),
+            (self.attitude, " rad"),
+            (self.joints, " at the joints"),
+        )
+        return ", ".join(f"{value:.3g}{unit}" for value, unit in parts if not math.isnan(value))
 
 
 def default_selection(description: RobotDescription, end_effector_link: str) -> OutputSelection:
@@ -207,7 +255,7 @@ class OutputVector:
     Raises
     ------
     ParameterError
-        The robot does not have what is selected; see :meth:`OutputSelection.require_valid`.
+        The robot lacks a selected output; see :meth:`OutputSelection.require_valid`.
     """
 
     def __init__(self, robot: SpaceRobot, selection: OutputSelection) -> None:
@@ -249,6 +297,7 @@ class OutputVector:
         self.reference = ca.vertcat(*references)
         self.error = ca.vertcat(*(group.error for group in groups))
         self.error_rate = ca.vertcat(*(group.error_rate for group in groups))
+        self._error_function: ca.Function | None = None
         self.acceleration = ca.vertcat(*(group.acceleration for group in groups))
         self.J_z = ca.vertcat(*(group.J for group in groups))
         self.bias = ca.vertcat(*(group.bias for group in groups))
@@ -287,6 +336,17 @@ class OutputVector:
             parts += _joint_parts(reference.joints)
         np.concatenate(parts, out=memory)
         _require_finite("reference", memory)
+
+    def errors(self, state: ControlState, reference: Reference) -> Array:
+        """Return the errors (m,) of a state from a reference; see :meth:`pack_reference`."""
+        if self._error_function is None:
+            inputs = [self.state, self.reference, *self.model.inputs.values()]
+            self._error_function = ca.Function("errors", inputs, [ca.densify(self.error)])
+        x, wanted = np.empty(self.state.numel()), np.empty(self.reference.numel())
+        self.pack_state(state, x)
+        self.pack_reference(reference, wanted)
+        found = self._error_function(x, wanted, *self.robot.weights.values())
+        return np.asarray(found.full()[:, 0])
 
     # -- groups -------------------------------------------------------------------------------
 
@@ -333,9 +393,9 @@ class OutputVector:
         return _Group(q_des - self.q, qdot_des - self.qdot, qddot_des, J, ca.SX(n, 1))
 
 
-def _pose_parts(what: str, pose: PoseReference | None) -> list[Array]:
+def _pose_parts(frame: str, pose: PoseReference | None) -> list[Array]:
     if pose is None:
-        raise TargetNotSetError(f"There is no reference for {what}, whose pose is controlled.")
+        raise TargetNotSetError(f"There is no reference for {frame}, whose pose is controlled.")
     return [
         pose.position,
         pose.quaternion,
@@ -352,15 +412,15 @@ def _joint_parts(joints: JointReference | None) -> list[Array]:
     return [joints.q, joints.qdot, joints.qddot]
 
 
-def _require_finite(what: str, memory: Array) -> None:
+def _require_finite(name: str, memory: Array) -> None:
     # One call: the square sum of finite numbers of any sensible size is finite.
     if not math.isfinite(memory.dot(memory)):
-        raise NotFiniteError(f"The {what} holds a number that is not finite.")
+        raise NotFiniteError(f"The {name} holds a number that is not finite.")
 
 
-def _require_known(what: str, names: Sequence[str], known: Sequence[str]) -> None:
+def _require_known(kind: str, names: Sequence[str], known: Sequence[str]) -> None:
     for name in names:
         if name not in known:
-            raise ParameterError(f"There is no {what} '{name}'; there are: {', '.join(known)}.")
+            raise ParameterError(f"There is no {kind} '{name}'; there are: {', '.join(known)}.")
         if names.count(name) > 1:
-            raise ParameterError(f"The {what} '{name}' is named twice.")
+            raise ParameterError(f"The {kind} '{name}' is named twice.")

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
-from support.executive_loop import PERIOD, TIP, ExecutiveLoop, goal_at
+from support.executive_loop import (
+    PERIOD,
+    SHAPE,
+    SHAPE_IS_CONTROLLED,
+    TIP,
+    ExecutiveLoop,
+    goal_at,
+)
 
+from spacerobot_ros.control import OutputSelection
 from spacerobot_ros.control.executive import _command_report
 from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.state import Actuation
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 
 
 def test_what_actuators_lose_is_reported_by_kind() -> None:
@@ -22,18 +34,41 @@ def test_what_actuators_lose_is_reported_by_kind() -> None:
     assert report.lost_effort == 2.5
 
 
-def test_the_distances_of_a_sentence_are_those_of_its_kind() -> None:
+def test_the_distances_of_a_message_are_euclidean_and_each_of_its_kind() -> None:
     loop = ExecutiveLoop(settle_time=0.02, time_limit=0.05)
     loop.answer()
     loop.place = np.array([0.03, -0.04, 0.0])
     loop.answer(3)
-    assert loop.status.message == "Holding; off by 0.04 m, 0 rad."
+    assert loop.status.message == "Holding; 0.05 m, 0 rad from the reference."
     loop.place = np.zeros(3)
     loop.aim(base=goal_at([0.3, 0.4, 0.0]), end_effector=goal_at(TIP))
     loop.answer()
-    assert loop.status.message == "Flying to the goal; 0.4 m, 0 rad from the reference."
+    assert loop.status.message == "Flying to the goal; 0.5 m, 0 rad from the reference."
     loop.answer(8)
-    assert loop.status.message == "The goal is not reached in time: 0.4 m, 0 rad from it."
+    assert loop.status.message == "The goal is not reached in time: 0.5 m, 0 rad from it."
+
+
+def test_a_goal_that_is_missed_is_as_far_as_the_goal_and_not_as_the_reference() -> None:
+    """A smooth reference has hardly left the start when the time is over."""
+    settings: dict[str, Any] = {"profile": "quintic", **SHAPE_IS_CONTROLLED}
+    loop = ExecutiveLoop(time_limit=0.05, **settings)
+    turned = np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])
+    goal = Goal(np.array([0.6, -0.8, 0.0]), turned, SHAPE + np.array([0.1, -0.3]))
+    loop.aim(base=IdentifiedGoal(goal))
+    loop.answer()
+    assert loop.status.message.startswith("Flying to the goal; 0 m, ")
+    loop.answer(8)
+    words = "The goal is not reached in time: 1 m, 0.2 rad, 0.3 at the joints from it."
+    assert loop.status.message == words
+
+
+def test_the_distance_of_poses_is_the_larger_one_in_the_axes_that_are_controlled() -> None:
+    selection = OutputSelection(("x", "rz", "y"), ("rx", "z", "ry"), ("elbow",), "tip")
+    found = selection.distance(np.array([3.0, -0.5, 4.0, 0.6, -4.9, 0.8, -2.0]))
+    assert (found.position, found.attitude, found.joints) == pytest.approx((5.0, 1.0, 2.0))
+    assert str(found) == "5 m, 1 rad, 2 at the joints"
+    joints = OutputSelection(joints=("elbow", "wrist")).distance(np.array([0.25, -0.5]))
+    assert str(joints) == "0.5 at the joints"
 
 
 def test_the_time_without_a_base_is_reported() -> None:

@@ -1,0 +1,138 @@
+"""Whether a goal of a controller is reached, failed or lost: one monitor, of numbers or symbols.
+
+The executive evaluates the monitor with numbers, state by state; SIMD lanes compile the same
+methods with CasADi symbols. Conditions are therefore numbers, 1 or 0, combined by arithmetic:
+``a * b`` is "a and b", ``1 - a`` is "not a".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.reference import Errors
+
+Scalar = Any
+"""A number or a CasADi symbol."""
+
+LOST_RATE = 1.5
+"""Ratio of a joint's rate to its largest rate beyond which control of the joint is lost."""
+
+LOST_STATES = 3
+"""Consecutive states beyond a bound after which control is lost: one may be a bad measurement."""
+
+_ROUNDING = 1e-9
+"""Largest rounding of a sum of control periods, s."""
+
+_OUTSIDE = -1.0
+"""Value of ``within_since`` while an error is beyond its tolerance."""
+
+
+class Decision(IntEnum):
+    """Outcome of a goal."""
+
+    NONE = 0
+    """The goal is still pursued."""
+    REACHED = 1
+    FAILED = 2
+    """The goal was not reached within the time limit."""
+    LOST = 3
+    """Control was lost: a joint was too fast, or the errors grew."""
+
+
+@dataclass
+class GoalMonitor:
+    """Memory of the states since a goal was begun, and the decision that follows from them.
+
+    Attributes
+    ----------
+    started
+        Time at which the goal was begun, s.
+    within_since
+        Time since which every error has been within its tolerance with the reference at rest, s;
+        -1 while that is not so.
+    fast_states, astray_states
+        Numbers of consecutive states in which a joint was too fast, and an error beyond its bound.
+    """
+
+    started: Scalar = 0.0
+    within_since: Scalar = _OUTSIDE
+    fast_states: Scalar = 0
+    astray_states: Scalar = 0
+
+    def begin(self, time: Scalar) -> None:
+        """Begin a goal at a time (s); joints that are too fast stay so."""
+        self.started, self.within_since, self.astray_states = time, _OUTSIDE, 0
+
+    def settle_anew(self) -> None:
+        """Begin the settling time again."""
+        self.within_since = _OUTSIDE
+
+    def shift_time(self, seconds: Scalar) -> None:
+        """Discount a jump of time (s), which is no progress of the goal."""
+        self.started += seconds
+        self.settle_anew()
+
+    def rates_lost(self, largest_share: Scalar) -> Scalar:
+        """Count a state by its largest joint rate, as a share of that joint's limit.
+
+        Returns whether joints were beyond :data:`LOST_RATE` in :data:`LOST_STATES` states.
+        """
+        self.fast_states = (largest_share > LOST_RATE) * (self.fast_states + 1)
+        return self.fast_states >= LOST_STATES
+
+    def errors_lost(self, largest_share: Scalar) -> Scalar:
+        """Count a state by its largest error, as a share of that error's bound.
+
+        Returns whether errors were beyond their bounds in :data:`LOST_STATES` states.
+        """
+        self.astray_states = (largest_share > 1.0) * (self.astray_states + 1)
+        return self.astray_states >= LOST_STATES
+
+    def outcome(
+        self, time: Scalar, at_rest: Scalar, errors: Errors, config: ControllerConfig
+    ) -> Scalar:
+        """Return the :class:`Decision` about a goal under control, by the errors of a state.
+
+        Parameters
+        ----------
+        time
+            Time of the state, s.
+        at_rest
+            Whether the reference has come to rest in the goal.
+        errors
+            Largest errors of the outputs by their kind.
+        config
+            Tolerances, settling time and time limit.
+        """
+        within = (
+            1.0
+            * at_rest
+            * (errors.position <= config.position_tolerance)
+            * (errors.attitude <= config.attitude_tolerance)
+            * (errors.joints <= config.joint_tolerance)
+        )
+        was_within = self.within_since >= 0
+        since = was_within * self.within_since + (1 - was_within) * time
+        self.within_since = within * since + (1 - within) * _OUTSIDE
+        settled = within * (time - since >= config.settle_time - _ROUNDING)
+        late = time - self.started >= config.time_limit - _ROUNDING
+        failed = (1 - settled) * late if config.time_limit else 0
+        return settled * Decision.REACHED + failed * Decision.FAILED
+
+    def decision(
+        self,
+        time: Scalar,
+        at_rest: Scalar,
+        errors: Errors,
+        rate_share: Scalar,
+        error_share: Scalar,
+        config: ControllerConfig,
+    ) -> Scalar:
+        """Return the :class:`Decision` by one state: lost, or else :meth:`outcome`."""
+        rates, lost = self.rates_lost(rate_share), self.errors_lost(error_share)
+        controlled = (1 - rates) * (1 - lost)
+        outcome = self.outcome(time, at_rest, errors, config)
+        return (1 - controlled) * Decision.LOST + controlled * outcome
