@@ -19,11 +19,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 import yaml
 
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError, SpaceRobotError
+from spacerobot_ros.model.compilation import BufferedFunction, dense_function
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_rpy
 
@@ -39,22 +41,22 @@ _LARGEST = 1e12
 _AXES = ("force along x", "force along y", "force along z", *(f"torque about {x}" for x in "xyz"))
 _KEYS = {"name", "link", "position", "rpy", "direction", "force", "min_on_time", "isp"}
 
-_THRIFT = 1e-5
-"""Weight of the cost beside the wrench. What it takes from the wrench, some 1e-10 of it, is given
-back afterwards; a much smaller weight would be lost in the rounding of the solver."""
+COST_WEIGHT = 1e-5
+"""Weight of the cost relative to the wrench. The cost takes some 1e-10 from the wrench, which is
+restored afterwards; a much smaller weight would be lost in the rounding of the solver."""
 
-_MET = 1e-9
-"""Largest missing share of a wrench that counts as given."""
+TIE_BREAK = 0.01
+"""Largest relative change of a cost. Thrusters placed symmetrically have many allocations
+of the same cost, among which rounding, which differs between machines, would choose."""
 
-_PREFERENCE = 1e4
-"""Weight of the part of the wrench that is given, relative to its cost."""
+_ACHIEVED = 1e-9
+"""Largest relative error of a wrench that counts as achieved."""
+
+_WRENCH_WEIGHT = 1e4
+"""Weight of the achieved part of a wrench beyond the thrust, relative to its cost."""
 
 _ROUNDING = 1e-9
 """Shorter parts of a time count as zero."""
-
-_FAVOUR = 0.01
-"""By how much of its cost a thruster may be favoured. Thrusters placed symmetrically have many
-allocations of the same cost, and rounding, which differs between machines, would choose."""
 
 _UNMET = 1e-6
 """Smaller parts of a wrench are not counted as missing, N or N m."""
@@ -291,10 +293,10 @@ def _number(entry: Mapping[str, Any], key: str, where: str, *, positive: bool) -
 
 @dataclass(frozen=True)
 class Allocation:
-    """``levels`` (m,): how much of each thruster; ``met`` (6,): the wrench that they make."""
+    """Levels of the thrusters, ``levels`` (m,), and their wrench, ``achieved`` (6,)."""
 
     levels: Array
-    met: Array
+    achieved: Array
 
 
 class ThrusterAllocation:
@@ -302,18 +304,21 @@ class ThrusterAllocation:
 
     The levels solve ``wrenches @ levels = wanted`` with ``0 <= levels <= most``. They are found by
     non-negative least squares (Lawson and Hanson) with one more row for the cost: as its weight
-    goes to zero the solution goes to the cheapest of the exact ones. Where a level would exceed
-    its upper bound, a linear programme finds the largest part of the wrench that can be given, and
-    its cheapest allocation: the wrench keeps its direction as it does in
-    :class:`spacerobot_ros.control.ActuatorLimits`. Of a wrench that no levels make, the nearest
-    that can be made is allocated, torques weighed by the thrusters' mean lever.
+    goes to zero the solution goes to the cheapest of the exact ones. If a level would exceed its
+    upper bound, a linear programme finds the largest achievable part of the wrench and its
+    cheapest allocation: the wrench keeps its direction as it does in
+    :class:`spacerobot_ros.control.ActuatorLimits`. For a wrench outside the cone of the thrusters
+    the nearest wrench in the cone is allocated, with torques weighted by the mean lever.
+
+    SIMD lanes have the active-set solver once more in C++ (``batch/thrusters.hpp``), because its
+    steps differ from lane to lane; test/batch holds both to the same random cases.
 
     Parameters
     ----------
     wrenches
         (6, m) force (N) over torque (N m) of each thruster at level one.
     cost
-        (m,) what level one of each costs, positive.
+        (m,) cost of each thruster at level one, positive.
     """
 
     def __init__(self, wrenches: Array, cost: Array) -> None:
@@ -339,18 +344,18 @@ class ThrusterAllocation:
     def _use(self, usable: npt.NDArray[np.int64]) -> None:
         self._usable = usable
         self._columns = self._matrix[:, usable]
-        self._extended = np.vstack([self._columns, _THRIFT * self._cost[usable]])
+        self._extended = np.vstack([self._columns, COST_WEIGHT * self._cost[usable]])
 
     @property
     def problem(self) -> tuple[Array, Array]:
-        """What is solved for a wanted wrench: the matrix (7, m) of the levels, whose last row is
-        their cost, and the weights (6,) of the wrench on the other side.
+        """The least-squares problem of a wrench: the matrix (7, m) of the levels, with the cost in
+        the last row, and the weights (6,) of the wrench on the right-hand side.
         """
         return self._extended, self._weights
 
     def allocate(self, wanted: Array, most: Array) -> Allocation:
-        """Return the levels (m,), each within ``most`` (m,), that make ``wanted`` (6,), or as much
-        of it as they can.
+        """Return levels (m,), each within ``most`` (m,), for a wrench ``wanted`` (6,), or for the
+        achievable part of it.
         """
         levels = np.zeros(self._cost.size)
         target = self._weights * wanted
@@ -358,47 +363,46 @@ class ThrusterAllocation:
         if size > 0.0 and self._usable.size:
             target = target / size
             share, _ = self._nnls(self._extended, np.append(target, 0.0))
-            share = self._completed(share, target, share > 0.0)
+            share = self._corrected(share, target, share > 0.0)
             bounds = most[self._usable] / size
             if np.any(share > bounds):
-                made = self._columns @ share
-                if np.linalg.norm(made - target) > _MET:
-                    target = made
+                achieved = self._columns @ share
+                if np.linalg.norm(achieved - target) > _ACHIEVED:
+                    target = achieved
                 share = self._largest_part(target, bounds)
             levels[self._usable] = np.minimum(size * share, most[self._usable])
         return Allocation(levels, self._wrenches @ levels)
 
-    def _completed(self, levels: Array, target: Array, free: npt.NDArray[np.bool_]) -> Array:
-        """Return the levels after the free ones have made up for what is missing, never below 0."""
+    def _corrected(self, levels: Array, target: Array, free: npt.NDArray[np.bool_]) -> Array:
+        """Return levels, at least zero, of which the free ones remove the error from the target."""
         columns = self._columns[:, free]
-        completed = levels.copy()
-        completed[free] += np.linalg.lstsq(columns, target - self._columns @ levels, rcond=None)[0]
-        return np.maximum(completed, 0.0)
+        corrected = levels.copy()
+        corrected[free] += np.linalg.lstsq(columns, target - self._columns @ levels, rcond=None)[0]
+        return np.maximum(corrected, 0.0)
 
     def _largest_part(self, target: Array, bounds: Array) -> Array:
         """Return the cheapest levels within bounds that make the largest part of the target."""
         from scipy.optimize import linprog
 
-        cost = np.append(self._cost[self._usable], -_PREFERENCE)
+        cost = np.append(self._cost[self._usable], -_WRENCH_WEIGHT)
         equations = np.column_stack([self._columns, -target])
         limits = [*((0.0, bound) for bound in bounds), (0.0, 1.0)]
         solution = linprog(cost, A_eq=equations, b_eq=np.zeros(6), bounds=limits).x
         levels, part = solution[:-1], solution[-1]
         inside = (levels > 0.0) & (levels < bounds)
-        return np.minimum(self._completed(levels, part * target, inside), bounds)
+        return np.minimum(self._corrected(levels, part * target, inside), bounds)
 
 
 class ThrusterModulator:
     """Turns a wanted wrench into on-times of thrusters, one control period after the other.
 
-    Sigma-delta modulation with shortest pulses. The outstanding impulse ``owed`` grows by the
-    wanted wrench times the period and shrinks by the impulses of the pulses fired. In every period
-    it is allocated anew, so that opposite contributions cancel; a thruster that is off opens once
-    its share is a whole shortest pulse, one that is on stays on as long as it has a share. What
-    remains outstanding is therefore at most one shortest pulse of each thruster: with ``t`` that
-    time and ``h`` the period, ``allocation <= t + h - (remaining part of a shortest pulse)`` holds
-    in every period if the wanted wrench is within the thrust. A wrench beyond it is dropped, not
-    made up for later.
+    Sigma-delta modulation with shortest pulses. ``pending_impulse`` grows by the wanted wrench
+    times the period and shrinks by the impulses of the pulses fired. It is allocated anew in every
+    period, so that opposite contributions cancel; :func:`pulse_function` turns the allocated
+    on-times into pulses. The pending impulse is therefore at most one shortest pulse of each
+    thruster: with ``t`` that time and ``h`` the period, ``allocation <= t + h - (remaining part of
+    a shortest pulse)`` holds in every period if the wanted wrench is within the thrust. A wrench
+    beyond the thrust is dropped, not compensated for later.
 
     Within a period a valve opens and closes at any time; a pulse begins with a period.
 
@@ -424,11 +428,11 @@ class ThrusterModulator:
         self._wrenches, self._shortest = table.wrenches, table.min_on_time
         count = len(table.names)
         # Numbers without rational relations: no sums of costs are equal either.
-        favour = np.sin(np.arange(1.0, count + 1.0) ** 2)
-        self.allocation = ThrusterAllocation(
-            self._wrenches, table.mass_flow * (1.0 + _FAVOUR * favour)
-        )
+        tie_break = 1.0 + TIE_BREAK * np.sin(np.arange(1.0, count + 1.0) ** 2)
+        self.allocation = ThrusterAllocation(self._wrenches, table.mass_flow * tie_break)
         """How wrenches are distributed over the thrusters."""
+        self._pulses = BufferedFunction(pulse_function(count))
+        self._pulses.inputs[3][:], self._pulses.inputs[4][:] = self._shortest, control_period
         self._excluded: list[str] = []
         for name in excluded:
             self.exclude(name)
@@ -466,41 +470,86 @@ class ThrusterModulator:
         self._excluded.append(name)
 
     def reset(self) -> None:
-        """Close all thrusters, nothing outstanding; the counts go on."""
-        self.owed = np.zeros(6)
-        """Impulse (6,) that was wanted and is still to be given, N s, N m s."""
-        self._left = np.zeros(len(self.table.names))
-        self._on: npt.NDArray[np.bool_] = np.zeros(len(self.table.names), dtype=np.bool_)
+        """Close all thrusters and drop the pending impulse; the counts go on."""
+        self.pending_impulse = np.zeros(6)
+        """Impulse (6,) that was wanted and has not been fired yet, N s, N m s."""
+        _, self._remaining, self._open, *_ = self._pulses.inputs
+        self._remaining[:] = self._open[:] = 0.0
         self.unmet[:] = 0.0
         self.begun[:] = False
 
     @property
     def under_way(self) -> Array:
-        """Impulse (6,) left in the shortest pulses that have begun, N s and N m s."""
-        return self._wrenches @ self._left
+        """Impulse (6,) of the remaining parts of shortest pulses that have begun, N s, N m s."""
+        return np.asarray(self._wrenches @ self._remaining)
 
     def fire(self, wrench: Array) -> Array:
-        """Return for how long each thruster (m,) is on in the next period, s.
+        """Return the on-time of each thruster (m,) in the next period, s.
 
         ``wrench`` (6,) is force (N) over torque (N m) at the origin of the base link, base
         components.
         """
-        h, shortest = self._control_period, self._shortest
-        wanted = self.owed + h * wrench
-        shares = self.allocation.allocate(wanted, shortest + h - self._left)
-        self.unmet[:] = (wanted - shares.met) / h
+        h = self._control_period
+        wanted = self.pending_impulse + h * wrench
+        shares = self.allocation.allocate(wanted, self._shortest + h - self._remaining)
+        self.unmet[:] = (wanted - shares.achieved) / h
         self.unmet_periods += bool(np.any(np.abs(self.unmet) > _UNMET))
-        levels = np.where(shares.levels > _ROUNDING * h, shares.levels, 0.0)
-        self.begun[:] = ~self._on & (levels > 0.0) & (levels >= (1.0 - _ROUNDING) * shortest)
-        longer = np.minimum(levels, np.maximum(h - self._left, 0.0))
-        new = np.where(
-            self._on, longer, np.where(self.begun, np.maximum(np.minimum(levels, h), shortest), 0.0)
-        )
-        on_time: Array = np.minimum(self._left + new, h)
-        self._left = self._left + new - on_time
-        self._left[self._left <= _ROUNDING * h] = 0.0
-        self._on = on_time >= (1.0 - _ROUNDING) * h
-        self.owed = shares.met - self._wrenches @ new
+        self._pulses.inputs[0][:] = shares.levels
+        self._pulses.evaluate()
+        on_time, added, remaining, opened, begun = self._pulses.outputs
+        self._remaining[:], self._open[:], self.begun[:] = remaining, opened, begun
+        self.pending_impulse = shares.achieved - self._wrenches @ added
         self.pulses += self.begun
         self.on_time += on_time
-        return on_time
+        return on_time.copy()
+
+
+PULSE_INPUTS = ("levels", "remaining", "open", "shortest", "h")
+"""Arguments of :func:`pulse_function`."""
+
+PULSE_OUTPUTS = ("on_time", "added", "next_remaining", "next_open", "begun")
+"""Results of :func:`pulse_function`."""
+
+
+def pulse_function(count: int) -> ca.Function:
+    """Return the pulses of a control period as a function of numbers or, in lanes, of symbols.
+
+    A closed thruster opens if its level is a whole shortest pulse; an open one stays open as long
+    as it has a level. It takes :data:`PULSE_INPUTS` and gives :data:`PULSE_OUTPUTS`, (count,) each:
+
+    ``levels``
+        Allocated on-times, s.
+    ``remaining``, ``next_remaining``
+        Remaining parts of shortest pulses before and after the period, s.
+    ``open``, ``next_open``
+        Whether each thruster is open at the beginning and at the end of the period.
+    ``shortest``, ``h``
+        Shortest pulses, s, and the control period, a scalar, s.
+    ``on_time``, ``added``
+        On-times in the period, and the parts of ``levels`` that pulses now take, s.
+    ``begun``
+        Whether a pulse begins.
+    """
+    sizes = (count, count, count, count, 1)
+    inputs = [ca.SX.sym(name, size) for name, size in zip(PULSE_INPUTS, sizes, strict=True)]
+    levels, remaining, opened, shortest, h = inputs
+    levels = ca.if_else(levels > _ROUNDING * h, levels, 0.0)
+    whole = ca.logic_and(levels > 0.0, levels >= (1.0 - _ROUNDING) * shortest)
+    begun = ca.logic_and(ca.logic_not(opened), whole)
+    longer = ca.fmin(levels, ca.fmax(h - remaining, 0.0))
+    new = ca.if_else(begun, ca.fmax(ca.fmin(levels, h), shortest), 0.0)
+    added = ca.if_else(opened, longer, new)
+    on_time = ca.fmin(remaining + added, h)
+    rest = remaining + added - on_time
+    results = (
+        on_time,
+        added,
+        ca.if_else(rest <= _ROUNDING * h, 0.0, rest),
+        on_time >= (1.0 - _ROUNDING) * h,
+        begun,
+    )
+    return dense_function(
+        "pulses",
+        dict(zip(PULSE_INPUTS, inputs, strict=True)),
+        dict(zip(PULSE_OUTPUTS, results, strict=True)),
+    )

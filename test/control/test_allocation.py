@@ -39,8 +39,8 @@ def test_what_thrusters_can_give_is_given(seed: int, count: int, scale: float) -
     wanted = wrenches @ levels
     found = ThrusterAllocation(wrenches, cost).allocate(wanted, np.full(count, np.inf))
     assert found.levels.min() >= 0.0
-    np.testing.assert_array_equal(found.met, wrenches @ found.levels)
-    assert np.linalg.norm(found.met - wanted) <= 1e-9 * (np.linalg.norm(wanted) + scale)
+    np.testing.assert_array_equal(found.achieved, wrenches @ found.levels)
+    assert np.linalg.norm(found.achieved - wanted) <= 1e-9 * (np.linalg.norm(wanted) + scale)
     assert cost @ found.levels <= cost @ levels * (1 + 1e-9)
 
 
@@ -51,7 +51,7 @@ def test_every_wrench_of_the_servicer_is_given_at_the_least_propellant(seed: int
     cost = SERVICER.mass_flow
     found = ThrusterAllocation(SERVICER.wrenches, cost).allocate(wanted, ALWAYS)
     cheapest = linprog(cost / cost[0], A_eq=SERVICER.wrenches, b_eq=wanted).fun * cost[0]
-    assert np.abs(found.met - wanted).max() <= 1e-9
+    assert np.abs(found.achieved - wanted).max() <= 1e-9
     assert found.levels.min() >= 0.0
     assert cost @ found.levels == pytest.approx(cheapest, rel=1e-7)
 
@@ -63,8 +63,10 @@ def test_beyond_the_thrust_the_wrench_keeps_its_direction(seed: int) -> None:
     most = rng.uniform(0.2, 1.0, 24)
     found = ThrusterAllocation(SERVICER.wrenches, SERVICER.mass_flow).allocate(wanted, most)
     assert np.all((found.levels >= 0.0) & (found.levels <= most))
-    part = float(found.met @ wanted / (wanted @ wanted))
-    np.testing.assert_allclose(found.met, part * wanted, atol=1e-9 * float(np.linalg.norm(wanted)))
+    part = float(found.achieved @ wanted / (wanted @ wanted))
+    np.testing.assert_allclose(
+        found.achieved, part * wanted, atol=1e-9 * float(np.linalg.norm(wanted))
+    )
     # max part subject to wrenches @ levels = part * wanted, scaled otherwise than in the package
     largest = linprog(
         np.append(np.zeros(24), -1.0),
@@ -104,8 +106,8 @@ def test_the_nearest_is_given_of_what_cannot_be_given(seed: int) -> None:
     other = lsq_linear(
         weights[:, None] * wrenches, weights * wanted, (0.0, np.inf), method="bvls", tol=1e-14
     )
-    np.testing.assert_allclose(found.met, wrenches @ other.x, atol=1e-6)
-    assert np.linalg.norm(found.met - wanted) > 1e-3
+    np.testing.assert_allclose(found.achieved, wrenches @ other.x, atol=1e-6)
+    assert np.linalg.norm(found.achieved - wanted) > 1e-3
 
 
 def test_of_a_wrench_in_an_unreachable_direction_the_bounds_leave_what_can_be_given() -> None:
@@ -116,7 +118,7 @@ def test_of_a_wrench_in_an_unreachable_direction_the_bounds_leave_what_can_be_gi
     for size in (1.0, 8.0, 1e3):
         found = allocation.allocate(size * np.array([1.0, 0.5, 0.7, 0, 0, 0]), np.ones(3))
         given_ = min(size, 2.0)
-        np.testing.assert_allclose(found.met, [given_, given_ / 2, 0, 0, 0, 0], atol=1e-9)
+        np.testing.assert_allclose(found.achieved, [given_, given_ / 2, 0, 0, 0, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -128,8 +130,8 @@ def test_bounded_thrusters_give_the_direction_that_unbounded_ones_would(seed: in
     free = allocation.allocate(wanted, np.full(5, np.inf))
     most = rng.uniform(0.2, 1.0, 5) * float(free.levels.max()) / 3.0
     found = allocation.allocate(wanted, most)
-    part = float(found.met @ free.met / (free.met @ free.met))
-    np.testing.assert_allclose(found.met, part * free.met, atol=1e-6)
+    part = float(found.achieved @ free.achieved / (free.achieved @ free.achieved))
+    np.testing.assert_allclose(found.achieved, part * free.achieved, atol=1e-6)
     used = free.levels > 1e-9 * free.levels.max()
     assert part == pytest.approx(min(1.0, *(most / np.maximum(free.levels, 1e-12))[used]), rel=1e-6)
 
@@ -142,12 +144,12 @@ def test_excluded_thrusters_are_replaced_as_long_as_the_others_suffice() -> None
     for _ in range(20):
         wanted = rng.normal(size=6)
         found = allocation.allocate(wanted, WHOLE)
-        np.testing.assert_allclose(found.met, wanted, atol=1e-9)
+        np.testing.assert_allclose(found.achieved, wanted, atol=1e-9)
         assert found.levels[[0, 7, 20]].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_without_thrusters_there_is_nothing() -> None:
     allocation = ThrusterAllocation(np.ones((6, 1)), np.ones(1))
     allocation.exclude(0)
-    assert allocation.allocate(np.ones(6), np.ones(1)).met.tolist() == [0.0] * 6
+    assert allocation.allocate(np.ones(6), np.ones(1)).achieved.tolist() == [0.0] * 6
     assert allocation.allocate(np.zeros(6), np.ones(1)).levels.tolist() == [0.0]
