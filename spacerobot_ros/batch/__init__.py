@@ -1,9 +1,8 @@
-"""Thousands of flights at once: the plant on vector registers, a flight in each lane."""
+"""Thousands of flights at once in SIMD lanes: one flight in each lane of a vector register."""
 
 from spacerobot_ros.batch.flights import (
     BatchResult,
     Controlled,
-    Decision,
     FlightProgram,
     Flights,
     FollowedSchedule,
@@ -13,6 +12,7 @@ from spacerobot_ros.batch.flights import (
 )
 from spacerobot_ros.batch.lanes import fly_lanes
 from spacerobot_ros.batch.scalar import fly_one_by_one
+from spacerobot_ros.control.goal_monitor import Decision
 
 __all__ = [
     "BatchResult",

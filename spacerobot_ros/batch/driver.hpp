@@ -1,69 +1,10 @@
-// Flies groups of flights, one in each lane, tick by tick. What follows LANES numbers that belong
-// together is called a row; a group's memory is a table of rows, the same for all groups.
+// Flies groups of flights, one in each lane, tick by tick. LANES numbers that belong together are a
+// row; the memory of a group is a table of ROWS rows.
 //
-// FLIGHT and REPORT are CasADi's functions of a tick: the latter also gives what is reported.
-// CONTROL, where there is one, gives the command for a state.
-
-struct Span {
-  long long from, to, count;  // rows
-};
-
-enum Program { HELD = 0, FOLLOWED = 1, CONTROLLED = 2 };
-
-enum Decision { NONE = 0, REACHED = 1, FAILED = 2, LOST = 3 };  // about the goal of a controller
-
-enum Pending { NOTHING = 0, COMMIT = 1, TICK = 2, FIRE = 3 };
-
-struct Job {
-  V *memory;               // groups x rows
-  long long groups, rows;
-  long long *at;           // of each group: the tick that is next
-  unsigned char *pending;  // of each group: what is next is to commit a tick, or to take it
-  // Arguments and results of the two functions: rows, in the order of CasADi.
-  const long long *arguments, *flight_results, *report_results;
-  long long argument_count, flight_result_count, report_result_count;
-  // After each tick.
-  const Span *copies, *sums, *peaks;
-  long long copy_count, sum_count, peak_count;
-  long long stop_row;      // where lanes are not zero the tick is to be taken otherwise; -1: none
-  long long alive_row;     // 1 in lanes that still fly
-  // Force and torque on the base: rows of the wrench, of two peaks and two impulses; -1: none.
-  long long wrench_row, wrench_peak_row, impulse_row;
-  double period;
-  long long period_ns;
-  // Commands.
-  long long program, command_row, command_count;
-  const double *table;     // (ticks, command_count), or with each_table (groups, ticks, count, LANES)
-  long long table_ticks, each_table;
-  // FOLLOWED: the table has shapes, and one more of them than ticks.
-  long long q_row, measured_row, bias_row, noise_row, n, noisy;
-  const double *normals;   // (groups, ticks from normals_from on, normals_width, LANES)
-  long long normals_from, normals_ticks, normals_width;
-  double gain, deadband;
-  // Reports.
-  const long long *instants;  // ticks, ascending
-  long long instant_count;
-  V *reports;              // (groups, instants, report rows)
-  const Span *reported;
-  long long reported_count, report_rows;
-  // CONTROLLED: rows of CONTROL's arguments and results, and those that the loop looks at.
-  const long long *control_arguments, *control_results;
-  long long control_argument_count, control_result_count;
-  long long normals_row, time_row, since_row, begun_row, exact_row, settled_row, reached_row;
-  V *reached;              // (groups, report rows): the state when a goal was reached
-  long long lowest_row, highest_row;  // of the joint positions
-  // CONTROLLED: what is decided about goals, when, and with which errors; whether flights then end.
-  long long wild_row, wild_count_row, errors_row, decision_row, decided_row, decided_errors_row;
-  long long lost_states, last_tick, ends, ended_row;
-  V *ended;                // (groups, report rows): the state at the end
-  // CONTROLLED: momenta as they are and as thrust explains them; the largest change of either.
-  long long momentum_row, expected_row, first_momenta_row, drift_row;
-  // Thrusters: by thruster what is solved for it (7) and its wrench (6); weights (6) of a wrench;
-  // shortest pulses, s, and flows, kg/s. Rows of the wanted wrench and of the modulation.
-  const double *thruster_matrix, *thruster_wrenches, *thruster_weights;
-  const double *thruster_shortest, *thruster_flow;
-  long long wanted_row, owed_row, left_row, on_row, levels_row, unallocated_row, propellant_row;
-};
+// native.py generates the declarations before this file: the first row of each name (namespace row),
+// sizes, enumerations, struct Job, and the rows of the arguments and results of CasADi's functions.
+// FLIGHT and REPORT step a tick; REPORT also gives the results of reports. CONTROL gives a
+// controller's command and decision for a state, PULSES the pulses of thrusters.
 
 static bool any(V flags) {
   for (int lane = 0; lane < LANES; ++lane)
@@ -81,23 +22,23 @@ static V *work_memory() {
 
 typedef int Function(const V **, V **, long long *, V *, int);
 
-static void call(Function *function, V *group, const long long *arguments, long long argument_count,
-                 const long long *results, long long result_count) {
+// Evaluate a function on the rows of a group.
+template <int ARGUMENTS, int RESULTS>
+static void call(Function *function, V *group, const long long (&arguments)[ARGUMENTS],
+                 const long long (&results)[RESULTS]) {
   const V *in[ARGUMENT_POINTERS];
   V *out[RESULT_POINTERS];
   static thread_local long long integers[INTEGER_SIZE];
-  for (long long i = 0; i < argument_count; ++i) in[i] = group + arguments[i];
-  for (long long i = 0; i < result_count; ++i) out[i] = group + results[i];
+  for (int i = 0; i < ARGUMENTS; ++i) in[i] = group + arguments[i];
+  for (int i = 0; i < RESULTS; ++i) out[i] = group + results[i];
   function(in, out, integers, work_memory(), 0);
 }
 
-static void evaluate(const Job &job, V *group, bool report) {
+static void evaluate(V *group, bool report) {
   if (report)
-    call(REPORT, group, job.arguments, job.argument_count, job.report_results,
-         job.report_result_count);
+    call(REPORT, group, REPORT_ARGUMENTS, REPORT_RESULTS);
   else
-    call(FLIGHT, group, job.arguments, job.argument_count, job.flight_results,
-         job.flight_result_count);
+    call(FLIGHT, group, FLIGHT_ARGUMENTS, FLIGHT_RESULTS);
 }
 
 static long long instant_of(const Job &job, long long tick) {
@@ -106,64 +47,62 @@ static long long instant_of(const Job &job, long long tick) {
   return -1;
 }
 
-// Copy what is reported of the state of a group, in the lanes where a flag is not zero.
-static void copy_report(const Job &job, long long g, V *to, V chosen) {
-  const V *group = job.memory + g * job.rows;
+// Copy the report of a group's state in the lanes where a flag is not zero.
+static void copy_report(const V *group, V *to, V chosen) {
   const Bits mask = chosen.x != 0.0;
-  for (long long i = 0; i < job.reported_count; ++i)
-    for (long long k = 0; k < job.reported[i].count; ++k) {
-      Numbers &there = to[job.reported[i].to + k].x;
-      there = mask ? group[job.reported[i].from + k].x : there;
+  for (const Span &span : REPORTED)
+    for (long long k = 0; k < span.count; ++k) {
+      Numbers &there = to[span.to + k].x;
+      there = mask ? group[span.from + k].x : there;
     }
 }
 
 static void record(const Job &job, long long g, long long tick) {
   const long long instant = instant_of(job, tick);
   if (instant >= 0)
-    copy_report(job, g, job.reports + (g * job.instant_count + instant) * job.report_rows, V(1.0));
+    copy_report(job.memory + g * ROWS,
+                job.reports + (g * job.instant_count + instant) * REPORT_ROWS, V(1.0));
+}
+
+// Return one number of each lane.
+static V lanes_of(const double *each) {
+  Numbers numbers;
+  for (int lane = 0; lane < LANES; ++lane) numbers[lane] = each[lane];
+  return V(numbers);
 }
 
 static V normal(const Job &job, long long g, long long tick, long long column) {
-  const double *each =
+  return lanes_of(
       job.normals +
-      ((g * job.normals_ticks + tick - job.normals_from) * job.normals_width + column) * LANES;
-  Numbers numbers;
-  for (int lane = 0; lane < LANES; ++lane) numbers[lane] = each[lane];
-  return V(numbers);
-}
-
-static void measure(const Job &job, long long g, long long tick, V *group) {
-  V *measured = group + job.measured_row;
-  const V *q = group + job.q_row, *bias = group + job.bias_row;
-  if (!job.noisy) {
-    for (long long j = 0; j < job.n; ++j) measured[j] = q[j];
-    return;
-  }
-  for (long long j = 0; j < job.n; ++j)
-    measured[j] = q[j] + bias[j] + group[job.noise_row] * normal(job, g, tick, j);
+      ((g * job.normals_ticks + tick - job.normals_from) * job.normals_width + column) * LANES);
 }
 
 static V entry(const Job &job, long long g, long long tick, long long column) {
-  if (!job.each_table) return V(job.table[tick * job.command_count + column]);
-  const double *each =
-      job.table + ((g * job.table_ticks + tick) * job.command_count + column) * LANES;
-  Numbers numbers;
-  for (int lane = 0; lane < LANES; ++lane) numbers[lane] = each[lane];
-  return V(numbers);
+  if (!job.each_table) return V(job.table[tick * COMMANDS + column]);
+  return lanes_of(job.table + ((g * job.table_ticks + tick) * COMMANDS + column) * LANES);
+}
+
+#ifndef CONTROL
+static void measure(const Job &job, long long g, long long tick, V *group) {
+  V *measured = group + row::measured;
+  const V *q = group + row::state, *bias = group + row::joint_bias;
+  for (long long j = 0; j < JOINTS; ++j)
+    measured[j] = job.noisy ? q[j] + bias[j] + group[row::joint_noise] * normal(job, g, tick, j)
+                            : q[j];
 }
 
 static void command(const Job &job, long long g, long long tick, V *group) {
-  V *to = group + job.command_row;
-  if (job.program == HELD) {
-    for (long long j = 0; j < job.command_count; ++j)
+  V *to = group + row::command;
+  if (job.program == program::HELD) {
+    for (long long j = 0; j < COMMANDS; ++j)
       to[j] = tick < job.table_ticks ? entry(job, g, tick, j) : V(0.0);
     return;
   }
   measure(job, g, tick, group);
-  const V *measured = group + job.measured_row;
+  const V *measured = group + row::measured;
   const long long last = job.table_ticks - 1, k = tick < last ? tick : last;
   const V gain(job.gain), band(job.deadband);
-  for (long long j = 0; j < job.command_count; ++j) {
+  for (long long j = 0; j < COMMANDS; ++j) {
     const V wanted = entry(job, g, k, j);
     const V velocity =
         k < last ? (entry(job, g, k + 1, j) - wanted) / V(job.period) : V(0.0);
@@ -176,174 +115,207 @@ static void command(const Job &job, long long g, long long tick, V *group) {
     }
   }
 }
+#endif
 
-#include "thrusters.hpp"
+#if THRUSTERS > 0
+// Allocate the pending impulse and that of the command; return whether lanes need Python for it.
+static bool allocate(const Job &job, V *group) {
+  bool waits = false;
+  for (int i = 0; i < 6; ++i) group[row::wanted + i] = group[row::command + JOINTS + i];
+  for (int lane = 0; lane < LANES; ++lane) {
+    double impulse[6], most[THRUSTERS], levels[THRUSTERS];
+    for (int i = 0; i < 6; ++i)
+      impulse[i] = group[row::pending_impulse + i].x[lane] +
+                   job.period * group[row::wanted + i].x[lane];
+    for (int j = 0; j < THRUSTERS; ++j)
+      most[j] = group[row::shortest + j].x[lane] + job.period - group[row::remaining + j].x[lane];
+    const bool beyond =
+        group[row::alive].x[lane] != 0.0 &&
+        !allocate_levels(job.thruster_matrix, job.thruster_weights, impulse, most, levels);
+    for (int j = 0; j < THRUSTERS; ++j)
+      group[row::levels + j].x[lane] = beyond ? 0.0 : levels[j];
+    group[row::unallocated].x[lane] = beyond;
+    waits = waits || beyond;
+  }
+  return waits;
+}
+
+// Fire the thrusters for a period; their wrench replaces that of the command.
+static void fire(const Job &job, V *group) {
+  call(PULSES, group, PULSES_ARGUMENTS, PULSES_RESULTS);
+  const V h(job.period);
+  V pending[6], wrench[6], flow(0.0);
+  for (int i = 0; i < 6; ++i) pending[i] = wrench[i] = V(0.0);
+  for (int j = 0; j < THRUSTERS; ++j) {
+    const V missing = group[row::levels + j] - group[row::added + j];
+    const V duty = group[row::on_time + j] / h;
+    for (int i = 0; i < 6; ++i) {
+      pending[i] += V(job.thruster_wrenches[j * 6 + i]) * missing;
+      wrench[i] += V(job.thruster_wrenches[j * 6 + i]) * duty;
+    }
+    flow += V(job.thruster_flow[j]) * duty;
+  }
+  for (int i = 0; i < 6; ++i) {
+    group[row::pending_impulse + i] = pending[i];
+    group[row::command + JOINTS + i] = wrench[i];
+  }
+  V &used = group[row::propellant];
+  assign_where(group[row::alive], used, used + h * flow);
+}
+#endif
 
 #ifdef CONTROL
-// Decide about the goals of a group, by the errors of the command at a tick.
-static void decide(const Job &job, long long tick, V *group) {
-  V lost(0.0);
-  for (int kind = 0; kind < 2; ++kind) {
-    V &count = group[job.wild_count_row + kind];
-    count = group[job.wild_row + kind] * (count + V(1.0));
-    lost = lost || count >= V(double(job.lost_states));
-  }
-  V &decision = group[job.decision_row];
-  V made(job.last_tick >= 0 && tick >= job.last_tick ? double(FAILED) : double(NONE));
-  assign_where(group[job.settled_row], made, V(double(REACHED)));
-  assign_where(lost, made, V(double(LOST)));
-  const V now = decision == V(double(NONE)) && made && group[job.alive_row];
-  if (!any(now)) return;
-  assign_where(now, decision, made);
-  assign_where(now, group[job.decided_row], V(double(tick)));
-  for (int k = 0; k < 3; ++k)
-    assign_where(now, group[job.decided_errors_row + k], group[job.errors_row + k]);
-}
-
-// Measure the state and evaluate the command for it; return whether lanes need another one.
+// Measure the state and evaluate the command for it; return whether lanes need Python for it.
 static bool control(const Job &job, long long g, long long tick, V *group) {
   for (long long k = 0; job.noisy && k < job.normals_width; ++k)
-    group[job.normals_row + k] = normal(job, g, tick, k);
-  group[job.time_row] = V(double(tick * job.period_ns) / 1e9);
-  call(CONTROL, group, job.control_arguments, job.control_argument_count, job.control_results,
-       job.control_result_count);
-  group[job.since_row] = group[job.begun_row];
-  V &reached = group[job.reached_row];
-  const V now = group[job.settled_row] && reached < V(0.0);
-  assign_where(now, reached, group[job.time_row]);
-  copy_report(job, g, job.reached + g * job.report_rows, now);
-  decide(job, tick, group);
-  return any(group[job.exact_row] && group[job.alive_row]);
+    group[row::normals + k] = normal(job, g, tick, k);
+  group[row::time] = V(double(tick * job.period_ns) / 1e9);
+  call(CONTROL, group, CONTROL_ARGUMENTS, CONTROL_RESULTS);
+  V &decision = group[row::decision];
+  const V undecided = decision == V(double(decision::NONE));
+  const V now = undecided && group[row::verdict] && group[row::alive];
+  if (any(now)) {
+    assign_where(now, decision, group[row::verdict]);
+    assign_where(now, group[row::decided], V(double(tick)));
+    for (int k = 0; k < 2 * JOINTS + 13; ++k)
+      assign_where(now, group[row::decided_state + k], group[row::measured + k]);
+  }
+  return any(group[row::exact] && group[row::alive]);
 }
 
-// Measure the first state of every group: what references begin from.
+// Measure the first state of every group, from which references begin.
 extern "C" void measure_starts(const Job *job) {
   for (long long g = 0; g < job->groups; ++g) {
-    V *group = job->memory + g * job->rows;
+    V *group = job->memory + g * ROWS;
     control(*job, g, 0, group);
-    group[job->since_row] = group[job->reached_row] = group[job->decided_row] = V(-1.0);
-    group[job->decision_row] = V(double(NONE));
-    group[job->wild_count_row] = group[job->wild_count_row + 1] = V(0.0);
+    group[row::decision] = V(double(decision::NONE));
+    group[row::decided] = V(-1.0);
   }
 }
 
-// End the flights of a group whose goals are decided, after the tick that is committed.
-static void end_decided(const Job &job, long long g, V *group) {
-  V &alive = group[job.alive_row];
-  const V ending = group[job.decision_row] && alive;
+// End flights of a group after the tick that is committed.
+static void end_where(const Job &job, long long g, V *group, V ending) {
+  V &alive = group[row::alive];
+  ending = ending && alive;
   if (!any(ending)) return;
-  copy_report(job, g, job.ended + g * job.report_rows, ending);
-  assign_where(ending, group[job.ended_row], V(double(job.at[g])));
+  copy_report(group, group + row::end_state, ending);
+  assign_where(ending, group[row::ended], V(double(job.at[g])));
   alive = alive && !ending;
 }
 
-// Return by how much thrust does not explain the momenta (6) of a group.
-static void unexplained(const Job &job, const V *group, V *to) {
-  for (int k = 0; k < 6; ++k) to[k] = group[job.momentum_row + k] - group[job.expected_row + k];
+extern "C" void end_flights(const Job *job) {
+  for (long long g = 0; g < job->groups; ++g)
+    end_where(*job, g, job->memory + g * ROWS, V(1.0));
 }
 
-static void watch_momenta(const Job &job, V *group, V alive) {
+// Return the part of the momenta (6) of a group that thrust does not explain.
+static void unexplained(const V *group, V *to) {
+  for (int k = 0; k < 6; ++k) to[k] = group[row::momentum + k] - group[EXPECTED_ROW + k];
+}
+
+static void watch_momenta(V *group, V alive) {
   V now[6];
-  unexplained(job, group, now);
+  unexplained(group, now);
   for (int part = 0; part < 2; ++part) {
     V square(0.0);
     for (int k = 3 * part; k < 3 * part + 3; ++k) {
-      const V change = now[k] - group[job.first_momenta_row + k];
+      const V change = now[k] - group[row::first_momenta + k];
       square += change * change;
     }
-    V &drift = group[job.drift_row + part];
+    V &drift = group[row::drift + part];
     assign_where(alive, drift, fmax(drift, sqrt(square)));
   }
 }
 #endif
 
 static void commit(const Job &job, long long g) {
-  V *group = job.memory + g * job.rows;
-  const V alive = group[job.alive_row];
-  for (long long i = 0; i < job.sum_count; ++i)
-    for (long long k = 0; k < job.sums[i].count; ++k)
-      group[job.sums[i].to + k] += group[job.sums[i].from + k] * alive;
-  for (long long i = 0; i < job.peak_count; ++i)
-    for (long long k = 0; k < job.peaks[i].count; ++k) {
-      V &peak = group[job.peaks[i].to + k];
-      assign_where(alive, peak, fmax(peak, fabs(group[job.peaks[i].from + k])));
+  V *group = job.memory + g * ROWS;
+  const V alive = group[row::alive];
+  for (const Span &span : SUMS)
+    for (long long k = 0; k < span.count; ++k)
+      group[span.to + k] += group[span.from + k] * alive;
+  for (const Span &span : PEAKS)
+    for (long long k = 0; k < span.count; ++k) {
+      V &peak = group[span.to + k];
+      assign_where(alive, peak, fmax(peak, fabs(group[span.from + k])));
     }
-  if (job.wrench_row >= 0)
-    for (int part = 0; part < 2; ++part) {
-      const V *w = group + job.wrench_row + 3 * part;
-      const V size = sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
-      V &peak = group[job.wrench_peak_row + part];
-      assign_where(alive, peak, fmax(peak, size));
-      V &impulse = group[job.impulse_row + part];
-      assign_where(alive, impulse, impulse + V(job.period) * size);
-    }
-  for (long long i = 0; i < job.copy_count; ++i)
-    for (long long k = 0; k < job.copies[i].count; ++k)
-      group[job.copies[i].to + k] = group[job.copies[i].from + k];
-  for (long long k = 0; k < job.n; ++k) {
-    V &lowest = group[job.lowest_row + k], &highest = group[job.highest_row + k];
-    assign_where(alive, lowest, fmin(lowest, group[job.q_row + k]));
-    assign_where(alive, highest, fmax(highest, group[job.q_row + k]));
+#ifdef WRENCH_ROW
+  for (int part = 0; part < 2; ++part) {
+    const V *w = group + WRENCH_ROW + 3 * part;
+    const V size = sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
+    V &peak = group[row::peak_wrench + part];
+    assign_where(alive, peak, fmax(peak, size));
+    V &impulse = group[row::impulse + part];
+    assign_where(alive, impulse, impulse + V(job.period) * size);
+  }
+#endif
+  for (const Span &span : COPIES)
+    for (long long k = 0; k < span.count; ++k) group[span.to + k] = group[span.from + k];
+  for (long long k = 0; k < JOINTS; ++k) {
+    V &lowest = group[row::lowest + k], &highest = group[row::highest + k];
+    assign_where(alive, lowest, fmin(lowest, group[row::state + k]));
+    assign_where(alive, highest, fmax(highest, group[row::state + k]));
   }
   job.at[g] += 1;
-  job.pending[g] = NOTHING;
+  job.pending[g] = pending::NOTHING;
   record(job, g, job.at[g]);
 #ifdef CONTROL
-  watch_momenta(job, group, alive);
-  if (job.ends) end_decided(job, g, group);
+  watch_momenta(group, alive);
+  if (job.ends) end_where(job, g, group, group[row::decision]);
 #endif
 }
 
 // Evaluate the report of every group at its state, and record it if the start is an instant.
 extern "C" void start_flights(const Job *job) {
   for (long long g = 0; g < job->groups; ++g) {
-    V *group = job->memory + g * job->rows;
-    evaluate(*job, group, true);
+    V *group = job->memory + g * ROWS;
+    evaluate(group, true);
     record(*job, g, 0);
-    for (long long k = 0; k < job->n; ++k)
-      group[job->lowest_row + k] = group[job->highest_row + k] = group[job->q_row + k];
+    for (long long k = 0; k < JOINTS; ++k)
+      group[row::lowest + k] = group[row::highest + k] = group[row::state + k];
 #ifdef CONTROL
-    unexplained(*job, group, group + job->first_momenta_row);
+    unexplained(group, group + row::first_momenta);
 #endif
   }
 }
 
-// Fly all groups until a tick, or until a lane needs another command or tick than this one; the
-// number of groups that wait for that is returned.
+// Fly all groups until a tick, or until lanes need Python for a step of the tick; return the number
+// of groups that wait for that.
 extern "C" long long fly_until(const Job *job, long long until) {
   long long waiting = 0;
   for (long long g = 0; g < job->groups; ++g) {
-    V *group = job->memory + g * job->rows;
-    if (job->pending[g] == COMMIT) commit(*job, g);
-    while (job->at[g] < until && any(group[job->alive_row])) {
+    V *group = job->memory + g * ROWS;
+    if (job->pending[g] == pending::COMMIT) commit(*job, g);
+    while (job->at[g] < until && any(group[row::alive])) {
       const long long tick = job->at[g];
 #ifdef CONTROL
-      if (job->pending[g] != TICK && job->pending[g] != FIRE && control(*job, g, tick, group)) {
-        job->pending[g] = TICK;
+      if (job->pending[g] != pending::TICK && job->pending[g] != pending::FIRE &&
+          control(*job, g, tick, group)) {
+        job->pending[g] = pending::TICK;
         ++waiting;
         break;
       }
 #if THRUSTERS > 0
-      if (job->pending[g] != FIRE && allocate(*job, group)) {
-        job->pending[g] = FIRE;
+      if (job->pending[g] != pending::FIRE && allocate(*job, group)) {
+        job->pending[g] = pending::FIRE;
         ++waiting;
         break;
       }
       fire(*job, group);
 #endif
-      job->pending[g] = NOTHING;
-      evaluate(*job, group, true);
+      job->pending[g] = pending::NOTHING;
+      evaluate(group, true);
 #else
       command(*job, g, tick, group);
-      evaluate(*job, group, instant_of(*job, tick + 1) >= 0);
+      evaluate(group, instant_of(*job, tick + 1) >= 0);
 #endif
-      if (job->stop_row >= 0) {
-        if (any((group[job->stop_row] != V(0.0)) && group[job->alive_row])) {
-          job->pending[g] = COMMIT;
-          ++waiting;
-          break;
-        }
+#ifdef STOP_ROW
+      if (any((group[STOP_ROW] != V(0.0)) && group[row::alive])) {
+        job->pending[g] = pending::COMMIT;
+        ++waiting;
+        break;
       }
+#endif
       commit(*job, g);
     }
   }

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.goal_monitor import Decision
 from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.errors import ParameterError
@@ -262,18 +262,6 @@ class Controlled:
     until_decided: bool = False
 
 
-class Decision(IntEnum):
-    """What became of the goal of a controller; the values are those of ``driver.hpp``."""
-
-    NONE = 0
-    REACHED = 1
-    FAILED = 2
-    """It was not reached within the time limit."""
-    LOST = 3
-    """Control was lost: joints too fast, or errors that grow. What the controller would do from
-    then on is not flown."""
-
-
 FlightProgram = FollowedSchedule | HeldCommands | Controlled
 
 
@@ -388,6 +376,11 @@ class Flights:
         step = self.integration_step or PLANTS[self.actuation].integration_step
         return steps_in(self.control_period, step)
 
+    @property
+    def thruster_count(self) -> int:
+        """Number of thrusters; 0: a controller's wrench acts as commanded."""
+        return 0 if self.thrusters is None else len(self.thrusters.names)
+
     def robot_of(self, index: int) -> SpaceRobot:
         """Return the robot of one flight."""
         if self.inertial is None:
@@ -440,23 +433,18 @@ class BatchResult:
         (N, n) ticks in which each joint was limited, by what limited it, as the plant counts.
     fallback_ticks
         (N,) ticks that the scalar plant flew because lanes cannot.
-    reached_time
-        (N,) when a controller had kept all errors within its tolerances for its settling time, s;
-        NaN where it had not, or there is none. The flight goes on.
-    reached_state
-        (N, 2 n + 20) the state then: q, qdot, pose, twist and momentum; NaN likewise.
     lowest, highest
         (N, n) ends of the ranges of the joint positions, over the states at all ticks.
     decision
         (N,) :class:`Decision` of a controller about its goal, the first one.
     decided_tick
         (N,) the tick whose state it was made at; -1: there was none.
-    decided_errors
-        (N, 3) the largest errors of positions (m), attitudes (rad) and joints then; NaN likewise.
+    decided_distance
+        (N, 3) the :class:`.OutputDistance` to the goal then; NaN likewise.
     end_tick
         (N,) how many ticks were flown.
     end_state
-        (N, 2 n + 20) the state then; NaN without a controller.
+        (N, 2 n + 20) the state then: q, qdot, pose, twist and momentum; NaN without a controller.
     momentum_drift
         (N, 2) largest change of linear and angular momentum that thrust does not explain; NaN
         without a controller.
@@ -480,13 +468,11 @@ class BatchResult:
     propellant: Array
     limited: Mapping[str, Counts]
     fallback_ticks: Counts
-    reached_time: Array
-    reached_state: Array
     lowest: Array
     highest: Array
     decision: Counts
     decided_tick: Counts
-    decided_errors: Array
+    decided_distance: Array
     end_tick: Counts
     end_state: Array
     momentum_drift: Array
@@ -518,13 +504,11 @@ class BatchResult:
             propellant=np.full(N, np.nan if flights.thrusters is None else 0.0),
             limited={name: np.zeros((N, n), np.int64) for name in (first, "stroke")},
             fallback_ticks=np.zeros(N, np.int64),
-            reached_time=np.full(N, np.nan),
-            reached_state=np.full((N, 2 * n + 20), np.nan),
             lowest=flights.starts.q.copy(),
             highest=flights.starts.q.copy(),
             decision=np.full(N, Decision.NONE, np.int64),
             decided_tick=np.full(N, -1, np.int64),
-            decided_errors=np.full((N, 3), np.nan),
+            decided_distance=np.full((N, 3), np.nan),
             end_tick=np.full(N, flights.ticks, np.int64),
             end_state=np.full((N, 2 * n + 20), np.nan),
             momentum_drift=np.full((N, 2), np.nan),

@@ -1,74 +1,66 @@
-"""Flights on vector registers: blocks of groups, each lane of a group a flight.
+"""Flights on vector registers: blocks of groups of SIMD lanes, one flight in each lane.
 
-A block's memory is one array (groups, rows, lanes); a row is a number of each flight of a group.
-``driver.hpp`` loops over the ticks; what no lane can do, it hands back: a flight whose joint
-touches a stop has that tick taken by the scalar plant, and goes on in its lane.
+A block's memory is one array (groups, rows, lanes); a row is one number of each flight of a group.
+``driver.hpp`` loops over the ticks and hands back steps that lanes cannot do: if a joint touches a
+stop, the scalar plant steps that flight for that tick, and the flight continues in its lane.
 """
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable
+from dataclasses import astuple, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.batch.compiled_tick import CompiledTick
-from spacerobot_ros.batch.controlling import (
-    CONTROL_INPUTS,
-    CONTROL_OUTPUTS,
-    control_state,
-)
 from spacerobot_ros.batch.flights import (
     BatchResult,
     Controlled,
     Counts,
-    Decision,
     Flights,
     FollowedSchedule,
     HeldCommands,
+    SensorErrors,
 )
-from spacerobot_ros.batch.native import Job, Span
+from spacerobot_ros.batch.native import CompiledTick, Job, Pending, Program
 from spacerobot_ros.batch.scalar import fly_one_by_one, plant_of
-from spacerobot_ros.batch.sensor_noise import SensorNoise
-from spacerobot_ros.control.executive import LOST_STATES
+from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.reference import ReferenceProfile
+from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.control.thrusters import ThrusterModulator
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.compilation import NoLibraryError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.model_functions import ModelFunctions
+from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
 from spacerobot_ros.private_files import warn_once
 from spacerobot_ros.simulation.effort_plant import EffortPlant
 from spacerobot_ros.times import SECOND
 
 _BLOCK_BYTES = 32 * 2**20
-"""Memory of a block of flights, noise and commands among it."""
+"""Memory of a block of flights, including noise and commands."""
 
 _MOST_GROUPS = 64
-"""Groups of a block: more gain nothing."""
+"""Largest number of groups in a block: more gain nothing."""
 
 _CHUNK_TICKS = 2000
-"""So many ticks are flown between two looks at signals, and noise is drawn for them."""
+"""Ticks that are flown, and for which noise is drawn, between two checks for signals."""
 
-_HELD, _FOLLOWED, _CONTROLLED = 0, 1, 2
-
-_COMMIT, _TICK, _FIRE = 1, 2, 3
-"""What a group waits for: to commit a tick, to take one, or to fire thrusters."""
-
-_PROGRAMS = {HeldCommands: _HELD, FollowedSchedule: _FOLLOWED, Controlled: _CONTROLLED}
+_PROGRAMS = {
+    HeldCommands: Program.HELD,
+    FollowedSchedule: Program.FOLLOWED,
+    Controlled: Program.CONTROLLED,
+}
 
 Flags = npt.NDArray[np.bool_]
 
 
 def fly_lanes(flights: Flights) -> BatchResult:
-    """Fly many flights at once.
+    """Fly many flights at once, one in each SIMD lane.
 
-    Every flight is the one that the plant flies on its own with the same numbers, to rounding
-    (1e-12 over the flights of the benchmark). Without a C++ compiler the plant flies them one by
-    one; :attr:`BatchResult.engine` says so.
+    Every flight equals that of the plant with the same numbers to rounding (1e-12 over the flights
+    of the benchmark). Without a C++ compiler the plant flies them one by one;
+    :attr:`BatchResult.engine` tells which of the two flew them.
     """
     try:
         return _fly_in_lanes(flights)
@@ -91,6 +83,7 @@ def _fly_in_lanes(flights: Flights) -> BatchResult:
     model, p = flights.robot.symbolic_model(inertial)
     tick = CompiledTick.of(flights, model)
     fit = _regular_starts(flights)
+    # For the plant's message about each irregular start.
     result = fly_one_by_one(flights, np.flatnonzero(~fit).tolist())
     failures = dict(result.failures)
     rows = np.flatnonzero(fit)
@@ -103,7 +96,7 @@ def _fly_in_lanes(flights: Flights) -> BatchResult:
 
 
 def _regular_starts(flights: Flights) -> Flags:
-    """Return which flights (N,) start where a plant can; the others have it say why not."""
+    """Return which flights (N,) start in a state that the plant accepts."""
     starts, robot = flights.starts, flights.robot
     fit = np.isfinite(starts.position).all(axis=1) & np.isfinite(starts.momenta).all(axis=1)
     fit &= np.isfinite(starts.qdot).all(axis=1)
@@ -116,7 +109,7 @@ def _regular_starts(flights: Flights) -> Flags:
 def _block_size(flights: Flights, tick: CompiledTick) -> int:
     """Return how many flights fit into a block."""
     n, chunk = flights.robot.n, min(flights.ticks, _CHUNK_TICKS)
-    each = 8 * (2 * sum(tick.sizes.values()) + 60 * len(flights.instants))
+    each = 8 * (2 * tick.rows.count + 60 * len(flights.instants))
     if flights.sensors is not None:
         each += 8 * chunk * (12 + 2 * n) * 2
     match flights.program:
@@ -132,73 +125,41 @@ def _block_size(flights: Flights, tick: CompiledTick) -> int:
     return int(groups * lanes)
 
 
-class _Rows:
-    """Names for the rows of a group's memory."""
-
-    def __init__(self, sizes: Mapping[str, int]) -> None:
-        self.slices: dict[str, slice] = {}
-        end = 0
-        for name, size in sizes.items():
-            self.slices[name] = slice(end, end + size)
-            end += size
-        self.count = end
-
-    def __getitem__(self, name: str) -> slice:
-        return self.slices[name]
-
-    def first(self, name: str, offset: int = 0) -> int:
-        return self.slices[name].start + offset
-
-    def span(self, from_: str, to: str) -> Span:
-        at = self.slices[from_]
-        return Span(at.start, self.slices[to].start, at.stop - at.start)
-
-
 class _Block:
-    """The memory of flights that are in lanes at the same time, and their flying.
+    """Memory of the flights that are in lanes at the same time.
 
-    Lanes that are left over fly the last flight again; what they give is dropped.
+    Surplus lanes repeat the last flight; their results are dropped.
     """
 
     def __init__(
         self, flights: Flights, tick: CompiledTick, model: ModelFunctions, p: Array, rows: Counts
     ) -> None:
         self._flights, self._tick, self._flown = flights, tick, rows
-        self._lanes = tick.driver.unit.lanes
+        self._lanes, self._rows = tick.driver.unit.lanes, tick.rows
         self._groups = -(-len(rows) // self._lanes)
-        wanted = self._groups * self._lanes
-        self._rows_of_lanes = np.concatenate([rows, np.repeat(rows[-1:], wanted - len(rows))])
-        n = flights.robot.n
-        effort = flights.actuation == "effort"
+        count = self._groups * self._lanes
+        self._rows_of_lanes = np.concatenate([rows, np.repeat(rows[-1:], count - len(rows))])
         self._modulator = None
         if flights.thrusters is not None:
             self._modulator = ThrusterModulator(flights.thrusters, flights.control_period)
-        thrusters = 0 if flights.thrusters is None else len(flights.thrusters.names)
-        self._rows = rows_ = _Rows(
-            {
-                **{"measured": n, "normals": 0, "time": 0, "since": 0, "begun": 0},
-                **{"exact": 0, "settled": 0, "wild": 0, "errors": 0},
-                **tick.sizes,
-                **{"alive": 1, "joint_bias": n, "joint_noise": 1, "reached": 1},
-                **{"limits": n if effort else 2 * n, "peak_rate": n, "peak_effort": n},
-                **{"peak_wrench": 2, "impulse": 2, "lowest": n, "highest": n},
-                **{"wild_count": 2, "decision": 1, "decided": 1, "decided_errors": 3, "ended": 1},
-                **{"first_momenta": 6, "drift": 2, "propellant": 1, "unallocated": 1},
-                **{"wanted": 6, "owed": 6, "left": thrusters, "on": thrusters, "levels": thrusters},
-            }
-        )
-        self._memory = _aligned((self._groups, rows_.count, self._lanes))
-        self._memory[:, rows_.first("alive")] = 1.0
+        self._memory = _aligned((self._groups, self._rows.count, self._lanes))
+        self._memory[:, self._rows["alive"]] = 1.0
+        self._memory[:, self._rows["decided_state"]] = np.nan
+        self._memory[:, self._rows["end_state"]] = np.nan
         self._set("p", p[self._rows_of_lanes])
         self._noise = SensorNoise(flights, self._rows_of_lanes)
         self._stopped: dict[int, EffortPlant] = {}
-        """The scalar plants of flights that have touched a stop, by their lane in the block."""
+        """Scalar plants of flights that have touched a stop, by their lane in the block."""
         self._ended: dict[int, int] = {}
-        """The ticks that flights could not take, by their lane in the block."""
+        """Ticks at which flights failed, by their lane in the block."""
         self._profiles: dict[int, ReferenceProfile] = {}
-        """Those of the flights with a controller, by their lane in the block."""
+        """Reference profiles of flights with a controller, by their lane in the block."""
         self._place(model, p)
-        self._job, self._kept = self._prepared()
+        self._at = np.zeros(self._groups, np.int64)
+        self._pending = np.zeros(self._groups, np.uint8)
+        width = self._rows.size("end_state")
+        self._reports = _aligned((self._groups, len(flights.instants), width, self._lanes))
+        self._job, self._referenced = self._prepared()
 
     def _set(self, name: str, values: Array) -> None:
         """Write rows (flights of the block, size) of a name."""
@@ -211,7 +172,7 @@ class _Block:
         return part.reshape(len(self._rows_of_lanes), -1)
 
     def _place(self, model: ModelFunctions, p: Array) -> None:
-        """Put the flights where they start."""
+        """Write the initial states, biases and gains of the flights."""
         starts, at = self._flights.starts, self._rows_of_lanes
         quaternion = starts.quaternion[at]
         quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
@@ -232,141 +193,53 @@ class _Block:
             self._set("joint_bias", self._flights.sensors.joint_bias[at])
             self._set("joint_noise", self._flights.sensors.noise[at, 4:5])
         if self._tick.controller is not None:
+            initial = astuple(GoalMonitor())[1:]
+            self._memory[:, self._rows["monitor"]] = np.reshape(initial, (1, -1, 1))
+            self._memory[:, self._rows["decided"]] = -1.0
             self._set("gains", self._tick.controller.gains(at.tolist()))
             if self._flights.sensors is not None:
                 errors = self._flights.sensors
                 self._set("bias", np.hstack([errors.pose_bias[at], errors.joint_bias[at]]))
                 self._set("sigma", errors.noise[at])
 
-    def _prepared(self) -> tuple[Job, list[Any]]:
-        """Return what the driver takes, and the memory that it points to."""
-        flights, kind, rows = self._flights, self._tick.layout, self._rows
-        n, effort = flights.robot.n, flights.actuation == "effort"
-        kept: list[Any] = []
-
-        def pointer(array: Any) -> int:
-            kept.append(array)
-            return int(array.ctypes.data) if isinstance(array, np.ndarray) else _address(array)
-
-        def spans(each: Sequence[Span]) -> Any:
-            return (Span * len(each))(*each)
-
-        state, limited = rows.first("next_state"), rows.first("limited", 1)
-        rates = rows.first("qdot") if not effort else state + n + 4
-        copies = [rows.span(a, b) for a, b in kind.copies.items()]
-        sums = [Span(limited, rows.first("limits"), n if effort else 2 * n)]
-        peaks = [Span(rates, rows.first("peak_rate"), n)]
-        if effort:
-            peaks.append(Span(rows.first("realised"), rows.first("peak_effort"), n))
-        reported = [Span(state, 0, n), Span(rates, n, n)]
-        width = 2 * n
-        for name, size in (("pose", 7), ("twist", 6), ("momentum", 7)):
-            reported.append(Span(rows.first(name), width, size))
-            width += size
-        instants = np.array(flights.instants, dtype=np.int64)
-        self._at = np.zeros(self._groups, np.int64)
-        self._pending = np.zeros(self._groups, np.uint8)
-        self._reports = _aligned((self._groups, len(instants), width, self._lanes))
-        arguments = _numbers([rows.first(name) for name in (*kind.inputs, "p")])
-        flight = _numbers([rows.first(name) for name in kind.flight])
-        report = _numbers([rows.first(name) for name in kind.reported])
-        table, program = self._table(), flights.program
+    def _prepared(self) -> tuple[Job, list[npt.NDArray[np.generic]]]:
+        """Return the driver's job, and the arrays that it points to."""
+        flights, program, table = self._flights, self._flights.program, self._table()
         each_table = table.ndim == 4
-        self._reached = _aligned((self._groups, width, self._lanes), np.nan)
-        self._ends = _aligned((self._groups, width, self._lanes), np.nan)
-        control_in, control_out = _numbers([]), _numbers([])
-        if isinstance(program, Controlled):
-            control_in = _numbers([rows.first(name) for name in CONTROL_INPUTS])
-            control_out = _numbers([rows.first(name) for name in CONTROL_OUTPUTS])
+        arrays: dict[str, npt.NDArray[np.generic]] = {
+            "memory": self._memory,
+            "at": self._at,
+            "pending": self._pending,
+            "table": table,
+            "instants": np.array(flights.instants, dtype=np.int64),
+            "reports": self._reports,
+        }
+        if self._modulator is not None:
+            matrix, weights = self._modulator.allocation.problem
+            thrusters = self._modulator.table
+            arrays |= {
+                "thruster_matrix": np.ascontiguousarray(matrix.T),
+                "thruster_weights": weights,
+                "thruster_wrenches": np.ascontiguousarray(thrusters.wrenches.T),
+                "thruster_flow": np.ascontiguousarray(thrusters.mass_flow),
+            }
+            self._memory[:, self._rows["shortest"]] = thrusters.min_on_time[:, np.newaxis]
         job = Job(
-            memory=pointer(self._memory),
             groups=self._groups,
-            rows=rows.count,
-            at=pointer(self._at),
-            pending=pointer(self._pending),
-            arguments=pointer(arguments),
-            flight_results=pointer(flight),
-            report_results=pointer(report),
-            argument_count=len(arguments),
-            flight_result_count=len(flight),
-            report_result_count=len(report),
-            copies=pointer(spans(copies)),
-            sums=pointer(spans(sums)),
-            peaks=pointer(spans(peaks)),
-            copy_count=len(copies),
-            sum_count=len(sums),
-            peak_count=len(peaks),
-            stop_row=rows.first("limited", 1 + n) if effort else -1,
-            alive_row=rows.first("alive"),
-            wrench_row=self._commanded_wrench() if effort else -1,
-            wrench_peak_row=rows.first("peak_wrench"),
-            impulse_row=rows.first("impulse"),
             period=flights.control_period,
             period_ns=round(flights.control_period * SECOND),
             program=_PROGRAMS[type(program)],
-            command_row=rows.first("command"),
-            command_count=table.shape[2] if each_table else table.shape[1],
-            table=pointer(table),
             table_ticks=table.shape[1] if each_table else table.shape[0],
             each_table=each_table,
-            q_row=rows.first("state"),
-            measured_row=rows.first("measured"),
-            bias_row=rows.first("joint_bias"),
-            noise_row=rows.first("joint_noise"),
-            n=n,
             noisy=self._noise.commanded_by,
-            gain=0.0,
-            deadband=0.0,
-            instants=pointer(instants),
-            instant_count=len(instants),
-            reports=pointer(self._reports),
-            reported=pointer(spans(reported)),
-            reported_count=len(reported),
-            report_rows=width,
-            control_arguments=pointer(control_in),
-            control_results=pointer(control_out),
-            control_argument_count=len(control_in),
-            control_result_count=len(control_out),
-            **{
-                f"{name}_row": rows.first(name)
-                for name in (
-                    *("normals", "time", "since", "begun", "exact", "settled", "reached"),
-                    *("lowest", "highest", "wild", "wild_count", "errors", "decision", "decided"),
-                    *("decided_errors", "ended", "momentum", "first_momenta", "drift"),
-                )
-            },
-            reached=pointer(self._reached),
-            ended=pointer(self._ends),
-            lost_states=LOST_STATES,
-            last_tick=-1 if self._tick.controller is None else self._tick.controller.last_tick,
+            instant_count=len(flights.instants),
             ends=isinstance(program, Controlled) and program.until_decided,
-            expected_row=rows.first("next_state", 2 * n + 4),
-            **{
-                f"{name}_row": rows.first(name)
-                for name in ("wanted", "owed", "left", "on", "levels", "unallocated", "propellant")
-            },
-            **{f"thruster_{name}": pointer(x) for name, x in self._thruster_numbers().items()},
+            **{name: array.ctypes.data for name, array in arrays.items()},
         )
         if isinstance(program, FollowedSchedule):
             job.gain = min(program.shape_gain, 1.0 / flights.control_period)
             job.deadband = program.deadband
-        return job, kept
-
-    def _commanded_wrench(self) -> int:
-        """Return the row where the wrench begins that is commanded."""
-        if self._modulator is not None:
-            return self._rows.first("wanted")
-        return self._rows.first("realised", self._flights.robot.n)
-
-    def _thruster_numbers(self) -> dict[str, Array]:
-        """Return what the driver knows of thrusters, by the ends of its names."""
-        modulator = self._modulator
-        if modulator is None:
-            return {}
-        matrix, weights = modulator.allocation.problem
-        numbers = {"matrix": matrix.T, "wrenches": modulator.table.wrenches.T, "weights": weights}
-        numbers |= {"shortest": modulator.table.min_on_time, "flow": modulator.table.mass_flow}
-        return {name: np.ascontiguousarray(x, dtype=float) for name, x in numbers.items()}
+        return job, list(arrays.values())
 
     def _table(self) -> Array:
         """Return commands (ticks, width), or (groups, ticks, width, lanes) where they differ."""
@@ -386,7 +259,7 @@ class _Block:
                     axis=-1,
                 )
             case Controlled():
-                table = np.zeros((1, self._tick.sizes["command"]))
+                table = np.zeros((1, self._rows.size("command")))
         if table.ndim == 3:
             grouped = table.reshape(self._groups, self._lanes, *table.shape[1:])
             table = np.moveaxis(grouped, 1, 3)
@@ -398,7 +271,7 @@ class _Block:
     # -- flying -------------------------------------------------------------------------------
 
     def fly(self, result: BatchResult, failures: dict[int, str]) -> None:
-        """Fly the flights and write what comes of them."""
+        """Fly the flights and write their results."""
         flights, job, driver = self._flights, self._job, self._tick.driver
         # A tick of no duration under no command reports the start.
         driver.start(job)
@@ -418,10 +291,12 @@ class _Block:
                 self._begin_control(failures)
             while driver.fly_until(job, end):
                 self._help(result, failures)
+        if self._tick.controller is not None:
+            driver.end(job)
         self._write(result)
 
     def _end(self, index: int, tick: int, why: str, failures: dict[int, str]) -> None:
-        """End the flight of a lane at a tick that it cannot take."""
+        """End the flight of a lane that fails at a tick."""
         group, lane = divmod(index, self._lanes)
         self._memory[group, self._rows["alive"], lane] = 0.0
         if index < len(self._flown):
@@ -429,17 +304,17 @@ class _Block:
             self._ended[index] = tick
 
     def _begin_control(self, failures: dict[int, str]) -> None:
-        """Begin the references of all flights at what is measured first."""
+        """Begin the references of all flights at their first measured states."""
         controller = self._tick.controller
         if controller is None:
             return
         self._tick.driver.measure_starts(self._job)
         states = self._get("measured")
-        numbers = np.zeros((len(states), self._tick.sizes["profile"]))
-        most = np.zeros((len(states), self._tick.sizes["bounds"]))
+        numbers = np.zeros((len(states), self._rows.size("profile")))
+        most = np.zeros((len(states), self._rows.size("bounds")))
         for index, (row, state) in enumerate(zip(self._rows_of_lanes, states, strict=True)):
             try:
-                profile, most[index] = controller.begin(int(row), control_state(state))
+                profile, most[index] = controller.begin(int(row), ControlState.unstack(state))
             except SpaceRobotError as error:
                 self._end(index, 0, str(error), failures)
                 continue
@@ -449,50 +324,52 @@ class _Block:
         self._set("bounds", most)
 
     def _help(self, result: BatchResult, failures: dict[int, str]) -> None:
-        """Do what lanes that wait cannot: give a command, allocate it to thrusters, or take a tick
-        of the scalar plant.
-        """
-        rows, alive = self._rows, self._rows["alive"]
-        kinds = {
-            _COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._take),
-            _TICK: (rows["exact"].start, self._command),
-            _FIRE: (rows["unallocated"].start, self._allocate),
+        """Do the step that lanes wait for: a command, an allocation, or a tick of the plant."""
+        rows, alive = self._rows, self._rows.first("alive")
+        steps: dict[Pending, tuple[int, Callable[[int, int, int, BatchResult], None]]] = {
+            Pending.COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._take),
         }
+        if self._tick.controller is not None:
+            steps[Pending.TICK] = rows.first("exact"), self._command
+        if self._modulator is not None:
+            steps[Pending.FIRE] = rows.first("unallocated"), self._allocate
         for group in np.flatnonzero(self._pending):
-            waits, help_lane = kinds[int(self._pending[group])]
-            lanes = (self._memory[group, waits] != 0.0) & (self._memory[group, alive][0] != 0.0)
+            waiting, step = steps[Pending(self._pending[group])]
+            lanes = (self._memory[group, waiting] != 0.0) & (self._memory[group, alive] != 0.0)
             for lane in np.flatnonzero(lanes):
                 index = int(group * self._lanes + lane)
                 try:
-                    help_lane(int(group), int(lane), index, result)
+                    step(int(group), int(lane), index, result)
                 except SpaceRobotError as error:
                     self._end(index, int(self._at[group]), str(error), failures)
+                else:
+                    if index < len(self._flown):
+                        result.fallback_ticks[self._flown[index]] += 1
 
     def _command(self, group: int, lane: int, index: int, result: BatchResult) -> None:
+        """Take the command from the controller itself."""
         controller, row = self._tick.controller, int(self._rows_of_lanes[index])
         assert controller is not None
-        state = control_state(self._memory[group, self._rows["measured"], lane])
+        state = ControlState.unstack(self._memory[group, self._rows["measured"], lane])
         tick = int(self._at[group])
         realised = controller.exact(row, self._profiles[index], tick, state).realised
         command = np.concatenate([realised.tau, realised.wrench_B])
         self._memory[group, self._rows["command"], lane] = command
-        if index < len(self._flown):
-            result.fallback_ticks[row] += 1
 
     def _allocate(self, group: int, lane: int, index: int, result: BatchResult) -> None:
+        """Allocate an impulse beyond the thrust, which is a linear programme."""
         modulator, period = self._modulator, self._flights.control_period
         assert modulator is not None
-        memory = {
-            name: self._memory[group, self._rows[name], lane]
-            for name in ("owed", "wanted", "left", "levels")
-        }
-        outstanding = memory["owed"] + period * memory["wanted"]
-        most = modulator.table.min_on_time + period - memory["left"]
-        memory["levels"][:] = modulator.allocation.allocate(outstanding, most).levels
-        if index < len(self._flown):
-            result.fallback_ticks[self._rows_of_lanes[index]] += 1
+
+        def rows(name: str) -> Array:
+            return self._memory[group, self._rows[name], lane]
+
+        impulse = rows("pending_impulse") + period * rows("wanted")
+        most = modulator.table.min_on_time + period - rows("remaining")
+        rows("levels")[:] = modulator.allocation.allocate(impulse, most).levels
 
     def _take(self, group: int, lane: int, index: int, result: BatchResult) -> None:
+        """Step the scalar plant, in which a joint touches its stop."""
         row, n = int(self._rows_of_lanes[index]), self._flights.robot.n
         if index not in self._stopped:
             plant = plant_of(self._flights, row)
@@ -508,7 +385,6 @@ class _Block:
         memory["momentum"][:], memory["limited"][1 + n] = plant.momentum, 0.0
         if index < len(self._flown):
             result.limited["stroke"][row] += plant.stroke_limited - before
-            result.fallback_ticks[row] += 1
 
     def _write(self, result: BatchResult) -> None:
         count, n, rows = len(self._flown), self._flights.robot.n, self._flown
@@ -537,43 +413,25 @@ class _Block:
         result.measured_pose[rows], result.measured_q[rows] = pose, q
 
     def _write_decisions(self, result: BatchResult, rows: Counts) -> None:
-        """Write what became of the goals of a controller."""
-        count, n = len(rows), self._flights.robot.n
-
-        def of_flights(name: str) -> Array:
-            return self._get(name)[:count]
-
-        time = of_flights("reached")[:, 0]
-        result.reached_time[rows] = np.where(time >= 0.0, time, np.nan)
-        result.reached_state[rows] = _by_flight(self._reached)[:count]
-        decision = of_flights("decision")[:, 0].astype(np.int64)
-        made = decision != Decision.NONE
-        result.decision[rows] = decision
-        result.decided_tick[rows] = of_flights("decided")[:, 0].astype(np.int64)
-        errors = of_flights("decided_errors")
-        result.decided_errors[rows] = np.where(made[:, np.newaxis], errors, np.nan)
-        result.momentum_drift[rows] = of_flights("drift")
-        # Flights that are not decided are where they are now.
-        state = of_flights("next_state")
-        parts = state[:, :n], state[:, n + 4 : 2 * n + 4], of_flights("pose")
-        now = np.hstack([*parts, of_flights("twist"), of_flights("momentum")])
-        ended = made & bool(self._job.ends)
-        states = np.where(ended[:, np.newaxis], _by_flight(self._ends)[:count], now)
-        result.end_state[rows] = states
-        at = np.repeat(self._at, self._lanes)[:count]
-        ticks = of_flights("ended")[:, 0].astype(np.int64)
-        result.end_tick[rows] = np.where(ended, ticks, at)
+        """Write the decisions about goals, and the ends of the flights."""
+        controller, count = self._tick.controller, len(rows)
+        assert controller is not None
+        result.decision[rows] = self._get("decision")[:count, 0].astype(np.int64)
+        result.decided_tick[rows] = self._get("decided")[:count, 0].astype(np.int64)
+        result.momentum_drift[rows] = self._get("drift")[:count]
+        result.end_state[rows] = self._get("end_state")[:count]
+        result.end_tick[rows] = self._get("ended")[:count, 0].astype(np.int64)
+        states = self._get("decided_state")
+        for index in np.flatnonzero(result.decision[rows] != Decision.NONE).tolist():
+            goal, state = self._profiles[index].goal, ControlState.unstack(states[index])
+            distance = controller.distance(state, goal)
+            result.decided_distance[rows[index]] = astuple(distance)
 
 
 def _rotated(quaternion: Array, vectors: Array) -> Array:
     """Return ``R v`` of quaternions (N, 4) and vectors (N, 3)."""
     x, w = quaternion[:, :3], quaternion[:, 3:]
     return np.asarray(vectors + 2 * np.cross(x, np.cross(x, vectors) + w * vectors))
-
-
-def _by_flight(rows: Array) -> Array:
-    """Return rows (groups, size, lanes) flight by flight."""
-    return np.swapaxes(rows, 1, 2).reshape(-1, rows.shape[1])
 
 
 def _lengthened(table: Array, ticks: int, dimensions: int, count: int) -> Array:
@@ -591,9 +449,72 @@ def _aligned(shape: tuple[int, ...], value: float = 0.0) -> Array:
     return memory[offset : offset + count].reshape(shape)
 
 
-def _numbers(values: Sequence[int]) -> npt.NDArray[np.int64]:
-    return np.array(values, dtype=np.int64)
+class SensorNoise:
+    """The random numbers of the sensors of a block's flights, as :class:`.Sensors` draws them."""
 
+    def __init__(self, flights: Flights, rows: Counts) -> None:
+        self._errors: SensorErrors | None = flights.sensors
+        self._whole = isinstance(flights.program, Controlled)
+        self._instants = flights.instants
+        self._n = flights.robot.n
+        self._rows = rows
+        if self._errors is None:
+            return
+        self._used = self._errors.used[rows] & self._errors.noise[rows].any(axis=1)
+        self._generators = [
+            np.random.default_rng(int(seed)) if used else None
+            for seed, used in zip(self._errors.seeds[rows], self._used, strict=True)
+        ]
+        self._at_instants = np.zeros((len(rows), len(self._instants), 12 + 2 * self._n))
 
-def _address(array: Any) -> int:
-    return ctypes.addressof(array)
+    @property
+    def commanded_by(self) -> bool:
+        """Whether commands follow from what is measured with errors: schedules look at joints."""
+        errors = self._errors
+        if errors is None:
+            return False
+        joints = errors.noise[self._rows, 4].any() or errors.joint_bias[self._rows].any()
+        return bool(self._whole or joints)
+
+    def drawn(self, begin: int, end: int, alive: Array) -> Array | None:
+        """Draw for the states at the ticks from ``begin`` to before ``end``; return what falls to
+        joint positions, (groups, ticks, n, lanes), or with a controller to everything. None where
+        no command follows from it. ``alive`` (groups, lanes): others need none any more.
+        """
+        if self._errors is None:
+            return None
+        ticks, width = end - begin, 12 + 2 * self._n
+        columns = slice(0, width) if self._whole else slice(12, 12 + self._n)
+        kept = None
+        if self.commanded_by:
+            kept = np.zeros((len(self._rows), ticks, columns.stop - columns.start))
+        chosen = [(i, tick - begin) for i, tick in enumerate(self._instants) if begin <= tick < end]
+        drawn = np.empty((ticks, width))
+        for index, generator in enumerate(self._generators):
+            if generator is None or not alive.flat[index]:
+                continue
+            generator.standard_normal(out=drawn)
+            if kept is not None:
+                kept[index] = drawn[:, columns]
+            for instant, tick in chosen:
+                self._at_instants[index, instant] = drawn[tick]
+        if kept is None:
+            return None
+        grouped = kept.reshape(-1, alive.shape[1], *kept.shape[1:])
+        return np.ascontiguousarray(np.moveaxis(grouped, 1, 3))
+
+    def measured(self, pose: Array, q: Array) -> tuple[Array, Array]:
+        """Return what is measured of poses (count, I, 7) and shapes (count, I, n)."""
+        if self._errors is None:
+            return pose, q
+        rows, count = self._rows[: len(pose)], len(pose)
+        noise = self._errors.noise[rows][:, None]
+        bias, drawn = self._errors.pose_bias[rows][:, None], self._at_instants[:count]
+        measured = pose.copy()
+        measured[..., :3] += bias[..., :3] + noise[..., :1] * drawn[..., :3]
+        turns = bias[..., 3:] + noise[..., 1:2] * drawn[..., 3:6]
+        for index in np.argwhere(turns.any(axis=2)):
+            at = tuple(index)
+            measured[at][3:] = quaternion_multiply(pose[at][3:], quaternion_from_rotvec(turns[at]))
+        of_joints = noise[..., 4:5] * drawn[..., 12 : 12 + self._n]
+        return measured, q + self._errors.joint_bias[rows][:, None] + of_joints

@@ -1,17 +1,36 @@
-"""The tick of a plant compiled for vector registers: a flight in each lane."""
+"""The ticks of a plant and of its commander, compiled for SIMD lanes: one flight in each lane.
+
+CasADi's functions become C++ in which every number is a vector register; ``driver.hpp`` loops over
+ticks and groups of lanes. Everything that Python and C++ have in common is declared here once and
+generated as C++: the rows of a group's memory (:class:`Rows`), the enumerations, and :class:`Job`.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 
-from spacerobot_ros.model.compilation import NoLibraryError, native_library, vector_source
+from spacerobot_ros.batch.controlling import CONTROL_INPUTS, CONTROL_OUTPUTS, BatchController
+from spacerobot_ros.batch.flights import Controlled, Flights
+from spacerobot_ros.control.goal_monitor import Decision
+from spacerobot_ros.control.thrusters import PULSE_INPUTS, PULSE_OUTPUTS, pulse_function
+from spacerobot_ros.model.compilation import (
+    NoLibraryError,
+    compilation_settings,
+    native_library,
+    vector_source,
+)
+from spacerobot_ros.model.model_functions import Composition, ModelFunctions
+from spacerobot_ros.parameters import values_of
+from spacerobot_ros.simulation import effort_plant, velocity_plant
 
 _HERE = Path(__file__).resolve().parent
 
@@ -21,7 +40,7 @@ _SELECTION = re.compile(r"\((\w+)\?(\w+):0\)")
 
 @dataclass(frozen=True)
 class VectorUnit:
-    """A kind of vector registers.
+    """Vector registers of a processor.
 
     Attributes
     ----------
@@ -30,7 +49,7 @@ class VectorUnit:
     lanes
         Numbers of 64 bits in a register.
     flags
-        What tells the compiler.
+        Options of the compiler.
     libmvec
         Letter of its functions in the vector library of the C library; empty: none.
     """
@@ -46,15 +65,15 @@ UNITS: dict[str, VectorUnit] = {
     "avx2": VectorUnit("AVX2", 4, ("-mavx2",), "d"),
     "sse2": VectorUnit("SSE2", 2, ("-msse2",), "b"),
 }
-"""By the name of the processor's flag, the widest first."""
+"""Vector registers by the name of the processor's flag, the widest first."""
 
 _PLAIN = VectorUnit("two at a time", 2, (), "")
-"""For processors of other kinds: the compiler makes of it what there is."""
+"""For other processors, whose registers the compiler chooses."""
 
 
 @lru_cache(maxsize=1)
 def vector_unit() -> VectorUnit:
-    """Return the widest kind that this processor and its kernel have."""
+    """Return the widest registers that this processor and its kernel support."""
     try:
         text = Path("/proc/cpuinfo").read_text("utf-8", errors="replace")
     except OSError:
@@ -64,61 +83,90 @@ def vector_unit() -> VectorUnit:
     return next((unit for flag, unit in UNITS.items() if flag in flags), _PLAIN)
 
 
-class Span(ctypes.Structure):
-    """Rows that are copied, added or compared: from, to, count."""
+class Program(IntEnum):
+    """Kind of commands: held, along a schedule, or of a controller."""
 
-    _fields_ = [(name, ctypes.c_longlong) for name in ("start", "to", "count")]
+    HELD = 0
+    FOLLOWED = 1
+    CONTROLLED = 2
 
 
-_POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_longlong, ctypes.c_double
+class Pending(IntEnum):
+    """Step of a tick that a group of lanes waits for."""
+
+    NOTHING = 0
+    COMMIT = 1
+    """To commit a tick, after some lanes have been stepped by the scalar plant."""
+    TICK = 2
+    """To step, after some lanes have got their command from the controller."""
+    FIRE = 3
+    """To fire thrusters, after some lanes have got their allocation."""
+
+
+_JOB = (
+    ("V *", "memory", "(groups, ROWS)"),
+    ("long long", "groups", ""),
+    ("long long *", "at", "(groups,) the next tick"),
+    ("unsigned char *", "pending", "(groups,) Pending"),
+    ("double", "period", "s"),
+    ("long long", "period_ns", ""),
+    ("long long", "program", "Program"),
+    ("const double *", "table", "(ticks, COMMANDS); each_table: (groups, ticks, COMMANDS, LANES)"),
+    ("long long", "table_ticks", "FOLLOWED: the table has shapes, one more than ticks"),
+    ("long long", "each_table", ""),
+    ("long long", "noisy", "whether commands depend on measurement errors"),
+    ("const double *", "normals", "(groups, ticks from normals_from on, normals_width, LANES)"),
+    ("long long", "normals_from", ""),
+    ("long long", "normals_ticks", ""),
+    ("long long", "normals_width", ""),
+    ("double", "gain", "FOLLOWED: feedback of shape errors, 1/s"),
+    ("double", "deadband", "FOLLOWED: m or rad"),
+    ("const long long *", "instants", "ticks whose states are reported, ascending"),
+    ("long long", "instant_count", ""),
+    ("V *", "reports", "(groups, instants, REPORT_ROWS)"),
+    ("long long", "ends", "CONTROLLED: whether flights end with the decision about their goals"),
+    ("const double *", "thruster_matrix", "(THRUSTERS, 7) of the allocation"),
+    ("const double *", "thruster_weights", "(6,) of a wrench in the allocation"),
+    ("const double *", "thruster_wrenches", "(THRUSTERS, 6) N, N m"),
+    ("const double *", "thruster_flow", "(THRUSTERS,) kg/s"),
+)
+"""Members of :class:`Job`: type in C++, name, meaning."""
+
+_MEMBER_TYPES: dict[str, Any] = {"long long": ctypes.c_longlong, "double": ctypes.c_double}
 
 
 class Job(ctypes.Structure):
-    """What ``driver.hpp`` takes, in its order."""
+    """Argument of the functions in ``driver.hpp``; its members are those of ``_JOB``."""
 
-    _fields_ = [
-        ("memory", _POINTER),
-        *((name, _WHOLE) for name in ("groups", "rows")),
-        *((name, _POINTER) for name in ("at", "pending")),
-        *((name, _POINTER) for name in ("arguments", "flight_results", "report_results")),
-        *((f"{name}_count", _WHOLE) for name in ("argument", "flight_result", "report_result")),
-        *((name, _POINTER) for name in ("copies", "sums", "peaks")),
-        *((f"{name}_count", _WHOLE) for name in ("copy", "sum", "peak")),
-        *((name, _WHOLE) for name in ("stop_row", "alive_row")),
-        *((name, _WHOLE) for name in ("wrench_row", "wrench_peak_row", "impulse_row")),
-        ("period", _REAL),
-        ("period_ns", _WHOLE),
-        *((name, _WHOLE) for name in ("program", "command_row", "command_count")),
-        ("table", _POINTER),
-        *((name, _WHOLE) for name in ("table_ticks", "each_table")),
-        *((name, _WHOLE) for name in ("q_row", "measured_row", "bias_row", "noise_row")),
-        *((name, _WHOLE) for name in ("n", "noisy")),
-        ("normals", _POINTER),
-        *((f"normals_{name}", _WHOLE) for name in ("from", "ticks", "width")),
-        *((name, _REAL) for name in ("gain", "deadband")),
-        ("instants", _POINTER),
-        ("instant_count", _WHOLE),
-        ("reports", _POINTER),
-        ("reported", _POINTER),
-        *((name, _WHOLE) for name in ("reported_count", "report_rows")),
-        *((name, _POINTER) for name in ("control_arguments", "control_results")),
-        *((f"control_{name}_count", _WHOLE) for name in ("argument", "result")),
-        *(
-            (f"{name}_row", _WHOLE)
-            for name in ("normals", "time", "since", "begun", "exact", "settled", "reached")
-        ),
-        ("reached", _POINTER),
-        *((f"{name}_row", _WHOLE) for name in ("lowest", "highest")),
-        *((f"{name}_row", _WHOLE) for name in ("wild", "wild_count", "errors")),
-        *((f"{name}_row", _WHOLE) for name in ("decision", "decided", "decided_errors")),
-        *((name, _WHOLE) for name in ("lost_states", "last_tick", "ends", "ended_row")),
-        ("ended", _POINTER),
-        *((f"{name}_row", _WHOLE) for name in ("momentum", "expected", "first_momenta", "drift")),
-        *((f"thruster_{name}", _POINTER) for name in ("matrix", "wrenches", "weights")),
-        *((f"thruster_{name}", _POINTER) for name in ("shortest", "flow")),
-        *((f"{name}_row", _WHOLE) for name in ("wanted", "owed", "left", "on", "levels")),
-        *((f"{name}_row", _WHOLE) for name in ("unallocated", "propellant")),
-    ]
+    _fields_ = [(name, _MEMBER_TYPES.get(kind, ctypes.c_void_p)) for kind, name, _ in _JOB]
+
+
+class Rows:
+    """The rows of a group's memory by name; a row is one number of each flight in the group."""
+
+    def __init__(self, sizes: Mapping[str, int]) -> None:
+        self.slices: dict[str, slice] = {}
+        end = 0
+        for name, size in sizes.items():
+            self.slices[name] = slice(end, end + size)
+            end += size
+        self.count = end
+
+    def __getitem__(self, name: str) -> slice:
+        return self.slices[name]
+
+    def first(self, name: str, offset: int = 0) -> int:
+        """Return the first row of a name, or one that is ``offset`` rows later."""
+        return int(self.slices[name].start) + offset
+
+    def size(self, name: str) -> int:
+        """Return the number of rows of a name."""
+        rows = self.slices[name]
+        return int(rows.stop - rows.start)
+
+    def span(self, source: str, target: str) -> tuple[int, int, int]:
+        """Return the first rows of two names of the same size, and that size."""
+        return self.first(source), self.first(target), self.size(source)
 
 
 class Driver:
@@ -126,12 +174,14 @@ class Driver:
 
     Parameters
     ----------
-    flight, report
-        The tick with the results that every tick needs, and with those of reports as well.
-    control
-        The command for a state; None: it follows from tables.
+    functions
+        CasADi's functions by their names in the driver: ``FLIGHT`` and ``REPORT``, the tick without
+        and with the results of reports; ``CONTROL``, the command for a state, and ``PULSES``, those
+        of thrusters, where there are any.
+    declarations
+        C++ for the driver: constants of the memory.
     thrusters
-        How many give its wrench; 0: it is given as it is commanded.
+        Number of thrusters that realise the commanded wrench; 0: the wrench acts as commanded.
 
     Raises
     ------
@@ -140,65 +190,264 @@ class Driver:
     """
 
     def __init__(
-        self,
-        flight: ca.Function,
-        report: ca.Function,
-        control: ca.Function | None = None,
-        thrusters: int = 0,
+        self, functions: Mapping[str, ca.Function], declarations: str, thrusters: int
     ) -> None:
         self.unit = vector_unit()
-        functions = [flight, report] if control is None else [flight, report, control]
-        self._library = _library(functions, self.unit, thrusters)
-        self._start = self._library.start_flights
-        self._fly = self._library.fly_until
-        for function in (self._start, self._fly):
-            function.argtypes = [ctypes.POINTER(Job)]
-        self._start.restype = None
-        self._fly.argtypes = [ctypes.POINTER(Job), _WHOLE]
-        self._fly.restype = _WHOLE
+        self._library = _library(functions, declarations, self.unit, thrusters)
+        job, whole = ctypes.POINTER(Job), ctypes.c_longlong
+        for name, arguments, result in (
+            ("start_flights", [job], None),
+            ("fly_until", [job, whole], whole),
+            *((("measure_starts", [job], None),) if "CONTROL" in functions else ()),
+            *((("end_flights", [job], None),) if "CONTROL" in functions else ()),
+        ):
+            function = getattr(self._library, name)
+            function.argtypes, function.restype = arguments, result
 
     def start(self, job: Job) -> None:
-        """Fill what is reported at the start."""
-        self._start(ctypes.byref(job))
+        """Evaluate and report the state at the start."""
+        self._library.start_flights(ctypes.byref(job))
 
     def measure_starts(self, job: Job) -> None:
-        """Fill what is measured at the start, with a control function."""
-        measure = self._library.measure_starts
-        measure.argtypes, measure.restype = [ctypes.POINTER(Job)], None
-        measure(ctypes.byref(job))
+        """Measure the state at the start; only with a controller."""
+        self._library.measure_starts(ctypes.byref(job))
 
     def fly_until(self, job: Job, tick: int) -> int:
-        """Fly to a tick; return how many groups wait for one of their lanes before it."""
-        return int(self._fly(ctypes.byref(job), tick))
+        """Fly to a tick; return the number of groups that wait for a step of Python before it."""
+        return int(self._library.fly_until(ctypes.byref(job), tick))
+
+    def end(self, job: Job) -> None:
+        """End the flights that are still under way; only with a controller."""
+        self._library.end_flights(ctypes.byref(job))
 
 
-def _library(functions: Sequence[ca.Function], unit: VectorUnit, thrusters: int) -> ctypes.CDLL:
+@dataclass(frozen=True)
+class CompiledTick:
+    """The compiled tick of flights that differ in numbers alone, and the rows of its memory.
+
+    Attributes
+    ----------
+    driver
+        The loop.
+    rows
+        Memory of a group.
+    controller
+        Source of the commands; None: tables.
+    """
+
+    driver: Driver
+    rows: Rows
+    controller: BatchController | None = None
+
+    @classmethod
+    def of(cls, flights: Flights, model: ModelFunctions) -> CompiledTick:
+        """Compile the tick of flights, or return it from an earlier compilation.
+
+        Raises
+        ------
+        NoLibraryError
+            It cannot be compiled here.
+        ParameterError
+            The law cannot drive the selected outputs, or cannot be flown in lanes.
+        """
+        key: tuple[Any, ...] = (
+            cls,
+            flights.actuation,
+            flights.substeps,
+            vector_unit(),
+            compilation_settings(),
+        )
+        program = flights.program
+        if isinstance(program, Controlled):
+            # All parameters but the gains, which each flight has of its own, are in the function.
+            given = values_of(program.config).items()
+            parameters = [each for each in given if not each[0].startswith("gains.")]
+            believed = program.robot or flights.robot
+            key = (*key, believed, repr(parameters), repr(program.config.motion))
+            key = (*key, flights.thruster_count)
+        if key not in model.derived:
+            model.derived[key] = cls._new(flights, model)
+        found: CompiledTick = model.derived[key]
+        if found.controller is not None and isinstance(program, Controlled):
+            return replace(found, controller=found.controller.serving(program))
+        return found
+
+    @classmethod
+    def _new(cls, flights: Flights, model: ModelFunctions) -> CompiledTick:
+        effort, robot = flights.actuation == "effort", flights.robot
+        names, n = _TICKS[flights.actuation], robot.n
+        make = (effort_plant if effort else velocity_plant).tick_function
+        whole = make(robot, Composition(model, ca.MX), flights.substeps)
+        inputs = whole.mx_in()
+        outputs = dict(zip(names.outputs, whole.call(inputs, True, False), strict=True))
+        # Reports need all but the poses of links.
+        reported = tuple(name for name in names.outputs if not name.startswith("link"))
+        arguments = {"FLIGHT": (*names.inputs, "p"), "REPORT": (*names.inputs, "p")}
+        results = {"FLIGHT": names.flight, "REPORT": reported}
+        functions = {
+            kind: ca.Function(
+                f"{flights.actuation}_{kind.lower()}", inputs, [outputs[each] for each in chosen]
+            )
+            for kind, chosen in results.items()
+        }
+        sizes = {
+            **{name: whole.nnz_in(i) for i, name in enumerate(arguments["FLIGHT"])},
+            **{name: whole.nnz_out(i) for i, name in enumerate(names.outputs)},
+        }
+        controller, count = None, flights.thruster_count
+        if isinstance(flights.program, Controlled):
+            controller = BatchController.of(flights)
+            functions["CONTROL"] = controller.function()
+            arguments["CONTROL"], results["CONTROL"] = CONTROL_INPUTS, CONTROL_OUTPUTS
+        if count:
+            functions["PULSES"] = pulse_function(count)
+            arguments["PULSES"], results["PULSES"] = PULSE_INPUTS, PULSE_OUTPUTS
+        for kind in ("CONTROL", "PULSES"):
+            if function := functions.get(kind):
+                sizes |= {each: function.nnz_in(i) for i, each in enumerate(arguments[kind])}
+                sizes |= {each: function.nnz_out(i) for i, each in enumerate(results[kind])}
+        rows = Rows(
+            {
+                **{"alive": 1, "measured": n, "joint_bias": n, "joint_noise": 1},
+                **{"limits": n if effort else 2 * n, "peak_rate": n, "peak_effort": n},
+                **{"peak_wrench": 2, "impulse": 2, "lowest": n, "highest": n},
+                **{"decision": 1, "decided": 1, "decided_state": 2 * n + 13},
+                **{"ended": 1, "end_state": 2 * n + 20},
+                **{"first_momenta": 6, "drift": 2, "propellant": 1, "unallocated": 1},
+                **{"wanted": 6, "pending_impulse": 6},
+                **sizes,
+            }
+        )
+        arrays = {
+            **{f"{kind}_ARGUMENTS": map(rows.first, names) for kind, names in arguments.items()},
+            **{f"{kind}_RESULTS": map(rows.first, names) for kind, names in results.items()},
+        }
+        copies = dict(names.copies)
+        if controller is not None:
+            copies["next_monitor"] = "monitor"
+        if count:
+            copies |= {"next_remaining": "remaining", "next_open": "open"}
+        state, limited = rows.first("next_state"), rows.first("limited", 1)
+        rates = state + n + 4 if effort else rows.first("qdot")
+        peaks = [(rates, rows.first("peak_rate"), n)]
+        if effort:
+            peaks.append((rows.first("realised"), rows.first("peak_effort"), n))
+        report, width = [(state, 0, n), (rates, n, n)], 2 * n
+        for name in ("pose", "twist", "momentum"):
+            report.append((rows.first(name), width, rows.size(name)))
+            width += rows.size(name)
+        spans = {
+            "COPIES": [rows.span(*each) for each in copies.items()],
+            "SUMS": [(limited, rows.first("limits"), rows.size("limits"))],
+            "PEAKS": peaks,
+            "REPORTED": report,
+        }
+        constants = {"ROWS": rows.count, "JOINTS": n, "COMMANDS": sizes["command"]}
+        constants |= {"REPORT_ROWS": width}
+        if effort:
+            # Lanes whose joint touches a stop are stepped by the scalar plant.
+            constants["STOP_ROW"] = limited + n
+            constants["WRENCH_ROW"] = rows.first(
+                "wanted" if count else "realised", 0 if count else n
+            )
+        if controller is not None:
+            constants["EXPECTED_ROW"] = state + 2 * n + 4
+        declarations = _declarations(rows, constants, arrays, spans)
+        return cls(Driver(functions, declarations, count), rows, controller)
+
+
+@dataclass(frozen=True)
+class _TickNames:
+    """Names of a tick function's arguments and results.
+
+    ``flight`` are the results that every tick needs, ``copies`` the results that become arguments
+    of the next tick.
+    """
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    flight: tuple[str, ...]
+    copies: Mapping[str, str]
+
+
+_TICKS = {
+    "velocity": _TickNames(
+        ("state", "command", "momenta", "r_cm", "h"),
+        (
+            *("next_state", "pose", "twist", "qdot", "momentum"),
+            *("link_R", "link_r", "limited", "next_r_cm"),
+        ),
+        ("next_state", "qdot", "limited", "next_r_cm"),
+        {"next_state": "state", "next_r_cm": "r_cm"},
+    ),
+    "effort": _TickNames(
+        ("state", "command", "h"),
+        (
+            *("next_state", "pose", "twist", "realised"),
+            *("momentum", "link_R", "link_r", "limited"),
+        ),
+        ("next_state", "realised", "limited"),
+        {"next_state": "state"},
+    ),
+}
+
+
+def _library(
+    functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit, thrusters: int
+) -> ctypes.CDLL:
     """Return the library, with the vector functions of the C library if it has them."""
     try:
-        return _compiled(functions, unit, unit.libmvec, thrusters)
+        return _compiled(functions, declarations, unit, unit.libmvec, thrusters)
     except NoLibraryError:
         if not unit.libmvec:
             raise
-        return _compiled(functions, unit, "", thrusters)
+        return _compiled(functions, declarations, unit, "", thrusters)
 
 
 def _compiled(
-    functions: Sequence[ca.Function], unit: VectorUnit, libmvec: str, thrusters: int
+    functions: Mapping[str, ca.Function],
+    declarations: str,
+    unit: VectorUnit,
+    libmvec: str,
+    thrusters: int,
 ) -> ctypes.CDLL:
-    renamed = [_renamed(function, f"vector_{function.name()}") for function in functions]
+    given = list(functions.values())
+    renamed = [_renamed(function, f"vector_{function.name()}") for function in given]
     body = _SELECTION.sub(r"where(\1,\2)", vector_source(renamed, "V"))
-    parts = [_definitions(functions, unit, libmvec, thrusters), _file("lanes.hpp"), body]
+    parts = [_definitions(given, unit, libmvec, thrusters), _file("lanes.hpp"), body]
     parts += [
         f"#define {name} {function.name()}"
-        for name, function in zip(("FLIGHT", "REPORT", "CONTROL"), renamed, strict=False)
+        for name, function in zip(functions, renamed, strict=True)
     ]
-    driver = _file("driver.hpp").replace('#include "thrusters.hpp"\n', _file("thrusters.hpp"))
-    parts += [driver, *(_trial(function) for function in functions)]
+    parts += [declarations, _file("thrusters.hpp"), _file("driver.hpp"), *map(_trial, given)]
     # Vectors as arguments between functions of this file: no other is called with them.
     flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *unit.flags)
     libraries = ("-lmvec",) if libmvec else ()
-    name = f"lanes_{functions[0].name()}"
-    return native_library(name, "\n".join(parts), flags, libraries, functions)
+    return native_library(f"lanes_{given[0].name()}", "\n".join(parts), flags, libraries, given)
+
+
+def _declarations(
+    rows: Rows,
+    constants: Mapping[str, int],
+    arrays: Mapping[str, Iterable[int]],
+    spans: Mapping[str, Iterable[tuple[int, int, int]]],
+) -> str:
+    """Return the C++ declarations that the driver shares with Python."""
+    lines = [f"#define {name} {value}" for name, value in constants.items()]
+    lines.append("namespace row {")
+    lines += [f"constexpr long long {name} = {at.start};" for name, at in rows.slices.items()]
+    lines.append("}")
+    for enum in (Program, Pending, Decision):
+        members = ", ".join(f"{each.name} = {each.value}" for each in enum)
+        lines.append(f"namespace {enum.__name__.lower()} {{ enum {{ {members} }}; }}")
+    lines.append("struct Span { long long from, to, count; };  // rows")
+    lines += [f"static const long long {name}[] = {_braces(x)};" for name, x in arrays.items()]
+    lines += [
+        f"static const Span {name}[] = {{{', '.join(map(_braces, each))}}};"
+        for name, each in spans.items()
+    ]
+    lines += ["struct Job {", *(f"  {kind} {name};  // {text}" for kind, name, text in _JOB), "};"]
+    return "\n".join(lines)
 
 
 def _renamed(function: ca.Function, name: str) -> ca.Function:
@@ -243,7 +492,7 @@ def _trial(function: ca.Function) -> str:
     )
 
 
-def _braces(numbers: Sequence[int]) -> str:
+def _braces(numbers: Iterable[int]) -> str:
     return "{" + ", ".join(map(str, numbers)) + "}"
 
 

@@ -20,6 +20,9 @@ from spacerobot_ros.campaign.draws import Draw
 from spacerobot_ros.campaign.one_by_one import node_robot, nominal_robots
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.executive import decided_message
+from spacerobot_ros.control.outputs import OutputDistance
+from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.scenario import Scenario
@@ -42,8 +45,8 @@ _COMMON = (
 """Parameters of the plant that may not."""
 
 _OUTCOMES = {
-    Decision.REACHED: (Outcome.REACHED, "The goal is reached"),
-    Decision.FAILED: (Outcome.FAILED, "The goal is not reached in time"),
+    Decision.REACHED: (Outcome.REACHED, ControllerState.REACHED),
+    Decision.FAILED: (Outcome.FAILED, ControllerState.FAILED),
 }
 
 
@@ -188,9 +191,8 @@ def _measures(
         outcome, flown = Outcome.INTERRUPTED, duration
         message = f"Interrupted after {duration:.6g} s of simulated time."
     else:
-        outcome, clause = _OUTCOMES[decision]
-        position, attitude, _ = result.decided_errors[row].tolist()
-        message = f"{clause}: {position:.3g} m, {attitude:.3g} rad from it."
+        outcome, state = _OUTCOMES[decision]
+        message = decided_message(state, OutputDistance(*result.decided_distance[row].tolist()))
         flown = decided * period_ns / SECOND
     scenario = drawn.scenario
     return Measures(

@@ -345,7 +345,7 @@ class OutputVector:
         x, wanted = np.empty(self.state.numel()), np.empty(self.reference.numel())
         self.pack_state(state, x)
         self.pack_reference(reference, wanted)
-        found = self._error_function(x, wanted, *self.robot.weights.values())
+        found = self._error_function(x, wanted, *self.robot.mass_arguments.values())
         return np.asarray(found.full()[:, 0])
 
     # -- groups -------------------------------------------------------------------------------

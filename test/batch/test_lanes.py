@@ -16,7 +16,6 @@ from spacerobot_ros.batch import (
     HeldCommands,
     SensorErrors,
     Starts,
-    compiled_tick,
     fly_lanes,
     fly_one_by_one,
     native,
@@ -197,8 +196,7 @@ def test_narrower_registers_give_the_same_flights(
     chosen = native._PLAIN if unit == "plain" else native.UNITS[unit]
     if chosen.lanes > widest.lanes:
         pytest.skip(f"this processor has no {chosen.name}")
-    for module in (native, compiled_tick):
-        monkeypatch.setattr(module, "vector_unit", lambda: chosen)
+    monkeypatch.setattr(native, "vector_unit", lambda: chosen)
     for flights in (
         velocity_flights(robots["servicer"], 19, each=True, deadband=0.0),
         effort_flights(robots["servicer"], 19),
