@@ -29,11 +29,11 @@ from spacerobot_ros.control.reference import ReferenceProfile
 from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.control.thrusters import ThrusterModulator
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.files import warn_once
 from spacerobot_ros.model.compilation import NoLibraryError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.model_functions import ModelFunctions
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
-from spacerobot_ros.private_files import warn_once
 from spacerobot_ros.simulation.effort_plant import EffortPlant
 from spacerobot_ros.times import SECOND
 

@@ -12,7 +12,7 @@ from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.report import MADE_BY, Results, named, panels, picture
 from spacerobot_ros.campaign.statistics import Paired, paired, paired_success
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.output_files import write_output
+from spacerobot_ros.files import write_output
 from spacerobot_ros.report.figures import INK, PALETTE, drawing
 from spacerobot_ros.report.page_parts import facts, html_page, table
 

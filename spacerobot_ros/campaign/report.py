@@ -29,9 +29,9 @@ from spacerobot_ros.campaign.statistics import (
     share,
     sobol_indices,
 )
+from spacerobot_ros.files import write_output
 from spacerobot_ros.measures import METRICS
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.output_files import write_output
 from spacerobot_ros.report.figures import FAINT, INK, PALETTE, PictureFormat, drawing, picture_of
 from spacerobot_ros.report.page_parts import facts, figure, html_page, table, tiles
 from spacerobot_ros.version import __version__

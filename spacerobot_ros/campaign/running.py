@@ -23,7 +23,7 @@ from spacerobot_ros.campaign.engines import chosen_engine, engine_called, fly_al
 from spacerobot_ros.campaign.extras import needed
 from spacerobot_ros.campaign.rows import FLIGHTS, Fallback, Row
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.private_files import warn_once
+from spacerobot_ros.files import warn_once
 from spacerobot_ros.version import __version__
 
 TASK_TIME = 2.0

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from spacerobot_ros.output_files import write_output
+from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
     from spacerobot_ros.flight.scenario import Scenario

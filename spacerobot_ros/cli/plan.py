@@ -26,7 +26,7 @@ from spacerobot_ros.cli.options import (
 )
 from spacerobot_ros.cli.progress import display
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.output_files import write_output
+from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
     from spacerobot_ros.planning import Goal
@@ -262,7 +262,6 @@ def library_command(
     """
     from spacerobot_ros.planning import PlanRequest
     from spacerobot_ros.planning.methods.optimal.method import OptimalGait
-    from spacerobot_ros.private_files import write_whole
     from spacerobot_ros.simulation.trials import state_of
 
     problem = problem_of(scenario, settings=settings)
@@ -277,7 +276,8 @@ def library_command(
     if out is None:
         where = method.keep_library(library)
     else:
-        write_whole(out, library.to_bytes())
+        # Of this user alone: plans begin with it, and refuse one that others may write.
+        write_output(out, library.to_bytes(), mode=0o600)
         where = out
     if where is None:
         fail("The library could not be kept; --out chooses another place.")

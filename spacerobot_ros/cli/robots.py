@@ -15,7 +15,7 @@ from spacerobot_ros.cli.errors import fail
 from spacerobot_ros.cli.options import json_option, out_option, picture_option, write_json
 from spacerobot_ros.cli.progress import display
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.output_files import write_output
+from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
     from spacerobot_ros.model import SpaceRobot

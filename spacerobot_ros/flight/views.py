@@ -14,10 +14,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.files import write_output
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
-from spacerobot_ros.output_files import write_output
 from spacerobot_ros.topics import TOPICS
 
 if TYPE_CHECKING:

@@ -2,12 +2,11 @@
 
 Without a compiler, or with ``SPACEROBOT_COMPILE=0``, the same functions run in CasADi's virtual
 machine: slower, with the same formulas. Compiled objects live in ``SPACEROBOT_CACHE_DIR``, by
-default ``$XDG_CACHE_HOME/spacerobot_ros`` (``~/.cache/spacerobot_ros``), named by what is in them.
+default ``$XDG_CACHE_HOME/spacerobot_ros`` (``~/.cache/spacerobot_ros``), named by their content.
 
-No object is loaded on trust. One from the cache is whole, of this user and of this function
-(:class:`.Cache`). One that the compiler has just delivered is an ELF file of this machine, complete
-by its own headers, and gave the virtual machine's numbers in a process of its own, which may crash.
-The compiler runs under a time limit, ``SPACEROBOT_COMPILE_TIMEOUT``.
+An object from the cache is whole, of this user and of this function (:class:`.Cache`). Compilers
+fail, hang, and run out of disk: a new object must give the virtual machine's numbers in a process
+of its own, which may crash, and the compiler has a time limit, ``SPACEROBOT_COMPILE_TIMEOUT``.
 """
 
 from __future__ import annotations
@@ -20,22 +19,23 @@ import math
 import os
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 import sysconfig
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import TypeVar
 
 import casadi as ca
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.files import Cache, warn_once
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.private_files import Cache, warn_once
 from spacerobot_ros.termination import tool
 
 # Contraction into fused multiply-adds would make the numbers depend on the processor.
@@ -48,41 +48,43 @@ _LONG_FLAGS = ("-O0", *_COMMON_FLAGS)
 still seven times that of the virtual machine."""
 
 _WORTH_KEEPING = 5000
-"""Operations from which on it takes a tenth of a second to derive a function, ten times what it
-takes to read it."""
+"""Number of operations of a function that takes a tenth of a second to derive, ten times as long
+as to read."""
 
 _COMPILE_TIMEOUT = 120.0
-"""Time that the compiler has for one function, s: ten times what the largest takes."""
+"""Time limit for compiling one function, s: ten times that of the largest."""
 
 _TRIAL_TIMEOUT = 20.0
-"""Time that a new object has to prove itself, s."""
+"""Time limit for trying a new object, s."""
 
 _SAME = 1e-6
-"""Relative difference that numbers of the compiler and of the virtual machine may have."""
+"""Largest relative difference between a compiled function and the virtual machine."""
 
 _BEYOND = 1e9
-"""Results beyond it are near a singularity: rounding decides them."""
+"""Results above it are near a singularity and depend on rounding."""
 
 _MOST_AT_HAND = 12
 
 _at_hand: dict[tuple[str, ...], ca.Function] = {}
-"""Kept functions that were asked for last, by their name, key and how they are compiled."""
+"""The kept functions that were used last, by name, key and settings of the compilation."""
 
 ANNOUNCEMENT = "announcement"
-"""The attribute of log records that say what begins and takes long."""
+"""Attribute of log records that announce a long computation."""
 
 _LOG = logging.getLogger(__name__)
 
+_Loaded = TypeVar("_Loaded")
+
 _hung: set[str] = set()
-"""Compilers that have run into the time limit: the next function is not to wait as long again."""
+"""Compilers that have exceeded the time limit: they are not called again."""
 
 
 class _CompilationError(Exception):
-    """There is no usable object; the text is a clause that says why."""
+    """An object cannot be made; the text is the reason, a clause."""
 
 
 class NoLibraryError(SpaceRobotError):
-    """There is no compiled library; the text is a clause that says why."""
+    """A library cannot be made; the text is the reason, a clause."""
 
 
 class BufferedFunction:
@@ -162,14 +164,15 @@ def compiled(function: ca.Function) -> ca.Function:
     """
     if not _is_wanted():
         return function
-    compiler, limit = c_compiler(), _time_limit()
+    compiler = c_compiler()
+    _time_limit()
     try:
         if compiler is None:
             raise _CompilationError("no C compiler (cc, gcc, clang or $CC) was found")
         key = _hash(f"{_built_for(compiler, _FLAGS)}\n{_source(function)}")
         if found := _loaded(Cache(cache_directory()), function.name(), key):
             return found
-        return _compiled(function, key, _FLAGS, compiler, limit)
+        return _compiled(function, key, _FLAGS, compiler)
     except _CompilationError as reason:
         _warn_of_virtual_machine(reason)
         return function
@@ -203,7 +206,7 @@ def kept_function(
     name
         The function's own.
     key
-        What tells it from all others: a hash of everything that it is derived from.
+        A hash of everything that the function is derived from.
     build
         Derives it.
     compiling
@@ -241,7 +244,7 @@ def _kept_or_derived(
     function = build()
     if compiling and compiler is not None:
         try:
-            return _compiled(function, compiled_key, _LONG_FLAGS, compiler, _time_limit())
+            return _compiled(function, compiled_key, _LONG_FLAGS, compiler)
         except _CompilationError as reason:
             _warn_of_virtual_machine(reason)
     if function.n_instructions() >= _WORTH_KEEPING:
@@ -256,7 +259,7 @@ def native_library(
     libraries: Sequence[str],
     tried: Sequence[ca.Function],
 ) -> ctypes.CDLL:
-    """Return a C++ source as a library that is compiled once, under all that holds for functions.
+    """Return a C++ source as a library, compiled, tried and cached as functions are.
 
     Parameters
     ----------
@@ -265,9 +268,10 @@ def native_library(
     source
         C++, which has the functions ``tried`` by their names with CasADi's interface.
     flags, libraries
-        Of the compiler; what the processor must understand is among the flags, and so in the key.
+        Arguments of the compiler. The flags choose the processor's instructions; they are part of
+        the key.
     tried
-        Functions whose numbers a new library has to give, in a process of its own.
+        Functions of the library that must give the virtual machine's numbers in a process.
 
     Raises
     ------
@@ -276,37 +280,24 @@ def native_library(
     ParameterError
         ``SPACEROBOT_COMPILE_TIMEOUT`` is not a number of seconds.
     """
-    compiler, limit = cxx_compiler(), _time_limit()
+    compiler = cxx_compiler()
     if compiler is None:
         raise NoLibraryError("no C++ compiler (c++, g++, clang++ or $CXX) was found")
     flags = [*flags, *_COMMON_FLAGS]
     key = _hash(f"{_built_for(compiler, flags)} {' '.join(libraries)}\n{source}")
-    cache = Cache(cache_directory())
-    if kept := cache.load(_file(name, key), key):
+    if kept := Cache(cache_directory()).load(_file(name, key), key):
         with suppress(OSError):
             return ctypes.CDLL(str(kept[0]))
-    if compiler in _hung:
-        raise NoLibraryError(f"{compiler} did not end before, and is not called again")
     try:
-        with tempfile.TemporaryDirectory(prefix="spacerobot_ros_") as folder:
-            work = Path(folder)
-            built = _built(source, compiler, flags, work, limit, libraries, "function.cpp")
-            for each in tried:
-                _try(each, built)
-            stored = cache.store(_file(name, key), key, built.read_bytes())
-            for path in (stored, built):
-                with suppress(OSError):
-                    if path is not None:
-                        return ctypes.CDLL(str(path))
+        return _made(
+            name, key, _Build(source, compiler, flags, libraries, "cpp"), tried, ctypes.CDLL
+        )
     except _CompilationError as reason:
         raise NoLibraryError(str(reason)) from None
-    except OSError as error:
-        raise NoLibraryError(error.strerror or str(error)) from None
-    raise NoLibraryError("the compiled library cannot be loaded")
 
 
 def vector_source(functions: Sequence[ca.Function], kind: str) -> str:
-    """Return C++ of functions in which every number is of a type of the caller's, ``kind``."""
+    """Return C++ of functions in which every number has the type ``kind``."""
     options = {"with_header": False, "cpp": True, "casadi_real": kind}
     generator = ca.CodeGenerator(functions[0].name(), options)
     for function in functions:
@@ -315,7 +306,7 @@ def vector_source(functions: Sequence[ca.Function], kind: str) -> str:
 
 
 def compilation_settings() -> tuple[str, ...]:
-    """Return what decides how functions are compiled and where they are kept."""
+    """Return the compiler and the cache's folder, on which compiled functions depend."""
     return (c_compiler() or "", str(cache_directory()))
 
 
@@ -399,9 +390,7 @@ def _loaded(cache: Cache, name: str, key: str) -> ca.Function | None:
     return None
 
 
-def _compiled(
-    function: ca.Function, key: str, flags: Sequence[str], compiler: str, limit: float
-) -> ca.Function:
+def _compiled(function: ca.Function, key: str, flags: Sequence[str], compiler: str) -> ca.Function:
     """Return the function newly compiled, and keep it in the cache.
 
     Raises
@@ -409,20 +398,61 @@ def _compiled(
     _CompilationError
         It cannot be compiled.
     """
-    name, cache = function.name(), Cache(cache_directory())
-    if compiler in _hung:
-        raise _CompilationError(f"{compiler} did not end before, and is not called again")
+    name = function.name()
     _announce()
+    build = _Build(_source(function), compiler, flags)
+    return _made(name, key, build, [function], lambda path: ca.external(name, path))
+
+
+@dataclass(frozen=True)
+class _Build:
+    """A source, and the call of the compiler that makes a shared object of it.
+
+    Attributes
+    ----------
+    source
+        Text of the source.
+    compiler, flags, libraries
+        Program, and arguments before and after the names of the files.
+    suffix
+        Suffix of the source file.
+    """
+
+    source: str
+    compiler: str
+    flags: Sequence[str]
+    libraries: Sequence[str] = ()
+    suffix: str = "c"
+
+
+def _made(
+    name: str,
+    key: str,
+    build: _Build,
+    tried: Sequence[ca.Function],
+    load: Callable[[str], _Loaded],
+) -> _Loaded:
+    """Compile a shared object, try its functions in a process, keep it in the cache, and load it.
+
+    Raises
+    ------
+    _CompilationError
+        There is no object that can be used.
+    """
+    limit = _time_limit()
+    if build.compiler in _hung:
+        raise _CompilationError(f"{build.compiler} did not end before, and is not called again")
     try:
         with tempfile.TemporaryDirectory(prefix="spacerobot_ros_") as folder:
-            built = _built(_source(function), compiler, flags, Path(folder), limit)
-            _try(function, built)
-            kept_at = cache.store(_file(name, key), key, built.read_bytes())
-            for path in (kept_at, built):
-                # A folder may forbid execution; what is loaded stays when its file is deleted.
-                with suppress(RuntimeError):
+            built = _built(build, Path(folder), limit)
+            for each in tried:
+                _try(each, built)
+            stored = Cache(cache_directory()).store(_file(name, key), key, built.read_bytes())
+            for path in (stored, built):
+                # A folder may forbid execution; a loaded object stays when its file is deleted.
+                with suppress(OSError, RuntimeError):
                     if path is not None:
-                        return ca.external(name, str(path))
+                        return load(str(path))
     except OSError as error:
         raise _CompilationError(error.strerror or str(error)) from None
     raise _CompilationError("the compiled object cannot be loaded")
@@ -430,7 +460,7 @@ def _compiled(
 
 @lru_cache(maxsize=1)
 def _announce() -> None:
-    """Log, once in a process, that something is compiled: the first flight of a robot waits."""
+    """Log, once in a process, that the first flight of a robot waits for the compiler."""
     _LOG.info(
         "Compiling the equations of this robot: once, some seconds.", extra={ANNOUNCEMENT: True}
     )
@@ -444,19 +474,16 @@ def _c_library() -> str:
     return ""
 
 
-def _built(
-    source: str,
-    compiler: str,
-    flags: Sequence[str],
-    folder: Path,
-    limit: float,
-    libraries: Sequence[str] = (),
-    file: str = "function.c",
-) -> Path:
-    """Return the object that the compiler makes of a source in a folder."""
-    c_file, built, output = (folder / name for name in (file, "function.so", "output"))
-    c_file.write_text(source, encoding="utf-8")
-    command = [compiler, *flags, "-o", str(built), str(c_file), *libraries, "-lm"]
+def _built(build: _Build, folder: Path, limit: float) -> Path:
+    """Return the object that the compiler makes in a folder."""
+    source, built, output = (
+        folder / f"function.{build.suffix}",
+        folder / "function.so",
+        folder / "output",
+    )
+    source.write_text(build.source, encoding="utf-8")
+    compiler = build.compiler
+    command = [compiler, *build.flags, "-o", str(built), str(source), *build.libraries, "-lm"]
     code = _run(command, output, limit)
     if code is None:
         _hung.add(compiler)
@@ -469,14 +496,13 @@ def _built(
         said = output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         reason = said[0][:300] if said else f"no reason given; is the disk of {folder.parent} full?"
         raise _CompilationError(f"{compiler} failed ({code}): {reason}")
-    _require_object(built, compiler)
     return built
 
 
 def _run(command: list[str], output: Path, limit: float) -> int | None:
     """Run a command that ends with this process; return its exit code, None beyond the limit."""
-    # Into a file: what the command has started may hold a pipe open for longer than it lives.
-    # What it leaves behind when it is ended goes with the folder.
+    # Into a file: children of the command may hold a pipe open longer than the command runs. Its
+    # temporary files are deleted with the folder.
     environment = {**os.environ, "TMPDIR": str(output.parent)}
     with (
         output.open("wb") as file,
@@ -489,56 +515,6 @@ def _run(command: list[str], output: Path, limit: float) -> int | None:
 
 
 # -- new objects ------------------------------------------------------------------------------
-
-_IDENTITY = slice(4, 6)
-_SHARED_OBJECT = 3
-
-
-def _require_object(path: Path, compiler: str) -> None:
-    """Refuse a file that is not a complete ELF shared object of this machine.
-
-    Raises
-    ------
-    _CompilationError
-        It is not.
-    """
-    said = f"{compiler} reported success, but what it delivered"
-    try:
-        content = path.read_bytes()
-    except OSError:
-        raise _CompilationError(f"{said} is not there") from None
-    if not content:
-        raise _CompilationError(f"{said} is empty")
-    own = _own_header()
-    if own is None:
-        return  # Not a machine of ELF files: the trial is all there is.
-    order = "<" if own[5] == 1 else ">"
-    wide = own[4] == 2
-    # e_type, e_machine, e_version, e_entry, e_phoff, e_shoff, e_flags, then six half words.
-    header = struct.Struct(f"{order}HHI{'QQQ' if wide else 'III'}I6H")
-    if len(content) < 16 + header.size or content[:4] != own[:4]:
-        raise _CompilationError(f"{said} is not an object file")
-    kind, machine, _, _, _, sections, _, _, _, _, size, count, _ = header.unpack_from(content, 16)
-    if (
-        content[_IDENTITY] != own[_IDENTITY]
-        or machine != struct.unpack_from(f"{order}H", own, 18)[0]
-        or kind != _SHARED_OBJECT
-    ):
-        raise _CompilationError(f"{said} is not a shared object of this machine")
-    # Linkers write the table of sections last.
-    if sections + size * count > len(content):
-        raise _CompilationError(f"{said} is cut short")
-
-
-@lru_cache(maxsize=1)
-def _own_header() -> bytes | None:
-    """Return the ELF header of the running interpreter; None where it has none."""
-    with suppress(OSError), Path("/proc/self/exe").open("rb") as file:
-        header = file.read(64)
-        if header[:4] == b"\x7fELF":
-            return header
-    return None
-
 
 _TRIAL = """
 import ctypes, json, sys

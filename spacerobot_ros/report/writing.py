@@ -9,7 +9,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.output_files import write_output
+from spacerobot_ros.files import write_output
 from spacerobot_ros.report.figures import (
     WIDTH,
     PictureFormat,

@@ -15,7 +15,7 @@ from pathlib import Path
 import casadi as ca
 import pytest
 
-from spacerobot_ros import private_files
+from spacerobot_ros import files
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot, compilation
 from spacerobot_ros.model.compilation import c_compiler, compiled
@@ -46,7 +46,7 @@ def cache(compiled_code: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     folder = tmp_path / "cache"
     monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(folder))
     monkeypatch.delenv("SPACEROBOT_COMPILE_TIMEOUT", raising=False)
-    monkeypatch.setattr(private_files, "_reported", set())
+    monkeypatch.setattr(files, "_reported", set())
     monkeypatch.setattr(compilation, "_hung", set())
     return folder
 
@@ -156,14 +156,11 @@ def test_an_object_under_the_name_of_another_is_not_loaded(
 @pytest.mark.parametrize(
     ("script", "reason"),
     [
-        (f'{AFTER}; : > "$out"', "is empty"),
-        ("exit 0", "is not there"),
-        (f'{AFTER}; echo hello > "$out"', "is not an object file"),
-        (f'{AFTER}; head -c 4000 /dev/zero > "$out"', "is not an object file"),
-        (f'$CC "$@"; {AFTER}; head -c 5000 "$out" > "$out.1"; mv "$out.1" "$out"', "is cut short"),
-        (f'$CC "$@"; {AFTER}; printf "\\001" | dd of="$out" bs=1 seek=19 conv=notrunc 2>/dev/null',
-         "is not a shared object of this machine"),
-        (f'{AFTER}; cp /proc/self/exe "$out"', "is not a shared object|failed when it was tried"),
+        (f'{AFTER}; : > "$out"', "failed when it was tried"),
+        ("exit 0", "failed when it was tried"),
+        (f'{AFTER}; echo hello > "$out"', "failed when it was tried"),
+        (f'$CC "$@"; {AFTER}; head -c 5000 "$out" > "$out.1"; mv "$out.1" "$out"',
+         "failed when it was tried"),
         ('$CC -Dsin=cos "$@"', "gives other numbers"),
         ('$CC -Dprobe=other "$@"', "failed when it was tried"),
         ("echo no room >&2; exit 3", r"failed \(3\): no room"),
@@ -286,11 +283,10 @@ def test_a_folder_of_somebody_else_is_not_used(
     assert "SPACEROBOT_CACHE_DIR" in caplog.text
 
 
-@pytest.mark.parametrize("whose", ["writable", "foreign", "link", "fifo"])
+@pytest.mark.parametrize("whose", ["writable", "foreign"])
 def test_a_file_that_others_could_have_written_is_replaced(
     whose: str,
     cache: Path,
-    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -298,16 +294,10 @@ def test_a_file_that_others_could_have_written_is_replaced(
     kept = only_file(cache)
     if whose == "writable":
         kept.chmod(0o666)
-    elif whose == "foreign":
+    else:
         if os.geteuid():
             pytest.skip("only root gives files away")
         give_away(kept, monkeypatch)
-    elif whose == "link":
-        kept.rename(tmp_path / "elsewhere")
-        kept.symlink_to(tmp_path / "elsewhere")
-    else:
-        kept.unlink()
-        os.mkfifo(kept)
     assert is_compiled()
     facts = only_file(cache).lstat()
     assert stat.S_IMODE(facts.st_mode) == 0o600

@@ -36,9 +36,9 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("control",),  # above planning, whose goals it takes
         ("planning",),
         ("model",),
-        ("events", "parameters", "private_files", "resources", "termination"),
+        ("events", "parameters", "resources", "termination"),
         ("times", "topics", "version"),
-        ("output_files",),
+        ("files",),
         ("errors",),
     ),
     f"{PACKAGE}.nodes": (

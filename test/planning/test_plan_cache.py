@@ -14,12 +14,12 @@ import numpy.typing as npt
 import pytest
 from planning.test_optimal import FOLDER, QUICK
 
-from spacerobot_ros import private_files
+from spacerobot_ros import files
 from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.files import Cache
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, plan
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
-from spacerobot_ros.private_files import Cache
 
 Array = npt.NDArray[Any]
 
@@ -48,7 +48,7 @@ def cache(
 ) -> Cache:
     """Return a cache of this test's own with that plan; a search for another one fails."""
     monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(private_files, "_reported", set())
+    monkeypatch.setattr(files, "_reported", set())
 
     def searching(*arguments: Any, **options: Any) -> None:
         raise PlanningError("searched")

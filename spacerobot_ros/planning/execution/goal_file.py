@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.files import UntrustedFileError, read_private, write_whole
 from spacerobot_ros.planning.core.goal import Goal
-from spacerobot_ros.private_files import UntrustedFileError, read_private, write_whole
 
 BASE = "base"
 """Key of the goal of the base in the file."""
@@ -96,7 +96,7 @@ class GoalFile:
         if self._path is None:
             return {}
         try:
-            return self._parse(read_private(self._path, follow=True).decode())
+            return self._parse(read_private(self._path).decode())
         except FileNotFoundError:
             return {}
         except UntrustedFileError as error:

@@ -23,6 +23,7 @@ import casadi as ca
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.files import Cache, UntrustedFileError, read_private
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array
@@ -37,7 +38,6 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     MotionLimits,
     Trajectory,
 )
-from spacerobot_ros.private_files import Cache, UntrustedFileError, read_private
 
 _CANDIDATES = 24
 """Loops of one kind from which the one that ends nearest to the goal is taken."""

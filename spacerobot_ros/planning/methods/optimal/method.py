@@ -22,6 +22,7 @@ import casadi as ca
 import numpy as np
 
 from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.files import Cache
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array
@@ -58,7 +59,6 @@ from spacerobot_ros.planning.methods.optimal.search import (
     MotionSearch,
     SearchBudget,
 )
-from spacerobot_ros.private_files import Cache
 from spacerobot_ros.version import __version__
 
 _CORRECTION_INTERVALS = 40

@@ -16,7 +16,7 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.output_files import write_output
+from spacerobot_ros.files import write_output
 
 
 @pytest.fixture

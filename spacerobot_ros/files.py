@@ -1,0 +1,289 @@
+"""Whole files, files that only this user can have written, and the cache.
+
+A file is replaced as a whole or not at all, because disks get full and processes are killed.
+
+Files that are executed, flown or resumed are read only where no other user of the machine could
+have written them: the folder of the cache may be a shared one. A :class:`Cache` keeps files that
+can be made again; it treats a damaged or untrusted file as missing, and warns once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import pwd
+import secrets
+import stat
+from contextlib import suppress
+from pathlib import Path
+
+from spacerobot_ros.errors import SpaceRobotError
+
+_LOG = logging.getLogger(__name__)
+
+_OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
+
+_MAGIC = b"spacerobot_ros cache 2"
+"""Begins the last line of a file of the cache; the number is that of the format."""
+
+_LARGEST = 256 * 2**20
+"""Largest file that :func:`read_private` reads, bytes."""
+
+_MCAP = b"\x89MCAP"
+"""First bytes of a bag."""
+
+_reported: set[str] = set()
+
+
+class UntrustedFileError(SpaceRobotError):
+    """A file or folder that other users may have altered; the message says how to mend it."""
+
+
+def warn_once(message: str) -> None:
+    """Log a warning, once in a process."""
+    if message not in _reported:
+        _reported.add(message)
+        _LOG.warning("%s", message)
+
+
+# -- whole files ------------------------------------------------------------------------------
+
+
+def write_whole(path: Path, content: bytes, *, durable: bool = True, mode: int = 0o600) -> None:
+    """Replace a file as a whole or not at all.
+
+    Parameters
+    ----------
+    path, content
+        The file and its new content.
+    durable
+        Whether to wait for the disk, so that the file is whole after a loss of power as well.
+    mode
+        Permissions of the file, without those that the umask forbids; by default only this user
+        may read it.
+
+    Raises
+    ------
+    OSError
+        It cannot be written; an older file stays.
+    """
+    made = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.new")
+    try:
+        with os.fdopen(os.open(made, os.O_CREAT | os.O_WRONLY | os.O_EXCL, mode), "wb") as file:
+            file.write(content)
+            file.flush()
+            if durable:
+                os.fsync(file.fileno())
+        os.replace(made, path)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(made)
+        raise
+    if durable:
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def write_output(path: Path, content: bytes | str, mode: int = 0o666) -> None:
+    """Write a report, picture or result, and the folders above it, as a whole or not at all.
+
+    ``mode`` are the permissions of a new file; an older file keeps its own. A bag is not replaced,
+    because it may be the only record of a flight. Devices and pipes are written to. A text is
+    written as UTF-8.
+
+    Raises
+    ------
+    SpaceRobotError
+        The file cannot be written, or is a bag; an older file stays.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _write_output(Path(os.path.realpath(path)), data, mode)
+    except OSError as error:
+        reason = error.strerror
+        if isinstance(error, FileExistsError | NotADirectoryError):
+            reason = f"{path.parent} is no folder"
+        raise SpaceRobotError(f"The file {path} cannot be written: {reason}.") from error
+
+
+def _write_output(path: Path, data: bytes, mode: int) -> None:
+    before = path.stat() if path.exists() else None
+    in_place = before is not None and not stat.S_ISREG(before.st_mode)
+    if before is not None and not in_place and _is_bag(path):
+        raise SpaceRobotError(f"The file {path} is a bag, which is not replaced: name another.")
+    if in_place or not os.access(path.parent, os.W_OK):
+        path.write_bytes(data)
+        return
+    if before is not None:
+        mode = stat.S_IMODE(before.st_mode)
+    write_whole(path, data, durable=False, mode=mode)
+
+
+def _is_bag(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(_MCAP)) == _MCAP
+
+
+# -- files of this user -----------------------------------------------------------------------
+
+
+def read_private(path: Path) -> bytes:
+    """Return the content of a file that only this user, or root, can have written.
+
+    Raises
+    ------
+    OSError
+        It cannot be read.
+    UntrustedFileError
+        It belongs to another user, or others may write it, or it is too large.
+    """
+    # A pipe that another user has put there would block the open.
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+        # Of the open file, whatever its name stands for by now.
+        facts = os.fstat(file.fileno())
+        if not stat.S_ISREG(facts.st_mode):
+            raise UntrustedFileError(f"'{path}' is not a regular file; remove it.")
+        _require_own(path, facts)
+        if facts.st_size > _LARGEST:
+            raise UntrustedFileError(f"'{path}' has {facts.st_size} bytes; remove it.")
+        return file.read(facts.st_size)
+
+
+def trusted_folder(folder: Path) -> Path:
+    """Return the resolved path of a folder into which only this user, or root, can write.
+
+    Raises
+    ------
+    OSError
+        There is no such folder.
+    UntrustedFileError
+        It belongs to another user, others may write it, or others may replace it.
+    """
+    real = folder.resolve(strict=True)
+    if not real.is_dir():
+        raise UntrustedFileError(f"'{folder}' is not a folder; remove it.")
+    _require_own(real, real.stat())
+    for parent in real.parents:
+        mode = parent.stat().st_mode
+        # In a folder with the sticky bit, as /tmp, no user renames files of another.
+        if mode & _OTHERS_MAY_WRITE and not mode & stat.S_ISVTX:
+            raise UntrustedFileError(_writable(parent, mode))
+    return real
+
+
+def _require_own(path: Path, facts: os.stat_result) -> None:
+    if facts.st_uid not in (0, os.geteuid()):
+        raise UntrustedFileError(f"'{path}' belongs to {_user(facts.st_uid)}; use one of your own.")
+    if facts.st_mode & _OTHERS_MAY_WRITE:
+        raise UntrustedFileError(_writable(path, facts.st_mode))
+
+
+def _writable(path: Path, mode: int) -> str:
+    return (
+        f"others may write '{path}' (mode {stat.S_IMODE(mode):o}); make it yours alone with "
+        f"chmod go-w '{path}'."
+    )
+
+
+def _user(number: int) -> str:
+    try:
+        return f"user {number} ({pwd.getpwuid(number).pw_name})"
+    except KeyError:
+        return f"user {number}"
+
+
+class Cache:
+    """A folder of files that can be made again. Its methods raise nothing: they warn.
+
+    The last line of a file holds its key, length and SHA-256, against disks that get full and
+    processes that are killed. The folder and the file must belong to this user, and no other user
+    may write them, because they are executed and flown.
+
+    Parameters
+    ----------
+    folder
+        Made where it is missing.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def load(self, name: str, key: str) -> tuple[Path, bytes] | None:
+        """Return path and content of a file that was stored under this key, or None."""
+        try:
+            path = trusted_folder(self.folder) / name
+        except UntrustedFileError as error:
+            self._refuse(error)
+            return None
+        except OSError:
+            return None
+        try:
+            return path, _checked(read_private(path), key)
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, UntrustedFileError) as error:
+            self.discard(name, _reason(error) if isinstance(error, OSError) else str(error))
+            return None
+
+    def store(self, name: str, key: str, content: bytes) -> Path | None:
+        """Store a content under a key; return its path, None if it cannot be stored."""
+        try:
+            _make(self.folder)
+            path = trusted_folder(self.folder) / name
+            write_whole(path, content + _trailer(content, key))
+        except UntrustedFileError as error:
+            self._refuse(error)
+            return None
+        except OSError as error:
+            warn_once(f"Nothing can be kept in the cache '{self.folder}': {_reason(error)}.")
+            return None
+        return path
+
+    def discard(self, name: str, why: str) -> None:
+        """Delete a file, and warn with the reason."""
+        path = self.folder / name
+        warn_once(f"'{path}' is thrown away and made anew: {why.rstrip('.')}.")
+        with suppress(OSError):
+            path.unlink()
+
+    def _refuse(self, error: UntrustedFileError) -> None:
+        warn_once(
+            f"The cache '{self.folder}' is not used, for its files are executed and flown: {error} "
+            "(SPACEROBOT_CACHE_DIR chooses another folder.)"
+        )
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or str(error)
+
+
+def _make(folder: Path) -> None:
+    """Make a folder and the folders above it, for this user alone whatever the umask."""
+    for each in (*reversed(folder.parents), folder):
+        if not each.exists():
+            with suppress(FileExistsError):
+                each.mkdir(mode=0o700)
+
+
+def _trailer(content: bytes, key: str) -> bytes:
+    digest = hashlib.sha256(content).hexdigest()
+    return b"\n%s %s %d %s\n" % (_MAGIC, key.encode(), len(content), digest.encode())
+
+
+def _checked(whole: bytes, key: str) -> bytes:
+    """Return the content of a file without its last line.
+
+    Raises
+    ------
+    ValueError
+        The line is not that of this content and key.
+    """
+    content = whole[: whole.rfind(b"\n" + _MAGIC + b" ")]
+    if not whole.endswith(_trailer(content, key)):
+        raise ValueError("it is damaged, or of something else")
+    return content
