@@ -505,7 +505,6 @@ class FlightLog:
         self.statuses: list[tuple[int, Status]] = []
         self.schedules: list[tuple[int, GaitSchedule]] = []
         self.refusals: list[tuple[float, str, Refusal]] = []
-        self.refused_states: list[tuple[float, str]] = []
         self._period_ns = period_ns
         self._thrusters = thrusters_in(plant)
         self._propellant = np.zeros(1)

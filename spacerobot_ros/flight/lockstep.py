@@ -25,39 +25,32 @@ from enum import Enum
 
 import numpy as np
 
-from spacerobot_ros.commanding.goal_follower import GoalFollower, Status, decision_event
-from spacerobot_ros.control import ControlState, NotFiniteError
-from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.controller import build_controller
-from spacerobot_ros.control.executive import END_EFFECTOR, GOAL_KEYS, ControlExecutive
-from spacerobot_ros.control.reference import HeldVelocityReference
-from spacerobot_ros.control.state import Reference
-from spacerobot_ros.control.status import ControllerStatus
-from spacerobot_ros.errors import CommandError, ParameterError, PlanningError, SpaceRobotError
+from spacerobot_ros.commanding.commander import ArrayDecoder, Commander, StateArrays
+from spacerobot_ros.commanding.controller import JOINT_REFERENCE, ControllerCommander
+from spacerobot_ros.commanding.goal_follower import GoalFollower, Status
+from spacerobot_ros.commanding.planner import PlannerCommander
+from spacerobot_ros.commanding.plant_state import Stamped
+from spacerobot_ros.control.executive import END_EFFECTOR
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event
 from spacerobot_ros.flight.flight import Flight, FlightLog
-from spacerobot_ros.flight.plant_listener import Change, PlantListener, Stopped
 from spacerobot_ros.flight.scenario import Scenario
-from spacerobot_ros.flight.state_synchroniser import Pairing, StateSynchroniser
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.shared_parameters import RobotConfig, robot_from_text, robot_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.method import GaitMethod
-from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.executive import Executive
-from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
-from spacerobot_ros.planning.execution.state_average import BaseMeasurement
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus, ScheduleStart
-from spacerobot_ros.planning.execution.worker import PlanningWorker
 from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator
 from spacerobot_ros.simulation.sensors import ReportedState
-from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
-from spacerobot_ros.times import HEADER_STAMP, SECOND, stamp_bytes
+from spacerobot_ros.simulation.status import PlantMonitor, PlantState
+from spacerobot_ros.times import SECOND
 
-_REFERENCE = "joint_reference"
+_GOAL_STAMP = 0, 1
+"""Stamp of the first goal that a mission client sends at time zero: seconds and nanoseconds."""
 
 Progress = Callable[[float, float], bool]
 """Called now and then with simulated time and the time the present schedule ends, s; returns
@@ -179,16 +172,30 @@ class _Moment(Enum):
     AFTER_COMMAND = "after its command"
 
 
-class _Measured:
-    """The :class:`~spacerobot_ros.planning.execution.state_average.MeasuredState` of a plant."""
+@dataclass(frozen=True)
+class _Host:
+    """The :class:`~spacerobot_ros.commanding.commander.CommanderHost` of a commander here."""
 
-    def __init__(self) -> None:
-        self.stamp_ns = 0
-        self.q: Array = np.zeros(0)
-        self.measurement: BaseMeasurement | None = None
+    flight: _LockstepFlight
+    send_command: Callable[[int], None]
 
-    def base(self) -> BaseMeasurement | None:
-        return self.measurement
+    def publish_status(self, status: Status) -> None:
+        self.flight.take_status(status)
+
+    def report_event(self, event: Event) -> None:
+        self.flight.take_event(event)
+
+    def announce(self, start: ScheduleStart) -> None:
+        self.flight.log.schedules.append((start.stamp_ns, start.schedule))
+
+    def log(self, level: str, message: str) -> None:
+        pass
+
+    def has_publisher(self, topic: str) -> bool:
+        return topic == "odom" or (topic == JOINT_REFERENCE and self.flight.has_planner)
+
+    def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
+        return [], []
 
 
 class _LockstepFlight:
@@ -205,26 +212,28 @@ class _LockstepFlight:
         self._commands = CommandValidator(self._plant, config)
         self._monitor = PlantMonitor(self._commands, self._plant, lockstep=True)
         self._faults_seen = self._plant.active
-        self._log = FlightLog(self._plant, self._reported, self._commands, self._period_ns)
-        self._goal_id = GoalIds().of(0, 1)
-        """Of the first goal that a mission client sends at time zero."""
-        self._follower = GoalFollower(self._goal_id)
+        self.log = FlightLog(self._plant, self._reported, self._commands, self._period_ns)
+        self._follower = GoalFollower(GoalIds().of(*_GOAL_STAMP))
         self._decided: _Moment | None = None
         self._moment = _Moment.BEFORE_COMMAND
         self._status: Status | None = None
-        self._events = self._log.events
-        self._planner = self._controller = None
-        commanders = scenario.commanders
-        self._decider = commanders[0]
-        if "planner" in commanders:
-            self._planner = _Planner(robots.planner, scenario.planner, robots.method)
-        if "coordinated_control" in commanders:
-            self._controller = _Controller(
-                robots.controller, scenario.controller, self._on_status, self._report_event
+        self._planner: PlannerCommander | None = None
+        self._controller: ControllerCommander | None = None
+        commanders: dict[str, Commander] = {}
+        if "planner" in scenario.commanders:
+            send = self._send_setpoint
+            if "coordinated_control" in scenario.commanders:
+                send = self._send_reference
+            commanders["planner"] = self._planner = PlannerCommander(
+                scenario.planner, _Host(self, send), method=robots.method
             )
-            if self._planner is not None:
-                self._controller.states.require(_REFERENCE)
-        self._listeners = {name: PlantListener() for name in commanders}
+            self._planner.use(robots.planner, ArrayDecoder())
+        if "coordinated_control" in scenario.commanders:
+            commanders["coordinated_control"] = self._controller = ControllerCommander(
+                scenario.controller, _Host(self, self._send_actuation)
+            )
+            self._controller.use(robots.controller, ArrayDecoder())
+        self._commanders = [commanders[name] for name in scenario.commanders]
 
     # -- the flight ---------------------------------------------------------------------------
 
@@ -237,6 +246,8 @@ class _LockstepFlight:
             wrench = source.quantity == "wrench"
             source.commanders = int(self._controller is not None) if wrench else 1
         self._commands.require_commanded()
+        for commander in self._commanders:
+            commander.activate()
         self._look_at_plant(PlantState.RUNNING)
         self._moment = _Moment.BEFORE_COMMAND
         self._send_goals()
@@ -267,6 +278,11 @@ class _LockstepFlight:
         return self._result(time.perf_counter() - began, interrupted)
 
     @property
+    def has_planner(self) -> bool:
+        """Whether there is a planner, whose reference a controller tracks."""
+        return self._planner is not None
+
+    @property
     def _time(self) -> float:
         return self._tick * self._period_ns / SECOND
 
@@ -277,7 +293,7 @@ class _LockstepFlight:
     def _report_state(self) -> None:
         """Report the state of a tick, as the node publishes it."""
         self._reported.update()
-        self._log.add_state(self._tick)
+        self.log.add_state(self._tick)
 
     def _step(self) -> bool:
         """Step under the commands of the tick; return whether the plant could."""
@@ -297,49 +313,53 @@ class _LockstepFlight:
         """Have the commanders answer the present state."""
         self._moment = _Moment.BEFORE_COMMAND
         quantities, now = self._reported.quantities, self._tick * self._period_ns
-        lost = self._reported.sensors.dropout
         q, qdot = quantities["measured_q"], quantities["measured_qdot"]
-        base = None
-        if not lost:
-            base = BaseMeasurement(quantities["measured_pose"], quantities["measured_twist"], qdot)
-        planner, controller = self._planner, self._controller
-        if planner is not None:
-            planner.answer(now, q, base)
-            self._take_outputs(planner)
-            setpoint = planner.executive.setpoint
-            if controller is None:
-                velocity = self._commands.sources[0].quantity == "velocity"
-                values = setpoint.velocity if velocity else np.zeros(len(q))
-                self._offer(self._commands.sources[0], values, now)
-                self._moment = _Moment.AFTER_COMMAND
-            else:
-                controller.take_reference(now, setpoint.position, setpoint.velocity)
-                self._log.add_command(_REFERENCE, self._tick, setpoint.velocity)
-        if controller is not None:
-            if base is not None:
-                controller.take_base(now, base)
-            try:
-                controller.take_joints(now, q, qdot, self._send)
-            except (CommandError, NotFiniteError) as error:
-                self._log.refused_states.append((self._time, str(error)))
+        if self._controller is not None:
+            # Joints whose pose is lost are answered at the next tick.
+            q, qdot = q.copy(), qdot.copy()
+        pose, twist = quantities["measured_pose"], quantities["measured_twist"]
+        state = StateArrays(now, q, qdot, pose, twist)
+        for commander in self._commanders:
+            if not self._reported.sensors.dropout:
+                commander.take_odom(now, state)
+            commander.take_joints(now, state)
 
-    def _send(self, effort: Array, wrench: Array) -> None:
+    def _send_setpoint(self, stamp_ns: int) -> None:
+        """Offer the setpoint of a planner that commands the joints itself."""
+        assert self._planner is not None
+        source, setpoint = self._commands.sources[0], self._planner.setpoint
+        velocity = source.quantity == "velocity"
+        values = setpoint.velocity if velocity else np.zeros(len(setpoint.velocity))
+        self._offer(source, values, stamp_ns)
+        self._moment = _Moment.AFTER_COMMAND
+
+    def _send_reference(self, stamp_ns: int) -> None:
+        """Give the setpoint of a planner to the controller."""
+        assert self._planner is not None
+        assert self._controller is not None
+        position, velocity = self._planner.setpoint.position, self._planner.setpoint.velocity
+        reference = StateArrays(stamp_ns, position.copy(), velocity.copy())
+        self._controller.receive_reference(JOINT_REFERENCE, stamp_ns, reference)
+        self.log.add_command(JOINT_REFERENCE, self._tick, velocity)
+
+    def _send_actuation(self, _: int) -> None:
         """Offer the commands of the controller; its later decisions follow them."""
-        now = self._tick * self._period_ns
+        assert self._controller is not None
+        now, effort = self._tick * self._period_ns, self._controller.effort
         for source in reversed(self._commands.sources):  # The wrench is sent first.
-            values = wrench if source.quantity == "wrench" else effort
+            values = self._controller.wrench if source.quantity == "wrench" else effort
             if source.quantity == "velocity":
                 values = np.zeros(len(effort))
             self._offer(source, values, now)
         self._moment = _Moment.AFTER_COMMAND
 
     def _offer(self, source: CommandSource, values: Array, now: int) -> None:
-        self._log.add_command(source.topic, self._tick, values)
+        self.log.add_command(source.topic, self._tick, values)
         if self._decided is _Moment.BEFORE_COMMAND:
             return
         refusal = self._commands.offer(source, now, values, now)
         if refusal is not None:
-            self._log.refusals.append((self._time, source.topic, refusal))
+            self.log.refusals.append((self._time, source.topic, refusal))
             if refusal.latches:
                 self._look_at_plant(PlantState.RUNNING)
 
@@ -349,28 +369,11 @@ class _LockstepFlight:
         """Pass a change of the plant's status to the commanders."""
         self._faults_seen, self._moment = self._plant.active, _Moment.AFTER_COMMAND
         before = self._monitor.status
-        self._events += self._monitor.update(activity, self._time)
+        self.log.events += self._monitor.update(activity, self._time)
         status = self._monitor.status
         if status is not before:
-            for name, listener in self._listeners.items():
-                self._take_news(name, listener, status)
-
-    def _take_news(self, name: str, listener: PlantListener, status: PlantStatus) -> None:
-        owner = self._planner if name == "planner" else self._controller
-        assert owner is not None
-        for news in listener.take(status, "plant"):
-            match news:
-                case Stopped():
-                    owner.executive.plant_stopped(
-                        news.why, news.commanded_until_ns, news.rests_since_ns
-                    )
-                case Change():
-                    raise AssertionError("this plant is neither reset nor rearmed")
-        if isinstance(owner, _Planner):
-            owner.executive.plant_rests = listener.rests
-            self._take_outputs(owner)
-        else:
-            owner.executive.plant_blocked = bool(listener.blocked)
+            for commander in self._commanders:
+                commander.receive_plant_status(status)
 
     # -- goals and statuses -------------------------------------------------------------------
 
@@ -379,45 +382,21 @@ class _LockstepFlight:
         scenario, goal = self._scenario, self._scenario.goal
         # A pose is checked, and its quaternion scaled, where it is received.
         given = Goal.checked(goal.position, goal.quaternion, goal.joint_positions)
-        unshaped = replace(given, joint_positions=None)
         if self._planner is not None:
-            self._planner.executive.propose(IdentifiedGoal(given, self._goal_id))
+            self._planner.receive_goal(BASE, *_GOAL_STAMP, lambda: given)
         if self._controller is not None:
-            self._submit(BASE, unshaped)
+            unshaped = replace(given, joint_positions=None)
+            self._controller.receive_goal(BASE, *_GOAL_STAMP, lambda: unshaped)
             tool = scenario.end_effector_goal
             if tool is not None:
-                self._submit(END_EFFECTOR, Goal.checked(tool.position, tool.quaternion))
+                self._controller.receive_goal(
+                    END_EFFECTOR, *_GOAL_STAMP, lambda: Goal.checked(tool.position, tool.quaternion)
+                )
 
-    def _submit(self, key: str, goal: Goal) -> None:
-        assert self._controller is not None
-        executive = self._controller.executive
-        try:
-            executive.submit(key, IdentifiedGoal(goal, self._goal_id))
-        except PlanningError as error:
-            executive.refuse(str(error), self._goal_id)
-
-    def _take_outputs(self, planner: _Planner) -> None:
-        """Take what the planner publishes beside its commands."""
-        outputs = planner.executive.outputs
-        while outputs:
-            output = outputs.popleft()
-            match output:
-                case PlannerStatus():
-                    self._on_status(output)
-                    event = decision_event(output)
-                    if event is not None:
-                        self._report_event(event)
-                case ScheduleStart(schedule, stamp_ns):
-                    self._log.schedules.append((stamp_ns, schedule))
-                case Event():
-                    self._report_event(output)
-                case _:
-                    pass  # For the log of a node.
-
-    def _on_status(self, status: Status) -> None:
+    def take_status(self, status: Status) -> None:
         """Follow the status as the client of a mission does."""
-        self._log.statuses.append((self._tick * self._period_ns, status))
-        if isinstance(status, PlannerStatus) is not (self._decider == "planner"):
+        self.log.statuses.append((self._tick * self._period_ns, status))
+        if isinstance(status, PlannerStatus) is not self.has_planner:
             return
         if self._decided is not None:
             return
@@ -425,9 +404,10 @@ class _LockstepFlight:
         if self._follower.take(status):
             self._decided = self._moment
 
-    def _report_event(self, event: Event) -> None:
+    def take_event(self, event: Event) -> None:
+        """Take an event; its time is now unless it has one."""
         stamped = event if event.time_s is not None else replace(event, time_s=self._time)
-        self._events.append(stamped)
+        self.log.events.append(stamped)
 
     def _result(self, wall_time: float, interrupted: str) -> Flight:
         decision = self._follower.decision
@@ -439,8 +419,8 @@ class _LockstepFlight:
             message = self._monitor.status.message or self._status.message
         plan_time = 0.0
         if self._planner is not None:
-            plan_time = self._planner.executive.statistics.plan_time_s
-        return self._log.flight(
+            plan_time = self._planner.statistics.plan_time_s
+        return self.log.flight(
             self._scenario,
             self._robots.description or self._robots.plant.description,
             outcome=outcome,
@@ -450,91 +430,3 @@ class _LockstepFlight:
             plan_time=plan_time,
             wall_time=wall_time,
         )
-
-
-class _Planner:
-    """What a planner node does with states."""
-
-    def __init__(self, robot: SpaceRobot, config: PlannerConfig, method: GaitMethod | None) -> None:
-        worker = PlanningWorker(robot, config, method)
-        self.executive = Executive(robot, config, worker, GoalFile(""))
-        self._measured = _Measured()
-
-    def answer(self, stamp_ns: int, q: Array, base: BaseMeasurement | None) -> None:
-        """Answer a state; without its base where that is lost."""
-        measured = self._measured
-        measured.stamp_ns, measured.q, measured.measurement = stamp_ns, q, base
-        self.executive.update(measured)
-
-
-class _Controller:
-    """What a node of coordinated control does with states."""
-
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        config: ControllerConfig,
-        on_status: Callable[[ControllerStatus], None],
-        on_event: Callable[[Event], None],
-    ) -> None:
-        self.executive = ControlExecutive(
-            build_controller(robot, config),
-            config,
-            on_status,
-            GoalFile("", GOAL_KEYS),
-            report_event=on_event,
-        )
-        self.states = StateSynchroniser(pose_required=True)
-        self._held = HeldVelocityReference(config.control_period)
-        self._q, self._qdot = np.zeros(robot.n), np.zeros(robot.n)
-        self._base: BaseMeasurement | None = None
-        self._reference: tuple[Array, Array] | None = None
-        self._stamp_ns = 0
-
-    def take_base(self, stamp_ns: int, base: BaseMeasurement) -> None:
-        """Take the pose and the twist of the base."""
-        self._base = base
-        self.states.put_odom(_stamp(stamp_ns))
-
-    def take_reference(self, stamp_ns: int, position: Array, velocity: Array) -> None:
-        """Take the setpoint of a planner."""
-        self._reference = position.copy(), velocity.copy()
-        self.states.put_required(_REFERENCE, _stamp(stamp_ns))
-
-    def take_joints(
-        self, stamp_ns: int, q: Array, qdot: Array, send: Callable[[Array, Array], None]
-    ) -> None:
-        """Take the joints of a state, and answer it; first one whose pose has not come.
-
-        Raises
-        ------
-        CommandError, NotFiniteError
-            The state is refused.
-        """
-        overdue = self.states.overdue()
-        if overdue is not None:
-            # An answer to a lost pose would come a tick late; what it estimates goes on from there.
-            self._answer(overdue, send if overdue is Pairing.WHOLE else None)
-        self._stamp_ns, self._q[:], self._qdot[:] = stamp_ns, q, qdot
-        self.states.put_joint_states(_stamp(stamp_ns))
-        pairing = self.states.ready()
-        if pairing is not None:
-            self._answer(pairing, send)
-
-    def _answer(self, pairing: Pairing, send: Callable[[Array, Array], None] | None) -> None:
-        measured, base = None, self._base
-        if pairing is Pairing.WHOLE and base is not None:
-            pose, twist = base.pose, base.twist
-            measured = ControlState(pose[:3], pose[3:], twist[:3], twist[3:], self._q, self._qdot)
-        reference = None
-        if self._reference is not None:
-            reference = Reference(joints=self._held.at_command(*self._reference))
-        now = self._stamp_ns / SECOND
-        result = self.executive.command(now, measured, self._q, self._qdot, reference)
-        if send is not None:
-            send(result.realised.tau, result.realised.wrench_B)
-        self.executive.evaluate(now, result)
-
-
-def _stamp(stamp_ns: int) -> bytes:
-    return bytes(HEADER_STAMP.start) + stamp_bytes(stamp_ns)

@@ -26,7 +26,6 @@ from spacerobot_ros.messages.layout import (
 )
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.execution.state_average import BaseMeasurement
 from spacerobot_ros.simulation.commands import (
     CommandSource,
     CommandValidator,
@@ -47,6 +46,8 @@ _LONGEST = 10_000
 
 _ROOM = 4096
 """Bytes for the header of a message of joints, and for a writer that packs it differently."""
+
+_POSE, _TWIST = "pose.pose.position.x", "twist.twist.linear.x"
 
 Quantity = Literal["position", "velocity", "effort"]
 """The numbers of a JointState."""
@@ -371,54 +372,33 @@ class JointReader:
             self._order = order
 
 
-class StateReader:
-    """The :class:`~spacerobot_ros.planning.execution.state_average.MeasuredState` of raw messages.
+class MessageDecoder:
+    """Reads measured states and references of one robot from serialised messages.
 
-    Everything but the positions of the joints is read only where it is needed.
+    It is the :class:`~spacerobot_ros.commanding.commander.StateDecoder` of the nodes.
 
     Parameters
     ----------
     joint_names
-        The robot's joints.
+        Joints of the robot, in its order.
     """
 
     def __init__(self, joint_names: Sequence[str]) -> None:
-        self.stamp_ns = 0
-        self.base_error: CommandError | None = None
-        """Why the last :meth:`base` could not be read."""
-        self.shape_reader = JointReader(joint_names, ["position"], complete=True)
         self._joints = JointReader(joint_names, ["position", "velocity"], complete=True)
-        self._odom = TemplateReader(
-            ODOMETRY, {"pose.pose.position.x": 7, "twist.twist.linear.x": 6}
-        )
-        self.q = self.shape_reader.values["position"]
+        self._references = JointReader(joint_names, ["position", "velocity"])
+        self._odom = TemplateReader(ODOMETRY, {_POSE: 7, _TWIST: 6})
+        self.q, self.qdot = self._joints.values["position"], self._joints.values["velocity"]
+        self.require, self.accept = self._joints.require, self._joints.accept
 
-    def accept(self, joint_states: bytes, odom: bytes | None) -> None:
-        """Make this the measured state; ``odom`` is of the same stamp, or None.
+    def base(self, odom: bytes) -> tuple[Array, Array]:
+        """Return pose (7,) and twist (6,) of an Odometry."""
+        self._odom.accept(odom)
+        return self._odom.floats(_POSE), self._odom.floats(_TWIST)
 
-        Raises
-        ------
-        CommandError
-            The joints are not those of the robot; the state before stays.
-        """
-        self.stamp_ns = self.shape_reader.accept(joint_states)
-        self._joints_raw, self._odom_raw = joint_states, odom
-
-    def base(self) -> BaseMeasurement | None:
-        """Return pose and twist of the base and the rates of the joints, None without odom."""
-        if self._odom_raw is None:
-            return None
-        try:
-            self._odom.accept(self._odom_raw)
-            self._joints.accept(self._joints_raw)
-        except CommandError as error:
-            self.base_error = error
-            return None
-        return BaseMeasurement(
-            self._odom.floats("pose.pose.position.x"),
-            self._odom.floats("twist.twist.linear.x"),
-            self._joints.values["velocity"],
-        )
+    def joint_reference(self, message: bytes) -> tuple[Array, Array]:
+        """Return positions and rates (n,) of a JointState; joints that it does not name are 0."""
+        self._references.accept(message)
+        return self._references.values["position"], self._references.values["velocity"]
 
 
 class CommandReader:

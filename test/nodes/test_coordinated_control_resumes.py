@@ -220,7 +220,7 @@ def test_a_goal_that_is_aborted_before_the_robot_is_known_is_not_flown_to(
     assert not file.exists()
     assert not harness.call(client, Trigger.Request()).success, "nothing waits any more"
     description.publish(String(data=URDF.read_text("utf-8")))
-    harness.spin_until(lambda: loop.node._robot is not None, "the robot is known")
+    harness.spin_until(lambda: loop.node.commander.robot is not None, "the robot is known")
     np.testing.assert_allclose(loop.answer()[0], 0.0, atol=1e-12)
 
 

@@ -96,7 +96,7 @@ def test_only_the_last_of_the_states_that_wait_is_answered(
     harness: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # On a loaded machine the plant makes up for late ticks: that is no jump of its time here.
-    monkeypatch.setattr("spacerobot_ros.nodes.common.state_times._PACE_SLACK", 1000.0)
+    monkeypatch.setattr("spacerobot_ros.commanding.plant_state._PACE_SLACK", 1000.0)
     flight = Flight(harness, {**SLOW, **BACKGROUND}, REAL_TIME)
     flight.start()
     flight.send(NEAR)

@@ -19,7 +19,6 @@ from support.planner_flight import NEAR, Flight
 from support.ros_harness import Harness
 
 from spacerobot_ros.errors import CommandError, SpaceRobotError
-from spacerobot_ros.flight.state_synchroniser import Pairing, StateSynchroniser
 from spacerobot_ros.messages.builders import path_message
 from spacerobot_ros.messages.readers import JointReader, UnreadableError
 from spacerobot_ros.nodes import PlantNode
@@ -190,7 +189,7 @@ def test_beside_another_robot_a_controller_sees_every_pose(harness: Harness) -> 
         beside = loop.answer()
         np.testing.assert_array_equal(beside[0], alone[0])
         np.testing.assert_array_equal(beside[1], alone[1])
-    state = loop.node._states
+    state = loop.node.commander.states
     assert not state._without_pose
 
 
@@ -210,32 +209,6 @@ def test_beside_another_robot_a_goal_is_reached(harness: Harness) -> None:
 
 
 # -- odom -------------------------------------------------------------------------------------
-
-
-def odom(x: float, tick: int = 1) -> bytes:
-    message = Odometry(child_frame_id="base_link")
-    message.header.stamp.sec = tick
-    message.pose.pose.position.x = x
-    return raw(message)
-
-
-@pytest.mark.parametrize("pose_required", [True, False])
-def test_poses_that_contradict_each_other_are_not_used(*, pose_required: bool) -> None:
-    states = StateSynchroniser(pose_required=pose_required)
-    state = [raw(joints(["a"], (tick, 0))) for tick in range(4)]
-    assert not states.put_odom(odom(0.1))
-    assert states.put_odom(odom(9.0))
-    states.put_joint_states(state[1])
-    assert states.ready() is Pairing.WITHOUT_POSE
-    assert not states.put_odom(odom(0.2, 2))
-    states.put_joint_states(state[2])
-    assert states.ready() is Pairing.WHOLE
-    assert states.put_odom(odom(9.0, 2))
-    assert states.ready() is None
-    assert not states.put_odom(odom(0.3, 3))
-    assert not states.put_odom(odom(0.3, 3))  # The same again, as for a new subscriber.
-    states.put_joint_states(state[3])
-    assert states.ready() is Pairing.WHOLE
 
 
 def test_a_planner_does_not_take_the_pose_of_a_second_node_for_its_own(harness: Harness) -> None:

@@ -227,7 +227,7 @@ def test_a_planner_that_plans_is_busy_and_not_silent(
 ) -> None:
     """A plan that is made at once keeps the planner from its heartbeats, and here nobody else."""
     flight = Watched(harness)
-    plan = flight.planner._executive._worker.plan  # type: ignore[union-attr]
+    plan = flight.planner.commander.executive._worker.plan  # type: ignore[union-attr]
 
     def slow(*given: Any) -> Any:
         end = time.monotonic() + 1.2
@@ -246,7 +246,7 @@ def test_a_planner_that_plans_is_busy_and_not_silent(
         beat(pulse)
 
     monkeypatch.setattr(flight.planner._liveness, "_publish", publish)
-    monkeypatch.setattr(flight.planner._executive._worker, "plan", slow)  # type: ignore[union-attr]
+    monkeypatch.setattr(flight.planner.commander.executive._worker, "plan", slow)  # type: ignore[union-attr]
     flight.send(NEAR)
     flight.wait("executing")
     at = heard.index("busy")

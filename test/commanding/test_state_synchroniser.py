@@ -3,33 +3,30 @@
 from __future__ import annotations
 
 import pytest
-from nav_msgs.msg import Odometry
-from rclpy.serialization import serialize_message
-from sensor_msgs.msg import JointState
 
-from spacerobot_ros.flight.state_synchroniser import Pairing, StateSynchroniser
+from spacerobot_ros.commanding.plant_state import Pairing, StateSynchroniser
 
 WHOLE, WITHOUT_POSE, LATE_POSE = Pairing.WHOLE, Pairing.WITHOUT_POSE, Pairing.LATE_POSE
 
 
-def message(kind: type[Odometry] | type[JointState], tick: int) -> bytes:
-    """Return a message of a tick; ticks are 0.4 s, so that both halves of the stamp matter."""
-    made = kind()
-    made.header.frame_id = "world"
-    made.header.stamp.sec, made.header.stamp.nanosec = divmod(tick * 400_000_000, 1_000_000_000)
-    return bytes(serialize_message(made))
+Message = tuple[str, int, float]
 
 
-def odom(tick: int) -> bytes:
-    return message(Odometry, tick)
+def odom(tick: int, x: float = 0.0) -> Message:
+    return "odom", tick, x
 
 
-def joints(tick: int) -> bytes:
-    return message(JointState, tick)
+def joints(tick: int) -> Message:
+    return "joint_states", tick, 0.0
+
+
+def stamped(message: Message) -> tuple[int, Message]:
+    """Return the stamp of a message of a tick of 0.4 s, and the message, as a commander puts it."""
+    return message[1] * 400_000_000, message
 
 
 class Commander:
-    """What both nodes do with each message, and what they are handed over."""
+    """A commander that records the states that it is handed."""
 
     def __init__(self, *, pose_required: bool) -> None:
         self.states = StateSynchroniser(pose_required=pose_required)
@@ -37,7 +34,7 @@ class Commander:
         self._tick = -1
 
     def odom(self, tick: int) -> None:
-        self.states.put_odom(odom(tick))
+        self.states.put_odom(*stamped(odom(tick)))
         self._poll()
 
     def joints(self, tick: int) -> None:
@@ -45,11 +42,11 @@ class Commander:
         if overdue is not None:
             self.handed.append((overdue, self._tick))
         self._tick = tick
-        self.states.put_joint_states(joints(tick))
+        self.states.put_joints(*stamped(joints(tick)))
         self._poll()
 
     def reference(self, tick: int) -> None:
-        self.states.put_required("joint_reference", joints(tick))
+        self.states.put_required("joint_reference", *stamped(joints(tick)))
         self._poll()
 
     def _poll(self) -> None:
@@ -74,11 +71,11 @@ def test_a_state_is_ready_with_its_second_message(order: tuple[str, str]) -> Non
     assert len(control.handed) == 3
 
 
-def test_stamps_that_differ_in_seconds_or_nanoseconds_alone_are_two_states() -> None:
+def test_poses_of_other_stamps_complete_no_state() -> None:
     control = Commander(pose_required=True)
     control.joints(0)
-    control.odom(5)  # 2 s: the same nanoseconds.
-    control.odom(1)  # 0.4 s: the same seconds.
+    control.odom(5)
+    control.odom(1)
     assert control.handed == []
     control.odom(0)
     assert control.handed == [(WHOLE, 0)]
@@ -160,23 +157,23 @@ def test_every_reference_must_be_of_the_same_tick(late: str) -> None:
     other = {"joint_reference": "base_reference"}.get(late, "joint_reference")
     for topic in (late, other):
         control.states.require(topic)
-        control.states.put_required(topic, joints(1))
+        control.states.put_required(topic, *stamped(joints(1)))
     control.odom(1)
     control.joints(1)
     assert control.handed == [(WHOLE, 1)]
     control.odom(2)
-    control.states.put_required(other, joints(2))
+    control.states.put_required(other, *stamped(joints(2)))
     control.joints(2)
     assert control.handed == [(WHOLE, 1)], "the other reference is of tick 1"
-    control.states.put_required(late, joints(2))
+    control.states.put_required(late, *stamped(joints(2)))
     assert control.states.ready() is WHOLE
     control.odom(3)
-    control.states.put_required(other, joints(3))
+    control.states.put_required(other, *stamped(joints(3)))
     control.joints(3)
     # The pose is there: what is missing is no loss of the pose, now or later.
     assert control.states.overdue() is WHOLE
-    control.states.put_required(late, joints(4))
-    control.states.put_required(other, joints(4))
+    control.states.put_required(late, *stamped(joints(4)))
+    control.states.put_required(other, *stamped(joints(4)))
     control.joints(4)
     assert len(control.handed) == 1, "it waits for its odom"
     control.odom(4)
@@ -187,7 +184,7 @@ def test_a_reference_that_is_no_longer_required_is_forgotten() -> None:
     control = Commander(pose_required=True)
     control.reference(1)
     control.states.require("joint_reference", required=False)
-    assert control.states.latest("joint_reference") == b""
+    assert control.states.latest("joint_reference") is None
     control.odom(2)
     control.joints(2)
     assert control.handed == [(WHOLE, 2)]
@@ -226,58 +223,72 @@ def test_an_old_pose_is_no_pose_of_a_new_state() -> None:
 
 def test_the_messages_themselves_are_kept_as_they_came() -> None:
     states = StateSynchroniser(pose_required=True)
-    assert (states.odom, states.joint_states, states.ready(), states.overdue()) == (
-        b"",
-        b"",
+    assert (states.odom, states.joints, states.ready(), states.overdue()) == (
+        None,
+        None,
         None,
         None,
     )
-    states.put_odom(odom(1))
-    states.put_joint_states(joints(2))
-    assert (states.odom, states.joint_states) == (odom(1), joints(2))
+    states.put_odom(*stamped(odom(1)))
+    states.put_joints(*stamped(joints(2)))
+    assert (states.odom, states.joints) == (odom(1), joints(2))
 
 
 def test_another_pose_of_one_time_is_a_contradiction_unless_the_plant_was_reset() -> None:
     states = StateSynchroniser(pose_required=True)
-    moved = Odometry()
-    moved.header.stamp.nanosec, moved.pose.pose.position.x = 1, 0.5
-    here = Odometry()
-    here.header.stamp.nanosec = 1
-    assert not states.put_odom(serialize_message(moved))
-    assert states.put_odom(serialize_message(here))
-    assert states.put_odom(serialize_message(moved))
+    assert not states.put_odom(*stamped(odom(1, 0.5)))
+    assert states.put_odom(*stamped(odom(1)))
+    assert states.put_odom(*stamped(odom(1, 0.5)))
     states.forget_pose()
-    assert not states.put_odom(serialize_message(here))
+    assert not states.put_odom(*stamped(odom(1)))
 
 
 @pytest.mark.parametrize("pose_required", [False, True])
 def test_a_pose_after_a_reset_is_not_that_of_joints_before_it(*, pose_required: bool) -> None:
     states = StateSynchroniser(pose_required=pose_required)
-    states.put_odom(odom(3))
-    states.put_joint_states(joints(3))
+    states.put_odom(*stamped(odom(3)))
+    states.put_joints(*stamped(joints(3)))
     assert states.ready() is Pairing.WHOLE
     states.forget_pose()
-    states.put_odom(odom(3))
+    states.put_odom(*stamped(odom(3)))
     assert states.ready() is None
-    states.put_joint_states(joints(3))
+    states.put_joints(*stamped(joints(3)))
     assert states.ready() is Pairing.WHOLE
     # Joints that were not handed over may be those after the reset.
-    states.put_joint_states(joints(4))
+    states.put_joints(*stamped(joints(4)))
     states.forget_pose()
-    states.put_odom(odom(4))
+    states.put_odom(*stamped(odom(4)))
     assert states.ready() in (Pairing.WHOLE, Pairing.LATE_POSE)
 
 
 def test_a_topic_that_is_required_again_keeps_its_message() -> None:
     states = StateSynchroniser(pose_required=True)
     states.require("joint_reference")
-    assert states.latest("joint_reference") == b""
-    states.put_odom(odom(3))
-    states.put_joint_states(joints(3))
+    assert states.latest("joint_reference") is None
+    states.put_odom(*stamped(odom(3)))
+    states.put_joints(*stamped(joints(3)))
     assert states.ready() is None, "it waits for its reference"
-    states.put_required("joint_reference", joints(3))
+    states.put_required("joint_reference", *stamped(joints(3)))
     states.require("joint_reference")
     assert states.latest("joint_reference") == joints(3)
     assert states.ready() is WHOLE
     states.require("joint_reference", required=False)
-    assert states.latest("joint_reference") == b""
+    assert states.latest("joint_reference") is None
+
+
+@pytest.mark.parametrize("pose_required", [True, False])
+def test_poses_that_contradict_each_other_are_not_used(*, pose_required: bool) -> None:
+    states = StateSynchroniser(pose_required=pose_required)
+    assert not states.put_odom(*stamped(odom(1, 0.1)))
+    assert states.put_odom(*stamped(odom(1, 9.0)))
+    states.put_joints(*stamped(joints(1)))
+    assert states.ready() is Pairing.WITHOUT_POSE
+    assert not states.put_odom(*stamped(odom(2, 0.2)))
+    states.put_joints(*stamped(joints(2)))
+    assert states.ready() is Pairing.WHOLE
+    assert states.put_odom(*stamped(odom(2, 9.0)))
+    assert states.ready() is None
+    assert not states.put_odom(*stamped(odom(3, 0.3)))
+    assert not states.put_odom(*stamped(odom(3, 0.3)))  # The same again, as for a new subscriber.
+    states.put_joints(*stamped(joints(3)))
+    assert states.ready() is Pairing.WHOLE

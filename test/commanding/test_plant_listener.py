@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.flight.plant_listener import Change, PlantListener, Stopped
+from spacerobot_ros.commanding.plant_state import Change, PlantListener, Stopped
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
 RUNNING = PlantStatus(PlantState.RUNNING, "A command is in force.")

@@ -1,23 +1,17 @@
-"""Which stamps of states are believed: lost messages, restarts, times that are not the plant's."""
+"""Stamps that are accepted: lost messages, restarts, times that are not the plant's."""
 
 from __future__ import annotations
 
 import pytest
-from nav_msgs.msg import Odometry
-from rclpy.serialization import serialize_message
-from sensor_msgs.msg import JointState
 
-from spacerobot_ros.nodes.common.state_times import StateTimes
+from spacerobot_ros.commanding.plant_state import Stamped, StampFilter
+from spacerobot_ros.times import SECOND
 
 PERIOD = 0.05
 
 
-def message(kind: type[Odometry] | type[JointState], seconds: float) -> bytes:
-    made = kind()
-    made.header.frame_id = "world"
-    stamp = divmod(round(seconds * 1e9), 1_000_000_000)
-    made.header.stamp.sec, made.header.stamp.nanosec = stamp
-    return bytes(serialize_message(made))
+def message(topic: str, seconds: float) -> Stamped:
+    return Stamped(round(seconds * SECOND), (topic, seconds))
 
 
 class Listener:
@@ -25,7 +19,7 @@ class Listener:
 
     def __init__(self, pace: float = 1.0) -> None:
         self.wall, self.pace, self.time = 100.0, pace, 40.0
-        self.times = StateTimes(PERIOD, clock=lambda: self.wall)
+        self.times = StampFilter(PERIOD, clock=lambda: self.wall)
         self.believed: list[float] = []
         """The times of the states that were admitted, s."""
 
@@ -38,10 +32,10 @@ class Listener:
             assert self.joints(self.time)
 
     def odom(self, seconds: float) -> bool:
-        return self.times.admits_odom(message(Odometry, seconds))
+        return self.times.admits_odom(*message("odom", seconds))
 
     def joints(self, seconds: float) -> bool:
-        admitted = self.times.admits(message(JointState, seconds))
+        admitted = self.times.admits(*message("joint_states", seconds))
         if admitted:
             self.believed.append(seconds)
         return admitted
@@ -53,8 +47,8 @@ class Listener:
             self.look()
         self.wall += wall % 0.1
 
-    def look(self) -> tuple[bytes, bytes] | None:
-        return self.times.believed()
+    def look(self) -> tuple[Stamped | None, Stamped] | None:
+        return self.times.accepted_jump()
 
 
 @pytest.mark.parametrize("pace", [1.0, 10.0, 500.0])
@@ -124,7 +118,7 @@ def test_a_restarted_plant_is_believed_when_nothing_contradicts_it(at: float) ->
         listener.wall += 0.1
         assert looks < 5
     assert looks >= 2
-    assert believed == (message(Odometry, at), message(JointState, at))
+    assert believed == (message("odom", at), message("joint_states", at))
     assert listener.joints(at + PERIOD)
     assert not listener.joints(listener.time + PERIOD)
     assert listener.times.ignored == 0

@@ -1,0 +1,477 @@
+"""Commanders without ROS: the answers of a planner or a controller to the states of a plant.
+
+A commander is given messages as they come (goals, odom, joints, the status of the plant) and calls
+its :class:`CommanderHost` in order: with statuses, events, lines for the log, and commands. Nodes
+are hosts that convert messages; the loop without ROS is one that passes arrays.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Literal, Protocol
+
+from spacerobot_ros.commanding.goal_follower import Status, decision_event
+from spacerobot_ros.commanding.plant_state import (
+    Change,
+    PlantListener,
+    Stamped,
+    StampFilter,
+    StateSynchroniser,
+    Stopped,
+)
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.executive import ControlExecutive
+from spacerobot_ros.errors import CommandError, PlanningError
+from spacerobot_ros.events import Event
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.executive import Executive
+from spacerobot_ros.planning.execution.goal_file import GoalFile, GoalIds, IdentifiedGoal
+from spacerobot_ros.planning.execution.status import ScheduleStart
+from spacerobot_ros.simulation.status import PlantStatus
+
+_STANDSTILL = 0.005
+"""Wall s without an answer after which only the last of the states that wait is answered."""
+
+_REPORT_PERIOD = 1.0
+"""Least wall s between two warnings about ignored states."""
+
+_COMPLAINT_PERIOD = 5.0
+"""Least wall s between two lines about the same fault of messages."""
+
+LogLevel = Literal["debug", "info", "warning", "error"]
+
+
+class Activity(Enum):
+    """Whether a commander answers states."""
+
+    INACTIVE = "inactive"
+    ACTIVE = "active"
+    DECIDED = "decided"
+    """It was to stop with the decision about a goal (``stop_when_decided``)."""
+
+
+class CommanderHost(Protocol):
+    """The surroundings of a commander: a node, a loop without ROS, or a test."""
+
+    def send_command(self, stamp_ns: int) -> None:
+        """Send the present values of the commander as the answer to the state of this stamp."""
+
+    def publish_status(self, status: Any) -> None:
+        """Publish a status of the goal."""
+
+    def report_event(self, event: Event) -> None:
+        """Publish an event."""
+
+    def announce(self, start: ScheduleStart) -> None:
+        """Publish a schedule that begins; only a planner has any."""
+
+    def log(self, level: LogLevel, message: str) -> None:
+        """Write a line into the log."""
+
+    def has_publisher(self, topic: str) -> bool:
+        """Whether a publisher of odom, or of a reference, is connected."""
+
+    def waiting_states(self) -> tuple[Iterable[Stamped], Iterable[Stamped]]:
+        """Return the odoms and joints that have come and were not given to the commander yet."""
+
+
+class StateDecoder(Protocol):
+    """Reads the messages of one robot, which are opaque to a commander."""
+
+    q: Array
+    """Positions (n,) of the joints that were accepted last, m or rad."""
+    qdot: Array
+    """Their rates (n,), m/s or rad/s."""
+
+    def require(self, joints: Any) -> None:
+        """Refuse joints of another robot: CommandError."""
+
+    def accept(self, joints: Any) -> int:
+        """Read joints into ``q`` and ``qdot``; return their stamp, ns, or raise CommandError."""
+
+    def base(self, odom: Any) -> tuple[Array, Array]:
+        """Return pose (7,) and twist (6,) of an odom or base reference, or raise CommandError."""
+
+    def joint_reference(self, message: Any) -> tuple[Array, Array]:
+        """Return positions and rates (n,) of a joint reference, or raise CommandError."""
+
+
+@dataclass(frozen=True, eq=False)
+class StateArrays:
+    """A state as arrays: joints, and where it is measured the base; all messages in one."""
+
+    stamp_ns: int
+    q: Array
+    qdot: Array
+    pose: Array | None = None
+    twist: Array | None = None
+
+
+class ArrayDecoder:
+    """A :class:`StateDecoder` of :class:`StateArrays`."""
+
+    q: Array
+    qdot: Array
+
+    def require(self, joints: StateArrays) -> None:
+        """Accept any joints."""
+
+    def accept(self, joints: StateArrays) -> int:
+        """Take the joints as they are."""
+        self.q, self.qdot = joints.q, joints.qdot
+        return joints.stamp_ns
+
+    def base(self, odom: StateArrays) -> tuple[Array, Array]:
+        """Return pose and twist."""
+        assert odom.pose is not None
+        assert odom.twist is not None
+        return odom.pose, odom.twist
+
+    def joint_reference(self, message: StateArrays) -> tuple[Array, Array]:
+        """Return positions and rates."""
+        return message.q, message.qdot
+
+
+class Commander(ABC):
+    """The part that planners and controllers share.
+
+    States are answered while the commander is active and knows its robot, and only those of the
+    plant's present time (:class:`StampFilter`). Goals that come before the robot wait for it. All
+    goals are given up when the plant reports that it does not obey (:class:`PlantListener`).
+
+    Parameters
+    ----------
+    config
+        Parameters of the commander.
+    host
+        Its surroundings.
+    goal_keys
+        What goals may be for.
+    pose_required
+        Whether a state waits for its odom.
+    clock
+        Returns the wall time, s.
+    """
+
+    executive: Executive | ControlExecutive | None = None
+
+    def __init__(
+        self,
+        config: PlannerConfig | ControllerConfig,
+        host: CommanderHost,
+        goal_keys: tuple[str, ...],
+        *,
+        pose_required: bool,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.config, self.host, self._clock = config, host, clock
+        self.activity = Activity.INACTIVE
+        self.robot: SpaceRobot | None = None
+        self.stamps = StampFilter(config.control_period, clock)
+        self.states = StateSynchroniser(pose_required=pose_required)
+        self.plant = PlantListener()
+        self._decoder: StateDecoder | None = None
+        self._goal_file = GoalFile(config.resume_file, goal_keys)
+        self._goal_ids = GoalIds()
+        self._waiting: dict[str, IdentifiedGoal] = {}
+        """Goals that have come before the robot."""
+        self._answered = clock()
+        self._ignored_reported, self._next_report = 0, 0.0
+        self._complained: dict[str, float] = {}
+        """By kind of fault the wall time of the last line about it, s."""
+
+    # -- life ---------------------------------------------------------------------------------
+
+    @property
+    def active(self) -> bool:
+        """Whether states are answered and goals accepted."""
+        return self.activity is Activity.ACTIVE
+
+    def use(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
+        """Command this robot from now on, and accept the goals that wait for it.
+
+        Raises
+        ------
+        SpaceRobotError
+            The configuration does not go with the robot.
+        """
+        self._build(robot, decoder)
+        self.robot, self._decoder = robot, decoder
+        self._follow_plant()
+        waiting, self._waiting = self._waiting, {}
+        for key, goal in waiting.items():
+            self._submit(key, goal)
+
+    def leave_robot(self, why: str) -> None:
+        """Give up the goals and the robot; goals wait for another one."""
+        if self.executive is not None:
+            self._give_up(Stopped(why))
+            self._release()
+        self.robot = self.executive = self._decoder = None
+
+    def activate(self) -> None:
+        """Answer states from now on; resume the goals that an earlier end cut off.
+
+        Raises
+        ------
+        ParameterError
+            The file of goals is refused.
+        """
+        self._resume(self._goal_file.load())
+        self.activity = Activity.ACTIVE
+        # A lockstep plant may have been waiting for an answer since before.
+        self.answer()
+
+    def deactivate(self) -> None:
+        """Give up the goals and command nothing any more; the file of goals stays."""
+        if self.activity is not Activity.INACTIVE and self.executive is not None:
+            self._release()
+        self.activity, self._waiting = Activity.INACTIVE, {}
+
+    # -- goals --------------------------------------------------------------------------------
+
+    def receive_goal(
+        self, key: str, sec: int, nanosec: int, read: Callable[[], Goal]
+    ) -> IdentifiedGoal | None:
+        """Accept or refuse a goal; either way a status or the answers to states tell.
+
+        Parameters
+        ----------
+        key
+            What the goal is for.
+        sec, nanosec
+            Stamp of its header, which names it.
+        read
+            Returns the goal, or raises PlanningError with the message of the refusal.
+
+        Returns
+        -------
+        IdentifiedGoal | None
+            The goal, None where it is refused.
+        """
+        goal_id = self._goal_ids.of(sec, nanosec)
+        try:
+            goal = read()
+            if not self.active:
+                raise PlanningError(f"The goal is refused: this node is {self.activity.value}.")
+            if self.plant.blocked:
+                raise PlanningError(self.plant.blocked)
+        except PlanningError as error:
+            self._refuse(str(error), goal_id)
+            return None
+        accepted = IdentifiedGoal(goal, goal_id)
+        self._accept(key, accepted)
+        return accepted
+
+    def abort(self) -> str | None:
+        """Give up all goals; return the message of the answer, None where there was no goal."""
+        if self._waiting:
+            message = "Aborted on request, before the robot was known."
+            self._abort_waiting(message)
+            return message
+        answer = self._abort_goal() if self.active else None
+        self._goal_file.delete()
+        return answer
+
+    def _accept(self, key: str, goal: IdentifiedGoal) -> None:
+        if self.executive is None:
+            self._waiting[key] = goal
+            self._report_waiting(goal, "The goal waits for a robot on robot_description.")
+        else:
+            self._submit(key, goal)
+
+    def _refuse(self, message: str, goal_id: str) -> None:
+        self._publish_decision(self._status("refused", message, goal_id))
+
+    def _abort_waiting(self, message: str) -> None:
+        """Give up the goals that wait for the robot."""
+        *_, goal = self._waiting.values()
+        self._waiting = {}
+        self._goal_file.delete()
+        self._publish_decision(self._status("aborted", message, goal.goal_id))
+
+    def _publish_decision(self, status: Status) -> None:
+        """Publish a status, and the event where it decides a goal."""
+        self._publish(status)
+        event = decision_event(status)
+        if event is not None:
+            self.host.report_event(event)
+
+    def _publish(self, status: Status) -> None:
+        self.host.publish_status(status)
+        if status.state.decided and self.config.stop_when_decided and self.active:
+            self.activity = Activity.DECIDED
+
+    # -- states -------------------------------------------------------------------------------
+
+    def receive_odom(self, stamp_ns: int, odom: Any) -> None:
+        """Take an odom as it comes; those of another time are set aside."""
+        if self.stamps.admits_odom(stamp_ns, odom):
+            self.take_odom(stamp_ns, odom)
+
+    def receive_joints(self, stamp_ns: int, joints: Any) -> None:
+        """Take joints as they come: those of another time are set aside, and late ones skipped."""
+        if self._clock() - self._answered > _STANDSTILL:
+            self._take_last(Stamped(stamp_ns, joints))
+        elif self._of_the_robot(joints) and self.stamps.admits(stamp_ns, joints):
+            self.take_joints(stamp_ns, joints)
+        self._answered = self._clock()
+
+    def take_odom(self, stamp_ns: int, odom: Any) -> None:
+        """Take an odom of the present time, and answer the state that it completes."""
+        if self.states.put_odom(stamp_ns, odom):
+            self._complain(
+                "contradiction",
+                "odom: two messages of one time differ; more than one node publishes it, and such "
+                "poses are not used.",
+            )
+        self.answer()
+
+    def take_joints(self, stamp_ns: int, joints: Any) -> None:
+        """Take joints of the present time, and answer the state that they complete."""
+        self.states.put_joints(stamp_ns, joints)
+        self.answer()
+
+    def look(self) -> str:
+        """Take a state that was set aside once its time is accepted; to be called ten times a s.
+
+        Returns
+        -------
+        str
+            A warning about messages that were ignored, at most once a second; empty: none.
+        """
+        stamps = self.stamps
+        # A plant that is paused publishes nothing that could contradict it.
+        jump = None if self.plant.paused else stamps.accepted_jump()
+        if jump is not None:
+            odom, joints = jump
+            if odom is not None:
+                self.take_odom(*odom)
+            self.take_joints(*joints)
+        if stamps.ignored > self._ignored_reported and self._clock() >= self._next_report:
+            self._ignored_reported = stamps.ignored
+            self._next_report = self._clock() + _REPORT_PERIOD
+            self.host.log("warning", stamps.last_ignored)
+            return stamps.last_ignored
+        return ""
+
+    def _take_last(self, joints: Stamped) -> None:
+        """Answer only the last of the states that wait after this process stood still.
+
+        An answer to one before it comes too late, and the motion of the joints before the first
+        answer does not tell whether they obey it.
+        """
+        waiting, others = self.host.waiting_states()
+        odoms, skipped = list(waiting), []
+        for newer in others:
+            ahead = newer.stamp_ns - joints.stamp_ns
+            if (
+                ahead > 0
+                and self.stamps.would_admit(newer.stamp_ns)
+                and self._of_the_robot(newer.message)
+            ):
+                joints = newer
+            else:
+                skipped.append(newer)
+        for each in (joints, *skipped):
+            if self._of_the_robot(each.message) and self.stamps.admits(*each):
+                for odom in odoms:
+                    if odom.stamp_ns >= self.stamps.now_ns:
+                        self.receive_odom(*odom)
+                odoms = []
+                self.take_joints(*each)
+
+    def _of_the_robot(self, joints: Any) -> bool:
+        # Those of another robot neither tell the time nor take the place of this one's.
+        try:
+            if self._decoder is not None:
+                self._decoder.require(joints)
+        except CommandError as error:
+            self._complain("joints", f"joint_states: {error}.")
+            return False
+        return True
+
+    def _complain(self, kind: str, message: str) -> None:
+        """Log a fault of messages, which may come with each of them."""
+        now = self._clock()
+        if now - self._complained.get(kind, -_COMPLAINT_PERIOD) >= _COMPLAINT_PERIOD:
+            self._complained[kind] = now
+            self.host.log("error", message)
+
+    # -- the plant ----------------------------------------------------------------------------
+
+    def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
+        """React to a status of the plant of this name."""
+        for change in self.plant.take(status, name):
+            if isinstance(change, Stopped):
+                self._give_up(change)
+                continue
+            if change is Change.RESET:
+                self.states.forget_pose()
+            if self.executive is not None:
+                self._plant_changed(change)
+        self._follow_plant()
+
+    def plant_silent(self, message: str) -> None:
+        """Give up the goals: nothing comes from the plant any more."""
+        self._give_up(Stopped(message))
+
+    def _give_up(self, stopped: Stopped) -> None:
+        if self.executive is not None:
+            self.executive.plant_stopped(
+                stopped.why, stopped.commanded_until_ns, stopped.rests_since_ns
+            )
+            self._hand_out()
+        elif self._waiting and stopped.commanded_until_ns is None:
+            self._abort_waiting(f"Aborted by the plant: {stopped.why}")
+
+    # -- differences --------------------------------------------------------------------------
+
+    @abstractmethod
+    def _status(self, state: str, message: str, goal_id: str) -> Status:
+        """Return the status of a goal that the executive does not know."""
+
+    @abstractmethod
+    def _build(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
+        """Build the executive."""
+
+    @abstractmethod
+    def _release(self) -> None:
+        """Give up everything that the executive does."""
+
+    @abstractmethod
+    def _resume(self, saved: Mapping[str, IdentifiedGoal]) -> None:
+        """Accept the goals of an earlier commander."""
+
+    @abstractmethod
+    def _submit(self, key: str, goal: IdentifiedGoal) -> None:
+        """Give a goal to the executive."""
+
+    @abstractmethod
+    def _abort_goal(self) -> str | None:
+        """Have the executive give up its goals; return what the robot does then."""
+
+    @abstractmethod
+    def answer(self) -> None:
+        """Answer the state that is ready, if one is and the commander is active."""
+
+    @abstractmethod
+    def _plant_changed(self, change: Change) -> None:
+        """Have the executive react to a change."""
+
+    @abstractmethod
+    def _follow_plant(self) -> None:
+        """Have the executive know whether the plant obeys."""
+
+    def _report_waiting(self, goal: IdentifiedGoal, message: str) -> None:  # noqa: B027
+        """Report a goal that nothing is done for yet."""
+
+    def _hand_out(self) -> None:  # noqa: B027
+        """Pass on the outputs that the executive has collected."""

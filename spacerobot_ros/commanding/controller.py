@@ -1,0 +1,189 @@
+"""Coordinated control without ROS: every state is answered with a wrench and joint efforts."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.commanding.commander import Activity, Commander, CommanderHost, StateDecoder
+from spacerobot_ros.commanding.plant_state import Change, Pairing
+from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, Reference
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
+from spacerobot_ros.control.reference import HeldVelocityReference
+from spacerobot_ros.control.status import ControllerState, ControllerStatus
+from spacerobot_ros.errors import CommandError, PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
+from spacerobot_ros.times import SECOND
+
+JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
+"""Topics of references for a controller; where one has a publisher, every state waits for it."""
+
+# Python looks up the member of an enum as slowly as it calls a function; these are for every state.
+_ACTIVE = Activity.ACTIVE
+_WHOLE = Pairing.WHOLE
+
+
+class ControllerCommander(Commander):
+    """Answers every state with a wrench and joint efforts (:class:`ControlExecutive`).
+
+    ``effort`` (n,), N m or N, and ``wrench`` (6,), N and N m in the base frame, are the values of
+    the last command.
+    """
+
+    config: ControllerConfig
+    executive: ControlExecutive | None
+
+    def __init__(
+        self,
+        config: ControllerConfig,
+        host: CommanderHost,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__(config, host, GOAL_KEYS, pose_required=True, clock=clock)
+        self._posed = self._odom_met = False
+        self.effort, self.wrench = np.zeros(0), np.zeros(6)
+
+    def _status(self, state: str, message: str, goal_id: str) -> ControllerStatus:
+        return ControllerStatus(ControllerState(state), message, goal_id)
+
+    def reconfigure(self, config: ControllerConfig) -> None:
+        """Use other gains, tolerances and times from now on."""
+        self.config = config
+        if self.executive is not None:
+            self.executive.configure(config)
+
+    def activate(self) -> None:
+        """Answer states from now on, each with the references that have a publisher."""
+        for topic in (JOINT_REFERENCE, BASE_REFERENCE):
+            self.states.require(topic, required=self.host.has_publisher(topic))
+        super().activate()
+
+    def receive_reference(self, topic: str, stamp_ns: int, message: Any) -> None:
+        """Take a reference, and answer the state that it completes."""
+        self.states.put_required(topic, stamp_ns, message)
+        self.answer()
+
+    def take_joints(self, stamp_ns: int, joints: Any) -> None:
+        """Take joints of the present time, after answering a state whose odom never came."""
+        overdue = None
+        if self.active and self.executive is not None and not self._waits_for_first_pose():
+            overdue = self.states.overdue()
+        if overdue is not None:
+            # An answer to a lost pose would come a tick late; what it estimates goes on from there.
+            self._answer_as(overdue, send=overdue is _WHOLE)
+        super().take_joints(stamp_ns, joints)
+
+    def _build(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
+        self.executive = ControlExecutive(
+            build_controller(robot, self.config),
+            self.config,
+            self._publish,
+            self._goal_file,
+            lambda message: self.host.log("error", message),
+            self.host.report_event,
+        )
+        self.effort = np.zeros(robot.n)
+        self._held_velocities = HeldVelocityReference(self.config.control_period)
+
+    def _release(self) -> None:
+        assert self.executive is not None
+        self.executive.reset()
+
+    def _resume(self, saved: Mapping[str, IdentifiedGoal]) -> None:
+        if self.executive is None:
+            self._waiting = dict(saved)
+        else:
+            self.executive.resume(saved)
+        if saved:
+            self.host.log("info", "Going on to an earlier goal.")
+
+    def _submit(self, key: str, goal: IdentifiedGoal) -> None:
+        assert self.executive is not None
+        try:
+            self.executive.submit(key, goal)
+        except PlanningError as error:
+            self._refuse(str(error), goal.goal_id)
+
+    def _refuse(self, message: str, goal_id: str) -> None:
+        if self.executive is None:
+            super()._refuse(message, goal_id)
+        else:
+            self.executive.refuse(message, goal_id)
+
+    def _abort_goal(self) -> str | None:
+        if self.executive is None:
+            return None
+        self.executive.abort()
+        return "The robot holds where it is."
+
+    def _plant_changed(self, change: Change) -> None:
+        assert self.executive is not None
+        if change is Change.RESET:
+            self.executive.plant_reset()
+        else:
+            self.executive.plant_obeys_again()
+
+    def _follow_plant(self) -> None:
+        if self.executive is not None:
+            self.executive.plant_blocked = bool(self.plant.blocked)
+
+    def _waits_for_first_pose(self) -> bool:
+        """Whether the state before came when odom was not connected yet: its pose is not lost."""
+        if self._posed:
+            return False
+        before, self._odom_met = self._odom_met, self.host.has_publisher("odom")
+        return not before
+
+    def answer(self) -> None:
+        """Answer a state once, as soon as all its messages are there."""
+        if self.executive is not None and self.activity is _ACTIVE:
+            pairing = self.states.ready()
+            if pairing is not None:
+                self._answer_as(pairing)
+
+    def _answer_as(self, pairing: Pairing, *, send: bool = True) -> None:
+        """Answer one state with one command of the same stamp."""
+        executive, decoder, states = self.executive, self._decoder, self.states
+        assert executive is not None
+        assert decoder is not None
+        self._posed = self._posed or pairing is _WHOLE
+        try:
+            stamp = decoder.accept(states.joints)
+        except CommandError as error:
+            self.stamps.withdraw()
+            self._complain("state", f"The state is refused: {error}")
+            return
+        try:
+            q, qdot, measured = decoder.q, decoder.qdot, None
+            if pairing is _WHOLE:
+                pose, twist = decoder.base(states.odom)
+                measured = ControlState(pose[:3], pose[3:], twist[:3], twist[3:], q, qdot)
+            now = stamp / SECOND
+            result = executive.command(now, measured, q, qdot, self._reference(decoder))
+        except (CommandError, NotFiniteError) as error:
+            self._complain("state", f"The state is refused: {error}")
+            return
+        self.effort[:], self.wrench[:] = result.realised.tau, result.realised.wrench_B
+        if send:
+            self.host.send_command(stamp)
+        executive.evaluate(now, result)
+
+    def _reference(self, decoder: StateDecoder) -> Reference | None:
+        """Return the reference from outside for this state; None if there is none."""
+        base, joints = self.states.latest(BASE_REFERENCE), self.states.latest(JOINT_REFERENCE)
+        if base is None and joints is None:
+            return None
+        base_reference, joint_reference = None, None
+        if base is not None:
+            pose, twist = decoder.base(base)
+            base_reference = PoseReference.with_body_twist(pose[:3], pose[3:], twist[:3], twist[3:])
+        if joints is not None:
+            joint_reference = self._held_velocities.at_command(*decoder.joint_reference(joints))
+        return Reference(base=base_reference, joints=joint_reference)

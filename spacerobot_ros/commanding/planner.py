@@ -1,0 +1,204 @@
+"""The planner without ROS: every state is answered with a setpoint of the joints."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+from spacerobot_ros.commanding.commander import Activity, Commander, CommanderHost, StateDecoder
+from spacerobot_ros.commanding.plant_state import Change, Pairing
+from spacerobot_ros.errors import CommandError
+from spacerobot_ros.events import Event
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.executive import Executive, Transition
+from spacerobot_ros.planning.execution.goal_file import BASE, IdentifiedGoal
+from spacerobot_ros.planning.execution.state_average import BaseMeasurement
+from spacerobot_ros.planning.execution.status import (
+    Notice,
+    PlannerState,
+    PlannerStatistics,
+    PlannerStatus,
+    ScheduleStart,
+    goal_values,
+)
+from spacerobot_ros.planning.execution.tracker import Setpoint
+from spacerobot_ros.planning.execution.worker import PlanningWorker
+
+# Python looks up the member of an enum as slowly as it calls a function; these are for every state.
+_ACTIVE = Activity.ACTIVE
+_WITHOUT_POSE, _LATE_POSE = Pairing.WITHOUT_POSE, Pairing.LATE_POSE
+
+
+class _MeasuredState:
+    """A measured state for the planner: everything but the joints is read where it is needed."""
+
+    def __init__(self, decoder: StateDecoder) -> None:
+        self.decoder = decoder
+        self.stamp_ns = 0
+        self.odom: Any = None
+        self.base_error: CommandError | None = None
+        """Why the last :meth:`base` could not be read."""
+
+    @property
+    def q(self) -> Array:
+        return self.decoder.q
+
+    def base(self) -> BaseMeasurement | None:
+        if self.odom is None:
+            return None
+        try:
+            return BaseMeasurement(*self.decoder.base(self.odom), self.decoder.qdot)
+        except CommandError as error:
+            self.base_error = error
+            return None
+
+
+class PlannerCommander(Commander):
+    """Answers every state with a setpoint of the joints (:class:`Executive`).
+
+    Parameters
+    ----------
+    config, host, clock
+        As of every commander.
+    method
+        Gait method; None: the one that the configuration names.
+    long_work
+        Context in which plans are made that take long.
+    """
+
+    config: PlannerConfig
+    executive: Executive | None
+
+    def __init__(
+        self,
+        config: PlannerConfig,
+        host: CommanderHost,
+        *,
+        method: GaitMethod | None = None,
+        long_work: Callable[[], AbstractContextManager[None]] = nullcontext,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__(config, host, (BASE,), pose_required=False, clock=clock)
+        self._method, self._long_work = method, long_work
+
+    def _status(self, state: str, message: str, goal_id: str) -> PlannerStatus:
+        return PlannerStatus(PlannerState(state), message, goal_id)
+
+    @property
+    def statistics(self) -> PlannerStatistics:
+        """Plans and commands so far."""
+        return PlannerStatistics() if self.executive is None else self.executive.statistics
+
+    @property
+    def setpoint(self) -> Setpoint:
+        """Values of the command for the state that was answered last."""
+        assert self.executive is not None
+        return self.executive.setpoint
+
+    def reconfigure(self, config: PlannerConfig) -> None:
+        """Plan and evaluate with other tolerances from now on."""
+        self.config = config
+        if self.executive is not None:
+            self.executive.config = config
+
+    def interrupt(self) -> None:
+        """Cancel the plan that is being made; may be called in any thread."""
+        if self.executive is not None:
+            self.executive.cancel_plan()
+
+    def _build(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
+        worker = PlanningWorker(robot, self.config, self._method, self._long_work)
+        self.executive = Executive(robot, self.config, worker, self._goal_file)
+        self._measured = _MeasuredState(decoder)
+
+    def _release(self) -> None:
+        assert self.executive is not None
+        commands = self.statistics.commands_published
+        self.host.log("info", f"{commands} commands were published.")
+        self.executive.stop()
+        self._hand_out()
+
+    def _resume(self, saved: Mapping[str, IdentifiedGoal]) -> None:
+        goal = saved.get(BASE)
+        if goal is None:
+            self._publish(PlannerStatus(PlannerState.IDLE, "Waiting for a goal pose."))
+            return
+        self._accept(BASE, goal)
+        self._report_waiting(goal, "Resuming an earlier goal.")
+
+    def _submit(self, key: str, goal: IdentifiedGoal) -> None:
+        assert self.executive is not None
+        self.executive.propose(goal)
+
+    def _report_waiting(self, goal: IdentifiedGoal, message: str) -> None:
+        values = goal_values(goal.goal)
+        self._publish(PlannerStatus(PlannerState.PLANNING, message, goal.goal_id, values))
+
+    def _abort_goal(self) -> str | None:
+        if self.executive is None:
+            return None
+        message = self.executive.abort()
+        self._hand_out()
+        return message
+
+    def _plant_changed(self, change: Change) -> None:
+        assert self.executive is not None
+        if change is Change.RESET:
+            self.executive.plant_reset()
+            self._hand_out()
+
+    def _follow_plant(self) -> None:
+        if self.executive is not None:
+            self.executive.plant_rests = self.plant.rests
+
+    def answer(self) -> None:
+        """Answer a state as soon as its joints are there; only plans need its pose."""
+        executive = self.executive
+        if executive is None or self.activity is not _ACTIVE:
+            return
+        states = self.states
+        pairing = states.ready()
+        if pairing is None:
+            return
+        measured = self._measured
+        measured.odom = None if pairing is _WITHOUT_POSE else states.odom
+        try:
+            measured.stamp_ns = measured.decoder.accept(states.joints)
+        except CommandError as error:
+            self.stamps.withdraw()
+            self._complain("state", f"joint_states: {error}.")
+            return
+        if pairing is _LATE_POSE:
+            # The state was answered without it, and is planned from when the next joints come.
+            executive.observe(measured)
+        else:
+            executive.update(measured)
+            if executive.outputs:
+                self._hand_out()
+                if self.activity is not _ACTIVE:
+                    return
+            self.host.send_command(measured.stamp_ns)
+        if measured.base_error is not None:
+            self._complain("odom", f"odom: {measured.base_error}.")
+            measured.base_error = None
+
+    def _hand_out(self) -> None:
+        assert self.executive is not None
+        outputs, host = self.executive.outputs, self.host
+        while outputs:
+            match outputs.popleft():
+                case PlannerStatus() as status:
+                    self._publish_decision(status)
+                case ScheduleStart() as start:
+                    host.announce(start)
+                case Event() as event:
+                    host.report_event(event)
+                case Notice(severity, message):
+                    host.log(severity.value, message)
+                case Transition(source, event, target):
+                    host.log("debug", f"{source.value} -> {target.value}: {event.value}")

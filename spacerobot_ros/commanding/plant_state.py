@@ -1,0 +1,438 @@
+"""A commander's knowledge of its plant: states of the present time, whole states, its status.
+
+Messages are opaque here: each comes with its stamp, in ns, and is handed over as it came.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, NamedTuple
+
+from spacerobot_ros.simulation.status import PlantState, PlantStatus
+from spacerobot_ros.times import SECOND
+
+_NO_STAMP = -1
+"""The stamp of no message; that of a message is never negative."""
+
+
+class Stamped(NamedTuple):
+    """A message and its stamp, ns."""
+
+    stamp_ns: int
+    message: Any
+
+
+_NOTHING = Stamped(_NO_STAMP, None)
+
+
+# -- states of the present time ---------------------------------------------------------------
+
+SHORTEST_DOUBT = 0.2
+"""Least wall s without a state of the old time before a time jump is accepted."""
+
+_STEP_SLACK = 1.5
+"""Largest distance between two states without a loss, in steps of the plant."""
+
+_PACE_SLACK = 2.0
+"""Largest ratio of the time that lost states took to the time that its pace so far explains."""
+
+_LOOKS = 2
+"""Looks without a state of the old time before a time jump is accepted."""
+
+_LONGEST_STEP = 100
+"""Largest step of a plant with another rate, in control periods."""
+
+
+@dataclass
+class _PendingJump:
+    """A state that is stamped with another time, set aside."""
+
+    since: float
+    """Wall time at which the first state of that time came, s."""
+    joints: Stamped
+    looks: int = 0
+    """Calls of :meth:`StampFilter.accepted_jump` since then."""
+
+
+class StampFilter:
+    """Separates states of the plant's present time from those that are stamped with another one.
+
+    A stamp is plausible
+
+    * within 1.5 steps after the state before, or equal to it: no message was lost;
+    * further ahead by no more than twice the time that passed in as much wall time before:
+      messages were lost, or this process was stopped for a while.
+
+    Any other state is a *time jump*, and set aside. When a state of the old time follows, it is
+    ignored and counted. When none does for 0.2 s of wall time (and for four states), the time has
+    really changed, as after a restart of the plant, and the jump is accepted. A plant in lockstep
+    waits that long for its answer.
+
+    Parameters
+    ----------
+    control_period
+        Time between two states, s.
+    clock
+        Returns the wall time, s.
+    """
+
+    def __init__(self, control_period: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._period = round(control_period * SECOND)
+        self._step = self._period
+        """Time between two states as far as is known, ns."""
+        self._longest = -1
+        """Largest plausible step without a loss, ns; negative before the first state."""
+        self._before_ns, self._wall = _NO_STAMP, 0.0
+        self._origin_ns, self._origin_wall = 0, 0.0
+        """The first state of this time, from which its pace is measured."""
+        self._jump: _PendingJump | None = None
+        self._jump_odom = _NOTHING
+        self._last_jump_ns = 0
+        """Size of the jump that was accepted last, ns."""
+        self.now_ns = 0
+        """Stamp of the last state that was admitted, ns; 0 before the first."""
+        self.ignored = 0
+        """Number of states and poses that were ignored because of their stamps."""
+        self.last_ignored = ""
+        """Message for the user about the last one."""
+
+    def admits(self, stamp_ns: int, joints: Any) -> bool:
+        """Return whether joints are of the present time; others are set aside."""
+        if not 0 <= stamp_ns - self.now_ns <= self._longest and not self._explained(stamp_ns):
+            self._set_aside(Stamped(stamp_ns, joints))
+            return False
+        self._before_ns, self.now_ns = self.now_ns, stamp_ns
+        self._wall = self._clock()
+        if self._jump is not None or self._jump_odom.message is not None:
+            self._ignore_jump()
+        return True
+
+    def would_admit(self, stamp_ns: int) -> bool:
+        """Return whether joints with this stamp would be admitted, and change nothing."""
+        ahead = stamp_ns - self.now_ns
+        return 0 <= ahead <= max(self._longest, self._loss(self._clock()))
+
+    def admits_odom(self, stamp_ns: int, odom: Any) -> bool:
+        """Return whether a pose is of the present time; others are set aside.
+
+        It comes before the joints of its stamp, or after them.
+        """
+        ahead, longest = stamp_ns - self.now_ns, self._longest
+        if -longest <= ahead <= longest or longest < 0:
+            return True
+        if 0 <= ahead <= self._loss(self._clock()):
+            return True
+        self._jump_odom = Stamped(stamp_ns, odom)
+        return False
+
+    def withdraw(self) -> None:
+        """Undo the last admission: the state is not one of the robot."""
+        if self._before_ns == _NO_STAMP:
+            self._longest, self.now_ns = -1, 0
+        else:
+            self.now_ns = self._origin_ns = self._before_ns
+            self._origin_wall = self._wall
+
+    def accepted_jump(self) -> tuple[Stamped | None, Stamped] | None:
+        """Return odom (if it came) and joints that were set aside and whose time is now accepted.
+
+        To be called several times a second; None: no jump is accepted.
+        """
+        jump = self._jump
+        if jump is None:
+            return None
+        # While this process itself stood still, states of the old time may have come unseen.
+        jump.looks += 1
+        if jump.looks < _LOOKS or self._clock() - jump.since < self._patience:
+            return None
+        stamp, now = jump.joints.stamp_ns, self._clock()
+        size = stamp - self.now_ns
+        if size == self._last_jump_ns and 0 < size <= _LONGEST_STEP * self._period:
+            # The plant's rate is another one than this commander's.
+            self._step = size
+            self._longest = round(_STEP_SLACK * size)
+        self._last_jump_ns = size
+        self._before_ns, self.now_ns, self._wall = self.now_ns, stamp, now
+        self._origin_ns, self._origin_wall = stamp, now
+        odom, self._jump, self._jump_odom = self._jump_odom, None, _NOTHING
+        return (odom if odom.stamp_ns == stamp else None), jump.joints
+
+    def _explained(self, stamp_ns: int) -> bool:
+        """Whether a stamp is that of a first state, or lost messages explain it."""
+        now = self._clock()
+        if self._longest < 0:
+            self._longest = round(_STEP_SLACK * self._step)
+            self._origin_ns, self._origin_wall = stamp_ns, now
+            self.now_ns = _NO_STAMP
+            return True
+        return 0 <= stamp_ns - self.now_ns <= self._loss(now)
+
+    def _loss(self, now: float) -> float:
+        """Return the largest plausible step at a wall time where messages were lost, ns."""
+        return self._longest + _PACE_SLACK * self._pace * (now - self._wall)
+
+    @property
+    def _pace(self) -> float:
+        """Simulated ns per wall s of this time so far."""
+        elapsed = self._wall - self._origin_wall
+        return (self.now_ns - self._origin_ns) / elapsed if elapsed > 0 else 0.0
+
+    @property
+    def _patience(self) -> float:
+        """Wall s without a state of the old time after which a jump is accepted."""
+        pace = self._pace
+        return max(SHORTEST_DOUBT, 4 * self._step / pace if pace > 0 else 0.0)
+
+    def _set_aside(self, joints: Stamped) -> None:
+        """Keep a state of another time; it replaces the one before."""
+        jump = self._jump
+        if jump is not None and 0 <= joints.stamp_ns - jump.joints.stamp_ns <= self._longest:
+            jump.joints = joints
+        else:
+            self._jump = _PendingJump(self._clock(), joints)
+
+    def _ignore_jump(self) -> None:
+        """Count the messages that were set aside as ignored: the old time goes on."""
+        joints = _NOTHING if self._jump is None else self._jump.joints
+        for name, given in (("joint_states", joints), ("odom", self._jump_odom)):
+            if given.message is None or given.stamp_ns == self.now_ns:
+                continue
+            ahead = (given.stamp_ns - self.now_ns) / SECOND
+            self.ignored += 1
+            self.last_ignored = (
+                f"A message on '{name}' is ignored: its stamp is {abs(ahead):.4g} s "
+                f"{'ahead of' if ahead > 0 else 'behind'} the time of the states."
+            )
+        self._jump, self._jump_odom = None, _NOTHING
+
+
+# -- whole states -----------------------------------------------------------------------------
+
+
+class Pairing(str, Enum):
+    """Which messages of a state a :class:`StateSynchroniser` hands over."""
+
+    WHOLE = "whole"
+    """Joints and odom of one stamp."""
+
+    WITHOUT_POSE = "without pose"
+    """Joints alone: their odom has not come."""
+
+    LATE_POSE = "late pose"
+    """Odom of a state that was handed over without it before."""
+
+
+# Python looks up the member of an enum as slowly as it calls a function; these are for every state.
+_WHOLE, _WITHOUT_POSE, _LATE_POSE = Pairing.WHOLE, Pairing.WITHOUT_POSE, Pairing.LATE_POSE
+
+
+class StateSynchroniser:
+    """Pairs the latest odom and joints by their stamps, and hands every state over once.
+
+    A commander either requires the pose (a controller) or does not (a planner, which needs it
+    only to plan):
+
+    * *Pose required:* a state is ready when its odom is there. Where odom fails, this is known
+      when the next joints come: the state before is then :meth:`overdue`. From then on states are
+      ready without their pose, until an odom comes again.
+    * *Pose optional:* a state is ready with its joints; odom that comes after them is handed over
+      as a :attr:`Pairing.LATE_POSE`.
+
+    Topics beside these two can be required as well (:meth:`require`): a state then waits for a
+    message of its stamp on each of them.
+
+    Parameters
+    ----------
+    pose_required
+        Whether a state waits for its odom.
+    """
+
+    def __init__(self, *, pose_required: bool) -> None:
+        self._pose_required = pose_required
+        self.odom: Any = None
+        """The latest odom; None before the first."""
+        self.joints: Any = None
+        """The latest joints; None before the first."""
+        self._odom_ns = self._joints_ns = _NO_STAMP
+        self._odom_fresh = self._joints_fresh = self._without_pose = False
+        self._required: dict[str, Stamped] = {}
+        """Latest messages of the topics that are required beside odom and joints."""
+
+    def require(self, topic: str, *, required: bool = True) -> None:
+        """Have states wait for a message on one more topic from now on, or no longer."""
+        if not required:
+            self._required.pop(topic, None)
+        else:
+            self._required.setdefault(topic, _NOTHING)
+
+    def put_odom(self, stamp_ns: int, odom: Any) -> bool:
+        """Accept an odom; poses are measured (again).
+
+        Return whether it contradicts the one before, of the same stamp: then another node
+        publishes odom, too, and the state has no pose.
+        """
+        contradicts = stamp_ns == self._odom_ns and odom != self.odom
+        self._odom_ns, self.odom = stamp_ns, odom
+        self._odom_fresh, self._without_pose = not contradicts, contradicts
+        return contradicts
+
+    def forget_pose(self) -> None:
+        """Take no later odom for a contradiction: the plant shows another state of one time.
+
+        Nor is it the pose of joints that were handed over before.
+        """
+        self.odom, self._odom_ns, self._odom_fresh = None, _NO_STAMP, False
+        if not self._joints_fresh:
+            self.joints, self._joints_ns = None, _NO_STAMP
+
+    def put_joints(self, stamp_ns: int, joints: Any) -> None:
+        """Accept joints; see :meth:`overdue` for the state before."""
+        self.joints, self._joints_ns = joints, stamp_ns
+        self._joints_fresh = True
+
+    def put_required(self, topic: str, stamp_ns: int, message: Any) -> None:
+        """Accept a message of another topic, which is required from now on."""
+        self._required[topic] = Stamped(stamp_ns, message)
+
+    def latest(self, topic: str) -> Any:
+        """Return the latest message of a required topic; None if there is none."""
+        return self._required.get(topic, _NOTHING).message
+
+    def ready(self) -> Pairing | None:
+        """Hand over the state that is ready; None if there is none, or it was handed over."""
+        stamp = self._joints_ns
+        together = stamp == self._odom_ns
+        if not self._pose_required:
+            posed = self._odom_fresh and together
+            self._odom_fresh = self._odom_fresh and not together
+            if self._joints_fresh:
+                self._joints_fresh = False
+                return _WHOLE if posed else _WITHOUT_POSE
+            return _LATE_POSE if posed else None
+        if (
+            self._joints_fresh
+            and (self._without_pose or (self._odom_fresh and together))
+            and all(given.stamp_ns == stamp for given in self._required.values())
+        ):
+            self._odom_fresh = self._joints_fresh = False
+            return _WITHOUT_POSE if self._without_pose else _WHOLE
+        return None
+
+    def overdue(self) -> Pairing | None:
+        """Hand over a state that was never ready; to be called when the next joints come.
+
+        :attr:`Pairing.WITHOUT_POSE`: its odom is missing, and states are ready without from now
+        on. :attr:`Pairing.WHOLE`: another required topic is silent.
+        """
+        if not self._joints_fresh:
+            return None
+        self._joints_fresh = False
+        self._without_pose = self._joints_ns != self._odom_ns
+        return _WITHOUT_POSE if self._without_pose else _WHOLE
+
+
+# -- the status of the plant ------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Stopped:
+    """The plant does not obey commands.
+
+    Attributes
+    ----------
+    why
+        Message of the plant.
+    commanded_until_ns
+        Where it rests because no command came: the stamp of the last one; None: it obeys nothing.
+    rests_since_ns
+        Time since which it rests then, as far as is known.
+    """
+
+    why: str
+    commanded_until_ns: int | None = None
+    rests_since_ns: int = 0
+
+
+class Change(Enum):
+    """Other changes that a plant reports."""
+
+    OBEYS = "obeys"
+    """Commands pass again."""
+    RESET = "reset"
+    """The robot is back in its initial state."""
+
+
+class PlantListener:
+    """Follows plant/status: whether the plant obeys, and its resets; none need be published."""
+
+    def __init__(self) -> None:
+        self._status: PlantStatus | None = None
+        self._name = "plant"
+
+    @property
+    def blocked(self) -> str:
+        """Reason why no goal is accepted now, for the user; empty: goals are accepted."""
+        status = self._status
+        if status is None:
+            return ""
+        if status.latched_fault:
+            return f"The plant is latched: {status.latched_fault}; call '{self._name}/rearm' first."
+        if status.state is PlantState.FAILED:
+            return f"The plant has failed: {status.message}"
+        return ""
+
+    @property
+    def rests(self) -> bool:
+        """Whether no command is in force: none has come, or none is obeyed."""
+        status = self._status
+        return status is not None and (status.state is PlantState.RESTING or bool(self.blocked))
+
+    @property
+    def paused(self) -> bool:
+        """Whether the plant's time stands still."""
+        return self._status is not None and self._status.state is PlantState.PAUSED
+
+    def take(self, status: PlantStatus, name: str = "plant") -> list[Stopped | Change]:
+        """Take the next status of the plant of this name; return the changes to react to.
+
+        Statuses may be missed: the counters of a plant tell the changes in between.
+        """
+        before, was_blocked = self._status, bool(self.blocked)
+        self._status, self._name = status, name
+        changes: list[Stopped | Change] = []
+        if self.blocked:
+            if before is None or not was_blocked or status.latched_fault != before.latched_fault:
+                changes.append(Stopped(status.message))
+            return changes
+        if before is None:
+            return changes
+        if status.rearms > before.rearms and not was_blocked:
+            changes.append(Stopped("Commands pass again after a fault was latched."))
+        if status.timeouts > before.timeouts or (
+            status.reason == "timeout" and before.reason != "timeout"
+        ):
+            rested = _rested(status)
+            if rested is not None:
+                changes.append(rested)
+        if status.resets > before.resets:
+            changes.append(Change.RESET)
+        if was_blocked or status.rearms > before.rearms:
+            changes.append(Change.OBEYS)
+        return changes
+
+
+def _rested(status: PlantStatus) -> Stopped | None:
+    """Return since when a plant rests, or has rested; None if its times are not finite."""
+    last, since = status.last_command_s, status.time_s
+    last = since if last is None else last
+    why = status.message
+    if status.reason != "timeout":
+        since, why = last, "The joints were brought to rest: no command came in time."
+    if not (math.isfinite(last) and math.isfinite(since)):
+        return None
+    return Stopped(why, round(last * SECOND), round(since * SECOND))
