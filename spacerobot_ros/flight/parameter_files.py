@@ -14,7 +14,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.parameters import declared
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.viewer.config import ViewerConfig
+from spacerobot_ros.viewer.server import ViewerConfig
 
 CONFIGS: Mapping[str, type[Any]] = {
     "plant": PlantConfig,

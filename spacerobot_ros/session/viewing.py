@@ -1,4 +1,4 @@
-"""The viewer beside a command, in a process of its own: it must not take time from the plant."""
+"""A viewer process beside a command, of lower priority, so that it takes no time from the plant."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from spacerobot_ros.termination import child_options
 from spacerobot_ros.viewer.server import require_viser
 
 _START = 30.0
-"""Wall s within which the page must be there."""
+"""Wall time within which the page must be served, s."""
 
 _END = 1.5
-"""Wall s that the process has to end after a signal before it is killed."""
+"""Wall time after SIGINT at which the process is killed, s."""
 
 _NICENESS = 5
 
@@ -38,18 +38,18 @@ _CHILD = "spacerobot_ros.session.child"
 def viewing(
     parameters: Mapping[str, Value], show: Callable[[str], None], namespace: str = ""
 ) -> Iterator[None]:
-    """Have a viewer run while something else does; ``show`` is given the line with its address.
+    """Run a viewer while the block lasts; ``show`` receives the line with its address.
 
-    A viewer that ends by itself ends nothing else; that it did is shown in the end.
+    If the viewer ends early, the block goes on and a line at its end reports it.
 
     Parameters
     ----------
     parameters
-        Of the viewer, by name.
+        Parameters of the viewer, by name.
     show
-        Shows a line to people.
+        Shows a line to the user.
     namespace
-        Of the stack that it shows.
+        Namespace of the stack.
 
     Raises
     ------
@@ -80,30 +80,30 @@ def viewing(
         try:
             show(_announcement(process, log))
             for line in _lines(log):
-                show(line)  # Of an address that others reach.
+                show(line)  # A warning about an address that others can reach.
             yield
             if process.poll() is not None:
-                show(f"The viewer had ended before: {(_lines(log) or ['it was killed.'])[-1]}")
+                show(f"The viewer ended early: {(_lines(log) or ['it was killed.'])[-1]}")
         finally:
             _end(process)
 
 
 def yield_to_flight(pid: int) -> None:
-    """Have the processes of a session give way to everything that flies."""
+    """Lower the priority of a process below everything that flies."""
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, pid, _NICENESS)
-    # Linux may share the processor among sessions first; niceness counts within each alone.
+    # Linux may divide the processor among sessions first; niceness counts within a session only.
     with suppress(OSError):
         Path(f"/proc/{pid}/autogroup").write_text(str(_NICENESS), "ascii")
 
 
 def _lines(log: Path) -> list[str]:
-    """Return what the viewer has written to standard error."""
+    """Return the lines that the viewer has written to standard error."""
     return log.read_text("utf-8", errors="replace").strip().splitlines()
 
 
 def _announcement(process: subprocess.Popen[bytes], log: Path) -> str:
-    """Return the line that the viewer writes once its page is there."""
+    """Return the line that the viewer prints once its page is served."""
     assert process.stdout is not None
     text, deadline = b"", time.monotonic() + _START
     while not text.endswith(b"\n"):
@@ -112,7 +112,7 @@ def _announcement(process: subprocess.Popen[bytes], log: Path) -> str:
             more = os.read(process.stdout.fileno(), 4096)
             if not more:
                 lines = _lines(log)
-                raise SpaceRobotError(lines[-1] if lines else "The viewer has ended at its start.")
+                raise SpaceRobotError(lines[-1] if lines else "The viewer ended at its start.")
             text += more
         elif time.monotonic() > deadline:
             raise SpaceRobotError(f"The viewer has not served its page within {_START:g} s.")

@@ -1,6 +1,6 @@
-"""The page on which a robot is watched and steered; it knows no ROS.
+"""The live page that shows and steers a robot, without ROS.
 
-The page shows a :class:`~spacerobot_ros.viewer.port.StackState` and hands out what its users want
-as :data:`~spacerobot_ros.viewer.port.Action`; the viewer node gives it the one and carries out the
-other.
+The page shows a :class:`~spacerobot_ros.viewer.state.StackState` and returns the actions of its
+users as :data:`~spacerobot_ros.viewer.state.Action`; the viewer node provides the state and carries
+out the actions.
 """

@@ -1,4 +1,4 @@
-"""What the page says: texts and numbers from the state of the stack, without a page."""
+"""Texts, tables and curves of the page, made from the state of the stack."""
 
 from __future__ import annotations
 
@@ -9,27 +9,25 @@ from html import escape
 
 import numpy as np
 
-from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.model.rotations import quaternion_multiply
-from spacerobot_ros.planning import Goal, PoseError
+from spacerobot_ros.planning import PoseError
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import KINDS, Targets, parse_fault
 from spacerobot_ros.simulation.status import PlantState
-from spacerobot_ros.viewer.port import Momenta, Notice, StackState
 from spacerobot_ros.viewer.reachability import Check, Verdict
+from spacerobot_ros.viewer.state import Momenta, Notice, Part, StackState
 
 Color = tuple[int, int, int]
 
 SILENT_AFTER = 1.0
-"""Wall s without a state after which the page says so."""
+"""Wall time without a state after which the page reports it, s."""
 
 _NEAR_LIMIT = 0.05
-"""Share of its range that a joint is from its end when it counts as near."""
+"""Distance from a limit below which a joint is marked, as a share of its range."""
 
 _LONGEST_NAME = 21
-"""Characters of the name of a joint that are shown."""
+"""Characters shown of the name of a joint."""
 
 COLORS: Mapping[Verdict, Color] = {
     Verdict.UNCHECKED: (150, 150, 160),
@@ -37,61 +35,23 @@ COLORS: Mapping[Verdict, Color] = {
     Verdict.REACHABLE: (40, 180, 90),
     Verdict.REFUSED: (220, 60, 60),
 }
-"""Of the ghost, by what is known of its goal."""
+"""Colours of the ghost, by the verdict on its goal."""
 
 _LEVELS = ("#2a9d5c", "#c98a00", "#d23c3c")
-"""Of texts of level OK, WARN and ERROR: readable on white and on black."""
+"""Text colours of the levels OK, WARN and ERROR: readable on white and on black."""
 
 _QUIET = "#8a8f98"
-
-
-def rpy_from_quaternion(quaternion: Array) -> Array:
-    """Return the angles (3,) about the fixed axes x, y, z, in this order, rad.
-
-    Source: `R = Rz(yaw) Ry(pitch) Rx(roll)`, as URDF has it; at a pitch of 90 deg roll is zero.
-    """
-    x, y, z, w = quaternion
-    sine = float(np.clip(2 * (w * y - z * x), -1.0, 1.0))
-    if abs(sine) > 1 - 1e-12:
-        return np.array([0.0, math.copysign(math.pi / 2, sine), 2 * math.atan2(z, w)])
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.array([roll, math.asin(sine), yaw])
-
-
-def quaternion_from_rpy(rpy: Sequence[float] | Array) -> Array:
-    """Return the quaternion (x, y, z, w) of such angles, rad."""
-    halves = 0.5 * np.asarray(rpy, float)
-    (sr, sp, sy), (cr, cp, cy) = np.sin(halves), np.cos(halves)
-    yaw_pitch = quaternion_multiply(np.array([0, 0, sy, cy]), np.array([0, sp, 0, cp]))
-    product: Array = quaternion_multiply(yaw_pitch, np.array([sr, 0, 0, cr]))
-    return product
-
-
-def goal_of(
-    position: Sequence[float] | Array,
-    quaternion: Sequence[float] | Array,
-    shape: Array | None = None,
-) -> Goal:
-    """Return the goal of the numbers on the page; ``shape`` (n,) to end in, m or rad, if any.
-
-    Raises
-    ------
-    GoalError
-        They are no pose.
-    """
-    return Goal.checked(list(position), list(quaternion), shape)
 
 
 # -- the head of the page -----------------------------------------------------------------------
 
 
-def silence(state: StackState) -> str:
-    """Return a sentence where no state comes, else an empty text."""
+def silence_message(state: StackState) -> str:
+    """Return a message if states have stopped or never came, else an empty text."""
     if state.replay is not None and (state.replay.paused or state.replay.ended):
         return ""
     if state.age_s == math.inf:
-        return "No state has come yet: no plant is running in this ROS domain and namespace."
+        return "No state received yet: no plant is running in this ROS domain and namespace."
     if state.age_s < SILENT_AFTER:
         return ""
     if state.plant is not None and state.plant.state is PlantState.PAUSED:
@@ -100,7 +60,7 @@ def silence(state: StackState) -> str:
 
 
 def time_to_go(state: StackState) -> float | None:
-    """Return how long the planned manoeuvre still takes, s; None where none is flown."""
+    """Return the remaining time of the planned manoeuvre, s; None if none is flown."""
     planner, measured = state.planner, state.measured
     if planner is None or measured is None or planner.state is not PlannerState.EXECUTING:
         return None
@@ -109,24 +69,24 @@ def time_to_go(state: StackState) -> float | None:
     return max(0.0, planner.ends_at_s - measured.time_s) if planner.ends_at_s else None
 
 
-def share_flown(state: StackState) -> float:
-    """Return how much of the planned manoeuvre is flown, 0 to 1; 0 where none is."""
+def progress(state: StackState) -> float:
+    """Return the flown share of the planned manoeuvre, 0 to 1; 0 if none is flown."""
     left, planner = time_to_go(state), state.planner
     if left is None or planner is None or planner.manoeuvre_time_s <= 0.0:
         return 0.0
     return min(1.0, max(0.0, 1.0 - left / planner.manoeuvre_time_s))
 
 
-def head(state: StackState, *, described: bool = True) -> str:
-    """Return the state of the stack as HTML; ``described``: whether a robot is known."""
+def status_html(state: StackState, *, described: bool = True) -> str:
+    """Return the state of the stack; ``described``: whether a robot is known."""
     lines = []
-    quiet = silence(state)
-    if quiet:
-        lines.append(_line(quiet, 2))
+    silence = silence_message(state)
+    if silence:
+        lines.append(_line(silence, 2))
     elif not described:
-        lines.append(_line("No robot is shown: nothing valid has come on robot_description.", 2))
+        lines.append(_line("No robot is shown: no valid robot_description has been received.", 2))
     for name, seconds in sorted(state.silent.items()):
-        lines.append(_line(f"Node '{name}' is silent for {math.floor(seconds)} s.", 2))
+        lines.append(_line(f"Node '{name}' has been silent for {math.floor(seconds)} s.", 2))
     lines.extend(_line(f"Node '{name}' is not active.", 1) for name in sorted(state.inactive))
     if state.measured is not None:
         left = time_to_go(state)
@@ -140,35 +100,35 @@ def head(state: StackState, *, described: bool = True) -> str:
     if state.plant is not None:
         plant = state.plant
         text = _status("Plant", plant.state.value, plant.message, plant.level)
-        lines.append(_faint(text, faint="plant" in state.absent))
+        lines.append(_greyed(text, offline="plant" in state.absent))
         lines.extend(_line(f"Fault: {each}", 1) for each in state.plant.faults)
     if state.planner is not None:
         status = state.planner
         text = _status("Planner", status.state.value, status.message, status.state.level)
-        lines.append(_faint(text, faint="planner" in state.absent))
+        lines.append(_greyed(text, offline="planner" in state.absent))
     if state.controller is not None:
         control = state.controller
         text = _status("Controller", control.state.value, control.message, control.state.level)
-        lines.append(_faint(text, faint="controller" in state.absent))
+        lines.append(_greyed(text, offline="controller" in state.absent))
     return padded("".join(lines))
 
 
 def padded(html: str) -> str:
-    """Return HTML with the margins and the size of the other elements of the page."""
+    """Return HTML with the margins and the font size of the other elements of the page."""
     return f'<div style="padding:2px 12px;font-size:.85em;line-height:1.35">{html}</div>'
 
 
-def _status(name: str, word: str, sentence: str, level: int) -> str:
+def _status(name: str, word: str, message: str, level: int) -> str:
     return (
         f'<div style="margin:2px 0"><b>{escape(name)}</b> '
         f'<span style="color:{_LEVELS[level]};font-weight:600">{escape(word)}</span> '
-        f"{escape(sentence)}</div>"
+        f"{escape(message)}</div>"
     )
 
 
-def _faint(html: str, *, faint: bool) -> str:
-    """Return HTML so that what is no longer so is hardly seen."""
-    return f'<div style="opacity:.45">{html}</div>' if faint else html
+def _greyed(html: str, *, offline: bool) -> str:
+    """Return the message of a node, greyed out if the node is offline."""
+    return f'<div style="opacity:.45">{html}</div>' if offline else html
 
 
 def _line(text: str, level: int | None) -> str:
@@ -176,8 +136,8 @@ def _line(text: str, level: int | None) -> str:
     return f'<div style="{style}margin:2px 0">{escape(text)}</div>'
 
 
-def verdict(check: Check) -> str:
-    """Return what is known of the goal that is shown, as HTML."""
+def check_html(check: Check) -> str:
+    """Return the result of checking the goal."""
     words = {
         Verdict.UNCHECKED: "not checked",
         Verdict.PLANNING: "planning",
@@ -190,14 +150,14 @@ def verdict(check: Check) -> str:
         f'background:rgb({red},{green},{blue});margin-right:.4em"></span>'
     )
     text = f"{dot}<b>Goal {words[check.verdict]}</b>"
-    return padded(f"{text} {escape(check.sentence)}")
+    return padded(f"{text} {escape(check.message)}")
 
 
 # -- tables -------------------------------------------------------------------------------------
 
 
-def joints(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -> str:
-    """Return the joints beside their limits as an HTML table with a bar each."""
+def joints_html(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -> str:
+    """Return a table of the joints (n,) and their limits, with a bar of each one's range."""
     rows = []
     lower, upper = robot.limits("lower"), robot.limits("upper")
     fastest, strongest = robot.limits("velocity"), robot.limits("effort")
@@ -221,13 +181,13 @@ def joints(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -> str
 
 
 def shortened(name: str) -> str:
-    """Return a name as long as there is room for: a longer one loses its middle."""
+    """Return a name, its middle left out if it is too long for a label."""
     half = (_LONGEST_NAME - 1) // 2
     return name if len(name) <= _LONGEST_NAME else f"{name[:half]}…{name[-half:]}"
 
 
 def _share(value: float, lower: float, upper: float) -> float | None:
-    """Return where a value is between its limits, 0 to 1; None where one is infinite."""
+    """Return the place of a value between its limits, 0 to 1; None if a limit is infinite."""
     if not (math.isfinite(lower) and math.isfinite(upper)) or upper <= lower:
         return None
     return float((value - lower) / (upper - lower))
@@ -249,12 +209,12 @@ def _of(value: float, limit: float) -> str:
 
 
 def _fixed(value: float, digits: int) -> str:
-    """Return a number with so many digits behind the point; what rounds to zero has no sign."""
+    """Return a number with some decimals; a rounded zero has no sign."""
     return f"{round(float(value), digits) + 0.0:.{digits}f}"
 
 
-def log(notices: Iterable[Notice]) -> str:
-    """Return the newest lines first as HTML."""
+def log_html(notices: Iterable[Notice]) -> str:
+    """Return the lines of the log, in the order given."""
     rows = []
     for notice in notices:
         time = "" if notice.time_s is None else f"{notice.time_s:.2f} s"
@@ -262,26 +222,20 @@ def log(notices: Iterable[Notice]) -> str:
         rows.append(
             f'<div style="margin:2px 0"><span style="color:{_QUIET}">{time} '
             f'{escape(notice.source)}</span> <span style="color:{color}">'
-            f"{escape(notice.sentence)}</span></div>"
+            f"{escape(notice.message)}</span></div>"
         )
-    return padded("".join(rows) or "Nothing has happened yet.")
+    return padded("".join(rows) or "No events yet.")
 
 
 # -- errors, momenta ----------------------------------------------------------------------------
 
 
-def base_error(state: StackState) -> tuple[float, float] | None:
-    """Return how far the base is from its goal, m and rad; None where there is no goal."""
-    goal, measured = state.goals.get("base"), state.measured
-    if goal is None or measured is None:
-        return None
-    error = PoseError.between(measured.pose[:3], measured.pose[3:], goal)
-    return error.distance, error.angle
-
-
-def tool_error(state: StackState) -> tuple[float, float] | None:
-    """Return how far the end-effector is from its goal, m and rad; None where there is no goal."""
-    goal, pose = state.goals.get("end_effector"), state.tool
+def goal_error(state: StackState, part: Part) -> tuple[float, float] | None:
+    """Return the distance of a part from its goal, m and rad; None without goal or pose."""
+    goal = state.goals.get(part)
+    pose = state.tool
+    if part == "base":
+        pose = None if state.measured is None else state.measured.pose
     if goal is None or pose is None:
         return None
     error = PoseError.between(pose[:3], pose[3:], goal)
@@ -289,25 +243,17 @@ def tool_error(state: StackState) -> tuple[float, float] | None:
 
 
 def momentum_drift(momenta: Momenta, first: Array) -> tuple[float, float]:
-    """Return how far both momenta are from what they should be, kg m/s and kg m^2/s.
+    """Return the drift of linear and angular momentum, kg m/s and kg m^2/s.
 
-    ``first`` (6,) are those of the beginning, where none are expected of thrusters.
+    It is measured from the expected momenta; if the plant publishes none, from ``first`` (6,).
     """
-    wanted = first if momenta.expected is None else momenta.expected
-    difference = momenta.actual - wanted
+    expected = first if momenta.expected is None else momenta.expected
+    difference = momenta.actual - expected
     return float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))
 
 
-def is_flying(state: StackState) -> bool:
-    """Whether a commander pursues a goal."""
-    planner, controller = state.planner, state.controller
-    return (
-        planner is not None and planner.state in (PlannerState.PLANNING, PlannerState.EXECUTING)
-    ) or (controller is not None and controller.state is ControllerState.TRACKING)
-
-
 def has_tool(state: StackState) -> bool:
-    """Whether goals can be sent for the end-effector: a controller is there, and it is known."""
+    """Whether the end-effector takes goals: a controller runs, and its pose is known."""
     return state.controller is not None and state.tool is not None
 
 
@@ -315,7 +261,7 @@ def has_tool(state: StackState) -> bool:
 
 
 def fault_kinds(targets: Targets) -> dict[str, list[str]]:
-    """Return the kinds of faults that have something to hit, with what that is."""
+    """Return the possible targets of each kind of fault that has any."""
     found = {name: targets.of(kind) for name, kind in KINDS.items()}
     return {name: names for name, names in found.items() if names}
 
@@ -323,15 +269,15 @@ def fault_kinds(targets: Targets) -> dict[str, list[str]]:
 def fault_line(
     kind: str, target: str, value: float, lasts_s: float, now_s: float, targets: Targets
 ) -> str:
-    """Return the line of a fault that begins now and ends after ``lasts_s``; 0: never.
+    """Return the description of a fault that begins now and lasts ``lasts_s``; 0: forever.
 
     Raises
     ------
     ParameterError
-        There is no such fault, or a number is none; the sentence says why.
+        There is no such fault, or a number is not finite.
     """
     if not (math.isfinite(lasts_s) and lasts_s >= 0.0):
-        raise ParameterError(f"The fault cannot last {lasts_s:g} s.")
+        raise ParameterError(f"The duration of the fault is {lasts_s:g} s; it must be 0 or more.")
     words = [kind, target]
     if kind in KINDS and KINDS[kind].value:
         words.append(f"{value:.9g}")
@@ -342,15 +288,15 @@ def fault_line(
     return line
 
 
-def faults(lines: Sequence[str]) -> str:
-    """Return the active faults as HTML."""
+def faults_html(lines: Sequence[str]) -> str:
+    """Return the active faults."""
     if not lines:
-        return quiet("No fault is active.")
+        return hint_html("No fault is active.")
     return padded("".join(_line(line, 1) for line in lines))
 
 
-def quiet(text: str) -> str:
-    """Return a text that explains something, as HTML."""
+def hint_html(text: str) -> str:
+    """Return an explanation, greyed."""
     return padded(f'<span style="color:{_QUIET}">{escape(text)}</span>')
 
 
@@ -358,16 +304,16 @@ def quiet(text: str) -> str:
 
 
 class History:
-    """Numbers over the last minutes of simulated time, a row for every look.
+    """Numbers over the last minutes of simulated time, one row per drawing.
 
     Parameters
     ----------
     width
         Numbers in a row.
     span_s
-        How far back, s of simulated time.
+        Length of the history, s of simulated time.
     most
-        Rows that are kept: older ones are thinned out.
+        Largest number of rows; beyond it every other one is dropped.
     """
 
     def __init__(self, width: int, span_s: float = 300.0, most: int = 600) -> None:
@@ -376,7 +322,7 @@ class History:
         self._width = width
 
     def add(self, time_s: float, values: Sequence[float] | Array) -> None:
-        """Add a row; of a time that is not later than the last, everything since is forgotten."""
+        """Add a row; rows of this time or later are dropped first (time may run back)."""
         while self._rows and self._rows[-1][0] >= time_s:
             self._rows.pop()
         self._rows.append(np.concatenate([[time_s], np.asarray(values, float)]))
@@ -388,23 +334,23 @@ class History:
             self._rows = deque([*kept[:-1:2], kept[-1]])
 
     def columns(self) -> tuple[Array, ...]:
-        """Return time (k,) and each number (k,); at least one row, of zeros."""
+        """Return time (k,) and each number (k,); one row of zeros if there is none yet."""
         if not self._rows:
-            # A figure has no scale for numbers that are none.
+            # A plot without numbers has no scale.
             return tuple(np.zeros(1) for _ in range(self._width + 1))
         table = np.array(self._rows)
         return tuple(np.ascontiguousarray(column) for column in table.T)
 
 
 class Trail:
-    """Where the base has been: points that are a step apart.
+    """The flown path of the base, as points at least a step apart.
 
     Parameters
     ----------
     step
-        m.
+        Least distance of neighbours, m.
     most
-        Points that are kept; beyond that every other one is dropped, and steps are twice as long.
+        Largest number of points; beyond it every other one is dropped and the step doubled.
     """
 
     def __init__(self, step: float, most: int = 1500) -> None:
@@ -413,7 +359,7 @@ class Trail:
         self._times: list[float] = []
 
     def add(self, time_s: float, point: Array) -> None:
-        """Add a point; time that runs back erases what came later."""
+        """Add a point; points of this time or later are dropped first (time may run back)."""
         while self._times and self._times[-1] >= time_s:
             self._times.pop()
             self._points.pop()

@@ -1,4 +1,4 @@
-"""The goal that is about to be sent: gizmos, number fields, and the ghost of the robot there."""
+"""The goal editor: gizmos, number fields, and a ghost of the robot at the goal."""
 
 from __future__ import annotations
 
@@ -19,46 +19,43 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.viewer.content import (
     COLORS,
-    goal_of,
-    quaternion_from_rpy,
-    quiet,
-    rpy_from_quaternion,
+    check_html,
+    hint_html,
     shortened,
-    verdict,
 )
-from spacerobot_ros.viewer.port import Part
 from spacerobot_ros.viewer.reachability import Check, Verdict
 from spacerobot_ros.viewer.scene import RobotDrawing, wxyz, xyzw
+from spacerobot_ros.viewer.state import Part
 
 if TYPE_CHECKING:
     import viser
 
 Defer = Callable[[Callable[[], None]], None]
-"""Has a function called in the thread that draws the page."""
+"""Queues a function for the thread that draws the page."""
 
 AT_REST_S = 0.3
-"""Wall s without a change after which a goal is checked."""
+"""Wall time without a change after which a goal is checked, s."""
 
 _APART = 0.01
-"""Where the ghost is nearer to the robot it is not drawn, in lengths of the robot and rad."""
+"""Distance from the robot below which the ghost is hidden, in robot lengths and rad."""
 
 _BASE, _TOOL = "/goal", "/end_effector_goal"
 _PART_OF: dict[str, Part] = {_BASE: "base", _TOOL: "end_effector"}
 
 
 class GoalEditor:
-    """Where the robot is to go; nothing is sent from here.
+    """Lets users choose a goal; it sends nothing itself.
 
     The gizmo of the end-effector moves along with that of the base, and can be moved alone.
 
     Parameters
     ----------
     server
-        Of the page; the number fields are added where its GUI stands.
+        Server of the page; the number fields are added to the current GUI container.
     defer
-        Where users' changes are handed over.
+        Queues the changes of users.
     on_note
-        Called with the sentence of what is refused.
+        Called with the reason when an input is refused.
     """
 
     def __init__(
@@ -71,15 +68,15 @@ class GoalEditor:
         self._changed_at: float | None = None
         self._check = Check(Verdict.UNCHECKED)
         gui = server.gui
-        self._none_taken = gui.add_html(quiet("A recording takes no goals."), visible=False)
-        self._verdict = gui.add_html(verdict(self._check))
-        # Any: mypy takes viser's values for read-only.
+        self._none_taken = gui.add_html(hint_html("A recording takes no goals."), visible=False)
+        self._verdict = gui.add_html(check_html(self._check))
+        # Any: for mypy viser's values are read-only.
         self._position: Any = gui.add_vector3("Goal (m)", (0.0, 0.0, 0.0), step=0.01)
         self._angles: Any = gui.add_vector3("Roll, pitch, yaw (deg)", (0.0, 0.0, 0.0), step=1.0)
         self._tool_too = gui.add_checkbox(
             "Goal for the end-effector",
             initial_value=True,
-            hint="Off: the end-effector keeps the goal that it has, if any.",
+            hint="Off: the end-effector keeps its current goal, if any.",
         )
         self._tool_too.visible = False
         self._final = _FinalShape(gui, defer, self._change)
@@ -103,31 +100,31 @@ class GoalEditor:
         return _TOOL in self._poses
 
     def add_tool(self, pose: Array | None) -> None:
-        """Put the goal of the end-effector to a pose (7,)."""
+        """Add a goal of the end-effector at a pose (7,)."""
         if pose is not None and self.placed:
             self._add_gizmo(_TOOL, 0.2 * self._reach)
             self._move(_TOOL, pose)
             self.touch(time.monotonic())
 
     def on_to_robot(self, act: Callable[[], None]) -> None:
-        """Have the goal put where the robot is when its button is pressed."""
+        """Call a function when the button that moves the goal to the robot is pressed."""
 
         @self._to_robot.on_click
         async def _(event: Any) -> None:
             self._defer(act)
 
     def show_robot(self, robot: RobotDescription | None, reach: float) -> None:
-        """Begin anew with another robot, whose scene is empty; None: there is none."""
+        """Start over with another robot, in an empty scene; None: there is none."""
         self._gizmos.clear()
         self._poses.clear()
         self._ghost, self._changed_at = None, None
         self._reach, self._robot = reach, robot
-        # What is known of the goal of another robot is of no use: it has other joints.
+        # The check of another robot's goal does not apply: it has other joints.
         self.show_check(Check(Verdict.UNCHECKED))
         self._final.show_robot(robot)
 
     def place(self, base: Array, tool: Array | None, q: Array, now: float) -> None:
-        """Put the goal to poses (7,), the ghost in a shape (n,)."""
+        """Set the goal to poses (7,) and the ghost to joint positions (n,)."""
         assert self._robot is not None
         if _BASE not in self._gizmos:
             self._add_gizmo(_BASE, 0.45 * self._reach)
@@ -144,23 +141,23 @@ class GoalEditor:
         self._changed_at = now
 
     def robot_is_at(self, pose: Array, q: Array) -> None:
-        """Take note of where the robot is: its base at a pose (7,), its joints at (n,).
+        """Update the pose (7,) of the robot's base and the positions (n,) of its joints.
 
-        The ghost has its shape as long as no plan or user has another one, and is not drawn where
-        it would only colour the robot.
+        The ghost takes these joint positions unless a plan or a user sets others, and is hidden
+        where it would only colour the robot.
         """
         self._final.robot_is_at(q)
         if self._ghost is None:
             return
         shape = self._check.shape
         if shape is None:
-            wanted = self._final.wanted
-            shape = q if wanted is None else wanted
+            final = self._final.positions
+            shape = q if final is None else final
             self._ghost.set_joint_positions(shape)
         self._ghost.base.visible = not self._is_there(pose, q, shape)
 
     def _is_there(self, pose: Array, q: Array, shape: Array) -> bool:
-        """Whether a robot at a pose, with joints at ``q``, is where the ghost is with ``shape``."""
+        """Whether a robot at a pose and joint positions ``q`` coincides with the ghost."""
         goal = self._poses[_BASE]
         distance = float(np.linalg.norm(goal[:3] - pose[:3]))
         turned = 2.0 * math.acos(min(1.0, abs(float(goal[3:] @ pose[3:]))))
@@ -168,17 +165,17 @@ class GoalEditor:
         return distance < _APART * self._reach and max(turned, bent) < _APART
 
     def show_tool(self, *, there: bool) -> None:
-        """Show or hide what is for the end-effector."""
+        """Show or hide the controls of the end-effector."""
         self._tool_too.visible = there
         if _TOOL in self._gizmos:
             self._gizmos[_TOOL].visible = there and self._tool_too.value
 
     def show_shape(self, *, there: bool) -> None:
-        """Show or hide what is for the joint positions to end in, which planners take."""
+        """Show or hide the final joint positions, which planners take."""
         self._final.show(visible=there)
 
     def show(self, *, visible: bool) -> None:
-        """Show or hide everything: a replay takes no goals."""
+        """Show or hide all controls: a replay takes no goals."""
         fields = (self._verdict, self._position, self._angles, self._to_robot)
         for handle in (*fields, *self._gizmos.values()):
             handle.visible = visible
@@ -190,20 +187,22 @@ class GoalEditor:
         Raises
         ------
         GoalError
-            The numbers are no pose.
+            A pose is not finite or its quaternion not of unit length.
         """
-        wanted = [_BASE]
-        if self._tool_too.visible and self._tool_too.value and _TOOL in self._poses:
-            wanted.append(_TOOL)
-        shapes = {_BASE: self._final.wanted}
+        names = [_BASE]
+        if self._tool_too.visible and self._tool_too.value:
+            names.append(_TOOL)
+        shapes = {_BASE: self._final.positions}
         return {
-            _PART_OF[name]: goal_of(self._poses[name][:3], self._poses[name][3:], shapes.get(name))
-            for name in wanted
+            _PART_OF[name]: Goal.checked(
+                self._poses[name][:3].tolist(), self._poses[name][3:].tolist(), shapes.get(name)
+            )
+            for name in names
             if name in self._poses
         }
 
     def goals_at_rest(self, now: float) -> dict[Part, Goal] | None:
-        """Return the goals once, when they have not been moved for a moment."""
+        """Return the goals once after every change, when they have come to rest; else None."""
         if self._changed_at is None or now - self._changed_at < AT_REST_S or not self.placed:
             return None
         self._changed_at = None
@@ -215,18 +214,18 @@ class GoalEditor:
 
     @property
     def moving(self) -> bool:
-        """Whether the goal has changed and is not checked yet."""
+        """Whether the goal has changed since it was last checked."""
         return self._changed_at is not None
 
     def touch(self, now: float) -> None:
-        """Have the goal checked again: something that it depends on has changed."""
+        """Request another check of the goal, because its preconditions have changed."""
         if self.placed:
             self._changed_at = now
 
     def show_check(self, check: Check) -> None:
-        """Show what is known of the goal."""
+        """Show the result of a check of the goal."""
         self._check = check
-        text = verdict(check)
+        text = check_html(check)
         if text != self._verdict.content:
             self._verdict.content = text
         if self._ghost is not None:
@@ -234,7 +233,7 @@ class GoalEditor:
             if check.shape is not None:
                 self._ghost.set_joint_positions(check.shape)
 
-    # -- what users change ----------------------------------------------------------------------
+    # -- changes by users --------------------------------------------------------------------------
 
     def _add_gizmo(self, name: str, scale: float) -> None:
         gizmo = self._server.scene.add_transform_controls(name, scale=scale, depth_test=False)
@@ -251,13 +250,13 @@ class GoalEditor:
             self._defer(lambda: self._drag(name, pose))
 
     async def _on_field(self, event: Any) -> None:
-        if event.client is not None:  # Else the page itself has written it.
+        if event.client is not None:  # Else the page itself wrote the value.
             position, angles = self._position.value, self._angles.value
             self._defer(lambda: self._type(position, angles))
 
     def _drag(self, name: str, pose: Array) -> None:
         if name not in self._gizmos or not np.all(np.isfinite(pose)):
-            return  # It is the gizmo of an earlier robot, or its pose has numbers that are none.
+            return  # The gizmo of an earlier robot, or a pose that is not finite.
         self._set(name, pose)
         self._show_fields()
 
@@ -265,7 +264,7 @@ class GoalEditor:
         if not self.placed:
             return
         try:
-            goal = goal_of(position, quaternion_from_rpy([math.radians(angle) for angle in angles]))
+            goal = Goal.from_rpy(position, angles)
         except GoalError as error:
             self._on_note(str(error))
             self._show_fields()
@@ -281,12 +280,12 @@ class GoalEditor:
         self._change()
 
     def _change(self) -> None:
-        """Take note of a goal that is another one now."""
+        """Note that the goal has changed."""
         if not self.placed:
             return
         self._changed_at = time.monotonic()
         if self._check.verdict is not Verdict.UNCHECKED:
-            self.show_check(Check(Verdict.PLANNING, "The goal moves."))
+            self.show_check(Check(Verdict.PLANNING, "The goal is being moved."))
 
     def _move(self, name: str, pose: Array) -> None:
         self._poses[name] = pose
@@ -304,12 +303,12 @@ class GoalEditor:
 
 
 class _FinalShape:
-    """The joint positions to end in, if any are asked for.
+    """Controls of the joint positions at the end of the manoeuvre.
 
     Parameters
     ----------
     gui, defer
-        As of :class:`GoalEditor`.
+        As for :class:`GoalEditor`.
     on_change
         Called when users have changed them.
     """
@@ -319,7 +318,7 @@ class _FinalShape:
         self._asked: Any = gui.add_checkbox(
             "Final joint positions",
             initial_value=False,
-            hint="Have the planner end in these joint positions, not in any.",
+            hint="The planner ends in these joint positions, not in any.",
         )
         self._asked.visible = False
         self._folder = gui.add_folder("At the end", visible=False)
@@ -331,14 +330,14 @@ class _FinalShape:
             defer(self._switch)
 
     @property
-    def wanted(self) -> Array | None:
-        """Positions (n,), m or rad; None: any."""
+    def positions(self) -> Array | None:
+        """Final positions (n,) of the joints, m or rad; None: any."""
         if not (self._asked.visible and self._asked.value):
             return None
         return np.array([field.value for field in self._fields], float)
 
     def show_robot(self, robot: RobotDescription | None) -> None:
-        """Have a field for each joint of another robot."""
+        """Show a field for each joint of another robot."""
         for field in self._fields:
             field.remove()
         self._fields, self._q, self._asked.value = [], np.zeros(0), False
@@ -351,7 +350,7 @@ class _FinalShape:
         self._switch()
 
     def _field(self, joint: Joint) -> Any:
-        """Return a slider between the limits of a joint, or a number where it has none."""
+        """Return a slider between the limits of a joint, or a number field if it has none."""
         label, name = f"{shortened(joint.name)} ({joint.unit})", joint.name
         low, high = joint.limits.lower, joint.limits.upper
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
@@ -364,18 +363,18 @@ class _FinalShape:
         return self._gui.add_slider(label, low, high, step, min(max(0.0, low), high), hint=name)
 
     def robot_is_at(self, q: Array) -> None:
-        """Take note of the positions (n,) of the robot."""
+        """Update the joint positions (n,) of the robot."""
         self._q = q
 
     def fill(self) -> None:
-        """Put the fields to where the robot is."""
+        """Set the fields to the joint positions of the robot."""
         for field, position in zip(self._fields, self._q, strict=False):
             low, high = getattr(field, "min", None), getattr(field, "max", None)
             value = round(float(position), 4)
             field.value = value if low is None or high is None else min(max(value, low), high)
 
     def show(self, *, visible: bool) -> None:
-        """Show or hide everything."""
+        """Show or hide these controls."""
         shown = visible and bool(self._fields)
         if shown != self._asked.visible:
             self._asked.visible = shown
@@ -389,12 +388,26 @@ class _FinalShape:
         self._on_change()
 
     async def _on_field(self, event: Any) -> None:
-        if event.client is not None:  # Else the page itself has written it.
+        if event.client is not None:  # Else the page itself wrote the value.
             self._defer(self._on_change)
 
 
 def carried(pose: Array, before: Array, after: Array) -> Array:
-    """Return a pose (7,) that moves along with another one, from ``before`` to ``after``."""
+    """Return a pose (7,) rigidly moved along with another one, from ``before`` to ``after``."""
     turn = quaternion_multiply(after[3:], quaternion_inverse(before[3:]))
     position = after[:3] + matrix_from_quaternion(turn) @ (pose[:3] - before[:3])
     return np.concatenate([position, quaternion_multiply(turn, pose[3:])])
+
+
+def rpy_from_quaternion(quaternion: Array) -> Array:
+    """Return roll, pitch and yaw (3,), the angles about the fixed axes x, y, z, rad.
+
+    Source: `R = Rz(yaw) Ry(pitch) Rx(roll)`, as URDF has it; at a pitch of 90 deg roll is zero.
+    """
+    x, y, z, w = quaternion
+    sine = float(np.clip(2 * (w * y - z * x), -1.0, 1.0))
+    if abs(sine) > 1 - 1e-12:
+        return np.array([0.0, math.copysign(math.pi / 2, sine), 2 * math.atan2(z, w)])
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.array([roll, math.asin(sine), yaw])

@@ -1,11 +1,14 @@
-"""The page: the scene and its panels, drawn from the state of the stack again and again.
+"""The page: the scene and its panels, redrawn from the state of the stack.
 
-Everything is drawn in one thread, that of :meth:`Page.update`. What browsers send arrives in
-threads of the server and waits in a queue until then.
+Everything is drawn in one thread, that of :meth:`Page.update`. Input of browsers arrives in threads
+of the server and waits in a queue for the next update.
 """
 
 from __future__ import annotations
 
+import math
+import time
+from collections import deque
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
@@ -13,42 +16,376 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spacerobot_ros.control.thrusters import ThrusterTable
-from spacerobot_ros.errors import GoalError
-from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.simulation.faults import Targets
+from spacerobot_ros.simulation.faults import KINDS, Targets
 from spacerobot_ros.viewer import content, scene
-from spacerobot_ros.viewer.config import ViewerConfig
-from spacerobot_ros.viewer.content import Trail
-from spacerobot_ros.viewer.goal_editor import GoalEditor
-from spacerobot_ros.viewer.panels import Buttons, Faults, Joints, Log, Plots, TimeLine
-from spacerobot_ros.viewer.port import Action, Fly, Measured, Notice, Part, Request, StackState
+from spacerobot_ros.viewer.content import History, Trail
+from spacerobot_ros.viewer.goal_editor import Defer, GoalEditor
 from spacerobot_ros.viewer.reachability import Check
+from spacerobot_ros.viewer.server import ViewerConfig
+from spacerobot_ros.viewer.state import (
+    Action,
+    Fly,
+    Inject,
+    Measured,
+    Notice,
+    Part,
+    Request,
+    Seek,
+    StackState,
+)
 
 if TYPE_CHECKING:
     import viser
 
+
+TakeAction = Callable[[Action], None]
+"""Takes an action of a user."""
+
+_MOST_NOTICES = 200
+_SHOWN_NOTICES = 60
+
+_COLORS = ("#3c82f0", "#f0961a", "#2a9d5c", "#c04fb5", "#d23c3c", "#17a2b8", "#9a7d0a", "#8a8f98")
+_AXIS = "#8a8f98"
+_PLOT_HEIGHT = 170
+
+_HANDS_OFF_S = 1.5
+"""Wall time for which the page does not move the time slider after a user has, s."""
+
+
+class Buttons:
+    """Buttons whose requests the stack carries out at once."""
+
+    def __init__(
+        self, gui: viser.GuiApi, defer: Defer, act: TakeAction, fly: Callable[[], None]
+    ) -> None:
+        self._fly = gui.add_button("Fly", color="green", hint="Send the goal that is shown.")
+        self._goal = gui.add_button_group(
+            "Goal", ("Abort",), hint="Drop the goal; the joints brake."
+        )
+        self._plant = gui.add_button_group(
+            "Plant",
+            ("Stop", "Rearm", "Reset"),
+            hint="Stop: everything comes to rest until Rearm. Reset: back to the initial state.",
+        )
+        self._time = gui.add_button_group("Time", ("Pause", "Resume"))
+
+        @self._fly.on_click
+        async def _(event: Any) -> None:
+            defer(fly)
+
+        for group in (self._goal, self._plant, self._time):
+
+            @group.on_click
+            async def _(event: Any) -> None:
+                request = Request(str(event.target.value).lower())
+                defer(lambda: act(request))
+
+    def show(self, *, visible: bool) -> None:
+        """Show or hide the buttons."""
+        for handle in (self._fly, self._goal, self._plant, self._time):
+            handle.visible = visible
+
+
+class TimeLine:
+    """Controls of a replay: play, hold, and a time slider."""
+
+    def __init__(self, gui: viser.GuiApi, defer: Defer, act: TakeAction) -> None:
+        self._gui, self._defer, self._act = gui, defer, act
+        self._folder = gui.add_folder("Replay", visible=False)
+        with self._folder:
+            self._buttons = gui.add_button_group("Replay", ("Play", "Hold"))
+        self._slider: Any = None
+        self._duration = 0.0
+        self._left_alone_until = -math.inf
+
+        @self._buttons.on_click
+        async def _(event: Any) -> None:
+            request = Request(str(event.target.value).lower())
+            defer(lambda: act(request))
+
+    def show(self, state: StackState, now: float) -> None:
+        """Show the position of the replay, if there is one."""
+        replay = state.replay
+        self._folder.visible = replay is not None
+        if replay is None:
+            return
+        if self._slider is None or replay.duration_s != self._duration:
+            self._make(replay.duration_s)
+        if now >= self._left_alone_until:
+            self._slider.value = min(max(replay.position_s, 0.0), self._slider.max)
+
+    def _make(self, duration: float) -> None:
+        if self._slider is not None:
+            self._slider.remove()
+        self._duration = duration
+        step = max(10.0 ** math.floor(math.log10(max(duration, 1e-3) / 1000)), 1e-3)
+        with self._folder:
+            self._slider = self._gui.add_slider(
+                "Time (s)", 0.0, max(math.ceil(duration / step) * step, step), step, 0.0
+            )
+
+        @self._slider.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                seconds = float(event.target.value)
+                self._defer(lambda: self._seek(seconds))
+
+    def _seek(self, seconds: float) -> None:
+        self._left_alone_until = time.monotonic() + _HANDS_OFF_S
+        self._act(Seek(seconds))
+
+
+class Faults:
+    """Menu of the faults that can be injected, and list of the active ones."""
+
+    def __init__(
+        self, gui: viser.GuiApi, defer: Defer, act: TakeAction, on_note: Callable[[str], None]
+    ) -> None:
+        self._act, self._on_note = act, on_note
+        self._targets, self._now_s = Targets(), 0.0
+        self._names: dict[str, list[str]] = {}
+        self._kind: Any = gui.add_dropdown("Fault", ("-",))
+        self._target: Any = gui.add_dropdown("Target", ("-",))
+        self._value = gui.add_number("Value", 0.0, step=0.01)
+        self._value.visible = False
+        self._meaning = gui.add_html("")
+        self._lasts = gui.add_number("For (s), 0: for good", 0.0, min=0.0, step=1.0)
+        self._inject = gui.add_button("Inject", color="orange")
+        self._clear = gui.add_button("Clear faults", color="gray")
+        self._active = gui.add_html("")
+
+        @self._kind.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                defer(self._show_kind)
+
+        @self._inject.on_click
+        async def _(event: Any) -> None:
+            defer(self._on_inject)
+
+        @self._clear.on_click
+        async def _(event: Any) -> None:
+            defer(lambda: act(Inject("clear")))
+
+    def offer(self, targets: Targets) -> None:
+        """Offer the faults of a plant with these targets."""
+        if targets == self._targets:
+            return
+        self._targets, self._names = targets, content.fault_kinds(targets)
+        before = self._kind.value
+        self._kind.options = tuple(self._names) or ("-",)
+        if before in self._names:
+            self._kind.value = before
+        self._show_kind()
+
+    def show_menu(self, *, visible: bool) -> None:
+        """Show or hide the menu; a replay shows active faults only."""
+        for handle in (self._kind, self._target, self._lasts, self._inject, self._clear):
+            handle.visible = visible
+        self._meaning.visible = visible
+        self._value.visible = visible and self._has_value
+
+    def show(self, state: StackState) -> None:
+        """Show the active faults."""
+        if state.measured is not None:
+            self._now_s = state.measured.time_s
+        faults = () if state.plant is None else state.plant.faults
+        text = content.faults_html(faults)
+        if text != self._active.content:
+            self._active.content = text
+
+    def _show_kind(self) -> None:
+        names = self._names.get(self._kind.value, ["-"])
+        before = self._target.value
+        self._target.options = tuple(names)
+        if before in names:
+            self._target.value = before
+        kind = KINDS.get(self._kind.value)
+        self._value.visible = self._has_value and self._kind.visible
+        self._meaning.content = "" if kind is None else content.hint_html(kind.value)
+
+    @property
+    def _has_value(self) -> bool:
+        """Whether the chosen kind of fault takes a number."""
+        kind = KINDS.get(self._kind.value)
+        return kind is not None and bool(kind.value)
+
+    def _on_inject(self) -> None:
+        try:
+            line = content.fault_line(
+                self._kind.value,
+                self._target.value,
+                float(self._value.value),
+                float(self._lasts.value),
+                self._now_s,
+                self._targets,
+            )
+        except ParameterError as error:
+            self._on_note(str(error))
+            return
+        self._act(Inject(line))
+
+
+class Plots:
+    """Plots of goal errors, momentum drift and joint positions over simulated time."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._gui = gui
+        self._tab_group = gui.add_tab_group()
+        with self._tab_group.add_tab("Errors"):
+            self._error = _Plot(gui, "Base error", ("m", "rad"), 0.01)
+            self._tool = _Plot(gui, "End-effector error", ("m", "rad"), 0.01)
+            self._tool.handle.visible = False
+        with self._tab_group.add_tab("Momentum"):
+            # In millionths, because axis labels have three decimals.
+            units = ("1e-6 kg m/s", "1e-6 kg m²/s")
+            self._momentum = _Plot(gui, "Momentum drift", units, 1.0)
+        self._joint_tab = self._tab_group.add_tab("Shape")
+        self._shape: _Plot | None = None
+        self._first: Array | None = None
+
+    def show_robot(self, robot: RobotDescription | None) -> None:
+        """Start over with another robot."""
+        self._first = None
+        for plot in (self._error, self._tool, self._momentum):
+            plot.clear()
+        if self._shape is not None:
+            self._shape.handle.remove()
+            self._shape = None
+        if robot is not None and robot.joint_names:
+            with self._joint_tab:
+                self._shape = _Plot(
+                    self._gui, "Joints (m, rad)", robot.joint_names, 0.01, signed=True
+                )
+
+    def add(self, state: StackState) -> None:
+        """Append the last state to the curves."""
+        measured = state.measured
+        if measured is None:
+            return
+        time_s = measured.time_s
+        error, tool = (content.goal_error(state, part) for part in ("base", "end_effector"))
+        if error is not None:
+            self._error.history.add(time_s, error)
+        if tool is not None:
+            self._tool.handle.visible = True
+            self._tool.history.add(time_s, tool)
+        if state.momenta is not None:
+            if self._first is None:
+                self._first = state.momenta.actual
+            drift = content.momentum_drift(state.momenta, self._first)
+            self._momentum.history.add(time_s, 1e6 * np.array(drift))
+        if self._shape is not None:
+            self._shape.history.add(time_s, measured.q)
+
+    def draw(self) -> None:
+        """Redraw the curves."""
+        for plot in (self._error, self._tool, self._momentum, self._shape):
+            if plot is not None:
+                plot.draw()
+
+
+class _Plot:
+    """A plot and its history; its colours can be seen on white and on black.
+
+    Parameters
+    ----------
+    gui, title
+        GUI that the plot is added to, and its title.
+    names
+        Names of the curves.
+    least
+        Least upper end of the axis, so that rounding errors do not look like peaks.
+    signed
+        Whether the numbers may be negative.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        title: str,
+        names: tuple[str, ...],
+        least: float,
+        *,
+        signed: bool = False,
+    ) -> None:
+        self.history = History(len(names))
+        series: list[Any] = [{"label": "t (s)"}]
+        for i, name in enumerate(names):
+            turn, color = divmod(i, len(_COLORS))
+            look = {"label": content.shortened(name), "stroke": _COLORS[color], "width": 1.5}
+            # Colours repeat with dashes, shorter each time.
+            series.append(look | ({"dash": (max(12 // turn, 2), 4)} if turn else {}))
+        faint = {"stroke": f"{_AXIS}33"}
+        axis: dict[str, Any] = {"stroke": _AXIS, "grid": faint, "ticks": faint}
+        # Mode 1 of uPlot's "soft limits": the axis ends there unless numbers go beyond.
+        end = {"pad": 0.1, "mode": 1}
+        ends = {"min": end | {"soft": -least if signed else 0.0}, "max": end | {"soft": least}}
+        self.handle: Any = gui.add_uplot(
+            self.history.columns(),
+            tuple(series),
+            title=title,
+            scales={"x": {"time": False}, "y": {"range": ends}},
+            axes=(axis | {"size": 34}, axis | {"size": 66}),  # type: ignore[arg-type]
+            height=_PLOT_HEIGHT,
+        )
+        self._width = len(names)
+
+    def clear(self) -> None:
+        """Drop the history."""
+        self.history = History(self._width)
+
+    def draw(self) -> None:
+        """Send the curves to browsers."""
+        self.handle.data = self.history.columns()
+
+
+class Log:
+    """Events and warnings, the newest first."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._html = gui.add_html(content.log_html(()))
+        self._notices: deque[Notice] = deque(maxlen=_MOST_NOTICES)
+        self._changed = False
+
+    def add(self, notice: Notice) -> None:
+        """Add a line."""
+        if self._notices and self._notices[0] == notice:
+            return  # An immediate repetition is shown once.
+        self._notices.appendleft(notice)
+        self._changed = True
+
+    def draw(self) -> None:
+        """Redraw the lines that have changed."""
+        if self._changed:
+            self._changed = False
+            self._html.content = content.log_html(list(self._notices)[:_SHOWN_NOTICES])
+
+
 _ROBOT = "/robot"
 
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
-"""Wall s from one drawing of the slower parts to the next."""
+"""Period of drawing of the slower parts, wall s."""
 
 CAMERA = np.array([1.1, 1.4, 0.8])
-"""From the robot to where a page looks at it from when it is opened, in lengths of the robot.
+"""Initial position of the camera relative to the robot, in robot lengths.
 
-What is ahead of the base, such as its arm, is then on the left: the panel is on the right.
+An arm ahead of the base is then on the left: the panel is on the right.
 """
 
 
 class Page:
-    """What browsers see; several of them see the same.
+    """The page; all browsers that open it see the same.
 
     Parameters
     ----------
     server
-        Serves the page.
+        Server of the page.
     config
-        How the page looks.
+        Its parameters.
     """
 
     def __init__(self, server: viser.ViserServer, config: ViewerConfig) -> None:
@@ -67,10 +404,10 @@ class Page:
     def _build(self) -> None:
         gui, defer = self._server.gui, self._inbox.put
         gui.configure_theme(**self._theme(dark=self._config.dark))
-        # Buttons come first: a sentence that grows by a line must not move them under the mouse.
-        self._time_line = TimeLine(gui, defer, self._want)
-        self._buttons = Buttons(gui, defer, self._want, self._fly)
-        self._head = gui.add_html(content.head(StackState()))
+        # Buttons come first, so that a growing status text does not move them under the mouse.
+        self._time_line = TimeLine(gui, defer, self._request)
+        self._buttons = Buttons(gui, defer, self._request, self._fly)
+        self._status = gui.add_html(content.status_html(StackState()))
         self._bar: Any = gui.add_progress_bar(0.0, visible=False)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Goal"):
@@ -78,14 +415,14 @@ class Page:
         with tabs.add_tab("Plots"):
             self._plots = Plots(gui)
         with tabs.add_tab("Joints"):
-            self._joints = Joints(gui)
+            self._joints = gui.add_html("")
         with tabs.add_tab("Faults"):
-            self._faults = Faults(gui, defer, self._want, self._refuse)
+            self._faults = Faults(gui, defer, self._request, self._refuse)
         with tabs.add_tab("Log"):
             self._log = Log(gui)
         self._editor.on_to_robot(self._goal_to_robot)
         look = gui.add_button(
-            "Look at the robot", color="gray", hint="Have this browser look at where it is now."
+            "Look at the robot", color="gray", hint="Turn the camera of this browser to the robot."
         )
 
         @look.on_click
@@ -112,13 +449,11 @@ class Page:
             "show_share_button": False,
         }
 
-    # -- what the stack is ----------------------------------------------------------------------
+    # -- the robot and its goal -----------------------------------------------------------------
 
-    def show_robot(
-        self, robot: RobotDescription | None, table: ThrusterTable | None = None
-    ) -> None:
-        """Begin anew with another robot; None: there is none."""
-        self._robot, self._table, self._drawing, self._last = robot, table, None, None
+    def show_robot(self, robot: RobotDescription | None) -> None:
+        """Start over with another robot; None: there is none."""
+        self._robot, self._table, self._drawing, self._last = robot, None, None, None
         self._around: scene.Surroundings | None = None
         self._server.scene.reset()
         reach = 1.0 if robot is None else scene.reach_of(robot)
@@ -133,11 +468,11 @@ class Page:
         self._drawing.base.visible = False  # Until its first state comes.
 
     def show_thrusters(self, table: ThrusterTable | None) -> None:
-        """Take the places of the thrusters, which are known later than the robot."""
+        """Set the thrusters, which are known later than the robot."""
         self._table = table
 
     def offer_faults(self, targets: Targets) -> None:
-        """Offer the faults of such a plant."""
+        """Offer the faults of a plant with these targets."""
         self._faults.offer(targets)
 
     def note(self, notice: Notice) -> None:
@@ -145,27 +480,27 @@ class Page:
         self._log.add(notice)
 
     def show_check(self, check: Check) -> None:
-        """Show what is known of the goal; nothing while it moves."""
+        """Show the result of a check of the goal, unless the goal is being moved."""
         if not self._editor.moving:
             self._editor.show_check(check)
 
     def goals_to_check(self, now: float) -> dict[Part, Goal] | None:
-        """Return the goals once, when they have not been moved for a moment, else None."""
+        """Return the goals once after every change, when they have come to rest; else None."""
         return self._editor.goals_at_rest(now)
 
     @property
     def goal_moves(self) -> bool:
-        """Whether the goal has changed since it was checked."""
+        """Whether the goal has changed since it was last checked."""
         return self._editor.moving
 
     def touch_goal(self, now: float) -> None:
-        """Have the goal checked again: something that it depends on has changed."""
+        """Request another check of the goal, because its preconditions have changed."""
         self._editor.touch(now)
 
     # -- drawing --------------------------------------------------------------------------------
 
     def update(self, state: StackState, now: float) -> list[Action]:
-        """Draw a state, and return what users want since the last time; ``now`` is wall time, s."""
+        """Draw a state; return the actions of users since the last call. ``now``: wall time, s."""
         before, self._state, self._now = self._state, state, now
         self._handle_inbox()
         with self._server.atomic():
@@ -180,7 +515,7 @@ class Page:
             if self._is_due("texts", _TEXTS_S):
                 self._draw_texts(state)
             if self._robot is not None and self._is_due("tables", _TABLES_S):
-                self._joints.show(self._robot, state)
+                self._draw_joints(self._robot, state)
             if self._is_due("plots", _PLOTS_S):
                 self._plots.draw()
         actions, self._actions = self._actions, []
@@ -218,12 +553,11 @@ class Page:
             )
 
     def _draw_texts(self, state: StackState) -> None:
-        text = content.head(state, described=self._robot is not None)
-        if text != self._head.content:
-            self._head.content = text
-        share = content.share_flown(state)
+        text = content.status_html(state, described=self._robot is not None)
+        if text != self._status.content:
+            self._status.content = text
         self._bar.visible = content.time_to_go(state) is not None
-        self._bar.value = round(100 * share, 1)
+        self._bar.value = round(100 * content.progress(state), 1)
         self._faults.show(state)
         self._log.draw()
         has_tool = content.has_tool(state)
@@ -232,18 +566,23 @@ class Page:
         self._editor.show_tool(there=has_tool and state.replay is None)
         self._editor.show_shape(there=state.planner is not None and state.replay is None)
 
-    def _is_due(self, what: str, period: float) -> bool:
-        if self._now < self._due.get(what, 0.0):
+    def _draw_joints(self, robot: RobotDescription, state: StackState) -> None:
+        last = state.measured
+        if last is not None:
+            self._joints.content = content.joints_html(robot, last.q, last.qdot, last.effort)
+
+    def _is_due(self, part: str, period: float) -> bool:
+        if self._now < self._due.get(part, 0.0):
             return False
-        self._due[what] = self._now + period
+        self._due[part] = self._now + period
         return True
 
     def _aim(self, camera: Any) -> None:
-        """Have a camera look at where the robot is, or will be."""
+        """Turn a camera to the robot; before its first state, to the origin."""
         at = np.zeros(3) if self._last is None else self._last.pose[:3]
         camera.position, camera.look_at = at + self._reach * CAMERA, at
 
-    # -- what users want ------------------------------------------------------------------------
+    # -- actions of users -----------------------------------------------------------------------
 
     def _handle_inbox(self) -> None:
         while True:
@@ -253,10 +592,10 @@ class Page:
                 return
             act()
 
-    def _want(self, action: Action) -> None:
+    def _request(self, action: Action) -> None:
         self._actions.append(action)
         if isinstance(action, Request):
-            self.note(Notice(f"{action.value.capitalize()} is requested.", source="page",
+            self.note(Notice(f"{action.value.capitalize()} requested.", source="page",
                              time_s=self._time_s))  # fmt: skip
 
     def _fly(self) -> None:
@@ -266,9 +605,9 @@ class Page:
             self._refuse(str(error))
             return
         if not goals:
-            self._refuse("There is no goal to fly to: the robot is not known yet.")
+            self._refuse("There is no goal to send: no state of the robot has been received yet.")
             return
-        self._want(Fly(goals))
+        self._request(Fly(goals))
 
     def _goal_to_robot(self) -> None:
         measured = self._state.measured
@@ -276,8 +615,8 @@ class Page:
             tool = self._state.tool if content.has_tool(self._state) else None
             self._editor.place(measured.pose, tool, measured.q, self._now)
 
-    def _refuse(self, sentence: str) -> None:
-        self.note(Notice(sentence, 2, self._time_s, "page"))
+    def _refuse(self, message: str) -> None:
+        self.note(Notice(message, 2, self._time_s, "page"))
 
     @property
     def _time_s(self) -> float | None:

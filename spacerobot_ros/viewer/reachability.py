@@ -1,8 +1,10 @@
-"""Whether a goal is reachable, found out by planning for it in a process of its own.
+"""Whether a goal is reachable: plans, and joint positions of an arm, in a child process.
 
-The process is of lower priority, so that neither the page nor the plant waits for it. It has one
-goal at a time: a newer one cancels the plan that is being made. Requests and answers are lines of
-JSON on its standard input and output.
+The process has a lower priority, so that neither the page nor the plant waits for it. It works on
+one goal at a time: a newer one cancels the plan in progress. Requests and answers are lines of JSON
+on its standard input and output. For a controller, which flies to any pose and reports only in
+flight that the arm is too short, joint positions are searched that bring the end-effector to its
+goal while the base is at its own.
 """
 
 from __future__ import annotations
@@ -23,7 +25,13 @@ from typing import IO, Any
 import numpy as np
 
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.model.rotations import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rotvec_from_quaternion,
+)
 from spacerobot_ros.model.shared_parameters import robot_from_text
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured, declared
@@ -34,25 +42,82 @@ from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.progress import reported
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
 from spacerobot_ros.termination import Terminated, child_options, guarded
-from spacerobot_ros.viewer.arm_shape import arm_shape, is_near
+from spacerobot_ros.viewer.state import Part, StackState
+
+_STARTS = 8
+"""Joint positions from which the search starts: the current ones, and random ones."""
+
+_EVALUATIONS = 30
+"""Most evaluations of the error in each search."""
+
+_NEAR = 1e-4
+"""Error below which an arm reaches its goal, m and rad."""
+
+_RADIAN = 0.5
+"""Weight of an error of one radian in the search, m."""
+
+
+def arm_shape(
+    robot: RobotDescription, link: str, base: Goal, tool: Goal, q: Array
+) -> tuple[Array, float, float]:
+    """Return the joint positions (n,) that bring a link nearest to its goal, and the error, m, rad.
+
+    The search starts at ``q`` and at random positions within the limits of the joints; for equal
+    arguments the result is the same.
+    """
+    # Imported here because scipy.optimize loads slowly.
+    from scipy.optimize import least_squares
+
+    kinematics = ForwardKinematics(robot)
+    end = kinematics.links.index(link)
+    R_WB = matrix_from_quaternion(base.quaternion)
+    goal_r = R_WB.T @ (tool.position - base.position)
+    goal_R = R_WB.T @ matrix_from_quaternion(tool.quaternion)
+
+    def error(shape: Array) -> Array:
+        R, r = kinematics.link_poses(shape)
+        turn = rotvec_from_quaternion(quaternion_from_matrix(R[end].T @ goal_R))
+        return np.concatenate([goal_r - r[end], _RADIAN * turn])
+
+    lower = np.where(np.isfinite(robot.limits("lower")), robot.limits("lower"), -math.pi)
+    upper = np.where(np.isfinite(robot.limits("upper")), robot.limits("upper"), math.pi)
+    # The solver requires a lower bound below the upper one.
+    lower, upper = np.minimum(lower, q) - 1e-9, np.maximum(upper, q) + 1e-9
+    random = np.random.default_rng(0)
+    best, least = q, error(q)
+    for number in range(_STARTS):
+        start = q if number == 0 else random.uniform(lower, upper)
+        found = least_squares(error, start, bounds=(lower, upper), max_nfev=_EVALUATIONS)
+        if np.linalg.norm(found.fun) < np.linalg.norm(least):
+            best, least = found.x, found.fun
+        if np.linalg.norm(least) < _NEAR:
+            break
+    return best, float(np.linalg.norm(least[:3])), float(np.linalg.norm(least[3:]) / _RADIAN)
+
+
+def is_near(distance: float, angle: float) -> bool:
+    """Whether an arm with such an error, m and rad, reaches its goal."""
+    return distance <= 2 * _NEAR and angle <= 4 * _NEAR
+
 
 _NICE = 10
-"""What is added to the niceness of the process: everything else goes first."""
+"""Added to the niceness of the process, so that everything else runs first."""
 
 _LONGEST_CANCELLATION = 2.0
-"""Wall s that a plan may take to end after its cancellation before the process is killed."""
+"""Wall time after the cancellation of a plan at which the process is killed, s."""
 
 _MOST_POINTS = 200
-"""Of the path that is sent back."""
+"""Largest number of points of the path in an answer."""
 
 
 class Verdict(str, Enum):
-    """What is known of a goal."""
+    """Verdict on a goal."""
 
     UNCHECKED = "unchecked"
-    """Nobody plans for it: the page is not to check, or only a controller flies."""
+    """No check: it is disabled, or only a controller flies."""
     PLANNING = "planning"
     REACHABLE = "reachable"
     REFUSED = "refused"
@@ -60,24 +125,24 @@ class Verdict(str, Enum):
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What a check has come to.
+    """Result of a check of a goal.
 
     Attributes
     ----------
     verdict
-        Of the goal.
-    sentence
-        The same for people, with the reason of a refusal.
+        The verdict.
+    message
+        Text for the user, with the reason of a refusal.
     duration_s
-        Of the manoeuvre, s; 0 where there is none.
+        Duration of the manoeuvre, s; 0 if there is none.
     shape
-        (n,) joints at its end, m or rad; None where there is none.
+        (n,) joint positions at its end, m or rad; None if there is none.
     path
-        (k, 3) of the base, m; None likewise.
+        (k, 3) path of the base, m; None if there is none.
     """
 
     verdict: Verdict
-    sentence: str = ""
+    message: str = ""
     duration_s: float = 0.0
     shape: Array | None = None
     path: Array | None = None
@@ -85,19 +150,19 @@ class Check:
 
 @dataclass(frozen=True)
 class Question:
-    """What is to be planned.
+    """A goal to check, and the situation to check it in.
 
     Attributes
     ----------
     urdf
-        The robot.
+        Description of the robot.
     parameters
-        The planner's own, as JSON texts by their names.
+        Parameters of the planner, as JSON texts by name.
     state, goal
-        From where, and to where.
+        Start and goal of the base.
     tool, link
-        Where a link is to be, for a controller, which plans nothing: then it is asked whether there
-        is a shape in which it is there. None: a planner flies.
+        Goal of a link, for a controller, which plans nothing: the check is then whether the arm can
+        reach it. None: a planner flies.
     """
 
     urdf: str
@@ -108,7 +173,7 @@ class Question:
     link: str = ""
 
     def to_json(self, number: int) -> str:
-        """Return the line that asks it."""
+        """Return the request as a line."""
         state, goal, tool = self.state, self.goal, self.tool
         return json.dumps(
             {
@@ -129,13 +194,53 @@ class Question:
         )
 
 
+def question_of(
+    state: StackState,
+    goals: Mapping[Part, Goal],
+    robot: RobotDescription | None,
+    parameters: Mapping[str, Mapping[str, str]],
+) -> Question | str:
+    """Return the question whether goals are reachable, or the reason why none is asked.
+
+    Parameters
+    ----------
+    state, goals
+        The state of the stack, and the goals by part.
+    robot
+        The robot; None: unknown.
+    parameters
+        Parameters of ``planner`` and ``controller``, as JSON texts by name, if known.
+    """
+    measured, goal, tool = state.measured, goals["base"], goals.get("end_effector")
+    if measured is None or robot is None:
+        return "No state received yet."
+    pose, q = (measured.pose[:3], measured.pose[3:]), measured.q
+    if state.planner is None:
+        if tool is None:
+            return "No planner is running: a controller flies the base to any pose."
+        known = parameters.get("controller", {})
+        link = robot.end_effector(json.loads(known.get("end_effector_frame", '""')))
+        if link not in robot.frames:
+            return "The end-effector is not a link of the robot."
+        return Question(robot.urdf, {}, RobotState(*pose, q), goal, tool, link)
+    if "planner" in state.absent:
+        return "The planner is offline."
+    if state.planner.state is PlannerState.PLANNING:
+        return "The planner is busy planning."
+    if "planner" not in parameters:
+        return "The planner's parameters have not been received yet."
+    momenta = np.zeros(6) if state.momenta is None else state.momenta.actual
+    start = RobotState(*pose, q, momenta[:3], momenta[3:])
+    return Question(robot.urdf, parameters["planner"], start, goal)
+
+
 def _listed(goal: Goal) -> list[float] | None:
-    """Return the joint positions of a goal."""
+    """Return the joint positions of a goal as a list."""
     return None if goal.joint_positions is None else goal.joint_positions.tolist()
 
 
 class GoalChecker:
-    """Answers questions in the background, the last one only."""
+    """Checks goals in the background; a new question replaces the one before."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -149,7 +254,7 @@ class GoalChecker:
         self._lock = threading.Lock()
 
     def ask(self, question: Question) -> None:
-        """Drop what is being planned, and plan for this."""
+        """Cancel the check in progress and start this one."""
         process = self._running()
         self._number += 1
         if not self._answered and self._cancelled_at is None:
@@ -159,7 +264,7 @@ class GoalChecker:
         self._send(process, self._last)
 
     def cancel(self) -> bool:
-        """Drop what is being planned; return whether anything was."""
+        """Cancel the check in progress; return whether there was one."""
         if self._process is None or self._answered:
             return False
         self._number += 1
@@ -169,7 +274,7 @@ class GoalChecker:
         return True
 
     def look(self) -> Check | None:
-        """Return the answer to the last question, once; before, how long it has been planned."""
+        """Return the answer to the last question once; before that, the time spent on it."""
         if self._answered:
             return None
         with self._lock:
@@ -251,7 +356,7 @@ def _check_of(answer: Mapping[str, Any]) -> Check:
     shape, path = answer.get("shape"), answer.get("path")
     return Check(
         Verdict(answer["verdict"]),
-        answer["sentence"],
+        answer["message"],
         answer.get("duration_s", 0.0),
         None if shape is None else np.array(shape, float),
         None if path is None else np.array(path, float).reshape(-1, 3),
@@ -262,18 +367,18 @@ def _check_of(answer: Mapping[str, Any]) -> Check:
 
 
 class Planner:
-    """Plans as the planner of a stack would, from rest; keeps what was built for the last one."""
+    """Plans from rest as the planner of the stack would; keeps the model of the last robot."""
 
     def __init__(self) -> None:
         self._built: tuple[str, Mapping[str, str]] | None = None
 
     def answer(self, question: Mapping[str, Any], cancellation: Cancellation) -> dict[str, Any]:
-        """Return what the plan comes to, as a line carries it.
+        """Return the fields of an answer.
 
         Raises
         ------
         PlanningCancelled
-            A newer question has come.
+            A newer question has arrived.
         """
         try:
             if question["tool"] is not None:
@@ -290,14 +395,14 @@ class Planner:
         except PlanningCancelled:
             raise
         except SpaceRobotError as error:
-            return {"verdict": Verdict.REFUSED.value, "sentence": str(error)}
+            return {"verdict": Verdict.REFUSED.value, "message": str(error)}
         path = schedule.path.position
         step = max(1, len(path) // _MOST_POINTS)
         duration = schedule.expected_duration
-        sentence = f"Reachable in {duration:.4g} s by '{schedule.method}'."
+        message = f"Reachable in {duration:.4g} s by '{schedule.method}'."
         return {
             "verdict": Verdict.REACHABLE.value,
-            "sentence": f"{sentence}{_left_out(schedule, goal, request.tolerance)}",
+            "message": f"{message}{_uncontrolled(schedule, goal, request.tolerance)}",
             "duration_s": duration,
             "shape": schedule.positions[-1].tolist(),
             "path": np.vstack([path[:-1:step], path[-1:]]).tolist(),
@@ -308,13 +413,13 @@ class Planner:
         known = {each.name for each in declared(PlannerConfig)}
         values = {name: json.loads(text) for name, text in parameters.items() if name in known}
         values = {name: value for name, value in values.items() if value is not None}
-        # The robot is that of the stack; the planner may have it from there as well.
+        # The robot is that of the question, wherever the planner takes its own from.
         self._config = configured(PlannerConfig, {**values, "robot_description": "", "robot": ""})
         self._worker = PlanningWorker(robot_from_text(urdf, self._config), self._config)
 
 
-def _left_out(schedule: GaitSchedule, goal: Goal, tolerance: Tolerance) -> str:
-    """Return which parts of a goal a schedule does not heed, and how far off its end is there."""
+def _uncontrolled(schedule: GaitSchedule, goal: Goal, tolerance: Tolerance) -> str:
+    """Return a sentence on each goal component the method does not control, with its error."""
     path, controls = schedule.path, schedule.controls
     error = PoseError.between(path.position[-1], path.quaternion[-1], goal)
     parts = []
@@ -325,32 +430,32 @@ def _left_out(schedule: GaitSchedule, goal: Goal, tolerance: Tolerance) -> str:
     if "shape" not in controls and goal.joint_positions is not None:
         parts.append(("final joint positions", ""))
     return "".join(
-        f" '{schedule.method}' does not heed the {part}"
-        # Where later schedules end is not known yet.
+        f" '{schedule.method}' does not control the {part}"
+        # The end of later schedules is not known yet.
         + (f": it ends {off} off." if off and not schedule.partial else ".")
         for part, off in parts
     )
 
 
 def _of_arm(question: Mapping[str, Any]) -> dict[str, Any]:
-    """Return whether there is a shape in which the end-effector is at its goal."""
+    """Return the answer on whether the arm reaches its goal."""
     robot = parse_robot(question["urdf"])
     base, tool = (Goal.checked(*question[name]) for name in ("goal", "tool"))
     q = np.array(question["state"][2], float)
     shape, distance, angle = arm_shape(robot, question["link"], base, tool, q)
     found = {"shape": shape.tolist()}
     if is_near(distance, angle):
-        sentence = "The end-effector can be at its goal there."
-        return {"verdict": Verdict.REACHABLE.value, "sentence": sentence, **found}
-    sentence = (
-        f"No shape was found in which the end-effector is at its goal: it is {distance:.3g} m and "
-        f"{angle:.3g} rad off in the nearest."
+        message = "The end-effector can reach its goal there."
+        return {"verdict": Verdict.REACHABLE.value, "message": message, **found}
+    message = (
+        f"The end-effector cannot reach its goal: the nearest joint positions found leave "
+        f"{distance:.3g} m and {angle:.3g} rad."
     )
-    return {"verdict": Verdict.REFUSED.value, "sentence": sentence, **found}
+    return {"verdict": Verdict.REFUSED.value, "message": message, **found}
 
 
 class _LastQuestion:
-    """The last question, for the thread that plans; a new one cancels the plan being made."""
+    """The last question, for the thread that plans; a new one cancels the plan in progress."""
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
@@ -366,7 +471,7 @@ class _LastQuestion:
     def take(self) -> tuple[dict[str, Any], Cancellation]:
         with self._condition:
             while self._question is None:
-                # Bounded, so that signals are noticed.
+                # A bounded wait lets signals through.
                 self._condition.wait(0.5)
             question, self._question = self._question, None
             self._cancellation = Cancellation()
@@ -377,7 +482,7 @@ def main() -> None:
     """Answer questions until standard input ends."""
     with guarded(), suppress(Terminated):
         os.nice(_NICE)
-        # What libraries print is not to be among the answers.
+        # Keep output of libraries out of the answers.
         answers = os.fdopen(os.dup(1), "w")
         os.dup2(2, 1)
         last = _LastQuestion()

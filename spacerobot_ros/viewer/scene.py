@@ -1,7 +1,8 @@
-"""The robot and what is drawn around it, as nodes of a viser scene.
+"""The robot and its surroundings, as nodes of a viser scene.
 
-A tree of frames like that of the URDF hangs on the pose of the base: only what a joint moves is
-sent again. Names of links stay out of the paths of nodes, which have slashes of their own.
+A tree of frames like that of the URDF hangs on the pose of the base: only transforms that a joint
+changes are sent again. Node paths are separated by slashes, so names of links, which may contain
+some, stay out of them.
 """
 
 from __future__ import annotations
@@ -31,17 +32,17 @@ _PLUME: Color = (255, 110, 40)
 _LINE = 3.0
 """Pixels."""
 
-_ROOM = 32
-"""Segments that a line has room for at least."""
+_LEAST_CAPACITY = 32
+"""Least capacity of a line, in segments."""
 
 _GRID: tuple[Color, Color] = (150, 150, 155), (120, 120, 128)
-"""Cells and sections: seen on white and on black."""
+"""Colours of cells and sections, visible on white and on black."""
 
 _MOST_TRIANGLES = 20_000
-"""Of a mesh that is sent to browsers: a finer one is made coarser."""
+"""Largest number of triangles of a mesh; finer ones are simplified."""
 
 _SCALE = 0.05
-"""Radius of the spheres that a robot without shapes has at its joints, m."""
+"""Radius of the spheres drawn at the joints of a robot without shapes, m."""
 
 
 def wxyz(quaternion: Array) -> Array:
@@ -60,15 +61,15 @@ class RobotDrawing:
     Parameters
     ----------
     scene
-        Where it is drawn.
+        Scene to draw in.
     path
-        The node of its base; what hangs on a node moves with it.
+        Path of the node of its base.
     robot
-        What is drawn.
+        The robot.
     color
-        Of everything; None: the colors of the URDF.
+        Color of all parts; None: the colors of the URDF.
     on_note
-        Called with a sentence about what cannot be drawn.
+        Called with a message about each shape that cannot be drawn.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class RobotDrawing:
         robot: RobotDescription,
         *,
         color: Color | None = None,
-        on_note: Callable[[str], None] = lambda sentence: None,
+        on_note: Callable[[str], None] = lambda message: None,
     ) -> None:
         self._scene, self._path, self._color, self._on_note = scene, path, color, on_note
         self._kinematics = kinematics = ForwardKinematics(robot)
@@ -117,7 +118,7 @@ class RobotDrawing:
         return [ball, *(bar for bar in bars if bar is not None)]
 
     def _solid(self, path: str, shape: Shape) -> Any | None:
-        """Draw a visual in the frame of its link; None where it cannot be drawn."""
+        """Draw a visual in the frame of its link; None if it cannot be drawn."""
         try:
             mesh = shape_mesh(shape, _MOST_TRIANGLES) if shape.kind == "mesh" else solid_mesh(shape)
         except MeshError as error:
@@ -134,14 +135,14 @@ class RobotDrawing:
         return self._scene.add_mesh_simple(path, mesh.vertices, faces, flat_shading=True, **look)
 
     def paint(self, color: Color) -> None:
-        """Give everything a color."""
+        """Set the color of all parts."""
         if color != self._color:
             self._color = color
             for solid in self._solids:
                 solid.color = color
 
     def place(self, pose: Array) -> None:
-        """Have the base at a pose (7,) in what the drawing hangs on."""
+        """Move the base to a pose (7,) in the frame of its parent node."""
         self.base.position = pose[:3]
         self.base.wxyz = wxyz(pose[3:])
 
@@ -154,7 +155,7 @@ class RobotDrawing:
 
 
 def _bar(end: Array) -> Shape | None:
-    """Return a thin cylinder from the origin to a point, None where that is the origin."""
+    """Return a thin cylinder from the origin to a point; None if that is the origin."""
     length = float(np.linalg.norm(end))
     if length < 1e-6:
         return None
@@ -166,7 +167,7 @@ def _bar(end: Array) -> Shape | None:
 
 
 def reach_of(robot: RobotDescription) -> float:
-    """Return a length that the whole robot fits into, from the origin of its base, m."""
+    """Return an upper bound of the distance of any part from the origin of the base, m."""
     farthest: dict[str, float] = {robot.base_link: 0.0}
     for joint in joints_outward(robot):
         farthest[joint.child] = farthest[joint.parent] + float(np.linalg.norm(joint.origin.r))
@@ -183,37 +184,37 @@ def reach_of(robot: RobotDescription) -> float:
 class Lines:
     """Connected points in the scene, such as a path.
 
-    A node has room for a number of segments, and another takes its place when there are more: pages
-    do not draw anew what changes its size.
+    A node has a fixed capacity of segments and is replaced by a larger one: browsers do not redraw
+    a node whose number of segments changes.
 
     Parameters
     ----------
     scene, path
-        Where it is drawn.
+        Scene to draw in, and path of the node.
     color
-        Of the line.
+        Color of the line.
     """
 
     def __init__(self, scene: viser.SceneApi, path: str, color: Color) -> None:
         self._scene, self._path, self._color = scene, path, color
-        self._room = 0
+        self._capacity = 0
         self._handle: Any = None
 
     def draw(self, points: Array) -> None:
-        """Connect points (k, 3), m; fewer than two draw nothing."""
+        """Connect points (k, 3), m; fewer than two clear the line."""
         self.draw_segments(np.stack([points[:-1], points[1:]], axis=1))
 
     def draw_segments(self, segments: Array) -> None:
-        """Draw segments (k, 2, 3), m; none: nothing."""
+        """Draw segments (k, 2, 3), m; none clear the line."""
         if not len(segments):
             if self._handle is not None:
                 self._handle.visible = False
             return
-        larger = len(segments) > self._room
+        larger = len(segments) > self._capacity
         if larger:
-            self._room = max(_ROOM, 2 ** (len(segments) - 1).bit_length())
-        # What is left of the room is at the end, without a length.
-        filled = np.broadcast_to(segments[-1, 1], (self._room, 2, 3)).astype(np.float32)
+            self._capacity = max(_LEAST_CAPACITY, 2 ** (len(segments) - 1).bit_length())
+        # Unused segments have zero length, at the end of the last one.
+        filled = np.broadcast_to(segments[-1, 1], (self._capacity, 2, 3)).astype(np.float32)
         filled[: len(segments)] = segments
         if larger:
             self._handle = self._scene.add_line_segments(
@@ -225,16 +226,16 @@ class Lines:
 
 
 def plumes(table: ThrusterTable, names: tuple[str, ...], duty: Array, length: float) -> Array:
-    """Return the segments (k, 2, 3) of the plumes of the thrusters that are on, base frame, m.
+    """Return the plumes of active thrusters as segments (k, 2, 3) in the base frame, m.
 
     Parameters
     ----------
     table
-        Where they are.
+        The thrusters of the robot.
     names, duty
-        Of each, for what part of the time it is on.
+        Names of thrusters, and the share of the time that each is on, 0 to 1.
     length
-        Of a plume that is always on, m.
+        Length of a plume at a duty of 1, m.
     """
     segments = []
     for name, part in zip(names, duty, strict=True):
@@ -251,19 +252,19 @@ class Surroundings:
     Parameters
     ----------
     scene
-        Where they are drawn.
+        Scene to draw in.
     reach
-        Length that the robot fits into, m.
+        Size of the robot, as of :func:`reach_of`, m.
     robot_path
-        The node of the robot's base, on which the plumes hang.
+        Path of the node of the robot's base, which carries the plumes.
     center
-        (3,) point above which the grid lies, m.
+        (3,) point below which the grid lies, m.
     """
 
     def __init__(self, scene: viser.SceneApi, reach: float, robot_path: str, center: Array) -> None:
         cell = 10.0 ** np.floor(np.log10(reach)) / 2
         cells, sections = _GRID
-        # Lines stay at round coordinates, wherever it is.
+        # Keep grid lines at round coordinates.
         x, y, _ = 10 * cell * np.round(center / (10 * cell))
         scene.add_grid(
             "/grid",

@@ -1,7 +1,8 @@
-"""The web server of the page: viser's, kept to this machine and to its own page.
+"""The web server of the page, and the parameters of the viewer.
 
-viser takes websockets from any page that a browser has open, and connects to a server of its
-makers when a client asks it to share the page. Both are prevented here: this page steers a robot.
+viser accepts websockets from any page that a browser has open, and connects to a server of its
+makers when a client asks it to share the page. Both are prevented here, against pages of strangers
+in a user's browser: this page steers a robot. For the same reason no other page may frame it.
 """
 
 from __future__ import annotations
@@ -14,25 +15,56 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.model.shared_parameters import WatchdogConfig
+from spacerobot_ros.parameters import parameter
 
 if TYPE_CHECKING:
     import viser
 
+
+@dataclass(frozen=True)
+class ViewerConfig(WatchdogConfig):
+    """Parameters of the viewer: address, drawing rate, and goal checks."""
+
+    host: str = parameter(
+        "127.0.0.1",
+        "address that the page is served at; any other one lets other machines steer the robot",
+    )
+    port: int = parameter(
+        8080,
+        "port of the page, or the next free one; 0: any",
+        minimum=0,
+        maximum=65535,
+    )
+    update_rate: float = parameter(
+        20.0, "how often the page is drawn, wall time", unit="Hz", minimum=1.0, maximum=60.0
+    )
+    dark: bool = parameter(False, "whether pages are dark when they are opened")
+    world_frame: str = parameter("world", "frame of the goals that the page sends")
+    check_goals: bool = parameter(
+        True, "plan for the goal that is shown, to tell whether it is reachable before it is sent"
+    )
+
+
 _MOST_PORTS = 100
-"""Ports that are tried one after the other."""
+"""Number of ports that are tried, one after the other."""
+
+_NO_FRAMES = {"Content-Security-Policy": "frame-ancestors 'none'", "X-Frame-Options": "DENY"}
+"""HTTP headers that keep browsers from showing the page inside another one."""
 
 _LABEL = "spacerobot"
 
 _construction = threading.Lock()
-"""While a server starts, a function of websockets is replaced."""
+"""Held while a server starts, when a function of websockets is replaced."""
 
 
 def require_viser() -> None:
-    """Refuse to go on without viser.
+    """Check that viser is installed.
 
     Raises
     ------
@@ -47,7 +79,7 @@ def require_viser() -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches an address."""
+    """Whether an address can be reached from this machine only."""
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -55,18 +87,18 @@ def is_loopback(host: str) -> bool:
 
 
 def free_port(host: str, port: int) -> int:
-    """Return ``port``, or the next one that nobody listens at; 0: any.
+    """Return ``port`` or the next free one; for 0 any free port.
 
     Raises
     ------
     ParameterError
-        The address is none of this machine, or a hundred ports are taken.
+        The address is not one of this machine, or a hundred ports are taken.
     """
     try:
         family, _, _, _, _ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     except OSError as error:
         raise ParameterError(
-            f"Parameter 'host' is '{host}', which is no address: {error}."
+            f"Parameter 'host' is '{host}', which is not an address: {error}."
         ) from None
     last = min(port + _MOST_PORTS, 65536) if port else 1
     problem: OSError | None = None
@@ -80,34 +112,34 @@ def free_port(host: str, port: int) -> int:
                 continue
             return int(probe.getsockname()[1])
     raise ParameterError(
-        f"The viewer finds no port at '{host}' from {port} to {last - 1}: "
+        f"No port at '{host}' from {port} to {last - 1} is free for the viewer: "
         f"{problem.strerror if problem else 'none is left'}."
     )
 
 
 def is_own_page(origin: str | None, host: str | None, served: str) -> bool:
-    """Whether a websocket is opened by a page of this server, or by no page at all.
+    """Whether a websocket is opened by a page of this server, or by a program that is no browser.
 
     Parameters
     ----------
     origin, host
-        What a browser says of the page that opens it, and of the server that it wants.
+        Headers of the request: the page that opens the websocket, and the server it addresses.
     served
         The address that the page is served at.
     """
     if origin is None:
-        return True  # Browsers always name one: this is a program.
+        return True  # Browsers always send an origin: this is a program.
     page = urlsplit(origin)
     name = page.hostname or ""
     if page.scheme not in ("http", "https") or page.netloc != host:
         return False
-    # A name that was made to point to this machine is no page of ours.
+    # A foreign name may have been made to resolve to this machine.
     return not is_loopback(served) or is_loopback(name)
 
 
 @contextmanager
-def _own_pages_only(served: str) -> Iterator[None]:
-    """Have websocket servers that start in here refuse other origins."""
+def _guarded_websockets(served: str) -> Iterator[None]:
+    """Make websocket servers that start in this block refuse other origins and frames."""
     import websockets.asyncio.server as module
     from websockets.http11 import Request, Response
 
@@ -123,6 +155,8 @@ def _own_pages_only(served: str) -> Iterator[None]:
                 refusal: Response = connection.respond(403, "This page steers a robot.\n")
                 return refusal
             answer: Response | None = process_request(connection, request)
+            if answer is not None:
+                answer.headers.update(_NO_FRAMES)
             return answer
 
         return serve(*given, process_request=process, **options)
@@ -146,22 +180,22 @@ def start_server(host: str, port: int) -> viser.ViserServer:
     import viser
 
     class LocalServer(viser.ViserServer):
-        """A server whose page is never shared."""
+        """A server that never shares its page through the internet."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
-            """Ask nobody."""
+            """Return None: no share is requested."""
             return None
 
-    # viser looks for a free port as well, but waits for ever where an address is wrong.
+    # viser looks for a free port as well, but waits forever if an address is wrong.
     port = free_port(host, port)
-    # It prints where it listens; the node says so, and in the stack's words.
-    with _construction, _own_pages_only(host), redirect_stdout(io.StringIO()):
+    # It prints its address; so does the node, in the format of the other commands.
+    with _construction, _guarded_websockets(host), redirect_stdout(io.StringIO()):
         server = LocalServer(host=host, port=port, label=_LABEL, verbose=False)
     return server
 
 
 def url_of(server: viser.ViserServer) -> str:
-    """Return where the page is."""
+    """Return the URL of the page."""
     host = server.get_host()
     if host in ("0.0.0.0", "::"):
         host = "127.0.0.1"

@@ -33,7 +33,7 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.viewer.config import ViewerConfig
+from spacerobot_ros.viewer.server import ViewerConfig
 
 FOLDER = Path(__file__).parents[1] / "expected"
 PARAMETERS, PLANS = FOLDER / "parameters.json", FOLDER / "plans.json"

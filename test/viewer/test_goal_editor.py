@@ -142,7 +142,7 @@ def test_fields_of_joints_stay_within_their_limits(server: Any) -> None:
     other = load_robot(robot_file("sliding_masses"))
     page.editor.show_robot(other, reach_of(other))
     assert len(page.final._fields) == 3
-    assert page.final.wanted is None
+    assert page.final.positions is None
 
 
 def test_a_goal_of_the_end_effector_that_appears_is_checked(server: Any) -> None:

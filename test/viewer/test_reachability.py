@@ -58,28 +58,28 @@ def test_joint_positions_of_a_goal_are_asked_for_and_a_method_without_them_says_
     assert as_asked(wanted)["goal"][2] == [0.1, -0.05, 0.2]
     answer = Planner().answer(as_asked(wanted), Cancellation())
     assert answer["verdict"] == "reachable"
-    assert "'lie_bracket' does not heed the final joint positions" in answer["sentence"]
+    assert "'lie_bracket' does not control the final joint positions" in answer["message"]
 
 
-def test_what_a_method_leaves_as_it_comes_is_said_of_a_goal_that_counts_as_reachable() -> None:
+def test_goal_components_that_a_method_does_not_control_are_named_with_their_errors() -> None:
     chain = replace(
         question(0.3, -0.4, 0.0, method="area_loop"),
         urdf=load_robot(robot_file("three_joint_arm")).urdf,
     )
     answer = Planner().answer(as_asked(chain), Cancellation())
     assert answer["verdict"] == "reachable", answer
-    assert "'area_loop' does not heed the position: it ends 0.5 m off." in answer["sentence"]
+    assert "'area_loop' does not control the position: it ends 0.5 m off." in answer["message"]
     here = replace(chain, goal=Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]))
-    assert "heed" not in Planner().answer(as_asked(here), Cancellation())["sentence"]
+    assert "control" not in Planner().answer(as_asked(here), Cancellation())["message"]
 
 
 def test_a_refusal_has_the_sentence_of_the_planner_and_the_next_goal_is_planned() -> None:
     planner = Planner()
     refused = planner.answer(as_asked(question(9.0, 0.0, 0.0)), Cancellation())
     assert refused["verdict"] == "refused"
-    assert "slider" in refused["sentence"] or "limits" in refused["sentence"]
+    assert "slider" in refused["message"] or "limits" in refused["message"]
     wrong = planner.answer(as_asked(question(0.1, 0.0, 0.0, method="none")), Cancellation())
-    assert (wrong["verdict"], "method" in wrong["sentence"]) == ("refused", True)
+    assert (wrong["verdict"], "method" in wrong["message"]) == ("refused", True)
     assert planner.answer(as_asked(question(0.1, 0.0, 0.0)), Cancellation())["verdict"] == (
         "reachable"
     )
@@ -166,7 +166,7 @@ def test_the_arm_of_a_controlled_robot_reaches_its_goal_or_not() -> None:
     far = Goal(tool.position + np.array([9.0, 0.0, 0.0]), tool.quaternion)
     answer = Planner().answer(as_asked(replace(near, tool=far)), Cancellation())
     assert answer["verdict"] == "refused"
-    assert "m and" in answer["sentence"]
+    assert "m and" in answer["message"]
 
 
 def _unit(quaternion: Array) -> Array:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from html import escape
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
@@ -24,30 +26,35 @@ from spacerobot_ros.simulation.faults import Targets
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.viewer import content
 from spacerobot_ros.viewer.content import History, Trail
-from spacerobot_ros.viewer.goal_editor import carried
-from spacerobot_ros.viewer.port import Measured, Momenta, Notice, StackState
+from spacerobot_ros.viewer.goal_editor import carried, rpy_from_quaternion
 from spacerobot_ros.viewer.reachability import Check, Verdict
+from spacerobot_ros.viewer.state import Measured, Momenta, Notice, StackState
 
 HERE = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0])
 STATE = StackState(Measured(4.0, HERE, np.zeros(3), np.zeros(3), np.zeros(3)), age_s=0.1)
+
+
+def quaternion_of(rpy: Any) -> np.ndarray:
+    return Rotation.from_euler("xyz", np.asarray(rpy)).as_quat()
+
 
 angles = st.floats(-math.pi, math.pi)
 
 
 @given(angles, st.floats(-math.pi / 2, math.pi / 2), angles)
 def test_angles_on_the_page_are_those_of_a_urdf(roll: float, pitch: float, yaw: float) -> None:
-    quaternion = content.quaternion_from_rpy((roll, pitch, yaw))
+    quaternion = quaternion_of((roll, pitch, yaw))
     R = matrix_from_rpy([roll, pitch, yaw])
     np.testing.assert_allclose(matrix_from_quaternion(quaternion), R, atol=1e-12)
-    again = matrix_from_rpy(content.rpy_from_quaternion(quaternion))
+    again = matrix_from_rpy(rpy_from_quaternion(quaternion))
     # At a pitch of 90 deg the angles are badly conditioned, like the arcsine.
     np.testing.assert_allclose(again, R, atol=2e-7)
 
 
 def test_a_vertical_pitch_has_angles() -> None:
     for pitch in (math.pi / 2, -math.pi / 2):
-        q = content.quaternion_from_rpy((0.3, pitch, 0.8))
-        again = content.quaternion_from_rpy(content.rpy_from_quaternion(q))
+        q = quaternion_of((0.3, pitch, 0.8))
+        again = quaternion_of(rpy_from_quaternion(q))
         np.testing.assert_allclose(
             matrix_from_quaternion(again), matrix_from_quaternion(q), atol=1e-7
         )
@@ -56,48 +63,48 @@ def test_a_vertical_pitch_has_angles() -> None:
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, 1e300])
 def test_numbers_that_are_no_goal_are_refused(number: float) -> None:
     with pytest.raises(GoalError):
-        content.goal_of((0.0, number, 0.0), (0.0, 0.0, 0.0, 1.0))
+        Goal.checked((0.0, number, 0.0), (0.0, 0.0, 0.0, 1.0))
     with pytest.raises(GoalError):
-        content.goal_of((0.0, 0.0, 0.0), content.quaternion_from_rpy((0.0, math.nan, 0.0)))
+        Goal.from_rpy((0.0, 0.0, 0.0), (0.0, math.degrees(number), 0.0))
 
 
 def test_silence_is_said() -> None:
-    assert "No state has come yet" in content.silence(StackState())
-    assert content.silence(STATE) == ""
-    assert content.silence(replace(STATE, age_s=5.9)) == "No state for 5 s."
+    assert "No state received yet" in content.silence_message(StackState())
+    assert content.silence_message(STATE) == ""
+    assert content.silence_message(replace(STATE, age_s=5.9)) == "No state for 5 s."
     paused = PlantStatus(PlantState.PAUSED, "Time stands still.")
-    assert content.silence(replace(STATE, age_s=5.9, plant=paused)) == ""
+    assert content.silence_message(replace(STATE, age_s=5.9, plant=paused)) == ""
     held = ReplayStatus(1.0, 2.0, paused=True, ended=False, rate=1.0)
-    assert content.silence(replace(STATE, age_s=5.9, replay=held)) == ""
-    assert content.silence(StackState(replay=held)) == "", "it has not begun"
+    assert content.silence_message(replace(STATE, age_s=5.9, replay=held)) == ""
+    assert content.silence_message(StackState(replay=held)) == "", "it has not begun"
     plays = replace(held, paused=False)
-    assert content.silence(replace(STATE, age_s=5.9, replay=plays)) == "No state for 5 s."
-    head = content.head(replace(STATE, silent={"/planner": 3.2}))
-    assert "Node &#x27;/planner&#x27; is silent for 3 s." in head
-    assert "Node &#x27;/plant&#x27; is not active." in content.head(
+    assert content.silence_message(replace(STATE, age_s=5.9, replay=plays)) == "No state for 5 s."
+    head = content.status_html(replace(STATE, silent={"/planner": 3.2}))
+    assert "Node &#x27;/planner&#x27; has been silent for 3 s." in head
+    assert "Node &#x27;/plant&#x27; is not active." in content.status_html(
         replace(STATE, inactive=("/plant",))
     )
-    assert "robot_description" not in content.head(STATE)
-    assert "nothing valid has come on robot_description" in content.head(STATE, described=False)
+    assert "robot_description" not in content.status_html(STATE)
+    assert "no valid robot_description" in content.status_html(STATE, described=False)
 
 
 def test_time_to_go_is_of_the_schedule_that_is_flown() -> None:
     executing = PlannerStatus(PlannerState.EXECUTING, manoeuvre_time_s=8.0, ends_at_s=10.0)
     flying = replace(STATE, planner=executing)
     assert content.time_to_go(flying) == pytest.approx(6.0)
-    assert content.share_flown(flying) == pytest.approx(0.25)
-    assert "6.0 s to go" in content.head(flying)
+    assert content.progress(flying) == pytest.approx(0.25)
+    assert "6.0 s to go" in content.status_html(flying)
     assert content.time_to_go(STATE) is None
-    assert content.share_flown(STATE) == 0.0
+    assert content.progress(STATE) == 0.0
     reached = replace(STATE, planner=replace(executing, state=PlannerState.REACHED))
     assert content.time_to_go(reached) is None
     lost = replace(flying, absent=frozenset({"planner"}))
     assert content.time_to_go(lost) is None, "nobody flies it any more"
-    assert "opacity" in content.head(lost)
-    assert "opacity" not in content.head(replace(flying, absent=frozenset({"controller"})))
+    assert "opacity" in content.status_html(lost)
+    assert "opacity" not in content.status_html(replace(flying, absent=frozenset({"controller"})))
     late = replace(STATE, planner=replace(executing, ends_at_s=3.0))
     assert content.time_to_go(late) == 0.0
-    assert content.share_flown(late) == 1.0
+    assert content.progress(late) == 1.0
 
 
 def test_what_nodes_say_is_no_html() -> None:
@@ -110,11 +117,11 @@ def test_what_nodes_say_is_no_html() -> None:
         silent={evil: 3.0},
     )
     texts = [
-        content.head(state),
-        content.faults((evil,)),
-        content.quiet(evil),
-        content.verdict(Check(Verdict.REFUSED, evil)),
-        content.log([Notice(evil, 2, 1.0, evil)]),
+        content.status_html(state),
+        content.faults_html((evil,)),
+        content.hint_html(evil),
+        content.check_html(Check(Verdict.REFUSED, evil)),
+        content.log_html([Notice(evil, 2, 1.0, evil)]),
     ]
     robot = load_robot(robot_file("three_joint_arm"))
     urdf = robot.urdf.replace(robot.joint_names[0], "a&lt;b&gt;c")
@@ -122,7 +129,7 @@ def test_what_nodes_say_is_no_html() -> None:
     assert f"Fault: {escape(evil)}" in texts[0]
     assert all("<img" not in text for text in texts)
     zeros = np.zeros(3)
-    table = content.joints(parse_robot(urdf), zeros, zeros, zeros)
+    table = content.joints_html(parse_robot(urdf), zeros, zeros, zeros)
     assert "a&lt;b&gt;c" in table
     assert "a<b>c" not in table
 
@@ -131,32 +138,34 @@ def test_joints_stand_beside_their_limits() -> None:
     robot = load_robot(robot_file("sliding_masses"))
     lower, upper = robot.limits("lower"), robot.limits("upper")
     middle = (lower + upper) / 2
-    rows = content.joints(robot, middle, np.zeros(3), np.zeros(3)).split("<tr>")[2:]
+    rows = content.joints_html(robot, middle, np.zeros(3), np.zeros(3)).split("<tr>")[2:]
     assert [name in row for name, row in zip(robot.joint_names, rows, strict=True)] == [True] * 3
     assert all("left:50%" in row for row in rows)
     near = upper - 0.01 * (upper - lower)
-    assert content.joints(robot, near, np.zeros(3), np.zeros(3)).count("left:99%") == 3
-    beyond = content.joints(robot, upper + 1.0, np.zeros(3), np.zeros(3))
+    assert content.joints_html(robot, near, np.zeros(3), np.zeros(3)).count("left:99%") == 3
+    beyond = content.joints_html(robot, upper + 1.0, np.zeros(3), np.zeros(3))
     assert beyond.count("left:100%;") == 3
     assert beyond.count("#d23c3c") == 3
     tiny = np.full(3, -1e-9)
-    assert "-0.0" not in content.joints(robot, tiny, tiny, tiny), "zero has no sign"
+    assert "-0.0" not in content.joints_html(robot, tiny, tiny, tiny), "zero has no sign"
 
 
 def test_errors_are_to_the_goal() -> None:
-    assert content.base_error(STATE) is None
-    turned = content.quaternion_from_rpy((0.0, 0.0, 0.5))
+    assert content.goal_error(STATE, "base") is None
+    turned = quaternion_of((0.0, 0.0, 0.5))
     goal = Goal(np.array([1.0, 2.0, 5.0]), turned)
-    assert content.base_error(replace(STATE, goals={"base": goal})) == pytest.approx((2.0, 0.5))
+    assert content.goal_error(replace(STATE, goals={"base": goal}), "base") == pytest.approx(
+        (2.0, 0.5)
+    )
     # That of the end-effector too, whatever the reference is that the controller follows to it.
     errors = {"end_effector.x": 9.0, "end_effector.rz": 0.9}
     report = CommandReport("model_based", False, 1.0, 0.0, 0.0, 0.0, 0.0, errors)
     controlled = ControllerStatus(ControllerState.TRACKING, command=report)
-    tool = Goal(np.array([4.0, 6.0, 3.0]), content.quaternion_from_rpy((0.0, 0.2, 0.0)))
+    tool = Goal(np.array([4.0, 6.0, 3.0]), quaternion_of((0.0, 0.2, 0.0)))
     flying = replace(STATE, controller=controlled, tool=HERE, goals={"end_effector": tool})
-    assert content.tool_error(flying) == pytest.approx((5.0, 0.2))
-    assert content.tool_error(replace(flying, goals={})) is None
-    assert content.tool_error(replace(flying, tool=None)) is None
+    assert content.goal_error(flying, "end_effector") == pytest.approx((5.0, 0.2))
+    assert content.goal_error(replace(flying, goals={}), "end_effector") is None
+    assert content.goal_error(replace(flying, tool=None), "end_effector") is None
 
 
 def test_momenta_are_compared_with_what_they_should_be() -> None:
@@ -219,7 +228,7 @@ def test_a_trail_is_as_long_as_the_flight_with_as_many_points_as_are_drawn() -> 
 
 
 def test_a_goal_that_is_carried_along_stays_where_it_is_beside_the_base() -> None:
-    quarter = content.quaternion_from_rpy((0.0, 0.0, math.pi / 2))
+    quarter = quaternion_of((0.0, 0.0, math.pi / 2))
     before = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     after = np.concatenate([[5.0, 5.0, 5.0], quarter])
     tool = np.array([3.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
@@ -236,5 +245,5 @@ def test_long_names_of_joints_have_room() -> None:
     assert len(set(short)) == 12, "they are told apart by their ends"
     robot = load_robot(robot_file("three_joint_arm"))
     urdf = robot.urdf.replace(f'"{robot.joint_names[0]}"', f'"{long[0]}"')
-    table = content.joints(parse_robot(urdf), *np.zeros((3, 3)))
+    table = content.joints_html(parse_robot(urdf), *np.zeros((3, 3)))
     assert f'title="{long[0]}">{short[0]}<' in table

@@ -31,8 +31,8 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
-from spacerobot_ros.viewer.port import Measured, StackState
-from spacerobot_ros.viewer.reachability import Check, Verdict
+from spacerobot_ros.viewer.reachability import Check, Verdict, question_of
+from spacerobot_ros.viewer.state import Measured, StackState
 
 URDF = load_robot(robot_file("sliding_masses")).urdf
 GOAL = Goal.checked([1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
@@ -108,10 +108,10 @@ class Stack:
         return self.viewer._page
 
     def head(self) -> str:
-        return str(self.page._head.content)
+        return str(self.page._status.content)
 
     def log(self) -> str:
-        return " | ".join(notice.sentence for notice in self.page._log._notices)
+        return " | ".join(notice.message for notice in self.page._log._notices)
 
     def until(self, predicate: Any, what: str) -> None:
         self.harness.spin_until(predicate, what)
@@ -144,9 +144,9 @@ def names_of(urdf_robot: Any) -> tuple[str, ...]:
 def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness) -> None:
     stack = Stack(harness)
     page = stack.page
-    stack.until(lambda: "No state has come yet" in stack.head(), "the page says so")
+    stack.until(lambda: "No state received yet" in stack.head(), "the page says so")
     stack.press(page._buttons._fly)
-    stack.until(lambda: "no goal to fly to" in stack.log(), "nothing is sent")
+    stack.until(lambda: "no goal to send" in stack.log(), "nothing is sent")
     stack.describe()
     stack.until(lambda: page._drawing is not None, "the robot")
     names = names_of(load_robot(robot_file("sliding_masses")))
@@ -191,7 +191,9 @@ def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness
     assert stack.called[3:] == ["/robot/pause True", "/robot/pause False"]
     stack.until(lambda: "Done: /robot/pause." in stack.log(), "its answer")
     stack.press(page._buttons._goal, "Abort")
-    stack.until(lambda: "No planner or controller answers 'abort' now." in stack.log(), "nobody")
+    stack.until(
+        lambda: "No planner or controller offers the service 'abort' now." in stack.log(), "nobody"
+    )
     stack.press(page._faults._clear)
     stack.until(lambda: stack.probe.count("/fault_injection") == 1, "clear")
     assert stack.probe.last("/fault_injection").data == "clear"
@@ -299,7 +301,9 @@ def test_a_replay_has_a_time_line(harness: Harness) -> None:
     harness.settle(stack.probe)
     assert line._slider.value == 7.5, "it does not fight the user's hand"
     stack.press(line._buttons, "Hold")
-    stack.until(lambda: "No replay answers 'pause' now." in stack.log(), "nobody is there")
+    stack.until(
+        lambda: "No replay offers the service 'pause' now." in stack.log(), "nobody is there"
+    )
 
 
 def test_the_parameters_of_a_plant_decide_on_its_faults(harness: Harness) -> None:
@@ -401,9 +405,9 @@ def test_nodes_that_are_gone_are_shown_no_longer(harness: Harness) -> None:
     pass_time(10.0)
     assert look().silent["/planner"] >= 10.0
     assert look().absent == {"planner"}
-    question, why_not = stack.viewer._question(replace(look(), measured=HERE), {"base": GOAL})
-    assert question is None
-    assert why_not == "The planner is not there now."
+    seen = replace(look(), measured=HERE)
+    answer = question_of(seen, {"base": GOAL}, load_robot(robot_file("sliding_masses")), {})
+    assert answer == "The planner is offline."
     assert look().planner == idle, "it may come back"
     pass_time(60.0)
     assert look().planner is None
@@ -419,7 +423,7 @@ def test_nodes_that_are_gone_are_shown_no_longer(harness: Harness) -> None:
     assert look().planner == idle, "it plans"
     beat("/planner", Pulse.ACTIVE, Role.COMMANDER)
     look()
-    listener._looked -= 1000.0
+    listener._last_call -= 1000.0
     pass_time(1000.0)
     assert look().planner == idle, "the viewer had stood still"
 
@@ -470,7 +474,7 @@ def test_a_commander_that_is_busy_is_waited_for(harness: Harness) -> None:
     viewer._send_goals(state, 137.0)
     assert "answered" not in stack.log(), "it may just have planned"
     viewer._send_goals(state, 142.0)
-    assert "Nobody has answered the goal: send it again." in stack.log()
+    assert "No planner or controller has answered the goal: send it again." in stack.log()
     # Heartbeats of a plant that is busy are of no commander.
     heart = stack.probe.create_publisher(DiagnosticStatus, "/heartbeat", 20)
     harness.connect()

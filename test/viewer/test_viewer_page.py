@@ -99,7 +99,7 @@ def test_a_mission_is_flown_from_the_page(
     url = nodes.start_viewer()
     with browser(tmp_path / "profile") as window:
         page = Page(window, url)
-        page.wait_for_text("No state has come yet")
+        page.wait_for_text("No state received yet")
         page.press("Fly")
         nodes.start("plant", *PLANT, files=FILE)
         nodes.start("planner", *PLANNER, files=FILE)
@@ -158,9 +158,9 @@ def test_a_mission_is_flown_from_the_page(
 
         # The planner dies and comes again; the page goes on.
         nodes.kill("planner")
-        page.wait_for_text("Node '/planner' is silent")
+        page.wait_for_text("Node '/planner' has been silent")
         nodes.start("planner", *PLANNER, files=FILE)
-        page.wait_for_text("Waiting for a goal pose.", without="is silent")
+        page.wait_for_text("Waiting for a goal pose.", without="has been silent")
         page.press("Goal")
         page.type(POSITION, (0, 0, 0))
         page.wait_for_text("Goal reachable")

@@ -17,11 +17,9 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.viewer import scene
-from spacerobot_ros.viewer.config import ViewerConfig
-from spacerobot_ros.viewer.page import CAMERA, Page
-from spacerobot_ros.viewer.panels import Plots, _Plot
-from spacerobot_ros.viewer.port import Measured, Momenta, StackState
-from spacerobot_ros.viewer.server import start_server, stop_server
+from spacerobot_ros.viewer.page import CAMERA, Page, Plots, _Plot
+from spacerobot_ros.viewer.server import ViewerConfig, start_server, stop_server
+from spacerobot_ros.viewer.state import Measured, Momenta, StackState
 
 
 @pytest.fixture(scope="module")

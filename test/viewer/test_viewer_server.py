@@ -1,4 +1,4 @@
-"""Who gets to the page: which ports, which origins, and nobody through a share."""
+"""Access to the page: ports, origins, frames, and shares."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import importlib.util
 import socket
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from http.client import HTTPConnection
 from typing import Any
 
 import pytest
@@ -64,6 +65,17 @@ def test_a_websocket_of_another_page_is_refused(server: Any) -> None:
     with pytest.raises(InvalidStatus) as refused:
         connect(address, subprotocols=[PROTOCOL], origin=Origin("https://evil.example"))
     assert refused.value.response.status_code == 403
+
+
+@pytest.mark.parametrize("path", ["/", "/assets/no_such_file.js"])
+def test_no_page_may_frame_this_one(server: Any, path: str) -> None:
+    connection = HTTPConnection("127.0.0.1", server.get_port(), timeout=10)
+    connection.request("GET", path)
+    response = connection.getresponse()
+    assert response.getheader("Content-Security-Policy") == "frame-ancestors 'none'"
+    assert response.getheader("X-Frame-Options") == "DENY"
+    assert (b"<html" in response.read().lower()) == (path == "/")
+    connection.close()
 
 
 def test_the_page_is_never_shared(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,9 +1,9 @@
-"""What a viewer knows of the stack: topics in, one state of everything out.
+"""Topics of the stack in, one :class:`~spacerobot_ros.viewer.state.StackState` out.
 
-The plant publishes its state hundreds or thousands of times a second, and a page is drawn twenty
-times. So streams are subscribed by a node that nobody spins: the middleware keeps the last message
-of each, and only that one is taken and read, when the page is drawn. Readers that confirm nothing
-hold nobody up.
+The plant publishes its state hundreds or thousands of times a second; a page is drawn twenty times
+a second. Streams are therefore subscribed by a node that is not spun: the middleware keeps the last
+message of each, which alone is taken and read when the page is drawn. Subscriptions are best
+effort, so that no publisher waits for the viewer.
 """
 
 from __future__ import annotations
@@ -37,50 +37,50 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND
-from spacerobot_ros.viewer.port import Firing, Measured, Momenta, Part, StackState
+from spacerobot_ros.viewer.state import Firing, Measured, Momenta, Part, StackState
 
 LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""The last message alone; no publisher waits for its confirmation."""
+"""Keeps the last message only; no publisher waits for an acknowledgement."""
 
 _SILENT_AFTER = 1.5
-"""Wall s without a heartbeat after which a node that was active is silent."""
+"""Wall time without a heartbeat after which an active node counts as silent, s."""
 
 _FORGOTTEN_AFTER = 60.0
-"""Wall s after which nothing more is said of it, nor of what it reported last."""
+"""Wall time after which a silent node and its last reports are no longer shown, s."""
 
 _JITTER_NS = 200_000
-"""By how many wall ns more than at best two messages of one tick may be published apart."""
+"""Jitter of the time between two messages published in one tick, wall ns."""
 
-_EXPECTED_NO_MORE_NS = SECOND
-"""Wall ns after which a plant no longer publishes what its momenta should be."""
+_NO_EXPECTED_NS = SECOND
+"""Wall time after which a plant counts as one that publishes no expected momenta, ns."""
 
 _MOST_POINTS = 1000
-"""Of a planned path."""
+"""Largest number of points of a planned path."""
 
 M = TypeVar("M")
 
 
 class Latest(Generic[M]):
-    """The last message of a topic, read when it is asked for.
+    """The last message of a topic, deserialized on demand.
 
     Parameters
     ----------
     node
-        Subscribes; nobody spins it.
+        The node that subscribes; it is not spun.
     kind, topic
-        Of the messages.
+        Type and topic of the messages.
     """
 
     def __init__(self, node: Node, kind: type[M], topic: str) -> None:
         self._kind = kind
         self.sent_ns = 0
-        """When the last message that was taken was published, wall ns."""
+        """Publication time of the last message taken, wall ns."""
         self._subscription = node.create_subscription(
             kind, topic, lambda raw: None, LATEST, raw=True
         )
 
     def take(self) -> M | None:
-        """Return the message that has come since the last time, None if none has."""
+        """Return the message received since the last call; None if there is none."""
         handle = self._subscription.handle
         with handle:
             taken = handle.take_message(self._kind, True)
@@ -89,25 +89,25 @@ class Latest(Generic[M]):
         try:
             message: M = deserialize_message(taken[0], self._kind)
         except RuntimeError:
-            return None  # It is no message of that type.
+            return None  # Not a message of that type.
         self.sent_ns = taken[1]["source_timestamp"]
         return message
 
 
 class Listener:
-    """Keeps what is known of the stack.
+    """Collects the state of the stack.
 
     Parameters
     ----------
     streams
-        A node that nobody spins.
+        A node that is not spun, for streams of states.
     node
-        The viewer's own, whose callbacks take what must not be missed.
+        The viewer node, whose callbacks take statuses, goals and heartbeats.
     frame
-        In which goals are.
+        Frame of the goals.
     on_status
-        Called with ``plant``, ``planner``, ``controller`` or ``replay`` and the full name of the
-        node that has reported, for every status.
+        Called for every status with ``plant``, ``planner``, ``controller`` or ``replay`` and the
+        full name of the node that published it.
     """
 
     def __init__(
@@ -124,10 +124,10 @@ class Listener:
         self._beats: dict[str, _Beat] = {}
         self._statuses: dict[str, Any] = {}
         self._reporters: dict[str, str] = {}
-        """The full name of the node that gave each status."""
-        self._gone: dict[str, str] = {}
-        """Nodes whose reports are not shown, by name; until the node that is named beats again."""
-        self._looked = time.monotonic()
+        """Full name of the node that published each status."""
+        self._hidden: dict[str, str] = {}
+        """Nodes whose reports are hidden, and the node whose next heartbeat shows them again."""
+        self._last_call = time.monotonic()
         self._planned: Array | None = None
         self._goals: dict[Part, Goal] = {}
         self.forget_state()
@@ -149,7 +149,7 @@ class Listener:
             )
 
     def forget_state(self) -> None:
-        """Wait for a state of another robot."""
+        """Drop the state, for another robot."""
         self._pose: Array | None = None
         self._stamp_s, self._came_at = 0.0, -math.inf
         self._q: tuple[Array, Array, Array] | None = None
@@ -157,19 +157,19 @@ class Listener:
         self._tool_pose: Array | None = None
         self._momenta: Momenta | None = None
         self._expected_now: Array | None = None
-        self._least_apart_ns = _EXPECTED_NO_MORE_NS
+        self._least_apart_ns = _NO_EXPECTED_NS
         self._firing: Firing | None = None
 
     def use(self, robot: RobotDescription) -> None:
-        """Read the joints of a robot."""
+        """Start reading the joints of a robot."""
         self._names = robot.joint_names
         self.forget_state()
 
     def state(self) -> StackState:
-        """Take what has come, and return what is known now."""
+        """Take the received messages and return the state of the stack."""
         now = time.monotonic()
         self._take_streams(now)
-        self._look_for_nodes_that_are_gone(now)
+        self._hide_lost_nodes(now)
         beats = self._beats.items()
         silent = {
             name: now - beat.at
@@ -180,7 +180,7 @@ class Listener:
         statuses = {
             key: status
             for key, status in self._statuses.items()
-            if self._reporters[key] not in self._gone
+            if self._reporters[key] not in self._hidden
         }
         return StackState(
             measured=self._measured,
@@ -192,7 +192,7 @@ class Listener:
             planner=statuses.get("planner"),
             controller=statuses.get("controller"),
             replay=statuses.get("replay"),
-            planned_path=None if self._reporters.get("planner") in self._gone else self._planned,
+            planned_path=None if self._reporters.get("planner") in self._hidden else self._planned,
             goals=dict(self._goals),
             silent=silent,
             inactive=inactive,
@@ -232,11 +232,11 @@ class Listener:
             self._firing = Firing(tuple(thrusters.name), np.array(thrusters.velocity))
 
     def _take_momenta(self) -> None:
-        """Take the momenta and what they should be, if both are of one tick.
+        """Take the momenta and the expected momenta, if both are of one tick.
 
-        They have no stamps. The plant publishes what they should be right after them: what was
-        published before them is of an earlier tick, and what came much later than ever is of a
-        later one.
+        They have no stamps. The plant publishes the expected momenta right after the momenta:
+        expected momenta published before them are of an earlier tick, and those published much
+        later than usual are of a later tick.
         """
         self._take_expected()
         momentum = self._momentum.take()
@@ -245,10 +245,10 @@ class Listener:
         if self._expected_now is not None and self._expected.sent_ns < self._momentum.sent_ns:
             self._take_expected()
             late = self._momentum.sent_ns - self._expected.sent_ns
-            if late > _EXPECTED_NO_MORE_NS:
+            if late > _NO_EXPECTED_NS:
                 self._expected_now = None
             elif late > 0:
-                return  # The next look has a pair.
+                return  # The next call has a pair.
         if self._expected_now is not None:
             apart = self._expected.sent_ns - self._momentum.sent_ns
             self._least_apart_ns = min(self._least_apart_ns, apart)
@@ -265,7 +265,7 @@ class Listener:
     def _take_joints(self, message: JointState) -> None:
         places = {name: i for i, name in enumerate(message.name)}
         if any(name not in places for name in self._names):
-            return  # Of another robot.
+            return  # A state of another robot.
         order = [places[name] for name in self._names]
 
         def read(values: Any) -> Array:
@@ -278,7 +278,7 @@ class Listener:
             self._q = read(message.position), read(message.velocity), read(message.effort)
             self._stamp_s = _seconds(message.header.stamp)
 
-    # -- what must not be missed ----------------------------------------------------------------
+    # -- statuses, goals, heartbeats ------------------------------------------------------------
 
     def _status_taker(
         self, key: str, read: Callable[[dict[str, str], str], Any]
@@ -288,10 +288,10 @@ class Listener:
             try:
                 status = read(dict(message.values), message.message)
             except SpaceRobotError:
-                return  # A status of some other node, which has other keys.
+                return  # A status of another kind of node.
             self._statuses[key] = status
             self._reporters[key] = message.name
-            self._gone.pop(message.name, None)
+            self._hidden.pop(message.name, None)
             if isinstance(status, PlannerStatus) and len(status.goal) == 7:
                 self._goals["base"] = Goal(np.array(status.goal[:3]), np.array(status.goal[3:]))
             self._on_status(key, message.name)
@@ -310,21 +310,21 @@ class Listener:
         try:
             self._goals[part] = goal_of(message, self._frame)
         except SpaceRobotError:
-            self._goals.pop(part, None)  # Its commander reports why it is refused.
+            self._goals.pop(part, None)  # Planner or controller report why it is refused.
 
     def _on_heartbeat(self, message: DiagnosticStatus) -> None:
-        with suppress(ValueError):  # Of no node of this package.
+        with suppress(ValueError):  # A heartbeat of another package.
             pulse = Pulse(message.message)
             self._beats[message.name] = _Beat(time.monotonic(), pulse, message.hardware_id)
-            self._gone = {name: by for name, by in self._gone.items() if by != message.name}
+            self._hidden = {name: by for name, by in self._hidden.items() if by != message.name}
 
-    def _look_for_nodes_that_are_gone(self, now: float) -> None:
-        """Show nothing more of nodes without heartbeats for long, nor of a replay that is over."""
-        if now - self._looked > _SILENT_AFTER:
-            # This process stood still: nobody else did.
-            gap = now - self._looked
+    def _hide_lost_nodes(self, now: float) -> None:
+        """Hide the reports of nodes that have long been silent, and of a replay that is over."""
+        if now - self._last_call > _SILENT_AFTER:
+            # This process was suspended: the others were not silent.
+            gap = now - self._last_call
             self._beats = {n: replace(b, at=b.at + gap) for n, b in self._beats.items()}
-        self._looked = now
+        self._last_call = now
         a_plant_runs = any(
             beat.role == Role.PLANT.value and beat.is_alive(now) for beat in self._beats.values()
         )
@@ -334,16 +334,16 @@ class Listener:
             if not over and (beat.pulse is Pulse.BUSY or now - beat.at <= _FORGOTTEN_AFTER):
                 continue
             del self._beats[name]
-            self._gone[name] = name
+            self._hidden[name] = name
             if is_replay:
-                # What it has shown was reported by nodes that give no heartbeats here.
+                # The recorded reports are of nodes without heartbeats here.
                 recorded = set(self._reporters.values()) - set(self._beats)
-                self._gone.update(dict.fromkeys(recorded, name))
+                self._hidden.update(dict.fromkeys(recorded, name))
 
 
 @dataclass(frozen=True)
 class _Beat:
-    """The last heartbeat of a node: when it came, wall s, its pulse and role."""
+    """The last heartbeat of a node: time of arrival, wall s, pulse and role."""
 
     at: float
     pulse: Pulse

@@ -1,4 +1,4 @@
-"""The viewer node: it shows a stack on a page, and does to the stack what users of the page do."""
+"""The viewer node: topics to the state of the page, actions of its users to topics and services."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, ClassVar
 
-import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
@@ -33,36 +32,35 @@ from spacerobot_ros.nodes.common.node import EVENTS, LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.remote_parameters import RemoteParameters
 from spacerobot_ros.nodes.viewer.listener import Listener
-from spacerobot_ros.planning import Goal, RobotState
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import Targets
 from spacerobot_ros.simulation.status import PlantState
 from spacerobot_ros.times import LATEST_NS, SECOND
-from spacerobot_ros.viewer.config import ViewerConfig
 from spacerobot_ros.viewer.page import Page
-from spacerobot_ros.viewer.port import (
-    Action,
-    Fly,
-    Inject,
-    Measured,
-    Notice,
-    Part,
-    Request,
-    Seek,
-    StackState,
-)
-from spacerobot_ros.viewer.reachability import Check, GoalChecker, Question, Verdict
+from spacerobot_ros.viewer.reachability import Check, GoalChecker, Question, Verdict, question_of
 from spacerobot_ros.viewer.server import (
+    ViewerConfig,
     is_loopback,
     require_viser,
     start_server,
     stop_server,
     url_of,
 )
+from spacerobot_ros.viewer.state import (
+    Action,
+    Fly,
+    Inject,
+    Notice,
+    Part,
+    Request,
+    Seek,
+    StackState,
+)
 
 ANNOUNCEMENT = "viewer      "
-"""What comes before the address of the page on standard output."""
+"""Text before the address of the page on standard output."""
 
 _ROSOUT = QoSProfile(
     depth=100,
@@ -70,7 +68,7 @@ _ROSOUT = QoSProfile(
     durability=DurabilityPolicy.VOLATILE,
 )
 _WARNING = 30
-"""Level of rcl_interfaces/Log from which on its lines are shown."""
+"""Least level of rcl_interfaces/Log that is shown."""
 
 _TOPICS: Mapping[Part, str] = {"base": "goal_pose", "end_effector": "end_effector/goal_pose"}
 
@@ -84,28 +82,26 @@ _SERVICES: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
     Request.PLAY: (("replay",), "pause", False),
     Request.HOLD: (("replay",), "pause", True),
 }
-"""Whose service a request calls, which one, and what it is told (None: it is a trigger)."""
+"""Of each request the nodes, their service, and its data (None: it is a trigger)."""
 
-_ASKED = ("plant", "planner", "controller")
-"""Whose parameters are of use."""
-
-_END_EFFECTOR = "end_effector_frame"
+_PARAMETERS_OF = ("plant", "planner", "controller")
+"""Nodes whose parameters are read."""
 
 _LONGEST_MEETING = 4.0
-"""Wall s that a goal waits for commanders that are known and not met yet."""
+"""Wall time that a goal waits for subscribers that are known but not matched yet, s."""
 
 _LONGEST_ANSWER = 5.0
-"""Wall s after which a commander that has a goal has said so."""
+"""Wall time within which a planner or controller answers a goal, s."""
 
 _MICROSECOND_NS = 1000
 _FLAG_NS = 1_000_000
 
 
 class ViewerNode(FlightNode):
-    """Serves a page on which the robot is watched and steered.
+    """Serves the page that shows and steers the robot.
 
-    It subscribes and publishes like any other tool: it works with nodes in other processes, that
-    begin before or after it, and with their successors. Opening the page moves nothing.
+    It subscribes and publishes like any other tool: it works with nodes of other processes, started
+    before or after it, and with nodes that replace them. Opening the page moves nothing.
     """
 
     Config: ClassVar = ViewerConfig
@@ -135,15 +131,15 @@ class ViewerNode(FlightNode):
         self._robot: RobotDescription | None = None
         self._urdf = ""
         self._full_names: dict[str, str] = {}
-        self._callers: dict[tuple[str, type[Any]], Client] = {}
+        self._clients_by_name: dict[tuple[str, type[Any]], Client] = {}
         self._remote_values: dict[str, dict[str, str]] = {}
-        self._asking: dict[str, RemoteParameters] = {}
-        self._to_ask_again: set[str] = set()
+        self._requests: dict[str, RemoteParameters] = {}
+        self._to_repeat: set[str] = set()
         self._planner_state: PlannerState | None = None
         self._sent = 0
         self._to_send: tuple[Mapping[Part, Goal], float] | None = None
         self._unanswered: tuple[str, float] | None = None
-        # Nobody spins this one: its messages wait until the page is drawn.
+        # This node is not spun: its messages wait until the page is drawn.
         self._streams = rclpy.create_node(
             f"_{self.get_name()}_streams",
             namespace=self.get_namespace(),
@@ -166,25 +162,25 @@ class ViewerNode(FlightNode):
         self._seek_topic = self.create_publisher(Float64, "replay/seek", STREAM)
 
     def activate(self) -> None:
-        """Draw the page again and again, and say on standard output where it is."""
+        """Start drawing the page, and print its address on standard output."""
         print(f"{ANNOUNCEMENT}{self.url}", flush=True)
         self._timer = self.create_timer(
             1.0 / self.config.update_rate, self._draw, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
 
     def start_sentence(self) -> str:
-        """Return where the page is."""
-        return f"Draws the page at {self.url} {self.config.update_rate:g} times a second."
+        """Return the address of the page."""
+        return f"Serves the page at {self.url}, drawn {self.config.update_rate:g} times a second."
 
     def deactivate(self) -> None:
-        """Draw no more; the page stays as it is."""
+        """Stop drawing; the page stays as it is."""
         self.destroy_timer(self._timer)
 
     def cleanup(self) -> None:
         """Close the page."""
         self._checker.close()
-        for asking in getattr(self, "_asking", {}).values():
-            asking.close()
+        for request in getattr(self, "_requests", {}).values():
+            request.close()
         server, self._server = self._server, None
         if server is not None:
             stop_server(server)
@@ -198,13 +194,13 @@ class ViewerNode(FlightNode):
         super().destroy_node()
 
     def report_event(self, event: Event) -> None:
-        """Report nothing: a spectator is no part of a flight, nor of its record."""
+        """Publish no event: the viewer is not part of the recorded flight."""
 
     # -- drawing --------------------------------------------------------------------------------
 
     def _draw(self) -> None:
         now, state = time.monotonic(), self._listener.state()
-        self._look_for_parameters()
+        self._take_parameters()
         for action in self._page.update(state, now):
             self._carry_out(action, state)
         planner = None if "planner" in state.absent else state.planner
@@ -221,62 +217,29 @@ class ViewerNode(FlightNode):
             self._checker.cancel()
         goals = self._page.goals_to_check(now)
         if goals is not None:
-            question, why_not = self._question(state, goals)
-            if question is None:
-                self._checker.cancel()
-                self._page.show_check(Check(Verdict.UNCHECKED, why_not))
-            else:
+            question = self._question(state, goals)
+            if isinstance(question, Question):
                 self._checker.ask(question)
+            else:
+                self._checker.cancel()
+                self._page.show_check(Check(Verdict.UNCHECKED, question))
         check = self._checker.look()
         if check is not None:
             self._page.show_check(check)
 
-    def _question(
-        self, state: StackState, goals: Mapping[Part, Goal]
-    ) -> tuple[Question | None, str]:
-        """Return what is to be planned, or None and why not."""
+    def _question(self, state: StackState, goals: Mapping[Part, Goal]) -> Question | str:
+        """Return the check of goals, or the reason why they are not checked."""
         if not self.config.check_goals:
-            return None, "Parameter 'check_goals' is false."
-        measured, goal = state.measured, goals["base"]
-        if measured is None or self._robot is None:
-            return None, "No state has come yet."
-        if state.planner is None:
-            return self._question_of_arm(measured, goals)
-        if "planner" in state.absent:
-            return None, "The planner is not there now."
-        if state.planner.state is PlannerState.PLANNING:
-            return None, "The planner plans."
-        parameters = self._remote_values.get("planner")
-        if parameters is None:
-            return None, "The planner's parameters are not known yet."
-        momenta = np.zeros(6) if state.momenta is None else state.momenta.actual
-        robot_state = RobotState(
-            measured.pose[:3], measured.pose[3:], measured.q, momenta[:3], momenta[3:]
-        )
-        return Question(self._urdf, parameters, robot_state, goal), ""
+            return "Parameter 'check_goals' is false."
+        return question_of(state, goals, self._robot, self._remote_values)
 
-    def _question_of_arm(
-        self, measured: Measured, goals: Mapping[Part, Goal]
-    ) -> tuple[Question | None, str]:
-        """Return whether the arm can be as a controller is to bring it, or None and why not."""
-        assert self._robot is not None
-        tool = goals.get("end_effector")
-        if tool is None:
-            return None, "No planner is there: a controller flies the base to any pose."
-        named = json.loads(self._remote_values.get("controller", {}).get(_END_EFFECTOR, '""'))
-        link = self._robot.end_effector(named)
-        if link not in self._robot.frames:
-            return None, "The end-effector is no link of the robot."
-        state = RobotState(measured.pose[:3], measured.pose[3:], measured.q)
-        return Question(self._urdf, {}, state, goals["base"], tool, link), ""
-
-    # -- what the stack says --------------------------------------------------------------------
+    # -- messages of the stack ------------------------------------------------------------------
 
     def _on_description(self, message: String) -> None:
         if message.data == self._urdf:
             return
         self._urdf = message.data
-        self._checker.cancel()  # What it would answer is of another robot.
+        self._checker.cancel()  # The question is about another robot.
         self._to_send = None
         try:
             self._robot = parse_robot(message.data)
@@ -295,12 +258,12 @@ class ViewerNode(FlightNode):
         if self._full_names.get(key) == name:
             return
         self._full_names[key] = name
-        # Services are found some seconds after their clients are made.
+        # Discovery of a service takes some seconds after its client is created.
         for keys, service, data in _SERVICES.values():
             if key in keys:
                 self._client(Trigger if data is None else SetBool, f"{name}/{service}")
-        if key in _ASKED:
-            self._ask(key)
+        if key in _PARAMETERS_OF:
+            self._request_parameters(key)
 
     def _on_event(self, received: DiagnosticStatus) -> None:
         message = read_status(received)
@@ -311,8 +274,8 @@ class ViewerNode(FlightNode):
         self._page.note(Notice(event.message, event.level, event.time_s, message.name))
         if event.kind in (EventKind.ACTIVATED, EventKind.NODE_BACK):
             for key, name in self._full_names.items():
-                if name == message.name and key in _ASKED:
-                    self._ask(key)
+                if name == message.name and key in _PARAMETERS_OF:
+                    self._request_parameters(key)
 
     def _on_log(self, message: RosoutLog) -> None:
         # The topic is the same in all namespaces, and loggers have dots for slashes.
@@ -324,42 +287,42 @@ class ViewerNode(FlightNode):
             self._note(printable(message.msg), level, printable(message.name))
 
     def _on_change(self, message: ParameterEvent) -> None:
-        for key in _ASKED:
+        for key in _PARAMETERS_OF:
             if self._full_names.get(key) == message.node and key in self._remote_values:
-                self._ask(key)
+                self._request_parameters(key)
 
-    def _ask(self, key: str) -> None:
-        """Ask a node for its parameters; once more where that is being done."""
-        name, before = self._full_names[key], self._asking.get(key)
+    def _request_parameters(self, key: str) -> None:
+        """Request the parameters of a node; again after a request in progress."""
+        name, before = self._full_names[key], self._requests.get(key)
         if before is not None and before.name == name:
-            # The question before is still open: an answer that nobody takes would block that node.
-            self._to_ask_again.add(key)
+            # The request before is still open: an answer that is never taken would block that node.
+            self._to_repeat.add(key)
             return
         if before is not None:
             before.close()
-        self._asking[key] = RemoteParameters(self, name)
+        self._requests[key] = RemoteParameters(self, name)
 
-    def _look_for_parameters(self) -> None:
-        for key, asking in tuple(self._asking.items()):
-            if not asking.look():
+    def _take_parameters(self) -> None:
+        for key, request in tuple(self._requests.items()):
+            if not request.look():
                 continue
-            del self._asking[key]
-            if asking.values is None or key in self._to_ask_again:
-                # A node that does not answer, but has reported a status, is there and busy.
-                self._to_ask_again.discard(key)
-                self._ask(key)
-            if asking.values is None:
+            del self._requests[key]
+            if request.values is None or key in self._to_repeat:
+                # A node that has reported a status but does not answer is busy.
+                self._to_repeat.discard(key)
+                self._request_parameters(key)
+            if request.values is None:
                 continue
-            if asking.values == self._remote_values.get(key):
+            if request.values == self._remote_values.get(key):
                 continue
-            self._remote_values[key] = asking.values
+            self._remote_values[key] = request.values
             if key == "plant":
                 self._show_plant()
             else:
                 self._page.touch_goal(time.monotonic())
 
     def _show_plant(self) -> None:
-        """Offer the faults of the plant, and show its thrusters."""
+        """Update the faults that can be injected, and the thrusters."""
         values = self._remote_values.get("plant")
         if self._robot is None or values is None:
             self._page.offer_faults(Targets())
@@ -379,10 +342,10 @@ class ViewerNode(FlightNode):
             self._note(str(error), 1)
             return None
 
-    def _note(self, sentence: str, level: int = 0, source: str = "") -> None:
-        self._page.note(Notice(sentence, level, None, source))
+    def _note(self, message: str, level: int = 0, source: str = "") -> None:
+        self._page.note(Notice(message, level, None, source))
 
-    # -- what users want ------------------------------------------------------------------------
+    # -- actions of users -----------------------------------------------------------------------
 
     def _carry_out(self, action: Action, state: StackState) -> None:
         match action:
@@ -397,11 +360,11 @@ class ViewerNode(FlightNode):
                 self._request(action)
 
     def _send_goals(self, state: StackState, now: float) -> None:
-        """Send what is to be sent once its readers are met, and notice where nobody answers."""
+        """Send pending goals once their subscribers are matched; report goals without an answer."""
         if self._to_send is not None:
             goals, until = self._to_send
             topics = [self._shape_topic, *(self._goal_topics[part] for part in goals)]
-            # A commander that has just begun is known before it can be reached.
+            # A node that has just started is discovered before its subscriptions are matched.
             met = all(
                 topic.get_subscription_count() >= self.count_subscribers(topic.topic_name)
                 for topic in topics
@@ -415,16 +378,18 @@ class ViewerNode(FlightNode):
             if any(status is not None and status.goal_id == goal_id for status in statuses):
                 self._unanswered = None
             elif state.busy or (
-                # Commanders answer with the next state.
+                # Planner and controller answer with the next state.
                 state.plant is not None and state.plant.state is PlantState.PAUSED
             ):
                 self._unanswered = goal_id, now + _LONGEST_ANSWER
             elif now >= until:
                 self._unanswered = None
-                self._note("Nobody has answered the goal: send it again.", 2, "page")
+                self._note(
+                    "No planner or controller has answered the goal: send it again.", 2, "page"
+                )
 
     def _send(self, goals: Mapping[Part, Goal]) -> None:
-        # No other goal has this stamp, by which statuses name it: other viewers may send one now.
+        # Statuses name a goal by its stamp, which is therefore unique among all viewers.
         self._sent += 1
         flag = time.time_ns() // _MICROSECOND_NS * _MICROSECOND_NS % _FLAG_NS
         time_ns = self._listener.time_ns() + flag + self._sent % 1000
@@ -439,27 +404,27 @@ class ViewerNode(FlightNode):
             o.x, o.y, o.z, o.w = goal.quaternion.tolist()
             self._goal_topics[part].publish(message)
         readers = self._goal_topics["base"].get_subscription_count()
-        # One of them is this node's own.
+        # One of them belongs to this node.
         if readers <= 1:
-            self._note("Nobody takes the goal: no planner and no controller is there.", 2, "page")
+            self._note("No planner or controller takes the goal: none is running.", 2, "page")
         else:
-            self._note("The goal is sent.", source="page")
+            self._note("Goal sent.", source="page")
             goal_id = GoalIds().of(sec, nanosec)
             self._unanswered = goal_id, time.monotonic() + _LONGEST_ANSWER
         if self._checker.cancel():
             self._page.show_check(Check(Verdict.UNCHECKED, "It was sent before it was checked."))
 
     def _send_shape(self, goal: Goal) -> None:
-        """Have the goal that follows end in its joint positions, or in any if it has none.
+        """Send the final joint positions of the goal that follows; empty for any.
 
-        Planners keep those of earlier goals, which others may have sent before there was a viewer.
+        Without them planners keep those of an earlier goal, which may be of another tool.
         """
         shape, names = goal.joint_positions, () if self._robot is None else self._robot.joint_names
-        wanted = JointState() if shape is None else JointState(name=names, position=shape.tolist())
-        self._shape_topic.publish(wanted)
+        message = JointState() if shape is None else JointState(name=names, position=shape.tolist())
+        self._shape_topic.publish(message)
 
     def _request(self, request: Request) -> None:
-        """Call the service of everybody that has it."""
+        """Call the service of a request on every node that has it."""
         keys, service, data = _SERVICES[request]
         called = False
         for key in keys:
@@ -477,16 +442,16 @@ class ViewerNode(FlightNode):
             )
         if not called:
             whose = " or ".join(keys)
-            self._note(f"No {whose} answers '{service}' now.", 2, "page")
+            self._note(f"No {whose} offers the service '{service}' now.", 2, "page")
 
     def _client(self, kind: type[Any], name: str) -> Client:
         key = (name, kind)
-        if key not in self._callers:
-            self._callers[key] = self.create_client(kind, name)
-        return self._callers[key]
+        if key not in self._clients_by_name:
+            self._clients_by_name[key] = self.create_client(kind, name)
+        return self._clients_by_name[key]
 
     def _on_answer(self, name: str, future: Any) -> None:
-        with suppress(Exception):  # A service that has gone.
+        with suppress(Exception):  # The service has ended.
             answer = future.result()
             self._note(answer.message, 0 if answer.success else 2, name)
 

@@ -1,4 +1,4 @@
-"""What the viewer node tells the page of the stack, and what the page tells the node to do."""
+"""The interface of the page: the state of the stack that it shows, and the actions of its users."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from spacerobot_ros.simulation.status import PlantStatus
 
 @dataclass(frozen=True)
 class Measured:
-    """The last state of the robot.
+    """The last measured state of the robot.
 
     Attributes
     ----------
@@ -45,7 +45,8 @@ class Momenta:
     actual
         (6,) summed over the bodies.
     expected
-        (6,) what they should be; None: those of the beginning.
+        (6,) the momenta that follow from thrust and other forces from outside; None: they are
+        constant.
     energy
         Kinetic energy, J.
     """
@@ -57,43 +58,43 @@ class Momenta:
 
 @dataclass(frozen=True)
 class Firing:
-    """What the thrusters do: their ``names``, and for what part of the last tick each was on."""
+    """Thruster activity: ``names``, and the share of the last tick that each was on, 0 to 1."""
 
     names: tuple[str, ...]
     duty: Array
 
 
 Part = Literal["base", "end_effector"]
-"""What a goal is for."""
+"""The part of the robot that a goal is for."""
 
 
 @dataclass(frozen=True)
 class StackState:
-    """Everything that is known of the stack at one look; None: not known, or not there.
+    """The state of the stack at one time; None: not known, or no such node.
 
     Attributes
     ----------
     measured, age_s
-        The last state, and for how many wall s no state has come; infinite before the first.
+        The last state, and the wall time since it came, s; infinite before the first.
     tool
         (7,) pose of the end-effector in the world.
     momenta, firing
         As the plant reports them.
     plant, planner, controller, replay
-        The last status of each, None where there is no such node.
+        The last status of each node; None if there is no such node.
     planned_path
-        (k, 3) positions of the base that the planner predicts, m.
+        (k, 3) positions of the base predicted by the planner, m.
     goals
-        What was last sent by anybody, by part.
+        The last goal sent by anyone, by part.
     silent
-        Nodes whose heartbeats have ended, by name, and for how many wall s.
+        Wall time since the last heartbeat of each node that has fallen silent, s, by name.
     inactive
-        Nodes that were deactivated or have ended in order, by name.
+        Names of the nodes that were deactivated or shut down.
     absent
-        Which of ``plant``, ``planner``, ``controller``, ``replay`` are of such nodes: what they
-        reported is no longer so.
+        The statuses among ``plant``, ``planner``, ``controller``, ``replay`` whose nodes are silent
+        or inactive: they may no longer be true.
     busy
-        Whether a commander plans or compiles, and answers when that is done.
+        Whether a planner or controller is planning or compiling, and answers only after that.
     """
 
     measured: Measured | None = None
@@ -117,49 +118,49 @@ class StackState:
 class Notice:
     """A line of the log: ``level`` 0 OK, 1 WARN, 2 ERROR; ``time_s`` simulated, if known, s."""
 
-    sentence: str
+    message: str
     level: int = 0
     time_s: float | None = None
     source: str = ""
 
 
 class Request(Enum):
-    """What services of the stack are asked for."""
+    """A request that a service of the stack carries out."""
 
     ABORT = "abort"
-    """The commanders give up their goals; the joints brake."""
+    """Planner and controller drop their goals; the joints brake."""
     STOP = "stop"
-    """The plant brings everything to rest and latches, until it is rearmed."""
+    """The plant brings everything to rest and refuses commands until ``REARM``."""
     REARM = "rearm"
     PAUSE = "pause"
     RESUME = "resume"
     RESET = "reset"
     PLAY = "play"
-    """Of a replay."""
+    """Continue a replay."""
     HOLD = "hold"
-    """A replay stands still."""
+    """Pause a replay."""
 
 
 @dataclass(frozen=True)
 class Fly:
-    """Send goals for the parts that have one, with one stamp."""
+    """Send goals, by part, all with one stamp."""
 
     goals: Mapping[Part, Goal]
 
 
 @dataclass(frozen=True)
 class Inject:
-    """Give the plant faults, a line each, or ``clear``."""
+    """Send fault descriptions to the plant, one a line, or ``clear``."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Seek:
-    """Go to a time of the replay, s from its beginning."""
+    """Continue the replay at a time, s from its start."""
 
     seconds: float
 
 
 Action = Request | Fly | Inject | Seek
-"""What a user of the page wants."""
+"""An action of a user of the page."""
