@@ -1,9 +1,9 @@
-"""The exceptions of this package: every one carries a sentence that a user can act on."""
+"""The exceptions of this package: each has a message that a user can act on."""
 
 from collections.abc import Iterable
 from enum import Enum
 
-_LONGEST_SENTENCE = 2000
+_LONGEST_MESSAGE = 2000
 
 
 def printable(text: str) -> str:
@@ -19,37 +19,37 @@ def printable(text: str) -> str:
 
 
 class SpaceRobotError(Exception):
-    """Base of every error this package raises on purpose, with one sentence for the user.
+    """Base of all errors of this package; the message is one sentence for the user.
 
-    Line breaks, control characters and endless lists in what it quotes go.
+    Line breaks and control characters are replaced, and a long message is shortened.
     """
 
-    def __init__(self, sentence: str = "") -> None:
-        line = printable(str(sentence))
-        if len(line) > _LONGEST_SENTENCE:
-            half = _LONGEST_SENTENCE // 2
+    def __init__(self, message: str = "") -> None:
+        line = printable(str(message))
+        if len(line) > _LONGEST_MESSAGE:
+            half = _LONGEST_MESSAGE // 2
             line = f"{line[:half]} ... {line[-half:]}"
         super().__init__(line)
 
 
 class RobotDescriptionError(SpaceRobotError):
-    """A URDF that does not describe a free-floating robot; the sentence names the element."""
+    """A URDF that does not describe a free-floating robot; the message names the element."""
 
 
 class MeshError(SpaceRobotError):
-    """A mesh that is not found or cannot be read; the sentence says why, and what to do."""
+    """A mesh that is not found or cannot be read; the message says why, and what to do."""
 
 
 class ParameterError(SpaceRobotError):
-    """A parameter or option whose value is refused; the sentence names it."""
+    """A parameter or option whose value is refused; the message names it."""
 
 
 class PlanningError(SpaceRobotError):
-    """A goal that is refused or cannot be reached; the sentence says why."""
+    """A goal that is refused or cannot be reached; the message says why."""
 
 
 class Proof(Enum):
-    """What proves that a goal cannot be reached."""
+    """Kinds of proofs that a goal cannot be reached."""
 
     LIMITS = "joint limits"
     """No shape within them is that of the goal."""
@@ -64,42 +64,42 @@ class Proof(Enum):
 class UnreachableError(PlanningError):
     """A goal that the robot cannot reach; ``proof`` is of what kind the reason is.
 
-    A goal that merely was not reached by what was tried is a :class:`NotFoundError`.
+    A goal to which the search found no manoeuvre is a :class:`NotFoundError`.
     """
 
-    def __init__(self, sentence: str, proof: Proof) -> None:
-        super().__init__(sentence)
+    def __init__(self, message: str, proof: Proof) -> None:
+        super().__init__(message)
         self.proof = proof
 
 
 class NotFoundError(PlanningError):
     """A goal to which no manoeuvre was found, which proves nothing.
 
-    The sentence says how hard it was tried, and what may help.
+    The message says how hard it was tried, and what may help.
     """
 
 
-def refusal_of_all(sentence: str, refusals: Iterable[Exception]) -> PlanningError:
-    """Return what a goal is refused with where several methods have refused it.
+def refusal_of_all(message: str, refusals: Iterable[Exception]) -> PlanningError:
+    """Return one refusal of a goal that several methods have refused.
 
     A proof of one holds for all; where there is none, one that searched may search longer.
     """
     refusals = list(refusals)
     for refusal in refusals:
         if isinstance(refusal, UnreachableError):
-            return UnreachableError(sentence, refusal.proof)
+            return UnreachableError(message, refusal.proof)
     if any(isinstance(refusal, NotFoundError) for refusal in refusals):
-        return NotFoundError(sentence)
-    return PlanningError(sentence)
+        return NotFoundError(message)
+    return PlanningError(message)
 
 
 class GoalError(PlanningError):
-    """A goal that is none: not finite, no rotation, the wrong number of entries."""
+    """An invalid goal: not finite, no rotation, the wrong number of entries."""
 
 
 class RecordingError(SpaceRobotError):
-    """A bag that cannot be written or read; the sentence says which, where and what to do."""
+    """A bag that cannot be written or read; the message says which, where and what to do."""
 
 
 class CommandError(SpaceRobotError):
-    """A joint command that the plant refuses; the sentence says why."""
+    """A joint command that the plant refuses; the message says why."""

@@ -19,7 +19,7 @@ import numpy as np
 from spacerobot_ros.errors import ParameterError
 
 Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
-"""What a parameter holds."""
+"""Type of a parameter's value."""
 
 C = TypeVar("C")
 
@@ -48,10 +48,10 @@ class Parameter:
     read_only
         Whether it keeps its value as long as the node is configured.
     texts
-        An array of texts, also taken as one text with its parts on lines of their own or between
-        semicolons.
+        Whether the array consists of texts; one text with parts on separate lines, or between
+        semicolons, is accepted as well.
     of_joints
-        An array has an entry for every joint of the robot; a text names some of its joints.
+        Whether the array has an entry for each joint of the robot, or the text names joints.
     """
 
     name: str
@@ -96,7 +96,7 @@ class Parameter:
             raise self._refusal(value, "a finite number")
         if whole and value != int(value):
             raise self._refusal(value, "a whole number")
-        if whole and not -(2**63) <= value < 2**63:  # What a ROS parameter holds.
+        if whole and not -(2**63) <= value < 2**63:  # The range of a ROS parameter.
             raise self._refusal(float(value), "a whole number of 64 bits")
         if not self.minimum <= value <= self.maximum:
             raise self._refusal(value, f"a number{self._range()}")
@@ -144,7 +144,7 @@ def parameter(
     texts: bool = False,
     of_joints: bool = False,
 ) -> Any:
-    """Return a field of a configuration; see :class:`Parameter` for what the arguments mean."""
+    """Return a field of a configuration; see :class:`Parameter` for the arguments."""
     declaration = Parameter(
         "", default, unit, description, minimum, maximum, tuple(choices), length, read_only, texts,
         of_joints,
@@ -208,7 +208,7 @@ def configured(kind: type[C], values: Mapping[str, Any], prefix: str = "") -> C:
     Raises
     ------
     ParameterError
-        A value is refused; the sentence names the parameter.
+        A value is refused; the message names the parameter.
     """
     return _reconfigured(kind(), kind(), values, prefix)
 
@@ -221,7 +221,7 @@ def reconfigured(config: C, values: Mapping[str, Any]) -> C:
     Raises
     ------
     ParameterError
-        A value is refused; the sentence names the parameter.
+        A value is refused; the message names the parameter.
     """
     return _reconfigured(config, type(config)(), values, "")
 

@@ -13,7 +13,7 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 _PACKAGE = "spacerobot_ros"
 
 _ROBOT_SUFFIXES = (".urdf", ".xacro", ".xml", ".sdf", ".world", ".mjcf")
-"""Suffixes of files that may be meant as a robot, also of those that are refused."""
+"""Suffixes of robot descriptions, with those of unsupported formats."""
 
 
 @lru_cache(maxsize=1)

@@ -1,9 +1,9 @@
-"""How a process ends: by a signal or with its parent, in seconds, and with what it has started.
+"""Signals that end a process, and child processes that end with it.
 
 A process is guarded from its first import on (:func:`guarded`). SIGINT, SIGTERM and SIGHUP then
-raise :class:`Terminated` in the main thread, unless what runs has asked for a request instead
-(:func:`ended_on_request`) because it has something to complete: a flight, a bag. A thread watches
-over both. It ends the process when the main thread does not react, and at once by a second signal.
+raise :class:`Terminated` in the main thread; work that must be completed, such as a flight or a
+bag, receives a request instead (:func:`ended_on_request`). A thread ends the process when the main
+thread does not react, and at once on a second signal.
 
 Processes that are started with :func:`child_options` end when this one does, however that ends:
 the kernel closes a pipe that they read, and on Linux sends them a signal as well.
@@ -34,25 +34,25 @@ _SENTENCES = {
 }
 
 _UNWINDING = 1.2
-"""Wall s that the main thread has to end after the exception of a signal."""
+"""Wall time that the main thread has to end after the exception of a signal, s."""
 
 _NOTICING = 5.0
-"""Wall s in which what has asked for requests must notice one: a plan may have to end first."""
+"""Wall time in which work must notice a request, s: a plan may have to end first."""
 
 _WITHOUT_PARENT = 1.7
-"""Wall s that a process has to end without its parent."""
+"""Wall time that a process has to end without its parent, s."""
 
 _SAME = 0.5
-"""Signals so close together are one, wall s: launchers send it beside the terminal."""
+"""Signals closer together count as one, wall s: launchers and terminals both send them."""
 
 _DYING = 0.3
-"""Longest wait for what was killed to be gone, wall s."""
+"""Longest wait for the end of killed processes, wall s."""
 
 _LIFELINE = "SPACEROBOT_LIFELINE"
 """Environment variable of a child: the pipe that its parent holds open, and who that is."""
 
 _ORPHANED = signal.SIGUSR2
-"""What the kernel sends to a child whose parent is gone (Linux)."""
+"""Signal of the kernel to a child whose parent has ended (Linux)."""
 
 _PR_SET_PDEATHSIG = 1
 
@@ -60,7 +60,7 @@ _END = b"\0"
 
 
 class Terminated(KeyboardInterrupt):
-    """A signal that ends what runs. As an interrupt it passes ``except Exception``.
+    """A signal that ends the process. As an interrupt it passes ``except Exception``.
 
     Parameters
     ----------
@@ -74,12 +74,12 @@ class Terminated(KeyboardInterrupt):
 
     @property
     def exit_code(self) -> int:
-        """What shells report of a process that such a signal has ended."""
+        """Exit code by which shells report such a signal."""
         return 128 + self.number
 
 
 class _Request:
-    """What is called on a signal: in the main thread, and at once in the guard's thread."""
+    """Functions to call on a signal: in the main thread, and at once in the guard's thread."""
 
     def __init__(self, main: Callable[[], None], at_once: Callable[[], None]) -> None:
         self.main, self.at_once = main, at_once
@@ -129,7 +129,7 @@ class _Guard:
         os.close(self._writer)
 
     def noticed(self) -> bool:
-        """Return whether a signal has come; who asks is busy with ending then."""
+        """Return whether a signal has come; the caller then completes its work."""
         if self.number is not None:
             self._notice_by = None
         return self.number is not None
@@ -142,7 +142,7 @@ class _Guard:
         elif not self._raised:
             self._raised = True
             if self._announcing:
-                # What the exception passes, such as a solver, writes warnings about it.
+                # Libraries that the exception passes, such as a solver, write warnings.
                 self._errors, sys.stderr = sys.stderr, io.StringIO()
             raise Terminated(number)
 
@@ -220,7 +220,7 @@ _guard: _Guard | None = None
 
 @contextmanager
 def guarded(*, announcing: bool = False) -> Iterator[bool]:
-    """Have signals, and the end of the parent, end what runs in here.
+    """Have signals, and the end of the parent, end the process in this context.
 
     Yields whether the guard is new: inside another one nothing changes. Outside the main thread,
     which alone has signals, nothing is done.
@@ -251,11 +251,10 @@ def guarded(*, announcing: bool = False) -> Iterator[bool]:
 def ended_on_request(
     main: Callable[[], None] = lambda: None, at_once: Callable[[], None] = lambda: None
 ) -> Iterator[Callable[[], bool]]:
-    """Turn signals into a request while something runs that completes its work before it ends.
+    """Turn signals into a request while work is completed.
 
-    Yields a function that returns whether the end was requested; it must be called now and then,
-    and what runs is left to itself from the first time that it says so. A second signal ends the
-    process at once.
+    Yields a function that returns whether the end was requested. It must be called now and then;
+    once it has returned True there is no time limit. A second signal ends the process at once.
 
     Parameters
     ----------
@@ -284,12 +283,12 @@ def ended_on_request(
 
 
 def termination() -> Terminated | None:
-    """Return what ends this process, None if nothing does."""
+    """Return the signal that ends this process, None without one."""
     return None if _guard is None or _guard.number is None else Terminated(_guard.number)
 
 
 def announce(ending: Terminated) -> None:
-    """Say on standard error, where there still is one, what ends this process."""
+    """Write the signal that ends this process to standard error, if that is still open."""
     if _guard is not None:
         _guard.speak()
     with suppress(OSError):  # The terminal may be gone.
@@ -312,10 +311,10 @@ def child_options(environment: Mapping[str, str] | None = None) -> dict[str, Any
 
 @contextmanager
 def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[bytes]]:
-    """Start a program that knows nothing of us, and kill what is left of it at the end.
+    """Start a program that does not end by itself with this process, and kill it at the end.
 
-    It and all that it starts are killed as well when this process is asked to end, and when this
-    process is gone. It is in a session of its own and gets no input.
+    The program and its children are also killed when this process is asked to end or is gone.
+    It is in a session of its own and has no input.
 
     Parameters
     ----------
@@ -361,7 +360,7 @@ def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[byte
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill a tool and what it has started."""
+    """Kill a tool and its children."""
     # Its session may not be there yet; closing the pipe then does the rest.
     with suppress(OSError):
         os.killpg(process.pid, signal.SIGKILL)

@@ -273,4 +273,4 @@ def verify_command(bag: Path, tolerance: float) -> None:
     click.echo(f"largest     {result.largest:.3g}{place}")
     if result.difference is not None:
         fail(f"The bag differs: {result.difference}")
-    click.echo("verified    every published state is what the commands make it")
+    click.echo("verified    every published state follows from the commands")

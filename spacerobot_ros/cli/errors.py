@@ -1,4 +1,4 @@
-"""How a command ends: its exit codes, and one sentence where it does not succeed."""
+"""Exit codes of commands, and one sentence where a command does not succeed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spacerobot_ros.termination import Terminated, announce, guarded, terminatio
 
 
 class ExitCode(IntEnum):
-    """What ends a command."""
+    """Exit codes of the command line."""
 
     DONE = 0
     """The goal was reached within tolerance; the bag is as it should be; nothing was refused."""
@@ -24,7 +24,7 @@ class ExitCode(IntEnum):
     """The goal was not reached or cannot be reached; the bag differs."""
 
     BAD_INPUT = 2
-    """The input is refused, or what the command needs is not there."""
+    """The input is refused, or a program or package that the command needs is missing."""
 
     INTERRUPTED = 130
     """By SIGINT, that is Ctrl-C; 128 plus the number of another signal: 129 SIGHUP, 143 SIGTERM."""
@@ -33,10 +33,10 @@ class ExitCode(IntEnum):
 _ROS = ("rclpy", "rosidl_parser", "ament_index_python")
 
 
-def fail(sentence: str = "") -> NoReturn:
-    """End a command that has done its work without success."""
-    if sentence:
-        click.echo(sentence, err=True)
+def fail(message: str = "") -> NoReturn:
+    """End a command without success, with a message."""
+    if message:
+        click.echo(message, err=True)
     sys.exit(ExitCode.NOT_REACHED)
 
 
@@ -58,7 +58,7 @@ def sentences() -> Iterator[None]:
     """End the process with one sentence and its exit code where an exception of ours is raised.
 
     A goal that a method cannot reach is no bad input; everything else that is refused is. A signal
-    ends it with one line and 128 plus its number, whatever has become of its exception on the way.
+    ends it with one line and 128 plus its number, even if a library has replaced its exception.
     """
     try:
         with guarded(announcing=True):

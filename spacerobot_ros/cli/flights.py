@@ -88,7 +88,7 @@ def run_command(
     from spacerobot_ros.session.run import run_scenario
 
     if view and realtime is None:
-        raise click.UsageError("--view needs --realtime: what is flown in lockstep is over soon.")
+        raise click.UsageError("--view needs --realtime: a flight in lockstep is over soon.")
     path = bag or free_name(Path("out") / f"{chosen.name}.mcap")
     with viewing_if(view, chosen.parameters("viewer")), display(chosen.name) as shown:
         result = run_scenario(chosen, path, shown.fly, processes=processes, longest=longest)
@@ -99,7 +99,7 @@ def run_command(
         click.echo(line)
     if report is not None and termination() is not None:
         words = shlex.join(["spacerobot", "report", str(path), "--out", str(report)])
-        click.echo(f"report      none of what was interrupted: `{words}` makes one")
+        click.echo(f"report      none of an interrupted flight: `{words}` makes one")
     end_if_requested()
     if report is not None:
         from spacerobot_ros.report import write_report
@@ -117,7 +117,7 @@ def _chosen(
     settings: tuple[str, ...],
     realtime: float | None,
 ) -> Scenario:
-    """Return the scenario with what the command line changes."""
+    """Return the scenario with the changes of the command line."""
     from spacerobot_ros.flight.scenario import scenario_or_robot
 
     scenario = goal.of(scenario_or_robot(name))
@@ -129,7 +129,7 @@ def _chosen(
 
 
 def _summary_lines(summary: dict[str, Any]) -> list[str]:
-    """Return the result as lines for people."""
+    """Return the result as lines for the user."""
     degrees = math.degrees(summary["attitude_error_rad"])
     return [
         f"{summary['scenario']}, {summary['method']}: {summary['message']}",

@@ -1,4 +1,4 @@
-"""What a command shows while it works: on standard error, if that is a terminal."""
+"""Progress of a command, on standard error if that is a terminal."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Display:
     Parameters
     ----------
     label
-        What is planned or flown.
+        Name of the scenario or robot.
     visible
         Whether anything is shown.
     """
@@ -65,7 +65,7 @@ class Display:
                 click.echo(sentence, err=True)
 
     def close(self) -> None:
-        """Leave the terminal as other lines want it."""
+        """Complete the line of the bar."""
         with self._lock:
             self._finish()
 
@@ -91,7 +91,7 @@ class Display:
 
 @contextmanager
 def display(label: str) -> Iterator[Display]:
-    """Have a display for the length of a block; where it is not visible, nothing is imported."""
+    """Show progress during a block; without a terminal nothing is imported."""
     shown = Display(label, visible=sys.stderr.isatty())
     try:
         if not sys.stderr.isatty():

@@ -83,7 +83,7 @@ def lines_of(found: Analysis) -> list[str]:
 
 
 def json_of(found: Analysis) -> dict[str, Any]:
-    """Return the findings as what JSON can hold; infinite condition numbers and limits are null."""
+    """Return the findings for JSON; infinite condition numbers and limits are null."""
     robot = found.robot
     finite = _finite(found)
     return {
@@ -219,7 +219,7 @@ def new_command(robot: str, out: Path | None) -> None:
     for line in lines_of(known):
         click.echo(line)
     for remark in remarks(model.description):
-        click.echo(f"{'to mind':<13}{remark}")
+        click.echo(f"{'note':<13}{remark}")
     click.echo()
     problem = first_problem(name, model, file)
     with display(name):

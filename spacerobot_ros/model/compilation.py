@@ -129,7 +129,7 @@ class BufferedFunction:
         Raises
         ------
         ValueError
-            An argument has the wrong size; the sentence names it.
+            An argument has the wrong size; the message names it.
         """
         for index, (memory, value) in enumerate(zip(self.inputs, arguments, strict=True)):
             if np.size(value) != memory.size:

@@ -1,6 +1,6 @@
 """``python -m spacerobot_ros.session.child MODULE ...``: a node that ends with its supervisor.
 
-The module of a node takes a second to import: the guard is there before it.
+The module of a node takes a second to import: the process is guarded before.
 """
 
 from __future__ import annotations

@@ -25,45 +25,44 @@ _FIRST_TURN = math.radians(5.0)
 """Largest turn of the base in the first scenario of a robot, rad."""
 
 _MOST_TURNS = 4 * math.pi
-"""Limits of joints beyond that may be meant in degrees, rad."""
+"""Joint limits above it may be in degrees, rad."""
 
 _EASY = 0.5
-"""Share of the room to its limits that a joint goes through for a first turn."""
+"""Part of the distance to its limits that a joint moves for a first rotation."""
 
 _ROOM = 1.0
-"""Most room of a joint that counts, m or rad: beyond it the base turns otherwise."""
+"""Largest distance to a limit that counts, m or rad: the connection changes beyond it."""
 
 _LEAST_TURN = math.radians(0.2)
-"""Smaller turns are not asked of the joints directly but by loops."""
+"""Smaller rotations are left to loops of the joints, rad."""
 
 _PARTS = 50.0
-"""The tolerance of a small turn is this part of it."""
+"""Ratio of a small rotation to its tolerance."""
 
 _LIGHT_BASE, _HEAVY_BASE = 0.2, 500.0
-"""Masses of the base, over that of all it carries, between which the base moves visibly and is no
-mere appendage."""
+"""Usual ratios of the base's mass to the mass of all other bodies."""
 
 _SLOWEST, _FASTEST = 1e-3, 50.0
-"""Joint speeds (m/s or rad/s) that are usual."""
+"""Usual joint speeds, m/s or rad/s."""
 
 
 def remarks(robot: RobotDescription) -> Iterator[str]:
-    """Yield what an author of a URDF may want to mend, a sentence each with how.
+    """Yield notes on unusual values of a URDF, each with a remedy.
 
-    Nothing of it keeps the robot from flying: what does is refused when the file is read.
+    The robot flies all the same; errors are refused when the file is read.
     """
     carried = robot.total_mass - robot.bodies[0].inertia.mass
     base = robot.bodies[0].inertia
     if carried > 0 and base.mass < _LIGHT_BASE * carried:
         yield (
             f"The base '{robot.base_link}' has {base.mass:.4g} kg and carries {carried:.4g} kg: it "
-            "moves more than what it carries. If it stands for a mount, give it the mass and "
+            "moves more than its load. If it stands for a mount, give it the mass and "
             "inertia of the spacecraft."
         )
     if carried > 0 and base.mass > _HEAVY_BASE * carried:
         yield (
             f"The base '{robot.base_link}' has {base.mass:.4g} kg, {base.mass / carried:.3g} times "
-            "what it carries: the joints hardly move it."
+            "its load: the joints hardly move it."
         )
     if base.mass > 0 and not np.any(base.about_com):
         yield (
@@ -96,7 +95,7 @@ def remarks(robot: RobotDescription) -> Iterator[str]:
     for link in robot.links:
         # Of a body as a whole it is refused.
         if flaw := flaw_of_inertia(link.inertia.about_com):
-            yield f"The inertia of link '{link.name}' {flaw} What it is welded to makes up for it."
+            yield f"The inertia of link '{link.name}' {flaw} The links welded to it make up for it."
     yield from _about_looks(robot)
 
 

@@ -38,13 +38,13 @@ from spacerobot_ros.times import SECOND, stamp_to_ns
 from spacerobot_ros.topics import NOT_RECORDED
 
 _START = 60.0
-"""Wall s within which every node must be there."""
+"""Longest wait for the start of all nodes, wall s."""
 
 _END = 10.0
-"""Wall s that a node has to end after a signal before it is killed."""
+"""Wall time that a node has to end after a signal before it is killed, s."""
 
 _WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-"""Fast DDS may go on writing into what a killed node has left behind, and not to its successor."""
+"""Fast DDS may go on writing into the shared memory of a killed node, not to its successor."""
 
 _PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 """Environment variables of Fast DDS: the file of its settings, by its new and its old name."""
@@ -61,21 +61,22 @@ _PROMPT_WRITERS = """<?xml version="1.0" encoding="UTF-8"?>
   </profiles>
 </dds>
 """
-"""Writers ask for confirmation, and repeat what was lost, after 10 ms instead of 3 s: the plant
-would have published more than its publishers keep by then, or have waited."""
+"""Settings by which writers ask for confirmation, and repeat lost messages, after 10 ms.
+
+The default is 3 s: by then the plant has published more than its publishers keep, or has waited."""
 
 _SETTLING = 1.0
-"""Wall s for the recorder to take in what was published before time stood still."""
+"""Wall time for the recorder to receive the last messages of the plant, s."""
 
 
 _SHORT_PATIENCE = 0.5
-"""Wall s that is left for an answer when all is to end soon."""
+"""Longest wait for an answer after an interrupt, wall s."""
 
 _LOOK_PERIOD = 0.05
-"""Wall s from one look at what is connected to the next."""
+"""Wall time from one check of the connections to the next, s."""
 
 _CHILD = "spacerobot_ros.session.child"
-"""Runs the module of a node, as long as this process is there."""
+"""Module that runs a node until this process ends."""
 
 
 class MultiProcessStack(Stack):
@@ -92,7 +93,7 @@ class MultiProcessStack(Stack):
     Raises
     ------
     SpaceRobotError
-        A node ended at its start; the sentence is the last that it wrote.
+        A node ended at its start; the message is the last line that it wrote.
     """
 
     can_kill: ClassVar[bool] = True
@@ -197,7 +198,7 @@ class MultiProcessStack(Stack):
 
     @property
     def statistics(self) -> PlannerStatistics:
-        """What the planner has done, once the flight is finished."""
+        """The planner's statistics, once the flight is finished."""
         return self._statistics
 
     def start(self, goal: Goal | None) -> None:
@@ -236,7 +237,7 @@ class MultiProcessStack(Stack):
                 )
 
     def close(self) -> None:
-        """End what still runs."""
+        """End all processes that still run."""
         left = [process for process in self.processes.values() if process.poll() is None]
         for process in left:
             process.send_signal(signal.SIGTERM)
@@ -266,7 +267,7 @@ class MultiProcessStack(Stack):
                 )
 
     def kill(self, name: str) -> None:
-        """Have a node end as it would by a crash."""
+        """Kill a node, as a crash would."""
         os.killpg(self.processes[name].pid, signal.SIGKILL)
         self.processes[name].wait()
 
@@ -306,7 +307,7 @@ class MultiProcessStack(Stack):
         self._clock_seen = time.monotonic()
 
     def _connected(self) -> bool:
-        """Whether everybody has met everybody, and the recorder records all that they publish."""
+        """Whether all nodes are connected, and the recorder records all that they publish."""
         requests = {name: Trigger.Request() for name in self.names}
         answers = self._call_all(self._get_connections, requests)
         nodes = {name: Connections.from_json(answer.message) for name, answer in answers.items()}
@@ -332,7 +333,7 @@ class MultiProcessStack(Stack):
                 raise SpaceRobotError(f"The {name} refuses: {self._last_line(name)}")
 
     def _ask_statistics(self, patience: float) -> None:
-        """Ask the planner what it has done; one that is interrupted may be busy."""
+        """Request the planner's statistics; one that is interrupted may be busy."""
         request = {"planner": Trigger.Request()}
         try:
             answer = self._call_all({"planner": self._get_statistics}, request, patience)["planner"]
@@ -345,7 +346,7 @@ class MultiProcessStack(Stack):
     def _call_all(
         self, services: Mapping[str, Client], requests: Mapping[str, Any], patience: float = _START
     ) -> dict[str, Any]:
-        """Return what nodes answer to requests, which are sent as soon as each is there."""
+        """Send requests, each as soon as its node is there, and return the answers."""
         names = ", ".join(requests)
         waiting = set(requests)
         answers: dict[str, Any] = {}
@@ -380,12 +381,12 @@ class _LateError(SpaceRobotError):
 
 
 class KillTimeline:
-    """Which node is to end and to start, as time goes on.
+    """Schedule of the nodes that are killed and started again.
 
     Parameters
     ----------
     kills
-        By time.
+        Ordered by time.
     """
 
     def __init__(self, kills: Sequence[Kill]) -> None:

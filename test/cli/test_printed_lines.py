@@ -396,7 +396,7 @@ def test_the_lines_of_a_verification(monkeypatch: pytest.MonkeyPatch) -> None:
         "flown again 340 ticks, 34 s\n"
         "compared    1705 messages\n"
         "largest     1.5e-13, pose.pose.position.y of /odom at 1.25 s\n"
-        "verified    every published state is what the commands make it\n"
+        "verified    every published state follows from the commands\n"
     )
     nothing = verified(monkeypatch, largest=0.0, largest_at=None).stdout.splitlines()
     assert nothing[2] == "largest     0"
