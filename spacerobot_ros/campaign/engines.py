@@ -22,46 +22,46 @@ ALL: Mapping[str, Callable[[], Engine]] = {
 
 
 def chosen_engine(campaign: Campaign, wanted: str) -> Engine:
-    """Return the engine that is wanted, or the first one that can fly a campaign.
+    """Return the engine ``wanted``; for ``auto`` the first one that can fly a campaign.
 
     Raises
     ------
     SpaceRobotError
-        The one that is wanted cannot; the sentence says why.
+        The engine cannot fly it, or none can; the message says why.
     """
     if wanted != "auto":
         engine = ALL[wanted]()
-        why = engine.refusal(campaign, asked=True)
-        if why:
-            raise SpaceRobotError(f"The engine '{wanted}' cannot fly this campaign: {why}")
+        reason = engine.refusal(campaign, asked=True)
+        if reason:
+            raise SpaceRobotError(f"The engine '{wanted}' cannot fly this campaign: {reason}")
         return engine
     reasons = []
     for name, make in ALL.items():
         engine = make()
-        why = engine.refusal(campaign)
-        if not why:
+        reason = engine.refusal(campaign)
+        if not reason:
             return engine
-        reasons.append(f"{name}: {why}")
+        reasons.append(f"{name}: {reason}")
     raise SpaceRobotError(f"No engine can fly this campaign. {' '.join(reasons)}")
 
 
 @cache
 def engine_called(name: str) -> Engine:
-    """Return an engine by its name, the same one in each process: it keeps what it has built."""
+    """Return an engine by its name, one per process: it reuses the models that it has built."""
     return ALL[name]()
 
 
 def fly_all(
     engine: Engine, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
 ) -> Iterator[Row]:
-    """Yield a row for each draw; what an engine leaves is flown after the others."""
-    left: list[Fallback] = []
+    """Yield a row for each draw; fallbacks are flown after the others."""
+    fallbacks: list[Fallback] = []
     for made in engine.fly(campaign, draws, stopped):
         if isinstance(made, Fallback):
-            left.append(made)
+            fallbacks.append(made)
         else:
             yield made
-    reasons = {each.draw.number: each.reason for each in left}
-    for row in engine_called(FLIGHTS).fly(campaign, [each.draw for each in left], stopped):
-        assert isinstance(row, Row), "it leaves nothing"
+    reasons = {each.draw.number: each.reason for each in fallbacks}
+    for row in engine_called(FLIGHTS).fly(campaign, [each.draw for each in fallbacks], stopped):
+        assert isinstance(row, Row), "the engine 'flights' has no fallbacks"
         yield replace(row, fallback=reasons[row.draw.number])

@@ -1,242 +1,472 @@
-"""Draws flown in lanes: those that follow one schedule from start to end, and coordinated control.
+"""Draws of a campaign flown in SIMD lanes: along a schedule of the planner, or under control.
 
-The planner's executive makes the plan of each draw, as in every engine. Where it would do anything
-but track that plan to its end and evaluate the goal (a correction, a joint that is limited or does
-not follow), the draw is flown again by the engine ``flights``: the rows are the same.
+A lane can follow one schedule to its end and evaluate the goal, or fly coordinated control to the
+decision of the goal monitor. A draw that needs more (a correction, a joint at a limit, control that
+is lost) is a :class:`.Fallback`, which the engine ``flights`` flies: the rows are the same.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spacerobot_ros.batch import Flights, FollowedSchedule, SensorErrors, Starts, fly_lanes
+from spacerobot_ros.batch import (
+    Controlled,
+    Decision,
+    Flights,
+    FollowedSchedule,
+    SensorErrors,
+    Starts,
+    fly_lanes,
+)
 from spacerobot_ros.batch.flights import BatchResult
 from spacerobot_ros.campaign.config import Campaign
-from spacerobot_ros.campaign.controlled_lanes import (
-    control_refusal,
-    end_effector_error,
-    fly_controlled,
-    require_lane,
-)
 from spacerobot_ros.campaign.draws import Draw, drawn_flight
-from spacerobot_ros.campaign.one_by_one import FlightsEngine, node_robot, robots_of
+from spacerobot_ros.campaign.one_by_one import (
+    FlightsEngine,
+    node_robot,
+    nominal_robots,
+    robots_of,
+)
 from spacerobot_ros.campaign.rows import LANES, Fallback, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
+from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.executive import decided_message
+from spacerobot_ros.control.outputs import OutputDistance
+from spacerobot_ros.control.status import ControllerState
+from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.lockstep import fly_scenario
+from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.measures import Measures, Outcome, momentum_drift
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
+from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
+from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import values_of
-from spacerobot_ros.planning import GaitSchedule, PoseError
+from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import PlannerStatus, remaining_error
 from spacerobot_ros.simulation.plant import InitialState
+from spacerobot_ros.times import SECOND
 
 _INSTANTS = 40
-"""States of a flight that are looked at, beside its last one."""
+"""States of a flight along a schedule that are evaluated, beside its last one."""
 
 _MOST_TICKS = 4_000_000
-"""Ticks of one batch: its schedules are in memory."""
-
-_MOST = 512
-"""Flights of one batch."""
-
-_MOST_CONTROLLED = 128
-"""Likewise, with a controller."""
+"""Largest number of ticks of one batch, whose schedules are in memory."""
 
 _LONGEST_BATCH = 4.0
-"""Wall s after which a batch is flown with those that are planned: what ends the campaign loses no
-more."""
+"""Wall time, s, after which a batch is flown with the draws that are ready; an interruption of the
+campaign loses no more."""
 
 _AT_END = 1e-6
-"""A schedule has ended when every joint is this near its last position, m or rad."""
+"""Largest distance of a joint from its last position at the end of a schedule, m or rad."""
+
+_GAINS = "coordinated_control.gains."
+"""Prefix of the controller's parameters that may differ from lane to lane."""
+
+_COMMON = (
+    *("plant.tick_rate", "plant.integration_step", "plant.thrusters", "plant.end_effector_frame"),
+    *("plant.beyond_limits", "plant.latched_faults", "plant.actuation", "plant.robot"),
+)
+"""Prefixes of the plant's parameters that all lanes share."""
+
+_COMMON_TO_SCHEDULES = (
+    *("plant.tick_rate", "plant.integration_step", "planner.tick_rate"),
+    *("planner.averaging", "planner.drift", "planner.replan", "planner.shape_"),
+    *("planner.max_corrections", "planner.output", "plant.actuation"),
+)
+"""Prefixes of the parameters that all lanes along schedules share."""
+
+_OUTCOMES = {
+    Decision.REACHED: (Outcome.REACHED, ControllerState.REACHED),
+    Decision.FAILED: (Outcome.FAILED, ControllerState.FAILED),
+}
 
 
 @dataclass(frozen=True)
-class _Planned:
-    """A draw with its schedule, and when that was made."""
+class _Plan:
+    """A schedule from the first state, and the planner's status when it began."""
+
+    schedule: GaitSchedule
+    status: PlannerStatus
+
+
+@dataclass(frozen=True)
+class _Ready:
+    """A draw that is ready for lanes: with its plan, if it follows one, and wall time for it, s."""
 
     draw: Draw
     flight: DrawnFlight
-    schedule: GaitSchedule
-    gait: PlannerStatus
-    plan_time: float
+    plan: _Plan | None = None
+    plan_time: float = 0.0
 
-    @classmethod
-    def of(
-        cls,
-        draw: Draw,
-        flight: DrawnFlight,
-        plan: tuple[GaitSchedule, PlannerStatus] | None,
-        began: float,
-    ) -> _Planned | None:
-        """Return a draw whose planning ``began`` at a wall time, s; None without a plan."""
-        return None if plan is None else cls(draw, flight, *plan, time.perf_counter() - began)
+    @property
+    def schedule(self) -> GaitSchedule:
+        """The schedule of the plan."""
+        assert self.plan is not None
+        return self.plan.schedule
 
 
 class LanesEngine:
-    """Many flights at once, on vector registers."""
+    """Many flights at once, in SIMD lanes."""
 
     name = LANES
     least = 64
 
     def __init__(self) -> None:
         self._flights = FlightsEngine()
-        self._kept: tuple[str, tuple[GaitSchedule, PlannerStatus] | None] | None = None
-        """The last plan from a state that was measured without noise, and what it follows from."""
-        self._planner: tuple[PlannerConfig, str] | None = None
-        """The planner's configuration of the last draw, mostly that of all, and its text."""
+        self._scheduled, self._controlled = _ScheduledLanes(), _ControlledLanes()
 
     def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
-        """Return why not, as a clause."""
-        why = self._flights.refusal(campaign)
-        if why:
-            return why
+        """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can."""
+        reason = self._flights.refusal(campaign)
+        if reason:
+            return reason
         scenario = campaign.scenario
         plant = scenario.plant
         if plant.faults or any(each.name.startswith("faults") for each in campaign.dispersions):
             return "it has faults"
         match scenario.commanders, plant.actuation:
             case ("planner",), "velocity":
-                return _tracking_refusal(campaign)
+                return self._scheduled.refusal(campaign)
             case ("coordinated_control",), "effort":
-                return control_refusal(campaign, asked=asked)
+                return self._controlled.refusal(campaign, asked=asked)
         return "lanes have velocities of a planner, or efforts of coordinated control"
 
     def fly(
         self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
     ) -> Iterator[Row | Fallback]:
-        """Fly draws in batches; leave those that need a planner or controller on the way."""
-        plans = "planner" in campaign.scenario.commanders
-        return (self._tracked if plans else self._controlled)(campaign, draws, stopped)
-
-    def _controlled(
-        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row | Fallback]:
-        """Fly draws of coordinated control."""
-        common = DrawnFlight.of(campaign.scenario)
-        for first in range(0, len(draws), _MOST_CONTROLLED):
-            if stopped():
-                return
-            batch = []
-            for draw in draws[first : first + _MOST_CONTROLLED]:
-                try:
-                    flight = drawn_flight(campaign, draw, common)
-                except SpaceRobotError as error:
-                    yield Row.failed(draw, error, self.name)
-                    continue
-                try:
-                    require_lane(campaign, flight)
-                except SpaceRobotError as error:  # It alone: the others of its batch are flown.
-                    yield Fallback(draw, str(error))
-                    continue
-                batch.append((draw, flight))
-            if not batch:
-                continue
-            try:
-                flown = fly_controlled(campaign, batch)
-            except SpaceRobotError as error:  # Of one of them: each is flown by itself.
-                yield from (Fallback(draw, str(error)) for draw, _ in batch)
-                continue
-            for draw, measures in flown:
-                if isinstance(measures, str):
-                    yield Fallback(draw, measures)
-                else:
-                    yield Row.of(campaign, draw, measures, self.name)
-
-    def _tracked(
-        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row | Fallback]:
-        """Fly draws that follow the plans of a planner."""
-        common, batch, ticks = DrawnFlight.of(campaign.scenario), list[_Planned](), 0
+        """Fly draws in batches."""
+        lanes: _ScheduledLanes | _ControlledLanes = self._controlled
+        if "planner" in campaign.scenario.commanders:
+            lanes = self._scheduled
+        common, batch, ticks = DrawnFlight.of(campaign.scenario), list[_Ready](), 0
         began = time.perf_counter()
         for draw in draws:
             if stopped():
                 return
             try:
-                planned = self._planned(draw, drawn_flight(campaign, draw, common))
-            except Exception as error:  # It is a row, with its reason.
+                ready = lanes.prepared(campaign, draw, drawn_flight(campaign, draw, common))
+            except Exception as error:  # The error becomes a row.
                 yield Row.failed(draw, error, self.name)
                 continue
-            if planned is None:
-                yield Fallback(draw, "had no schedule at the first state")
+            if isinstance(ready, Fallback):
+                yield ready
                 continue
-            batch.append(planned)
-            ticks += planned.schedule.ticks
+            batch.append(ready)
+            ticks += 0 if ready.plan is None else ready.schedule.ticks
             late = time.perf_counter() - began > _LONGEST_BATCH
-            if late or len(batch) >= _MOST or ticks > _MOST_TICKS:
-                yield from self._flown(campaign, batch)
+            if late or len(batch) >= lanes.most or ticks > _MOST_TICKS:
+                yield from self._flown(campaign, lanes, batch)
                 batch, ticks, began = [], 0, time.perf_counter()
         if batch:
-            yield from self._flown(campaign, batch)
+            yield from self._flown(campaign, lanes, batch)
 
-    def _planned(self, draw: Draw, flight: DrawnFlight) -> _Planned | None:
-        """Have the executive plan a draw; None where it makes no plan for the first state."""
+    def _flown(
+        self,
+        campaign: Campaign,
+        lanes: _ScheduledLanes | _ControlledLanes,
+        batch: Sequence[_Ready],
+    ) -> Iterator[Row | Fallback]:
+        """Fly a batch."""
         began = time.perf_counter()
+        try:
+            flights = lanes.flights(campaign, batch)
+            result = fly_lanes(flights)
+        except SpaceRobotError as error:  # Of one of them: each is flown by itself.
+            yield from (Fallback(each.draw, str(error)) for each in batch)
+            return
+        taken = (time.perf_counter() - began) / len(batch)
+        for row, ready in enumerate(batch):
+            if row in result.failures:
+                yield Fallback(ready.draw, "was refused by the plant")
+                continue
+            measures = lanes.measures(result, row, ready, flights)
+            if isinstance(measures, str):
+                yield Fallback(ready.draw, measures)
+            elif measures.duration > campaign.longest and ready.plan is not None:
+                yield Fallback(ready.draw, "took longer than the campaign allows")
+            else:
+                measures = replace(measures, wall_time=taken + ready.plan_time)
+                yield Row.of(campaign, ready.draw, measures, self.name)
+
+
+class _ScheduledLanes:
+    """Flights along the schedules that the planner's executive makes for the first states."""
+
+    most = 512
+    """Largest number of flights of one batch."""
+
+    def __init__(self) -> None:
+        self._last: tuple[str, _Plan | None] | None = None
+        """The last plan from a state measured without noise, and the values that determine it."""
+        self._planner: tuple[PlannerConfig, str] | None = None
+        """The planner's configuration of the last draw, mostly that of all, and its text."""
+
+    def refusal(self, campaign: Campaign) -> str:
+        """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can."""
+        planner, sensors = campaign.scenario.planner, campaign.scenario.plant.sensors
+        if planner.averaging > 1 or planner.drift_position or planner.drift_attitude:
+            return "the planner averages states, or watches the path"
+        if planner.replanning or planner.output != "commands":
+            return "the planner plans again on the way"
+        dispersed = [each.name for each in campaign.dispersions]
+        for name in dispersed:
+            if name.startswith(_COMMON_TO_SCHEDULES):
+                return f"'{name}' is dispersed, and all lanes share it"
+        noisy = sensors.joint_noise or any(sensors.joint_bias)
+        if noisy or any(name.startswith("plant.sensors.joint") for name in dispersed):
+            return "the joints are measured with errors"
+        return ""
+
+    def prepared(self, campaign: Campaign, draw: Draw, flight: DrawnFlight) -> _Ready | Fallback:
+        """Let the executive plan a draw."""
+        began = time.perf_counter()
+        plan = self._plan(flight)
+        if plan is None:
+            return Fallback(draw, "had no schedule at the first state")
+        return _Ready(draw, flight, plan, time.perf_counter() - began)
+
+    def _plan(self, flight: DrawnFlight) -> _Plan | None:
+        """Return the plan for the first state; the last one if the same values determine it."""
         if _has_noise(flight):
-            # What is measured differs from draw to draw.
-            return _Planned.of(draw, flight, _first_plan(flight), began)
+            return _first_plan(flight)
         planner = flight.scenario.planner
         if self._planner is None or self._planner[0] is not planner:
             self._planner = planner, repr(values_of(planner))
-        key = self._planner[1] + _key(flight)
-        if self._kept is None or self._kept[0] != key:
-            self._kept = key, _first_plan(flight)
-        return _Planned.of(draw, flight, self._kept[1], began)
+        key = self._planner[1] + _plan_key(flight)
+        if self._last is None or self._last[0] != key:
+            self._last = key, _first_plan(flight)
+        return self._last[1]
 
-    def _flown(self, campaign: Campaign, batch: list[_Planned]) -> Iterator[Row | Fallback]:
-        """Fly a batch in lanes."""
-        began = time.perf_counter()
-        flights, ends = _flights(batch)
-        result = fly_lanes(flights)
-        taken = (time.perf_counter() - began) / len(batch)
-        for row, planned in enumerate(batch):
-            measures = _measures(result, row, planned, flights, ends[row])
-            if isinstance(measures, str):
-                yield Fallback(planned.draw, measures)
-            elif measures.duration > campaign.longest:
-                yield Fallback(planned.draw, "took longer than the campaign allows")
-            else:
-                measures = replace(measures, wall_time=taken + planned.plan_time)
-                yield Row.of(campaign, planned.draw, measures, self.name)
+    def flights(self, campaign: Campaign, batch: Sequence[_Ready]) -> Flights:
+        """Return the batch of some draws."""
+        planner = batch[0].flight.scenario.planner
+        first, ticks = batch[0].schedule, [each.schedule.ticks for each in batch]
+        most = max(ticks)
+        if all(each.schedule is first for each in batch):
+            positions = first.positions
+        else:
+            positions = np.array([_padded(each.schedule.positions, most) for each in batch])
+        instants = np.unique([*np.linspace(0, most, _INSTANTS).astype(int), *ticks])
+        return _flights(
+            [each.flight for each in batch],
+            FollowedSchedule(positions, planner.shape_gain, planner.shape_deadband),
+            most,
+            instants=tuple(instants.tolist()),
+        )
+
+    def measures(
+        self, result: BatchResult, row: int, ready: _Ready, flights: Flights
+    ) -> Measures | str:
+        """Return the measures of a flight whose goal is decided at the end of its schedule, or the
+        reason for a fallback.
+        """
+        if any(counts[row].any() for counts in result.limited.values()):
+            return "had a joint at its limit"
+        scenario, schedule = ready.flight.scenario, ready.schedule
+        end = flights.instants.index(schedule.ticks)
+        measured, q = result.measured_pose[row, end], result.measured_q[row, end]
+        band = max(_AT_END, scenario.planner.shape_deadband)
+        if np.abs(schedule.positions[-1] - q).max(initial=0.0) > band:
+            return "had a joint that did not follow its schedule"
+        error = PoseError.between(measured[:3], measured[3:], scenario.goal, q)
+        remaining = remaining_error(error, schedule.controls)
+        outcome, message = Outcome.REACHED, f"The goal is reached: {remaining}."
+        if not scenario.planner.tolerance.admits(error, schedule.controls):
+            if scenario.planner.max_corrections:
+                return "needed corrections"
+            outcome = Outcome.FAILED
+            message = f"The goal is not reached: {remaining} after 0 correction(s)."
+        assert ready.plan is not None
+        pose = result.pose[row, end]
+        duration = float(result.time[end] - result.time[0])
+        return Measures(
+            outcome=outcome,
+            message=message,
+            duration=duration,
+            manoeuvre_time=duration,
+            error=PoseError.between(pose[:3], pose[3:], scenario.goal),
+            end_effector_error=_end_effector_error(
+                flights.robot, ready.flight, result.q[row, end], pose
+            ),
+            peak_rate=result.peak_rate[row],
+            peak_effort=np.zeros(flights.robot.n),
+            peak_wrench=np.zeros(2),
+            # The joints are on the schedule at every tick: nothing disturbs or limits them.
+            lowest=schedule.positions.min(axis=0),
+            highest=schedule.positions.max(axis=0),
+            momentum_drift=momentum_drift(result.momentum[row, : end + 1]),
+            corrections=ready.plan.status.corrections,
+            plan_time=ready.plan_time,
+        )
 
 
-def _tracking_refusal(campaign: Campaign) -> str:
-    """Return why lanes cannot follow the schedules of a campaign, as a clause; empty if so."""
-    scenario = campaign.scenario
-    plant = scenario.plant
-    planner = scenario.planner
-    if planner.averaging > 1 or planner.drift_position or planner.drift_attitude:
-        return "the planner averages states, or watches the path"
-    if planner.replanning or planner.output != "commands":
-        return "the planner plans again on the way"
-    dispersed = [each.name for each in campaign.dispersions]
-    changing = (
-        *("plant.tick_rate", "plant.integration_step", "planner.tick_rate"),
-        *("planner.averaging", "planner.drift", "planner.replan", "planner.shape_"),
-        *("planner.max_corrections", "planner.output", "plant.actuation"),
+class _ControlledLanes:
+    """Flights of coordinated control, to the decisions about their goals."""
+
+    most = 128
+    """Largest number of flights of one batch."""
+
+    def refusal(self, campaign: Campaign, *, asked: bool) -> str:
+        """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can.
+
+        On/off thrusters amplify rounding: 1e-15 m at the start become 1e-4 m and 0.1 s at the end.
+        A draw in lanes then differs from that of the engine ``flights``, and is flown only if lanes
+        are ``asked`` for by name.
+        """
+        scenario = campaign.scenario
+        plant = scenario.plant
+        if plant.thrusters and not asked:
+            return "its thrusters are on or off, which amplifies rounding: ask for lanes by name"
+        if plant.thrusters and plant.thrusters_excluded:
+            return "some of its thrusters are excluded"
+        if plant.beyond_limits != "clip":
+            return "the plant refuses commands beyond limits"
+        for dispersion in campaign.dispersions:
+            name = dispersion.name
+            own = name.startswith("coordinated_control.") and not name.startswith(_GAINS)
+            if own or name.startswith(_COMMON):
+                return f"'{name}' is dispersed, and all lanes share it"
+        try:
+            law = build_controller(nominal_robots(scenario).controller, scenario.controller).law
+        except SpaceRobotError as error:
+            return str(error)
+        if law.fixed_inputs is None:
+            return f"the law '{law.name}' with these options is more than one function"
+        for key, goal in _goals(scenario).items():
+            if goal is not None and not getattr(law.outputs.selection, key):
+                return f"the law '{law.name}' does not control the {key.replace('_', '-')}"
+        return ""
+
+    def prepared(self, campaign: Campaign, draw: Draw, flight: DrawnFlight) -> _Ready | Fallback:
+        """Check that a draw can be in a batch, whose other flights its error would end."""
+        ready = _Ready(draw, flight)
+        try:
+            self.flights(campaign, [ready])
+        except SpaceRobotError as error:
+            return Fallback(draw, str(error))
+        return ready
+
+    def flights(self, campaign: Campaign, batch: Sequence[_Ready]) -> Flights:
+        """Return the batch of some draws.
+
+        Raises
+        ------
+        SpaceRobotError
+            A parameter, a start or a goal is refused.
+        """
+        scenario = campaign.scenario
+        drawn = [each.flight for each in batch]
+        goals = [_goals(each.scenario) for each in drawn]
+        dispersed = any(each.name.startswith(_GAINS) for each in campaign.dispersions)
+        gains = tuple(each.scenario.controller.gains for each in drawn) if dispersed else ()
+        program = Controlled(
+            scenario.controller,
+            base=_poses([each["base"] for each in goals]),
+            end_effector=_poses([each["end_effector"] for each in goals]),
+            gains=gains,
+            robot=nominal_robots(scenario).controller,
+            until_decided=True,
+        )
+        return _flights(drawn, program, _ticks(campaign.longest, scenario.plant.period_ns))
+
+    def measures(
+        self, result: BatchResult, row: int, ready: _Ready, flights: Flights
+    ) -> Measures | str:
+        """Return the measures of a flight, or the reason for a fallback."""
+        decision, period_ns = Decision(result.decision[row]), ready.flight.scenario.plant.period_ns
+        decided = int(result.decided_tick[row])
+        if decision is Decision.LOST:
+            return "lost control"
+        if decided == 0:
+            return "ended at its first state"
+        n, end = flights.robot.n, result.end_state[row]
+        q, pose = end[:n], end[2 * n : 2 * n + 7]
+        duration = int(result.end_tick[row]) * period_ns / SECOND
+        if decision is Decision.NONE:
+            outcome, flown = Outcome.INTERRUPTED, duration
+            message = f"Interrupted after {duration:.6g} s of simulated time."
+        else:
+            outcome, state = _OUTCOMES[decision]
+            message = decided_message(state, OutputDistance(*result.decided_distance[row].tolist()))
+            flown = decided * period_ns / SECOND
+        return Measures(
+            outcome=outcome,
+            message=message,
+            duration=duration,
+            manoeuvre_time=flown,
+            error=PoseError.between(pose[:3], pose[3:], ready.flight.scenario.goal),
+            end_effector_error=_end_effector_error(flights.robot, ready.flight, q, pose),
+            peak_rate=np.maximum(result.peak_rate[row], np.abs(flights.starts.qdot[row])),
+            peak_effort=result.peak_effort[row],
+            peak_wrench=result.peak_wrench[row],
+            lowest=np.minimum(result.lowest[row], q),
+            highest=np.maximum(result.highest[row], q),
+            momentum_drift=result.momentum_drift[row],
+            propellant=math.nan if flights.thrusters is None else float(result.propellant[row]),
+            plan_time=0.0,
+        )
+
+
+def _flights(
+    drawn: Sequence[DrawnFlight],
+    program: FollowedSchedule | Controlled,
+    ticks: int,
+    instants: tuple[int, ...] = (),
+) -> Flights:
+    """Return the batch of drawn flights under the commands of a program."""
+    robot, nominal = node_robot("plant", drawn[0]), InertialParameters.of(drawn[0].nominal)
+    plants = [each.scenario.plant for each in drawn]
+    source = plants[0].thrusters
+    return Flights(
+        robot=robot,
+        actuation="effort" if isinstance(program, Controlled) else "velocity",
+        control_period=plants[0].control_period,
+        ticks=ticks,
+        starts=Starts.of(robot, [InitialState.of(plant) for plant in plants]),
+        program=program,
+        inertial=InertialParameters.stacked([each.inertial or nominal for each in drawn]),
+        sensors=SensorErrors.of(robot, [plant.sensors for plant in plants]),
+        integration_step=plants[0].integration_step,
+        instants=instants,
+        thrusters=find_thrusters(source, robot.description) if source else None,
     )
-    if any(name.startswith(changing) for name in dispersed):
-        return "what lanes have in common is dispersed"
-    sensors = plant.sensors
-    joints = sensors.joint_noise or any(sensors.joint_bias)
-    if joints or any(name.startswith("plant.sensors.joint") for name in dispersed):
-        return "the joints are not measured as they are"
-    return ""
+
+
+def _end_effector_error(
+    robot: SpaceRobot, flight: DrawnFlight, q: Array, pose: Array
+) -> PoseError | None:
+    """Return the error of the end-effector to its goal; None without one of them.
+
+    ``q`` (n,) are the joint positions, ``pose`` (7,) is the pose of the base in W.
+    """
+    goal = flight.scenario.end_effector_goal
+    link = robot.description.end_effector(flight.scenario.plant.end_effector_frame)
+    if goal is None or not link:
+        return None
+    R_BE, r_BE_B = robot.link_pose(link, q)
+    R_WB = matrix_from_quaternion(pose[3:])
+    return PoseError.between(pose[:3] + R_WB @ r_BE_B, quaternion_from_matrix(R_WB @ R_BE), goal)
+
+
+# -- schedules --------------------------------------------------------------------------------
 
 
 def _has_noise(flight: DrawnFlight) -> bool:
+    """Whether the first measured state may differ from draw to draw."""
     sensors = values_of(flight.scenario.plant.sensors)
     return any(np.any(value) for name, value in sensors.items() if name != "seed")
 
 
-def _first_plan(flight: DrawnFlight) -> tuple[GaitSchedule, PlannerStatus] | None:
-    """Have the executive plan for the first state; None where it makes no such plan."""
+def _first_plan(flight: DrawnFlight) -> _Plan | None:
+    """Let the executive plan for the first state; None if it makes no whole schedule."""
     period = flight.scenario.plant.control_period
     first = fly_scenario(flight.scenario, robots=robots_of(flight), longest=period)
     if len(first.schedules) != 1 or first.gait is None:
@@ -244,53 +474,21 @@ def _first_plan(flight: DrawnFlight) -> tuple[GaitSchedule, PlannerStatus] | Non
     ((begins_ns, schedule),) = first.schedules
     if begins_ns or schedule.partial or not schedule.ticks:
         return None
-    return schedule, first.gait
+    return _Plan(schedule, first.gait)
 
 
-def _key(flight: DrawnFlight) -> str:
-    """Return what the plan of a flight without noise follows from beside its planner, as a text."""
+def _plan_key(flight: DrawnFlight) -> str:
+    """Return a text of the values, beside the planner's, that determine a plan without noise."""
     scenario = flight.scenario
     plant = replace(scenario.plant, sensors=replace(scenario.plant.sensors, seed=0))
-    # The robot of the plant is only measured: at rest, whatever its masses are, unless it drifts.
+    # At rest the plan does not depend on the masses of the plant's robot, which is only measured.
     moving = any(plant.linear_momentum) or any(plant.angular_momentum)
-    inertial = flight.inertial
-    weight = None
-    if inertial is not None and (moving or plant.initial_center_of_mass):
-        weight = inertial.vector.tolist()
+    masses = None
+    if flight.inertial is not None and (moving or plant.initial_center_of_mass):
+        masses = flight.inertial.vector.tolist()
     goal = [*scenario.goal.position, *scenario.goal.quaternion]
     shape = scenario.goal.joint_positions
-    wanted = goal, None if shape is None else shape.tolist(), weight
-    return f"{plant} {wanted}"
-
-
-def _flights(batch: list[_Planned]) -> tuple[Flights, list[int]]:
-    """Return the batch of some draws, and which of its instants is the end of each."""
-    scenario = batch[0].flight.scenario
-    plant = scenario.plant
-    robot = node_robot("plant", batch[0].flight)
-    ticks = [each.schedule.ticks for each in batch]
-    most = max(ticks)
-    instants = np.unique([*np.linspace(0, most, _INSTANTS).astype(int), *ticks]).tolist()
-    configs = [each.flight.scenario.plant for each in batch]
-    nominal = InertialParameters.of(batch[0].flight.nominal)
-    positions: Array = np.array([_padded(each.schedule.positions, most) for each in batch])
-    first = batch[0].schedule
-    if all(each.schedule is first for each in batch):
-        positions = first.positions
-    planner = scenario.planner
-    flights = Flights(
-        robot=robot,
-        actuation="velocity",
-        control_period=plant.control_period,
-        ticks=most,
-        starts=Starts.of(robot, [InitialState.of(config) for config in configs]),
-        program=FollowedSchedule(positions, planner.shape_gain, planner.shape_deadband),
-        inertial=InertialParameters.stacked([each.flight.inertial or nominal for each in batch]),
-        sensors=SensorErrors.of(robot, [config.sensors for config in configs]),
-        integration_step=plant.integration_step,
-        instants=tuple(instants),
-    )
-    return flights, [instants.index(tick) for tick in ticks]
+    return f"{plant} {(goal, None if shape is None else shape.tolist(), masses)}"
 
 
 def _padded(positions: Array, ticks: int) -> Array:
@@ -298,47 +496,24 @@ def _padded(positions: Array, ticks: int) -> Array:
     return np.vstack([positions, np.repeat(positions[-1:], missing, axis=0)])
 
 
-def _measures(
-    result: BatchResult, row: int, planned: _Planned, flights: Flights, end: int
-) -> Measures | str:
-    """Return the measures of a flight that is decided at the end of its schedule; else the reason
-    why it is not.
-    """
-    if row in result.failures:
-        return "was refused by the plant"
-    if any(counts[row].any() for counts in result.limited.values()):
-        return "had a joint at its limit"
-    scenario, schedule = planned.flight.scenario, planned.schedule
-    measured, q = result.measured_pose[row, end], result.measured_q[row, end]
-    band = max(_AT_END, scenario.planner.shape_deadband)
-    if np.abs(schedule.positions[-1] - q).max(initial=0.0) > band:
-        return "had a joint that did not follow its schedule"
-    error = PoseError.between(measured[:3], measured[3:], scenario.goal, q)
-    left = remaining_error(error, schedule.controls)
-    outcome, message = Outcome.REACHED, f"The goal is reached: {left}."
-    if not scenario.planner.tolerance.admits(error, schedule.controls):
-        if scenario.planner.max_corrections:
-            return "needed corrections"
-        outcome = Outcome.FAILED
-        message = f"The goal is not reached: {left} after 0 correction(s)."
-    pose = result.pose[row, end]
-    duration = float(result.time[end] - result.time[0])
-    return Measures(
-        outcome=outcome,
-        message=message,
-        duration=duration,
-        manoeuvre_time=duration,
-        error=PoseError.between(pose[:3], pose[3:], scenario.goal),
-        end_effector_error=end_effector_error(
-            flights.robot, planned.flight, result.q[row, end], pose
-        ),
-        peak_rate=result.peak_rate[row],
-        peak_effort=np.zeros(flights.robot.n),
-        peak_wrench=np.zeros(2),
-        # The shape is that of the schedule in every tick: its feedback had nothing to do.
-        lowest=schedule.positions.min(axis=0),
-        highest=schedule.positions.max(axis=0),
-        momentum_drift=momentum_drift(result.momentum[row, : end + 1]),
-        corrections=planned.gait.corrections,
-        plan_time=planned.plan_time,
-    )
+# -- control ----------------------------------------------------------------------------------
+
+
+def _goals(scenario: Scenario) -> dict[str, Goal | None]:
+    return {"base": scenario.goal, "end_effector": scenario.end_effector_goal}
+
+
+def _poses(goals: Sequence[Goal | None]) -> Array | None:
+    """Return goals as a controller receives them, (N, 7); None without any."""
+    checked = [Goal.checked(each.position, each.quaternion) for each in goals if each is not None]
+    if not checked:
+        return None
+    return np.array([np.concatenate([each.position, each.quaternion]) for each in checked])
+
+
+def _ticks(longest: float, period_ns: int) -> int:
+    """Return the first tick at which a flight is interrupted."""
+    tick = max(1, int(longest * SECOND / period_ns) - 1)
+    while tick * period_ns / SECOND < longest:
+        tick += 1
+    return tick
