@@ -44,7 +44,7 @@ class Display:
             if self._bar is None or progress.starts <= self._bar.pos:
                 self._begin(f"planning {self._label}", progress.most, "%(info)s")
             self._bar.length = progress.most
-            self._bar.update(progress.starts - self._bar.pos, progress.sentence)
+            self._bar.update(progress.starts - self._bar.pos, progress.message)
 
     def fly(self, now: float, end: float) -> None:
         """Show simulated time against the end of the schedule, s; 0: there is none yet."""

@@ -144,9 +144,9 @@ def _joint_rows(robot: SpaceRobot) -> list[str]:
 
 
 def _rotation_lines(found: Analysis) -> list[str]:
-    lines = [f"{'rotation':<13}{found.anywhere.sentence}"]
+    lines = [f"{'rotation':<13}{found.anywhere.message}"]
     if found.planar.controllable:
-        lines = [f"{'rotation':<13}{found.planar.sentence}"]
+        lines = [f"{'rotation':<13}{found.planar.message}"]
     if found.nominal is not None:
         at, values = found.nominal, ", ".join(f"{x:.3g}" for x in found.nominal.singular_values)
         names = ", ".join(found.robot.joint_names[i] for i in at.joints)
@@ -181,7 +181,7 @@ def _finding(found: Controllability) -> dict[str, Any]:
         "singular_values": found.singular_values.tolist(),
         "joints": list(found.joints),
         "shape": found.shape.tolist(),
-        "sentence": found.sentence,
+        "sentence": found.message,
     }
 
 

@@ -1,4 +1,4 @@
-"""Goal to gait: one module a method, one common type."""
+"""Planning: from a goal to a gait, by one of several methods."""
 
 from spacerobot_ros.planning.api import plan
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled

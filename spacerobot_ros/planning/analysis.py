@@ -1,4 +1,4 @@
-"""What a robot can do by moving its joints: its parts, what loops turn, which methods suit it."""
+"""Abilities of a robot: turns of its base by joint motions, and the methods that suit it."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ class Analysis:
     robot
         The model.
     shape
-        (n,) the shape that is examined: as given, the best nominal one, or the middle.
+        (n,) the examined shape: the given one, the best nominal one, or the middle.
     nominal
         The three joints and their M there; None with fewer than three joints, or where loops turn
         the base about fewer than three axes everywhere.
     at_shape, anywhere
-        What first-order brackets span at ``shape``, and at the best of many.
+        The span of first-order brackets at ``shape``, and at the best of many shapes.
     conditions
         (300,) condition numbers of the best three brackets, shapes all over the shape space.
     planar, sliding
         The tests of papers 3 and 1.
     objections
-        Why each method does not suit the robot, by name; None if it does.
+        Reason why a method does not suit the robot, by name of the method; None if it does.
     """
 
     robot: SpaceRobot
@@ -68,7 +68,7 @@ class Analysis:
 
     @property
     def chosen(self) -> str:
-        """The method that ``auto`` mostly chooses, ``optimal`` where it suits; "" if none does."""
+        """The method that ``auto`` mostly chooses: ``optimal`` if it suits; "" if none does."""
         suits = [name for name, objection in self.objections.items() if not objection]
         return OptimalGait.name if OptimalGait.name in suits else next(iter(suits), "")
 
@@ -113,7 +113,7 @@ def analyze(robot: SpaceRobot, shape: Sequence[float] | None = None) -> Analysis
 
 
 def _objection(method: type[GaitMethod], robot: SpaceRobot) -> str | None:
-    """Return why a method plans no goal of a robot; None if it plans some."""
+    """Return the reason why a method plans no goal of a robot; None if it plans some."""
     try:
         method.require_suitable(robot)
     except PlanningError as refusal:
@@ -125,8 +125,8 @@ def _checked(robot: SpaceRobot, shape: Sequence[float]) -> Array:
     values = np.asarray(shape, dtype=float)
     if values.shape != (robot.n,) or not np.all(np.isfinite(values)):
         raise ParameterError(
-            f"The shape has {values.size} number(s), and a finite one is wanted for each of the "
-            f"{robot.n} joints of robot '{robot.description.name}': {', '.join(robot.joint_names)}."
+            f"The shape has {values.size} number(s); robot '{robot.description.name}' has "
+            f"{robot.n} joints, each with a finite one: {', '.join(robot.joint_names)}."
         )
     return values
 

@@ -42,21 +42,21 @@ def plan(
     robot
         The model, a URDF file, or the name of a robot of this package.
     goal
-        Where the base is to be; or ``position`` (3,) in m, ``rotvec`` (3,) in rad (exponential
-        coordinates), and ``joint_positions`` (n,) to end in, in m or rad.
+        Goal of the base; or ``position`` (3,) in m, ``rotvec`` (3,) in rad (exponential
+        coordinates), and the final ``joint_positions`` (n,) in m or rad.
     start
-        From where: a state, or the shape (n,) alone with the base at the origin of W; None is the
+        The start: a state, or the shape (n,) alone with the base at the origin of W; None is the
         shape zero, or as near to it as the joint limits allow.
     method
         Name of a gait method; ``options`` are its own.
     control_period, tolerance, integration_step
-        How long a command is held (s), how near to the goal is near enough, and the longest step of
-        the prediction (s): the plant's, for a flight that ends where the plan does.
+        Duration of a command (s), largest error at the goal, and longest step of the prediction
+        (s): the plant's, for a flight that ends where the plan does.
 
     Raises
     ------
     PlanningError
-        The goal is refused or cannot be reached; the sentence says why.
+        The goal is refused or cannot be reached; the message says why.
     ParameterError
         There is no such robot, method or option, or one is refused.
     """

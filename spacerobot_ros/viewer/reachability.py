@@ -498,7 +498,7 @@ def main() -> None:
 
         threading.Thread(target=read, daemon=True).start()
         planner, number = Planner(), 0
-        with reported(lambda progress: say(number=number, progress=progress.sentence)):
+        with reported(lambda progress: say(number=number, progress=progress.message)):
             while True:
                 question, cancellation = last.take()
                 number = question["number"]

@@ -265,7 +265,9 @@ def test_all_reasons_are_told_where_none_plans() -> None:
 def test_attitude_alone_is_no_substitute_for_a_pose() -> None:
     turns = made("turns", controls=ATTITUDE)
     method, built = choice_of(made("moves", refusal="Beyond stroke."), turns)
-    with pytest.raises(PlanningError, match=r"Beyond stroke\..*leave the position of the base"):
+    with pytest.raises(
+        PlanningError, match=r"Beyond stroke\..*does not control the position of the base"
+    ):
         method.plan(at(np.zeros(2)), goal_of([0, 0, 1]))
     # A longer manoeuvre to the pose is no worse than a turn.
     assert planned(made("moves", ticks=9), turns).notes["chosen"] == "moves"

@@ -119,7 +119,7 @@ def test_sliders_in_a_plane_or_too_few_are_not() -> None:
     for robot, count in ((two, 2), (flat, 3)):
         found = sliding_masses(SpaceRobot.from_urdf(robot.urdf))
         assert not found.controllable
-        assert f"{count} slider(s) of rank 2" in found.sentence
+        assert f"{count} slider(s) of rank 2" in found.message
 
 
 def test_planar_robots_turn_about_one_axis() -> None:
@@ -131,14 +131,14 @@ def test_planar_robots_turn_about_one_axis() -> None:
     assert brackets_anywhere(robot_named("planar_chain")).rank == 1
     arm = planar_chain(robot_named("three_joint_arm"))
     assert not arm.controllable
-    assert "not planar" in arm.sentence
+    assert "not planar" in arm.message
 
 
 def test_a_robot_of_one_joint_encloses_no_area() -> None:
     one = SpaceRobot.from_urdf(random_robot_urdf(np.random.default_rng(0), 1))
     found = brackets_anywhere(one)
     assert (found.rank, found.controllable, found.condition) == (0, False, np.inf)
-    assert "no loop encloses an area" in found.sentence
+    assert "no loop encloses an area" in found.message
 
 
 def objection(method: type[GaitMethod], robot: SpaceRobot) -> str:
@@ -225,5 +225,5 @@ def test_the_best_three_of_any_curvature_have_the_smallest_condition_number(join
 def test_brackets_say_where_they_were_looked_at() -> None:
     robot = robot_named("three_joint_arm")
     shape = np.array([0.1, -0.8, 1.5])
-    assert "at the shape [0.1, -0.8, 1.5]" in brackets_at(robot, shape).sentence
-    assert "at the best of 24 shapes" in brackets_anywhere(robot).sentence
+    assert "at the shape [0.1, -0.8, 1.5]" in brackets_at(robot, shape).message
+    assert "at the best of 24 shapes" in brackets_anywhere(robot).message

@@ -146,7 +146,7 @@ def test_a_given_duration_is_long_enough_or_refused(chain: SpaceRobot) -> None:
     assert schedule.duration == pytest.approx(4.0)
     shares = JointEfforts(chain, np.array([3.4, 1.6]), PERIOD).shares(schedule.positions)
     assert np.abs(shares).max() <= 0.85 * (1 + 1e-8)
-    with pytest.raises(PlanningError, match="the solver came to no way that keeps the limits"):
+    with pytest.raises(PlanningError, match="the solver found no path within the limits"):
         plan(chain, **asked, **limited, duration=1.5)
 
 

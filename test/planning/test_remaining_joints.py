@@ -182,7 +182,7 @@ def test_a_method_that_leaves_the_position_does_not_stand_in_for_one_that_does_n
     method = Planner(without, Tolerance(1e-3, 1e-3))
     goal = Goal(np.zeros(3), Rotation.from_rotvec([0.0, 0.0, 0.1]).as_quat())
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(2))
-    with pytest.raises(PlanningError, match="optimal would leave the position as it comes"):
+    with pytest.raises(PlanningError, match="optimal does not control the position of the base"):
         method.plan(state, goal)
 
 

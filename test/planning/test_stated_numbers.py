@@ -102,7 +102,7 @@ def test_the_path_of_many_cycles_is_predicted_at_the_end_of_some() -> None:
 
 def test_a_planar_robot_is_described_by_its_links_and_by_its_largest_curvature() -> None:
     found = planar_chain(SpaceRobot.from_file(FOLDER / "planar_chain.urdf"))
-    words = found.sentence
+    words = found.message
     assert words.startswith("3 links in a plane: loops of joints 'pin_1' and 'pin_2' turn")
     shapes = np.stack(np.meshgrid(*2 * [np.linspace(-np.pi, np.pi, 181)]), axis=-1)
     top = np.abs(phase_density(shapes)).max()

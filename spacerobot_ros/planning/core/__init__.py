@@ -1,1 +1,1 @@
-"""What every gait method shares: goals, states, schedules, predictions."""
+"""Types that all gait methods share: goals, states, schedules, predictions."""

@@ -1,9 +1,9 @@
-"""Which rotations of the base closed motions of the joints bring about: rank and conditioning.
+"""Rotations of the base by closed motions of the joints: rank and conditioning.
 
 A small loop in the plane of two joints turns the base by curvature times area (papers 1 and 2).
 Three such first-order brackets that span the three axes of rotation satisfy the Lie algebra rank
 condition, and attitude and shape are controllable (paper 1, proposition 1); brackets are analytic,
-so what they span at one shape they span at almost all (proposition 2). The position follows from
+so their span at one shape is that at almost all shapes (proposition 2). The position follows from
 attitude and shape; it is controllable with them where three sliders have independent slots.
 """
 
@@ -20,7 +20,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 
 WORST_CONDITION = 1e6
-"""Brackets that are worse conditioned do not span: rounding decides on their directions."""
+"""Condition number from which on brackets do not span: rounding decides on their directions."""
 
 NO_TURN = 1e-12
 """Singular values of brackets below this, rad per unit area, are rounding."""
@@ -34,20 +34,20 @@ _UNLIMITED = {JointKind.PRISMATIC: 1.0}
 
 @dataclass(frozen=True)
 class Controllability:
-    """What was found, at one shape.
+    """Findings about the brackets at one shape.
 
     Attributes
     ----------
     rank, needed
-        Axes of rotation that the brackets span, and how many there are to span.
+        Number of axes of rotation that the brackets span, and the number to be spanned.
     singular_values
         (3,) of the best three brackets, rad per unit area (rad^2, rad m or m^2), descending.
     joints
         The joints whose brackets they are.
     shape
         (n,) where.
-    sentence
-        The finding for people; where ``controllable`` is false, the reason.
+    message
+        The finding for the user; where ``controllable`` is false, the reason.
     """
 
     rank: int
@@ -55,11 +55,11 @@ class Controllability:
     singular_values: Array
     joints: tuple[str, ...]
     shape: Array
-    sentence: str
+    message: str
 
     @property
     def controllable(self) -> bool:
-        """Whether the brackets span what there is to span."""
+        """Whether the brackets span all axes that are needed."""
         return self.rank >= self.needed
 
     def require(self) -> None:
@@ -68,10 +68,10 @@ class Controllability:
         Raises
         ------
         PlanningError
-            It is not; the sentence says why.
+            It is not; the message says why.
         """
         if not self.controllable:
-            raise PlanningError(self.sentence)
+            raise PlanningError(self.message)
 
     @property
     def condition(self) -> float:
@@ -81,7 +81,7 @@ class Controllability:
 
 
 def shape_box(robot: SpaceRobot) -> tuple[Array, Array]:
-    """Return finite lower and upper bounds (n,) of the shape space: one turn where it is free."""
+    """Return finite bounds (n,), (n,) of the shape space: one turn for joints without limits."""
     joints = robot.description.movable_joints
     half = np.array([_UNLIMITED.get(joint.kind, np.pi) for joint in joints])
     lower = np.where(
@@ -129,12 +129,12 @@ def best_triple(K: Array, among: Sequence[int]) -> tuple[tuple[int, int, int], A
 def brackets_at(
     robot: SpaceRobot, shape: Array, among: Sequence[int] | None = None
 ) -> Controllability:
-    """Return what the first-order brackets span at a shape (n,), of joints with these indices."""
+    """Return the span of the first-order brackets of joints (indices) at a shape (n,)."""
     return _brackets(robot, shape[np.newaxis], among)
 
 
 def brackets_anywhere(robot: SpaceRobot, among: Sequence[int] | None = None) -> Controllability:
-    """Return what the first-order brackets span at the best of shapes all over the shape space."""
+    """Return the span of the first-order brackets at the best of shapes all over the space."""
     return _brackets(robot, sample_shapes(robot, _SAMPLES), among)
 
 
@@ -145,7 +145,7 @@ def sliders_of(robot: SpaceRobot) -> list[int]:
 
 
 def slot_matrix(robot: SpaceRobot, shape: Array, sliders: Sequence[int]) -> Array:
-    """Return (3, s): how far the centre of mass moves in the base with each slider, m/m.
+    """Return the motion (3, s) of the centre of mass in the base with each slider, m/m.
 
     It is linear in a slider, so a unit step is exact.
     """
@@ -193,22 +193,22 @@ def sliding_masses(robot: SpaceRobot) -> Controllability:
 
 
 def _brackets(robot: SpaceRobot, shapes: Array, among: Sequence[int] | None) -> Controllability:
-    """Return what the brackets span at the shape of shapes (N, n) where three are best."""
+    """Return the span of the brackets at that of the shapes (N, n) where three are best."""
     joints = list(range(robot.n)) if among is None else list(among)
     name = robot.description.name
     if len(joints) < 2:
-        sentence = f"Robot '{name}' has {len(joints)} joint(s): no loop encloses an area."
-        return Controllability(0, 3, np.zeros(3), (), shapes[0], sentence)
+        message = f"Robot '{name}' has {len(joints)} joint(s): no loop encloses an area."
+        return Controllability(0, 3, np.zeros(3), (), shapes[0], message)
     K = curvatures(robot, shapes)
     pairs = np.array(list(itertools.combinations(joints, 2)))
     values = np.linalg.svd(K[:, :, pairs[:, 0], pairs[:, 1]], compute_uv=False)
     rank = int(max(_rank(row) for row in values))
     where, names = f"at the best of {len(shapes)} shapes", robot.joint_names
     if len(joints) < 3:
-        sentence = f"Loops of two joints of robot '{name}' turn its base about one axis at a time."
+        message = f"Loops of two joints of robot '{name}' turn its base about one axis at a time."
         chosen = tuple(names[i] for i in joints)
         return Controllability(
-            min(rank, 1), 3, np.pad(values[0], (0, 2)), chosen, shapes[0], sentence
+            min(rank, 1), 3, np.pad(values[0], (0, 2)), chosen, shapes[0], message
         )
     found = [best_triple(at, joints) for at in K]
     singular = np.linalg.svd(np.array([M for _, M in found]), compute_uv=False)
@@ -219,20 +219,20 @@ def _brackets(robot: SpaceRobot, shapes: Array, among: Sequence[int] | None) -> 
         where = f"at the shape {np.round(shapes[0], 4).tolist()}"
     if rank == 3:
         condition = singular[best, 0] / singular[best, 2]
-        sentence = (
+        message = (
             f"First-order brackets of joints {', '.join(triple)} span the three axes of rotation "
             f"(condition number {condition:.3g} {where})."
         )
     else:
-        sentence = (
+        message = (
             f"First-order brackets of the joints of robot '{name}' span {rank} of the three axes "
             f"of rotation {where}: small loops turn the base about no other."
         )
-    return Controllability(rank, 3, singular[best], triple, shapes[best], sentence)
+    return Controllability(rank, 3, singular[best], triple, shapes[best], message)
 
 
 def _rank(values: Array) -> int:
-    """Return how many of descending singular values count."""
+    """Return the number of descending singular values that are not rounding."""
     return int(np.sum(values > max(NO_TURN, float(values[0]) / WORST_CONDITION)))
 
 

@@ -1,4 +1,4 @@
-"""Goals, the states that plans begin in, and how far apart they are."""
+"""Goals, the states in which plans begin, and the error between them."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ POSE: frozenset[Controlled] = frozenset({"position", "attitude"})
 
 
 ALMOST = 0.5
-"""Share of its tolerance by which a position that is out of reach may be missed by the plan."""
+"""Share of its tolerance by which a plan may miss a position that is out of reach."""
 
 _FARTHEST = 1e12
 """Beyond it a float64 does not resolve a millimetre, m or rad."""
 
 _LARGEST_ANGLE = 2e6 * np.pi
-"""A million turns: beyond them the digits of an angle are not its attitude's any more, rad."""
+"""A million turns, rad: beyond them an angle does not resolve its attitude."""
 
 
 @dataclass(frozen=True)
@@ -138,11 +138,11 @@ class Goal:
         )
 
 
-def _numbers(given: npt.ArrayLike, what: str) -> Array:
+def _numbers(given: npt.ArrayLike, name: str) -> Array:
     try:
         return np.asarray(given, dtype=float)
     except (TypeError, ValueError, OverflowError):
-        raise GoalError(f"The goal {what} {given!r} is not a list of numbers.") from None
+        raise GoalError(f"The goal {name} {given!r} is not a list of numbers.") from None
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ class PoseError:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How near to a goal is near enough: ``position`` m, ``attitude`` rad, each joint m or rad."""
+    """Largest errors of a reached goal: ``position`` m, ``attitude`` rad, joints m or rad."""
 
     position: float
     attitude: float

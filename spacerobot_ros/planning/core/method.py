@@ -1,4 +1,4 @@
-"""What every gait method is: a request in, a schedule or a reason out."""
+"""The interface of gait methods: from a request to a schedule, or to a refusal."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _AT_REST = 1e-9
 """Momenta below this times the mass count as zero, m/s and m^2/s."""
 
 _BEYOND = 1e-9
-"""Rounding that a goal shape may be beyond a limit by, m or rad."""
+"""Rounding by which a goal shape may exceed a limit, m or rad."""
 
 
 @dataclass(frozen=True)
 class InitialMotion:
-    """How the joints move where a gait begins.
+    """Motion of the joints at the beginning of a gait.
 
     Attributes
     ----------
@@ -47,11 +47,11 @@ class PlanRequest:
     Attributes
     ----------
     state
-        Where the gait begins.
+        The state in which the gait begins.
     goal
-        Where it is to end.
+        The goal at which it is to end.
     tolerance
-        How near to the goal is near enough.
+        Largest errors at the goal.
     correction
         Whether an earlier schedule for the same goal has just ended: the remaining error is small,
         and options that fix the size of the first manoeuvre do not apply.
@@ -60,8 +60,8 @@ class PlanRequest:
         the choices that it made: ``auto`` stays with its method, and methods that plan piece by
         piece go on from its ``progress``.
     motion
-        How the joints move where the gait begins; None: they rest. Only methods that declare
-        ``starts_in_motion`` are asked with it.
+        Motion of the joints at the beginning of the gait; None: they rest. Only methods that
+        declare ``starts_in_motion`` are asked with it.
     """
 
     state: RobotState
@@ -88,7 +88,7 @@ class GaitMethod(ABC):
     robot
         The model.
     control_period
-        How long a command is held, s.
+        Duration of a command, s.
     integration_step
         Longest Runge-Kutta step of the predicted attitude, s; the plant's, for equal numbers.
     options
@@ -99,7 +99,7 @@ class GaitMethod(ABC):
     name
         Name in the registry, and of the group of parameters ``<name>.<option>``.
     controls
-        The parts of a goal that the method's schedules control; the others come out as they must.
+        The parts of a goal that the method's schedules control; the others follow from these.
         A method that chooses among others states them in each schedule alone.
     starts_in_motion
         Whether its gaits may begin while the joints move (``PlanRequest.motion``).
@@ -132,7 +132,7 @@ class GaitMethod(ABC):
         self._setup()
 
     def _setup(self) -> None:  # noqa: B027 - methods that delegate have nothing to set up here
-        """Set up what follows from robot and options; called once, when they are there."""
+        """Set up everything that depends on robot and options alone; called once."""
 
     @classmethod  # noqa: B027 - any robot is suitable by default
     def require_suitable(cls, robot: SpaceRobot) -> None:
@@ -141,7 +141,7 @@ class GaitMethod(ABC):
         Raises
         ------
         PlanningError
-            It is such a robot; the sentence says why.
+            It is such a robot; the message says why.
         """
 
     @abstractmethod
@@ -151,7 +151,7 @@ class GaitMethod(ABC):
         Raises
         ------
         PlanningError
-            The method cannot reach the goal; the sentence says why.
+            The method cannot reach the goal; the message says why.
         PlanningCancelled
             The cancellation was requested meanwhile.
         """
@@ -183,7 +183,7 @@ class GaitMethod(ABC):
         )
 
     def _goal_shape(self, goal: Goal) -> Array | None:
-        """Return the shape (n,) of the goal within the joint limits, None where it has none.
+        """Return the shape (n,) of the goal within the joint limits, None if it has none.
 
         Raises
         ------

@@ -23,7 +23,7 @@ class BasePrediction:
     robot
         The model.
     control_period
-        How long a command is held, s.
+        Duration of a command, s.
     integration_step
         Longest Runge-Kutta step of the attitude, s; the plant's, for equal numbers.
 
@@ -72,7 +72,7 @@ class BasePrediction:
     def path(self, state: RobotState, positions: Array, attitudes: Array | None = None) -> BasePath:
         """Return the base path of the shapes ``positions`` (N + 1, n), at some of the ticks.
 
-        ``attitudes`` (N + 1, 4) at the ticks, where they are known already.
+        ``attitudes`` (N + 1, 4) are those at the ticks, if they are known already.
         """
         if attitudes is None:
             attitudes = self.attitudes(positions, state.quaternion, state.angular_momentum)

@@ -22,7 +22,7 @@ _PACKAGE = "spacerobot_ros"
 
 @dataclass(frozen=True)
 class SearchProgress:
-    """How far a search has come.
+    """Progress of a search.
 
     Attributes
     ----------
@@ -38,20 +38,20 @@ class SearchProgress:
     best_s: float = math.inf
 
     @property
-    def sentence(self) -> str:
-        """The same for people, without an end."""
+    def message(self) -> str:
+        """The text for the user, without a full stop."""
         best = f"best {self.best_s:.4g} s" if math.isfinite(self.best_s) else "none found yet"
         return f"start {self.starts} of at most {self.most}, {best}"
 
 
 def log_progress(logger: logging.Logger, progress: SearchProgress, line: str) -> None:
-    """Log a line about a search, with how far that has come."""
+    """Log a line about a search, with its progress."""
     logger.info(line, extra={_KEY: progress})
 
 
 @contextmanager
 def reported(
-    show: Callable[[SearchProgress], None], announce: Callable[[str], None] = lambda sentence: None
+    show: Callable[[SearchProgress], None], announce: Callable[[str], None] = lambda message: None
 ) -> Iterator[None]:
     """Have functions called in the threads of those that work in here.
 
@@ -60,12 +60,12 @@ def reported(
     show
         Called with the progress of every search.
     announce
-        Called with the sentence of what begins and takes long.
+        Called with a message when other long work begins.
     """
     handler, logger = _Handler(show, announce), logging.getLogger(_PACKAGE)
     before = logger.level
     logger.addHandler(handler)
-    # Other handlers report what they did before: they have levels of their own.
+    # Other handlers report as before: they have levels of their own.
     logger.setLevel(logging.INFO if before == logging.NOTSET else min(before, logging.INFO))
     try:
         yield

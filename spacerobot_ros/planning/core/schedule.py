@@ -46,16 +46,16 @@ class GaitSchedule:
     goal
         The goal that it was planned for.
     notes
-        Named results of the method, for reports (a paper's symbols where it has them).
+        Named results of the method, for reports (with the symbols of its paper).
     partial
         It ends short of the goal on purpose: the next piece is planned from the pose that is
         measured at its end.
     remaining
-        What the schedules after a partial one are expected to take until the goal is reached, s.
+        Expected duration of the schedules after a partial one until the goal is reached, s.
     controls
-        The parts of the goal that it controls, and by which its result is evaluated.
+        The parts of the goal that it controls; its result is evaluated by these.
     progress
-        What its method needs to go on with the same goal, of a type of the method's own; see
+        State of its method for the next schedule to the same goal, of a type of its own; see
         ``PlanRequest.previous``.
     """
 
@@ -148,7 +148,7 @@ def straight_motion(
 
 
 def _duration(robot: SpaceRobot, move: Array, wanted: float) -> float:
-    """Return how long a leg takes, s: infinity if a joint without speed is to move."""
+    """Return the duration of a leg, s: infinity if a joint without speed is to move."""
     active = np.abs(move) > _NO_MOTION
     if not active.any():
         return 0.0

@@ -18,7 +18,7 @@ _REPLAN_PERIOD = 2.0
 
 @dataclass(frozen=True)
 class PlannerConfig(CommanderConfig):
-    """How a planner plans, tracks its schedules and corrects what remains."""
+    """Parameters of planning, of tracking schedules, and of corrections."""
 
     method: str = parameter("auto", "gait method", choices=tuple(METHODS))
     integration_step: float = parameter(
@@ -101,7 +101,7 @@ class PlannerConfig(CommanderConfig):
 
     @property
     def method_options(self) -> Mapping[str, Any]:
-        """The options of the methods, by name, where the output decides what they leave open.
+        """The options of the methods by name; the output decides on those that are left open.
 
         A controller that is given a reference drives the joints by efforts, which are limited.
         """
@@ -112,5 +112,5 @@ class PlannerConfig(CommanderConfig):
 
     @property
     def tolerance(self) -> Tolerance:
-        """Within which errors a goal is reached."""
+        """Largest errors at which a goal is reached."""
         return Tolerance(self.position_tolerance, self.attitude_tolerance, self.joint_tolerance)

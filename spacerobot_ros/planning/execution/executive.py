@@ -980,5 +980,5 @@ class Executive:
 
 
 def _gait_by(method: str) -> str:
-    """Return the gait of a method with its article, such as "an optimal gait", for messages."""
+    """Return "an optimal gait" or the like, for messages."""
     return f"{'an' if method[:1] in tuple('aeiou') else 'a'} {method} gait"

@@ -52,7 +52,7 @@ class GoalFile:
     path
         The file; empty: nothing is saved and nothing is loaded.
     keys
-        What the goals may be for; a file with other keys is refused.
+        Allowed keys of goals; a file with other keys is refused.
     """
 
     def __init__(self, path: str, keys: tuple[str, ...] = (BASE,)) -> None:

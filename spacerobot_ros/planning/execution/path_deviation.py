@@ -1,7 +1,7 @@
 """Deviation of the measured base from its predicted path, and the errors of masses behind it.
 
-At zero momentum the path of the shape and ratios of masses and inertias alone determine how the
-base turns. Where it turns otherwise than predicted, the model's masses and inertias are wrong. To
+At zero momentum the turn of the base depends on the path of the shape and on ratios of masses and
+inertias alone. A turn that differs from the predicted one shows errors of these in the model. To
 first order the deviation of the base path is linear in their relative errors: a sensitivity of the
 path multiplies each. Linear least squares over many noisy poses, with a prior on the errors, give
 the estimate (one step of Gauss-Newton about the model).

@@ -1,4 +1,4 @@
-"""Measured states, and where a robot at rest is, from several of them."""
+"""Measured states, and the state of a robot at rest as their average."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class BaseMeasurement(NamedTuple):
 
 
 class MeasuredState(Protocol):
-    """A measured state: the joints always, the base where it is measured at the same time."""
+    """A measured state: the joints, and the base if it was measured at the same time."""
 
     @property
     def stamp_ns(self) -> int:
@@ -106,7 +106,7 @@ class StateAverage:
         rates = np.mean(self._rates, axis=0)
         if not (np.all(np.isfinite(poses)) and np.all(np.isfinite(np.concatenate([q, rates])))):
             raise PlanningError("The measured state is not finite; see odom and joint_states.")
-        # Attitudes lie within noise of each other: the mean of what separates them from the first.
+        # Attitudes differ by noise: the mean of their turns from the first.
         first = poses[0, 3:]
         quaternion = first
         if len(poses) > 1:

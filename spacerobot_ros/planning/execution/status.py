@@ -26,7 +26,7 @@ class PlannerState(str, Enum):
 
     @property
     def decided(self) -> bool:
-        """Whether nothing more will happen for the goal that the status is about."""
+        """Whether the goal of the status is decided: it is not pursued any more."""
         return self not in (PlannerState.IDLE, PlannerState.PLANNING, PlannerState.EXECUTING)
 
     @property
@@ -48,15 +48,16 @@ class PlannerStatus:
     message
         The text for the user.
     goal_id
-        Which goal the status is about; empty: none, or one whose id is not known.
+        Id of the goal that the status is about; empty: none, or a goal without an id.
     goal
-        (7,) its position in m and quaternion (x, y, z, w); empty where it is not reported.
+        (7,) its position in m and quaternion (x, y, z, w); empty if it is not reported.
     corrections
         New plans after the first for this goal that count as corrections.
     position_error_m, attitude_error_rad
-        Remaining error of the measured base pose; None where it was not evaluated.
+        Remaining error of the measured base pose; None if it was not evaluated.
     manoeuvre_time_s
-        Duration of all schedules for the goal so far, without what a later one cut off; 0: none.
+        Duration of all schedules for the goal so far, as far as later ones did not cut them off;
+        0: none.
     ends_at_s
         Simulated time at which the latest schedule ends; 0: none.
     method
@@ -218,8 +219,8 @@ def _note(text: str) -> list[float] | float | str:
 def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
     """Return the duration of the schedules for the last goal that were flown, s.
 
-    It is as the planner counts it, without what a flight that was cut off left of the last
-    schedule; where the planner has not counted it, as when it was aborted, :func:`time_to_end`.
+    As the planner counts it, less the rest of the last schedule where the flight was cut off; where
+    the planner has not counted it, as after an abort, :func:`time_to_end`.
 
     Parameters
     ----------

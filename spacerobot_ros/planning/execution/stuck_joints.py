@@ -41,9 +41,9 @@ class StuckJointWatch:
     ticks
         N; 0: nothing is ever stuck.
     control_period
-        How long a command is held, s.
+        Duration of a command, s.
     band
-        Measured shapes that are as near as this to the wanted ones are there, m or rad.
+        Shape errors up to this are noise, m or rad.
     """
 
     def __init__(self, joints: int, ticks: int, control_period: float, band: float = 0.0) -> None:
@@ -64,10 +64,10 @@ class StuckJointWatch:
         self._standstill_ticks = 0
 
     def look(self, q: Array, wanted: Array, velocity: Array) -> list[int]:
-        """Return which joints are stuck, mostly none.
+        """Return the indices of the joints that are found stuck, mostly none.
 
-        ``q`` and ``wanted`` (n,) are the measured and the wanted shape now, ``velocity`` (n,) what
-        is commanded until the next tick.
+        ``q`` and ``wanted`` (n,) are the measured and the wanted shape now, ``velocity`` (n,) the
+        command until the next tick.
         """
         if not self._suspicious:
             self._looks += 1
@@ -100,7 +100,7 @@ class StuckJointWatch:
         return [int(i) for i in np.flatnonzero(stuck)]
 
     def _watch_standstill(self, q: Array, velocity: Array) -> None:
-        """Note since when no joint has moved, and how far each was commanded to go meanwhile."""
+        """Count the ticks without any motion, and sum the commanded motion of each joint since."""
         if np.abs(q - self._standstill_q).max(initial=0.0) > self._band:
             self._standstill_q[:] = q
             self._standstill_asked[:] = 0.0

@@ -29,10 +29,10 @@ _LONGEST_SETTLING = 5.0
 
 @dataclass(frozen=True)
 class Setpoint:
-    """What the joints are commanded; the arrays are the tracker's own and change in place.
+    """Command of the joints; the arrays are the tracker's own and change in place.
 
-    ``position`` (n,) is the wanted shape now, in m or rad, ``velocity`` (n,) what is held until the
-    next tick, in m/s or rad/s.
+    ``position`` (n,) is the wanted shape now, m or rad; ``velocity`` (n,) is held until the next
+    tick, m/s or rad/s.
     """
 
     position: Array
@@ -81,11 +81,11 @@ class ScheduleFollower:
     Parameters
     ----------
     schedule
-        What to follow.
+        The schedule to follow.
     start_ns
         Stamp of its first tick, ns.
     shape_gain
-        Feedback from shape error to velocity, 1/s; it makes up for what the plant did not do.
+        Feedback from shape error to velocity, 1/s.
     deadband
         Shape errors up to this are noise and not fed back, m or rad.
     """
@@ -115,7 +115,7 @@ class ScheduleFollower:
         return not far or late > _LONGEST_SETTLING * SECOND
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether the schedule says where the shape is to be at a time, or its end still does."""
+        """Whether the schedule, or the settling after it, covers a time."""
         return self._start_ns <= stamp_ns <= self._end_ns + _LONGEST_SETTLING * SECOND
 
     def take_over(self, stamp_ns: int, after: float) -> TakeOver | None:
@@ -123,7 +123,7 @@ class ScheduleFollower:
         return TakeOver.of(self.schedule, self._start_ns, stamp_ns, after)
 
     def braking(self, stamp_ns: int, duration: float) -> BrakingFollower:
-        """Return what brakes along this schedule to rest within ``duration`` s from now."""
+        """Return a follower that brakes along this schedule to rest within ``duration`` s."""
         return BrakingFollower(self.schedule, self._start_ns, stamp_ns, duration, self._gain)
 
     def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
@@ -149,7 +149,7 @@ class BrakingFollower:
     Parameters
     ----------
     schedule
-        What was followed.
+        The schedule that was followed.
     start_ns
         Stamp of its first tick, ns.
     stamp_ns
@@ -273,8 +273,8 @@ class TrajectoryTracker:
     def take_over(self, stamp_ns: int, q: Array, after: float) -> TakeOver | None:
         """Return the tick ``after`` s from now or later at which a plan may take over.
 
-        Its first shape is ``q`` (n,), which is measured, where that is not the wanted one but for
-        noise. None where no schedule is tracked, or it is over then.
+        Its first shape is the wanted one, but for joints whose measured position in ``q`` (n,) is
+        off by more than noise. None if no schedule is tracked, or it is over by then.
         """
         if not isinstance(self._follower, ScheduleFollower):
             return None
@@ -326,8 +326,8 @@ class TrajectoryTracker:
 
     def hold(self, q: Array, *, obeyed: bool = True) -> None:
         """Write the setpoint that keeps the shape, where nothing is tracked."""
-        # A reference must stay where it is; a plant makes rest of the shape that it has. While no
-        # command is in force, what the joints do is not to be undone when commands pass again.
+        # The reference of a controller must not follow the measured shape; for a plant, rest is any
+        # shape. Motions while no command is in force are not undone afterwards.
         if self._commands_plant or not self._holding or not obeyed:
             if math.isfinite(q.dot(q)):
                 self.setpoint.position[:] = q

@@ -94,9 +94,9 @@ class PlanningTask:
     Attributes
     ----------
     request
-        What is planned from the measured state.
+        The request, from the measured state.
     stuck
-        Joints to plan without, by name, and where they are, m or rad.
+        Positions of the joints to plan without, m or rad, by name.
     required
         Parts of the goal that a plan without them must control.
     braking
@@ -124,7 +124,7 @@ class Planned:
 
 @dataclass(frozen=True)
 class Refused:
-    """Why no plan was made, as a sentence, and the wall time that this took, s."""
+    """The reason why no plan was made, as a message, and the wall time that this took, s."""
 
     reason: str
     wall_time: float = 0.0
@@ -140,11 +140,11 @@ class PlanningWorker:
     Parameters
     ----------
     robot
-        For which is planned.
+        The model.
     config
         Of the planner.
     method
-        What plans with all joints; None: the method that the configuration names.
+        The method with all joints; None: the one that the configuration names.
     long_work
         Returns the context in which a plan is made at once.
 
@@ -230,7 +230,7 @@ class PlanningWorker:
         Raises
         ------
         PlanningError
-            There is none; the sentence says why.
+            There is none; the message says why.
         """
         method = self._method_for(task)
         if task.take_over is not None:

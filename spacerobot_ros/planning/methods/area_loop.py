@@ -2,11 +2,11 @@
 
 Small loops round a nominal shape turn the base by ``dTheta = M S``: M (3, 3) the curvature of the
 connection for the joint pairs (1, 2), (2, 3), (3, 1), S the areas that the loop encloses in their
-planes. Each cycle makes up for the share k of the turn that is left, ``S = k M^-1 dTheta``; what
-the first order misses is left for the next, which begins from the attitude that was measured.
+planes. Each cycle makes up for the share k of the turn that is left, ``S = k M^-1 dTheta``; the
+error of the first order is left for the next, which begins from the measured attitude.
 
-All edges are straight lines of the shape from rest to rest: what they turn the base by depends on
-the path alone, and held commands move along it.
+All edges are straight lines of the shape from rest to rest: the turn of the base depends on the
+path alone, and held commands move along it.
 
 Loops go along joint axes and enclose given areas (figure 5) in the planes of the joints (1, 2),
 (2, 3) and (3, 1); an area is positive where the path goes round counter-clockwise. Six edges of a
@@ -46,7 +46,7 @@ _NEGLIGIBLE = 1e-3
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 Ends = list[tuple[Array, float]]
-"""Shapes (n,) that straight legs lead to, and how long each leg is to take, s."""
+"""Ends (n,) of straight legs, and the durations of these, s."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +84,10 @@ class AreaLoopOptions:
 
 @dataclass(frozen=True)
 class AreaLoopProgress:
-    """Progress that the next schedule for the same goal continues from.
+    """State from which the next schedule for the same goal continues.
 
-    ``nominal`` is the nominal shape that was chosen, ``cycles`` how many are flown when the
-    schedule has ended.
+    ``nominal`` is the chosen nominal shape, ``cycles`` the number of cycles flown at the end of
+    the schedule.
     """
 
     nominal: NominalShape
@@ -132,8 +132,7 @@ class AreaLoopGait(GaitMethod):
         """Plan the way to the nominal shape and the next cycle; see :meth:`GaitMethod.plan`.
 
         The schedule is ``partial`` unless its own prediction reaches the goal. ``most_cycles`` and
-        ``longest`` bound what the goal takes, with the cycles before, which ``request.previous``
-        counts.
+        ``longest`` bound the cycles for the goal, with those before (``request.previous``).
         """
         if self._refusal is not None:
             raise PlanningError(str(self._refusal))
@@ -152,7 +151,7 @@ class AreaLoopGait(GaitMethod):
         nominal = self._nominal.nearest_turn(chosen, state.q)
         flown = 0 if progress is None else progress.cycles
         gait = self._moved(gait, [(nominal.shape, self.options.edge_time)])
-        # The way from the nominal to the final shape turns the base too: aim that far beside.
+        # The way from the nominal to the final shape turns the base too.
         aside = self._turn(nominal, final)
         target = quaternion_multiply(goal.quaternion, quaternion_inverse(aside))
         remaining = 0.0
@@ -186,7 +185,7 @@ class AreaLoopGait(GaitMethod):
     ) -> tuple[_Gait, Notes, float]:
         """Add one cycle for the turn ``left`` (3,), rad.
 
-        The paper's symbols are returned as well, and how many cycles the goal is expected to take.
+        Also returned are the paper's symbols and the expected number of cycles for the goal.
 
         Cycles go on until the attitude is off by ``enough`` (rad); ``flown`` are done.
         """
@@ -234,7 +233,7 @@ class AreaLoopGait(GaitMethod):
         )
 
     def _cycles_left(self, missing: float, share: float, enough: float) -> float:
-        """Return how many cycles a turn (rad) takes to first order, the first by a share of k.
+        """Return the number of cycles for a turn (rad) to first order, the first by a share of k.
 
         While edges are as long as they may be, every cycle turns the base as far; then the
         missing turn shrinks by the factor 1 - k.
@@ -324,7 +323,7 @@ class EdgePath:
         Each (V, 3): the vertices in the order of travel, the first again at the end; the middle of
         the box that holds them is the origin.
     excess
-        By how much the longest edge is too long; 1: as long as it may be.
+        Largest ratio of an edge to the longest that is allowed.
     """
 
     loops: tuple[Array, ...]
@@ -383,7 +382,7 @@ def _rectangles(areas: Array, longest: Array) -> EdgePath:
     for area, (i, j) in zip(areas, PLANES, strict=True):
         if area == 0.0:
             continue
-        # Both edges take the same share of what they may be.
+        # Both edges are the same share of the longest.
         share = np.sqrt(abs(area) / (longest[i] * longest[j]))
         excess = max(excess, float(share))
         loop = np.zeros((5, 3))

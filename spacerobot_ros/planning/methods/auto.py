@@ -32,11 +32,10 @@ class Candidate:
 class AutoGait(GaitMethod):
     """Plans by every method that suits the robot, and takes the shortest manoeuvre.
 
-    Where a method that suits the robot moves the base to a position, one that leaves the position
-    as it comes does not stand in for it. A manoeuvre that ends off the goal, or controls less of
-    it than another, is taken only where there is no better one. A goal stays with the method of
-    the schedule that was flown for it before, as long as that plans. A schedule is that of the
-    chosen method, in all but its notes.
+    Where a method that suits the robot controls the position, methods that do not are left out. A
+    manoeuvre that ends off the goal, or controls less of it than another, is taken only if there
+    is no better one. A goal stays with the method of the schedule that was flown for it before, as
+    long as that plans. A schedule is that of the chosen method, in all but its notes.
 
     Parameters
     ----------
@@ -68,13 +67,13 @@ class AutoGait(GaitMethod):
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan by the methods that suit, and compare; see :meth:`GaitMethod.plan`.
 
-        ``notes`` name the method that is taken (``chosen``), why (``because``), and what all of
-        them came to (``compared``).
+        ``notes`` name the method that is taken (``chosen``), the reason (``because``), and the
+        results of all methods (``compared``).
 
         Raises
         ------
         PlanningError
-            No method plans; the sentences of all of them say why. It is an `UnreachableError` where
+            No method plans; the messages of all of them say why. It is an `UnreachableError` where
             one of them proves it, and else a `NotFoundError` where one of them searched.
         """
         refusals = dict(self._unsuitable)
@@ -108,19 +107,19 @@ class AutoGait(GaitMethod):
 
     def _refusal(self, refusals: Mapping[str, SpaceRobotError]) -> PlanningError:
         """Return the refusal of a goal that no method plans: the proof of one, or all reasons."""
-        # What a method has against a robot says nothing of a goal.
+        # Refusals of the robot say nothing about the goal.
         of_goal = [refusals[name] for name in self._candidates if name not in self._unsuitable]
         for refusal in of_goal:
             if isinstance(refusal, UnreachableError):
                 return refusal
         reasons = " ".join(f"{name}: {refusals[name]}" for name in self._candidates)
-        sentence = f"No method plans this goal of robot '{self.robot.description.name}'. {reasons}"
-        return refusal_of_all(sentence, of_goal)
+        message = f"No method plans this goal of robot '{self.robot.description.name}'. {reasons}"
+        return refusal_of_all(message, of_goal)
 
     def _standing(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
-        """Return the methods to compare; give the reason against the others.
+        """Return the methods to compare; add the refusals of the others.
 
-        These are methods that leave a part of the pose as it comes, which another one controls.
+        The others do not control a part of the pose that one of the methods controls.
         """
         pose: dict[str, frozenset[Controlled]] = {}
         for name in self._candidates:
@@ -135,7 +134,7 @@ class AutoGait(GaitMethod):
             if more:
                 lost = " and ".join(sorted(frozenset[str]().union(*more) - parts))
                 refusals[name] = PlanningError(
-                    f"{name} would leave the {lost} of the base as it comes."
+                    f"{name} does not control the {lost} of the base; another method does."
                 )
         return [name for name in pose if name not in refusals]
 
@@ -146,7 +145,7 @@ class AutoGait(GaitMethod):
         refusals: dict[str, SpaceRobotError],
         cancellation: Cancellation,
     ) -> GaitSchedule | None:
-        """Return the schedule of one method, None where it refuses; its sentence is kept."""
+        """Return the schedule of one method, None if it refuses; the refusal is kept."""
         try:
             return self._method(name).plan(request, cancellation)
         except PlanningCancelled:
@@ -163,7 +162,7 @@ class AutoGait(GaitMethod):
 
 @dataclass(frozen=True)
 class _Result:
-    """What a method planned.
+    """Result of a method.
 
     Attributes
     ----------
@@ -194,8 +193,8 @@ class _Result:
         return not self.reaches, less, self.schedule.expected_duration
 
     @property
-    def sentence(self) -> str:
-        """The duration, and what there is to say against it."""
+    def message(self) -> str:
+        """The duration, and the objection to it if there is one."""
         about = "about " if self.schedule.partial else ""
         off = "" if self.reaches else ", which ends off the goal"
         return f"{about}{self.schedule.expected_duration:.6g} s{off}"
@@ -209,7 +208,7 @@ def _noted(
     refusals: Mapping[str, SpaceRobotError],
 ) -> GaitSchedule:
     """Return a schedule with notes on the manoeuvres that it was compared with."""
-    compared = [f"{name}: {result.sentence}." for name, result in results.items()]
+    compared = [f"{name}: {result.message}." for name, result in results.items()]
     compared += [f"{name}: {refusal}" for name, refusal in refusals.items()]
     notes = {"chosen": chosen, "because": because, "compared": " ".join(compared)}
     return replace(schedule, notes={**schedule.notes, **notes})

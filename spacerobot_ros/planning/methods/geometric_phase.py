@@ -1,4 +1,4 @@
-"""Planar robots, and how far a path of shapes turns their base: the geometric phase of paper 3.
+"""Planar robots, and the turn of their base by a path of shapes: the geometric phase of paper 3.
 
 A planar robot's joints all turn about parallel axes, and nothing tilts its base. The attitude is
 one angle theta about the axis of the robot. At zero angular momentum
@@ -69,7 +69,7 @@ def planar_axis(robot: SpaceRobot) -> Array:
     Raises
     ------
     PlanningError
-        The robot has fewer than three links or is not planar; the sentence names the joint.
+        The robot has fewer than three links or is not planar; the message names the joint.
     """
     name, bodies = robot.description.name, robot.description.bodies
     if len(bodies) < 3:
@@ -86,7 +86,7 @@ def planar_axis(robot: SpaceRobot) -> Array:
                 f"Robot '{name}' is not planar in the sense of paper 3: joint '{joint.name}' "
                 "slides, and all joints must turn about parallel axes."
             )
-        # Joints about parallel axes leave all axes where they are: one shape tells.
+        # Turns about parallel axes do not move the axes: one shape tells.
         rotations.append(rotations[body.parent] @ body.origin.R)
         axes.append(rotations[-1] @ joint.axis)
         if np.linalg.norm(np.cross(axes[0], axes[-1])) > _OUT_OF_PLANE:
@@ -131,15 +131,15 @@ def planar_chain(robot: SpaceRobot) -> Controllability:
         shape[[i, j]] = curvature_peaks(plane, middle[[i, j]], box[np.newaxis, :, [i, j]])[0]
         tops.append((abs(float(plane.curvature(shape[[i, j]]))), (names[i], names[j]), shape))
     largest, pair, shape = max(tops, key=lambda top: top[0])
-    sentence = (
+    message = (
         f"{robot.n + 1} links in a plane: loops of joints '{pair[0]}' and '{pair[1]}' turn the "
         f"base by up to {largest:.3g} rad a unit of area, round {np.round(shape, 3).tolist()} "
         "(paper 3)."
     )
     if largest <= NO_TURN:
-        sentence = f"Loops of the joints of robot '{robot.description.name}' do not turn its base."
+        message = f"Loops of the joints of robot '{robot.description.name}' do not turn its base."
     values = np.array([largest, 0.0, 0.0])
-    return Controllability(int(largest > NO_TURN), 1, values, pair, shape, sentence)
+    return Controllability(int(largest > NO_TURN), 1, values, pair, shape, message)
 
 
 class PlanarPhase:

@@ -1,6 +1,6 @@
 """Sliding masses, first-order Lie brackets: the manoeuvre of paper 1, section 5.
 
-Step 1 finds the final shape ``zf`` that puts the base where it is to be (eq. 9). Step 2 slides
+Step 1 finds the final shape ``zf`` that puts the base at the goal position (eq. 9). Step 2 slides
 the masses there (eq. 10). Step 3 turns the base by n equal cycles of three frequencies whose
 brackets add up to the attitude that is missing.
 
@@ -173,19 +173,19 @@ class LieBracketGait(GaitMethod):
             z = z0 + dz
             worst = int(np.argmax(np.maximum(lower - z, z - upper)))
             name = self.robot.joint_names[self.sliders[worst]]
-            sentence = (
+            message = (
                 f"The goal is beyond stroke: it needs joint '{name}' at {z[worst]:.4g} m, and its "
                 f"stroke is [{lower[worst]:.4g}, {upper[worst]:.4g}] m."
             )
         else:
-            sentence = (
+            message = (
                 f"The goal is beyond stroke: {len(self.sliders)} sliders put the base no nearer "
                 f"than {gap:.3g} m to it."
             )
         # Other joints move the centre of mass too, but not by this method.
         if len(self.sliders) < self.robot.n or self.robot.description.coupled:
-            raise PlanningError(sentence)
-        raise UnreachableError(sentence, Proof.LIMITS)
+            raise PlanningError(message)
+        raise UnreachableError(message, Proof.LIMITS)
 
     def _slide(self, z0: Array, z_f: Array) -> Array:
         """Step 2: shapes (N + 1, n) under ``v_i = c_i sin^2(2 pi n1 t / t1)``, eq. (10)."""
@@ -219,7 +219,7 @@ class LieBracketGait(GaitMethod):
     def _turn(
         self, quaternion: Array, z_f: Array, request: PlanRequest
     ) -> tuple[Array, int, Notes]:
-        """Step 3: one cycle of shapes (m + 1, n), how many of them, and the paper's symbols."""
+        """Step 3: one cycle of shapes (m + 1, n), the number of cycles, and the paper's symbols."""
         wanted = attitude_error(quaternion, request.goal.quaternion)
         enough = request.tolerance.attitude
         if np.linalg.norm(wanted) <= _NO_ROTATION:
@@ -256,7 +256,7 @@ class LieBracketGait(GaitMethod):
         least: int,
         enough: float,
     ) -> _Turn:
-        """Ask for what the first order misses as well, until the turn misses ``enough`` (rad).
+        """Add the error of the first order to the wanted turn, until it is below ``enough`` (rad).
 
         The number of cycles is chosen once, from ``least`` up, so that the answer is smooth.
         """
@@ -293,7 +293,7 @@ class LieBracketGait(GaitMethod):
 
     def _fit(self, alpha: Array, triple: tuple[int, int, int], z_f: Array, least: int) -> _Turn:
         """Choose n, from ``least`` up, so that the cycle keeps rates and strokes; more cycles are
-        smaller ones. With ``least`` 0 it is what ``loop_area`` gives.
+        smaller ones. With ``least`` 0 it follows from ``loop_area``.
         """
         n = least or max(1, math.ceil(float(np.linalg.norm(alpha)) / self.options.loop_area))
         amplitudes = self._amplitudes(alpha)
@@ -322,7 +322,7 @@ class LieBracketGait(GaitMethod):
 
     def _amplitudes(self, alpha: Array) -> Array:
         """Return (b11, b12, b21, a22, a31): ``a22 b12 = 2 alpha1/pi``, ``a31 b21 = alpha2/pi``,
-        ``a31 b11 = alpha3/pi``, each product raised by what the polygons lose.
+        ``a31 b11 = alpha3/pi``, each product raised by the loss of polygons.
         """
         p12, p23, p13 = 2 * alpha[0] / np.pi, alpha[1] / np.pi, alpha[2] / np.pi
         a22 = self.options.a22_ratio * math.sqrt(abs(p12))

@@ -43,7 +43,7 @@ _NO_ROOM = 1e-4
 """Edges shorter than this, m or rad, are none."""
 
 _SAME_SHAPE = 1e-3
-"""Joints that are held may be this far from where they were, m or rad."""
+"""Held joints may have moved by this much, m or rad."""
 
 _AROUND = np.array(list(itertools.product((0.0, -1.0, 1.0), repeat=3)))
 
@@ -121,8 +121,7 @@ class NominalChoice:
     def at(self, q: Array, kept: NominalShape | None = None) -> NominalShape:
         """Return the nominal shape to use from shape ``q`` (n,).
 
-        Of a robot with more than three joints the others rest where they are; ``kept``, an earlier
-        choice, holds as long as they do.
+        Other joints than the three rest; ``kept``, an earlier choice, holds as long as they do.
 
         Raises
         ------
@@ -231,7 +230,7 @@ def _best_of(
         best = _most_central(at, _measure(matrices, longest), (lower + upper) / 2)
         step = step / 2
         at = np.clip(at[best] + step * _AROUND, lower, upper)
-    # The centre of the last neighbourhood is what was best.
+    # The centre of the last neighbourhood is the best point.
     shape = held.copy()
     shape[chosen] = at[0]
     return NominalShape(shape, triple, matrices[best], longest[best])

@@ -30,7 +30,7 @@ from spacerobot_ros.planning.methods.registry import build_method
 
 @dataclass(frozen=True)
 class _Progress:
-    """That of a schedule without the ``stuck`` joints: of the method ``planner`` that made it."""
+    """Progress of a schedule without the ``stuck`` joints, which the method ``planner`` made."""
 
     stuck: frozenset[str]
     planner: str
@@ -40,18 +40,18 @@ class _Progress:
 class RemainingJointsGait(GaitMethod):
     """Plans with the joints that are not stuck; the others are part of the bodies they join.
 
-    Its schedules name every joint and leave the stuck ones where they are.
+    Its schedules name every joint; the stuck ones rest in them.
 
     Parameters
     ----------
     robot, control_period, integration_step
         As for any :class:`GaitMethod`.
     stuck
-        The joints that do not move, by name, and where they are, m or rad: the model is that of
-        the robot with these joints fixed there.
+        Positions of the joints that do not move, m or rad, by name: the model is that of the robot
+        with these joints fixed there.
     method, options
-        What plans for the robot that is left, as for :func:`build_method`; where it refuses,
-        ``auto`` is tried.
+        The method for the remaining joints, as for :func:`build_method`; if it refuses, ``auto`` is
+        tried.
     required
         Parts of the goal that a schedule must control.
     """
@@ -114,7 +114,7 @@ class RemainingJointsGait(GaitMethod):
                 continue
             if lost := self._required - schedule.controls:
                 parts = " and ".join(sorted(lost))
-                left = f"{schedule.method} would leave the {parts} as it comes."
+                left = f"{schedule.method} does not control the {parts} of the base."
                 reasons.append(PlanningError(left))
                 continue
             if "shape" in schedule.controls and shape is not None:
@@ -134,7 +134,7 @@ class RemainingJointsGait(GaitMethod):
     def _going_on(self, previous: GaitSchedule | None) -> tuple[list[str], GaitSchedule | None]:
         """Return the methods to try, and the previous schedule as theirs.
 
-        What was planned with other joints is not gone on with.
+        Progress with other joints does not count.
         """
         progress = None if previous is None else previous.progress
         if previous is None or not isinstance(progress, _Progress):

@@ -43,7 +43,7 @@ from spacerobot_ros.planning.methods.geometric_phase import (
 )
 
 _WORTHWHILE = 0.1
-"""A missing turn below this share of the tolerance is left as it is."""
+"""A missing turn below this share of the tolerance is not corrected."""
 
 _NO_ROTATION = 1e-9
 
@@ -189,7 +189,7 @@ class SquarePathGait(GaitMethod):
         return math.remainder(twist, 2 * math.pi)
 
     def _legs(self, psi_e: Array, loop: SquareLoop | None) -> list[tuple[Array, float]]:
-        """Return the ends (n,) of the straight legs, and how long each is to take, s."""
+        """Return the ends (n,) of the straight legs, and the duration of each, s."""
         step_1, step_2, step_3, step_4 = self._durations
         legs = [(psi_e, step_1)]
         if loop is not None:
@@ -214,7 +214,7 @@ class SquarePathGait(GaitMethod):
 
 @dataclass(frozen=True)
 class SquareLoop:
-    """A square in shape space that turns the base by what was wanted.
+    """A square in shape space that turns the base by the wanted angle.
 
     Attributes
     ----------
@@ -225,7 +225,7 @@ class SquareLoop:
     side
         ``z*``, rad.
     loops
-        How often it is gone round.
+        Number of times round it.
     clockwise
         Sense of travel in the plane (psi_i, psi_j).
     corners
@@ -381,7 +381,7 @@ class SquareSearch:
         def excess(z: float) -> float:
             return sign * float(candidates.plane.squares(centre, np.array([z]))[0]) - wanted
 
-        # The last digit of a phase depends on how many legs are integrated together.
+        # The last digit of a phase depends on the number of legs that are integrated together.
         if excess(side) <= 0:
             return row, side
         return row, float(self._root(excess, 0.0, side, xtol=1e-13, rtol=1e-14))

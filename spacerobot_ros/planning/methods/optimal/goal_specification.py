@@ -50,7 +50,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 _NO_ROTATION = 1e-9
 
 _SAMPLES = 12
-"""Shapes in general position at which it is tested what a robot can do."""
+"""Shapes in general position at which a robot is tested."""
 
 _NONE = 1e-7
 """Singular values below this share of the largest count as zero."""
@@ -98,7 +98,7 @@ class GoalSpecification:
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: OptimalOptions) -> GoalSpecification:
-        """Return what the options make of the goals of a robot."""
+        """Return the goal specification of a robot by the options."""
         position = options.base_position == 1
         if options.base_position == 0:
             position = slides_anywhere(robot)
@@ -127,7 +127,7 @@ class GoalSpecification:
         Raises
         ------
         PlanningError
-            There is none; the sentence says why.
+            There is none; the message says why.
         """
         name = robot.description.name
         if robot.n == 0:
@@ -152,7 +152,7 @@ class GoalSpecification:
         Parameters
         ----------
         robot, request, limits
-            For whom, what, and within which limits.
+            The model, the request, and the limits of its motion.
         shape
             (n,) of the goal, within the joint limits; None: any.
         direction_W
@@ -293,7 +293,7 @@ def _require_within_one_joint(
 ) -> None:
     """Refuse a turn beyond those between the limits of the only joint, which is at ``q`` (1,).
 
-    The base turns about ``axis`` (3,), to and fro with the joint: by how much is an integral.
+    The base turns about ``axis`` (3,), to and fro with the joint; the angle is an integral.
     """
     ends = np.array([limits.lower[0], limits.upper[0]])
     if not np.all(np.isfinite(ends)):
@@ -416,7 +416,7 @@ def _distance(robot: SpaceRobot, q: Array, wanted: Array) -> float:
 def _no_shape(
     robot: SpaceRobot, limits: MotionLimits, near: Array, wanted: Array
 ) -> UnreachableError | NotFoundError:
-    """Return why no shape puts the base where it is wanted; ``near`` (n,) came nearest."""
+    """Return the reason why no shape puts the base at ``wanted``; ``near`` (n,) came nearest."""
     name, distance = robot.description.name, _distance(robot, near, wanted)
     gap = CenterReach.of(robot, limits.lower, limits.upper).gap(wanted)
     if gap <= _ON_THE_SPOT:
@@ -431,13 +431,13 @@ def _no_shape(
     if len(sliders_of(robot)) == robot.n == 3 and _distance(robot, free, wanted) <= _ON_THE_SPOT:
         worst = int(np.argmax(np.maximum(limits.lower - free, free - limits.upper)))
         joint = robot.description.movable_joints[worst]
-        sentence = (
+        message = (
             f"The goal is beyond the joint limits: it needs joint '{joint.name}' at "
             f"{free[worst]:.4g} {joint.unit}, and optimal keeps it in [{limits.lower[worst]:.4g}, "
             f"{limits.upper[worst]:.4g}] {joint.unit}."
         )
         if np.abs(free).max() < _LIKELY * (1 + np.abs(limits.span(near)[1]).max()):
-            return UnreachableError(sentence, Proof.LIMITS)
+            return UnreachableError(message, Proof.LIMITS)
     return UnreachableError(
         "The goal position is out of reach: without thrust the centre of mass stays where it is, "
         f"and the joints of '{name}' put the base no nearer than {gap:.3g} m to it.",
@@ -458,7 +458,7 @@ class CenterReach:
     origin
         (3,) m, base components.
     slots
-        (3, s) how far the centre of mass moves with each slider of fixed direction, m/m.
+        (3, s) motion of the centre of mass with each slider of fixed direction, m/m.
     lower, upper
         (s,) ends of their ranges, m.
     radius
@@ -498,7 +498,7 @@ class CenterReach:
         return cls(origin / total, slots, lower[sliders], upper[sliders], radius / total)
 
     def gap(self, point: Array) -> float:
-        """Return how far a point (3,) is from the set, m: no shape comes nearer."""
+        """Return the distance of a point (3,) from the set, m: no shape comes nearer."""
         if not np.isfinite(self.radius):
             return 0.0
         beside = point - self.origin
@@ -521,10 +521,10 @@ def _of_moving_joints(robot: SpaceRobot, lower: Array, upper: Array) -> tuple[Ar
 
 @dataclass(frozen=True)
 class _Place:
-    """What is known of the frame of a body, whatever the shape.
+    """Bounds on the frame of a body for all shapes.
 
     It is within ``around`` m of ``r`` (3,), displaced by the ``sliders``: pairs of an index and a
-    direction (3,). ``R`` (3, 3) is its attitude in the base, None where that depends on the shape.
+    direction (3,). ``R`` (3, 3) is its attitude in the base, None if that depends on the shape.
     """
 
     r: Array

@@ -3,15 +3,15 @@
 The shapes at the ticks are points of the trajectory; between them the shape moves along chords,
 with velocities that are means over a tick. So joints, velocities and accelerations keep their
 limits, but the areas of the chords' loops are not quite those of the curves, nor is the solution's
-attitude that of the plant's integration. Newton's method bends the path by a few smooth waves until
+attitude that of the plant's integration. Newton's method adds a few smooth waves to the path until
 the plant's own prediction ends on the goal. The first variation of the final attitude is
 
 ``eta = R_f' sum_k R_k K(q_k)(dq_k, q_k' dt)``,  K the curvature of the connection,
 
-for a bend ``dq`` that vanishes at both ends. Where a bend needs more speed or acceleration than
-there is, the manoeuvre takes a few ticks longer.
+for a change ``dq`` that vanishes at both ends. Where that needs more speed or acceleration than
+the limits allow, the manoeuvre takes a few ticks longer.
 
-Where that fails and the last shape is free, it is bent as well: loops of some robots do not turn
+Where that fails and the last shape is free, it is changed as well: loops of some robots do not turn
 the base. A manoeuvre of a few ticks only is a polygon, whose chords are no image of the curve any
 more; one of two or three may have too few corners to end on the goal, and takes a tick more.
 """
@@ -37,10 +37,10 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 
 _WAVES = 6
-"""Waves of a joint that a path is bent by."""
+"""Waves of a joint that are added to a path."""
 
 _REACHED = 1e-11
-"""Attitude error that is as good as none, rad."""
+"""Attitude error that counts as zero, rad."""
 
 _MOST_STEPS = 25
 _MOST_STRETCHES = 40
@@ -56,8 +56,8 @@ _ROUNDING = 0.02
 _WITHIN = 1e-9
 """Rounding that a limit may be exceeded by, relative."""
 
-_SHYNESS = 0.02
-"""Share of half a joint's range, off its ends, within which a path is bent less."""
+_END_ZONE = 0.02
+"""Share of half a joint's range, off its ends, within which waves are smaller."""
 
 
 @dataclass(frozen=True)
@@ -73,16 +73,16 @@ class HeldCommands:
 
 @dataclass(frozen=True)
 class ManoeuvreModel:
-    """What all manoeuvres of one robot must obey.
+    """Model and constraints of all manoeuvres of one robot.
 
     Attributes
     ----------
     robot, prediction, control_period
-        The model, the base motion that commands cause, and how long each is held, s.
+        The model, the prediction of the base motion, and the duration of a command, s.
     axes
         (m, 3) directions in the base along which the attitude is reached.
     constraints, efforts
-        What the path must keep; no efforts: any.
+        Constraints of the path; no efforts: any.
     """
 
     robot: SpaceRobot
@@ -135,12 +135,12 @@ class CommandHolder:
             factor = math.inf
             for moves_end in (False, True)[: 1 + free]:
                 positions = trajectory.at_ticks(ticks)
-                held = self._bent(positions, boundary, final, limits, moves_end=moves_end)
+                held = self._adjusted(positions, boundary, final, limits, moves_end=moves_end)
                 if held is None:
                     continue
                 needed, overrun = limits.excess(held.positions, self._period, before)
                 if overrun > _WITHIN:
-                    held = self._bent(
+                    held = self._adjusted(
                         positions, boundary, final, limits, moves_end=moves_end, clipped=True
                     )
                     if held is None:
@@ -164,7 +164,7 @@ class CommandHolder:
                 return None
         return None
 
-    def _bent(
+    def _adjusted(
         self,
         positions: Array,
         boundary: BoundaryConditions,
@@ -174,10 +174,10 @@ class CommandHolder:
         moves_end: bool,
         clipped: bool = False,
     ) -> HeldCommands | None:
-        """Bend shapes (N + 1, n) until they end in the goal attitude; None if they do not.
+        """Add waves to shapes (N + 1, n) until they end in the goal attitude; None if they do not.
 
-        ``moves_end``: the last shape is bent, too. ``clipped``: after every step, shapes beyond the
-        joint limits are put on them, and the others take over what that changes.
+        ``moves_end``: the last shape is changed, too. ``clipped``: after every step, shapes beyond
+        the joint limits are put on them, and the others make up for the change.
         """
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         # The solver's last shape is the wanted one to its own precision.
@@ -209,22 +209,24 @@ class CommandHolder:
         return None
 
     def _waves(self, positions: Array, limits: MotionLimits) -> Array:
-        """Return bends (N + 1, waves, n) of one joint each, in proportion to its speed."""
+        """Return waves (N + 1, w, n) of one joint each, in proportion to its speed."""
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         order = np.arange(1, _WAVES + 1)
         shape = np.sin(math.pi * s) * np.sin(math.pi * s * order) / order
         speed, half = self._speed(positions[0], limits)
         room = np.minimum(positions - limits.lower, limits.upper - positions)
         with np.errstate(divide="ignore", invalid="ignore"):
-            shy = np.clip(np.nan_to_num(room / (_SHYNESS * half), nan=0.0), 0.0, 1.0)
+            fading = np.clip(np.nan_to_num(room / (_END_ZONE * half), nan=0.0), 0.0, 1.0)
         # Smooth where it begins, so that accelerations stay small.
-        shy = shy**2 * (3 - 2 * shy)
+        fading = fading**2 * (3 - 2 * fading)
         joints = np.eye(self._n) * speed
-        bends = shape[:, :, np.newaxis, np.newaxis] * (shy[:, np.newaxis] * joints)[:, np.newaxis]
-        return np.asarray(bends.reshape(len(positions), -1, self._n))
+        waves = (
+            shape[:, :, np.newaxis, np.newaxis] * (fading[:, np.newaxis] * joints)[:, np.newaxis]
+        )
+        return np.asarray(waves.reshape(len(positions), -1, self._n))
 
     def _ramps(self, s: Array, limits: MotionLimits) -> Array:
-        """Return bends (N + 1, n, n) that move the last shape."""
+        """Return ramps (N + 1, n, n) that move the last shape."""
         speed, _ = self._speed(np.zeros(self._n), limits)
         return np.asarray((s**2 * (3 - 2 * s))[:, :, np.newaxis] * np.eye(self._n) * speed)
 
@@ -245,6 +247,6 @@ class CommandHolder:
         twists = np.einsum("akji,kj,kwi->kaw", K, moved, waves[chosen])
         R = np.array([matrix_from_quaternion(x) for x in quaternions[chosen]])
         R_f = matrix_from_quaternion(quaternions[-1])
-        # The last step of a bend that does not vanish at the end turns the base directly.
+        # The last step of a change that does not vanish at the end turns the base directly.
         direct = self._connection(positions[-1])[3:] @ waves[-1].T
         return np.asarray(R_f.T @ np.einsum("kab,kbw->aw", R, twists) - direct)

@@ -103,7 +103,7 @@ class InitialGuesses:
         return np.clip(shapes, limits.lower, limits.upper)
 
     def _size(self, q: Array, half: Array, angle: float) -> float:
-        """Return how much of the half ranges a loop takes that turns the base by ``angle``."""
+        """Return the size, in half ranges, of a loop that turns the base by ``angle``."""
         n = len(q)
         K = np.abs(self._curvature(q).full()[3:]).sum(axis=0).reshape(n, n)
         largest = float((K * np.outer(half, half)).max())
@@ -190,7 +190,7 @@ def _trigonometric(rng: np.random.Generator, s: Array, n: int) -> Array:
 
 
 def _three_frequencies(rng: np.random.Generator, s: Array, n: int) -> Array:
-    """A cycle of step 3 of paper 1, among any three joints (two, where there are no three)."""
+    """A cycle of step 3 of paper 1, among any three joints (two, if there are no three)."""
     phi = 2 * math.pi * s
     b11, b12, b21, a22, a31 = rng.normal(size=5)
     cycle = (
@@ -263,10 +263,10 @@ class SolutionLibrary:
         return hashlib.sha256(self.to_bytes()).hexdigest()
 
     def nearest(self, boundary: BoundaryConditions, limits: MotionLimits) -> Iterator[Array]:
-        """Yield the shapes (M, n) of the manoeuvres whose ends are nearest, bent to these ends."""
+        """Yield the shapes (M, n) of manoeuvres with the nearest ends, moved to these ends."""
         half = limits.span(boundary.start)[1]
         half = np.where(half > 0, half, 1.0)
-        # The angle between two turns, and what the shapes at both ends differ by.
+        # The angle between two turns, and the distances of the shapes at both ends.
         apart = 2 * np.arccos(np.clip(np.abs(self.turns @ boundary.turn), 0.0, 1.0))
         begins = np.linalg.norm((self.shapes[:, 0] - boundary.start) / half, axis=1)
         distance = apart + begins
@@ -278,8 +278,10 @@ class SolutionLibrary:
             s = np.linspace(0.0, 1.0, len(shapes))[:, np.newaxis]
             late = s**3 * (10 - 15 * s + 6 * s**2)
             last = shapes[-1] if boundary.final is None else boundary.final
-            bent = shapes + (1 - late) * (boundary.start - shapes[0]) + late * (last - shapes[-1])
-            yield np.clip(bent, limits.lower, limits.upper)
+            changed = (
+                shapes + (1 - late) * (boundary.start - shapes[0]) + late * (last - shapes[-1])
+            )
+            yield np.clip(changed, limits.lower, limits.upper)
 
     def to_bytes(self) -> bytes:
         """Return it as an archive of numpy."""
@@ -301,7 +303,7 @@ class SolutionLibrary:
             with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
                 found = cls(str(arrays["key"]), arrays["turns"], arrays["shapes"])
         except (OSError, EOFError, KeyError, MemoryError, ValueError, zipfile.BadZipFile):
-            # What numpy says of it recommends to trust it.
+            # The message of numpy recommends to trust the file.
             raise ValueError("it holds no library") from None
         turns, shapes = found.turns, found.shapes
         fits = turns.shape[1:] == (4,) and shapes.ndim == 3 and len(shapes) == len(turns) > 0
@@ -313,7 +315,7 @@ class SolutionLibrary:
 
 
 def library_key(robot: SpaceRobot, limits: MotionLimits, axes: Array, *, position: bool) -> str:
-    """Return a hash of what the manoeuvres of a library depend on."""
+    """Return a hash of everything that the manoeuvres of a library depend on."""
     digest = hashlib.sha256(robot.equations_key.encode())
     for numbers in (*vars(limits).values(), axes):
         digest.update(np.ascontiguousarray(numbers, dtype=float).tobytes())

@@ -3,8 +3,8 @@
 Where the plant is driven by efforts, a controller tracks the held commands. Between two of them the
 reference has the mean of their velocities and the acceleration that leads from one to the other in
 a control period; the efforts of that motion, by inverse dynamics (:func:`.joint_efforts` of the
-model), are what the controller asks for beside its feedback. Efforts are quadratic in the speed: so
-a motion whose efforts are f^2 times what they may be keeps the limits in f times its time.
+model), are the controller's command beside its feedback. Efforts are quadratic in the speed: so a
+motion whose efforts are f^2 times their limits keeps these in f times its time.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages
 
 _ROOM = 0.98
-"""Share of the limits that a solution uses: bends of its path take the rest."""
+"""Share of the limits that a solution uses: changes of its path take the rest."""
 
 _AT_LIMITS, _WITHIN = 0.9, 0.1
 """Shares of the limits at which guesses count as made for them, below and beyond one."""
@@ -50,7 +50,7 @@ class JointEfforts:
     limit
         (n,) largest effort of every joint in a motion, N or N m; infinite: any.
     control_period
-        How long a command is held, s.
+        Duration of a command, s.
 
     Raises
     ------
@@ -95,7 +95,7 @@ class JointEfforts:
         return self._shares(positions, (before + after) / 2, (after - before) / self._period)
 
     def excess(self, positions: Array, velocity: Array | float = 0.0) -> float:
-        """Return by what factor held commands would have to be slower; at most 1: they need not.
+        """Return the factor by which held commands must be slower; at most 1: they need not be.
 
         Arguments are those of :meth:`shares`.
         """
@@ -166,7 +166,7 @@ class EffortLimitedShooting(MultipleShooting):
 
     @property
     def converged(self) -> bool:
-        """Whether the last solution is one, and not what the search was cut short at."""
+        """Whether the solver has converged on the last solution."""
         return super().converged if self._last is None else self._last.converged
 
     def solve(

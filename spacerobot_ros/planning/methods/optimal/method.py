@@ -67,19 +67,19 @@ _STARTS_IN_MOTION = 12
 """Guesses that are tried for a manoeuvre from moving joints: the robot flies on meanwhile."""
 
 _NOTHING_LEFT = 1e-10
-"""A goal this near, rad, m and joint coordinates, is where the robot is."""
+"""Errors up to this are zero: the robot is at the goal; rad, m and joint coordinates."""
 
 _EQUAL = 1e-7
-"""What a manoeuvre that was kept may miss its ends by, rad, m and joint coordinates."""
+"""Largest error at the ends of a cached manoeuvre, rad, m and joint coordinates."""
 
 _NEAR_LIMIT = 0.95
 """Share of a limit beyond which a manoeuvre counts as limited by it."""
 
 _LONGER, _MORE_TICKS = 1.25, 20
-"""What held commands take at most in place of optimal.longest: times it, and ticks more."""
+"""Longest duration of held commands: a factor of optimal.longest, and additional ticks."""
 
 _ROUNDING = 1e-8
-"""What it may exceed a limit by, relative or in joint coordinates."""
+"""Largest excess of a cached manoeuvre over a limit, relative or in joint coordinates."""
 
 
 class OptimalGait(GaitMethod):
@@ -181,9 +181,7 @@ class OptimalGait(GaitMethod):
         try:
             self._constraints.check(q[np.newaxis], attitude, self.control_period)
         except CandidateError as reason:
-            raise PlanningError(
-                f"The robot is where it must not be: at the start, {reason}."
-            ) from None
+            raise PlanningError(f"The start violates a path constraint: {reason}.") from None
         key = None
         if self._cache is not None and not correction:
             key = self._key(request)
@@ -209,7 +207,7 @@ class OptimalGait(GaitMethod):
                 f"{found.starts} start(s); a longer one may find a faster manoeuvre."
             )
         schedule = self._schedule(state, goal, found.held.positions, notes)
-        # What a busy machine made of the goal is not to be flown on a quiet one.
+        # The result of a busy machine is not to be flown on a quiet one.
         if self._cache is not None and key is not None and not found.cut_short:
             kept_plan = _KeptPlan(schedule.positions, notes)
             self._cache.store(_file(key), key, kept_plan.to_bytes())
@@ -223,7 +221,7 @@ class OptimalGait(GaitMethod):
         limits: MotionLimits,
         cancellation: Cancellation,
     ) -> GaitSchedule:
-        """Plan from moving joints; what remains of the motion so far is the first guess."""
+        """Plan from moving joints; the rest of the motion so far is the first guess."""
         too_fast = np.abs(motion.velocity) > limits.velocity * (1 + _ROUNDING)
         if too_fast.any():
             names = ", ".join(np.array(self.robot.joint_names)[too_fast])
@@ -305,10 +303,11 @@ class OptimalGait(GaitMethod):
             shares["effort"] = np.abs(self._efforts.shares(positions, velocity))
         names = np.array(self.robot.joint_names)
         active = {
-            what: names[share.max(axis=0) > _NEAR_LIMIT].tolist() for what, share in shares.items()
+            limit: names[share.max(axis=0) > _NEAR_LIMIT].tolist()
+            for limit, share in shares.items()
         }
-        sentences = (f"{what} of {' '.join(joints)}" for what, joints in active.items() if joints)
-        return ", ".join(sentences) or "nothing"
+        parts = (f"{limit} of {' '.join(joints)}" for limit, joints in active.items() if joints)
+        return ", ".join(parts) or "nothing"
 
     def _key(self, request: PlanRequest) -> str:
         state, goal, tolerance = request.state, request.goal, request.tolerance

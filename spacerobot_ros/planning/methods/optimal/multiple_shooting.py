@@ -42,7 +42,7 @@ _OPTIONS = {
 
 @dataclass(frozen=True)
 class StopRule:
-    """When a solver stops before it has converged.
+    """Conditions on which a solver stops before it has converged.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class StopRule:
 
 @dataclass(frozen=True)
 class DurationBounds:
-    """What a trajectory may take, s: from ``shortest`` to ``longest``."""
+    """Bounds of the duration of a trajectory, s."""
 
     shortest: float
     longest: float
@@ -117,7 +117,7 @@ class MultipleShooting:
 
     @property
     def converged(self) -> bool:
-        """Whether the last solution is one, and not what the search was cut short at."""
+        """Whether the solver has converged on the last solution."""
         return bool(self._solver.stats()["success"])
 
     def solve(
@@ -138,9 +138,9 @@ class MultipleShooting:
         boundary, limits, guess
             The problem, and where the solver begins.
         stop
-            When the solver stops early.
+            Conditions on which the solver stops early.
         duration
-            What it may take.
+            Its bounds.
         """
         N, layout = self.intervals, self._program.layout
         vertices = np.array([np.tile(x, (N + 1, 1)) for x in (limits.lower, limits.upper)])
@@ -223,7 +223,7 @@ class _Watch(ca.Callback):
         self.best, self._least, self._stop, self._iterates = None, math.inf, stop, 0
 
     def get_n_in(self) -> int:
-        """Return the number of what a solver reports."""
+        """Return the number of values that a solver reports."""
         return int(ca.nlpsol_n_out())
 
     def get_n_out(self) -> int:

@@ -152,7 +152,7 @@ _FREE = 1e6
 """Bounds of a box beyond this, m or rad, are none where a joint has no limits."""
 
 _ROOM = 0.02
-"""What a solution keeps off its path constraints, relative: they are imposed between steps."""
+"""Distance of a solution from its path constraints, relative: they are imposed at steps alone."""
 
 
 class CandidateError(PlanningError):
@@ -204,7 +204,7 @@ class MotionLimits:
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: OptimalOptions) -> MotionLimits:
-        """Return the robot's own limits, narrowed by what the options give for every joint.
+        """Return the robot's own limits, narrowed by the options.
 
         Raises
         ------
@@ -256,7 +256,7 @@ class MotionLimits:
     def excess(
         self, positions: Array, period: float, velocity: Array | float = 0.0
     ) -> tuple[float, float]:
-        """Return by what factor held commands would have to be slower, and what they overrun.
+        """Return the factor by which held commands must be slower, and the largest overrun.
 
         ``positions`` (N + 1, n) are the shapes at ticks of ``period`` seconds, at rest after;
         before, ``velocity`` (n,) is held. The factor is at most 1 where velocities and
@@ -271,7 +271,7 @@ class MotionLimits:
     def shares(
         self, positions: Array, period: float, velocity: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Return what share of their limits velocities (N + 2, n) and accelerations (N + 1, n) are.
+        """Return velocities (N + 2, n) and accelerations (N + 1, n) as shares of their limits.
 
         Arguments are those of :meth:`excess`.
         """
@@ -362,7 +362,7 @@ class PathConstraints:
     boxes
         (K, 2, n) lower and upper corners of boxes of shapes that the joints must not enter.
     bodies
-        What stands for the boxes in the program.
+        The smooth bodies that replace the boxes in the program.
     """
 
     base_rate: float = 0.0
@@ -404,7 +404,7 @@ class PathConstraints:
 
     @property
     def on_knots(self) -> int:
-        """How many inequalities :meth:`symbolic` returns."""
+        """Number of inequalities that :meth:`symbolic` returns."""
         return len(self.boxes) + (self.axis_B is not None)
 
     def symbolic(self, q: ca.SX, quaternion: ca.SX, direction: ca.SX) -> ca.SX:

@@ -51,15 +51,15 @@ from spacerobot_ros.planning.methods.optimal.transcription import PathInequality
 
 _LOG = logging.getLogger(__name__)
 
-_NOTHING = "the solver came to no way that keeps the limits"
+_NOTHING = "the solver found no path within the limits"
 _NOT_HELD = "held commands could not be brought to the goal within the limits"
 
 _FEWEST_TICKS = 2
 """A manoeuvre has at least as many: one begins to move, another one stops."""
 
 _GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
-"""A gentle manoeuvre has as many ticks or takes as long, s, whichever is less: it corrects what is
-left, and haste would leave more."""
+"""A gentle manoeuvre has as many ticks or takes as long, s, whichever is less: it corrects a
+small error, and haste would leave a larger one."""
 
 _LAST_CALL = 5.0
 """Factor of the time budget after which a search without any solution ends."""
@@ -75,7 +75,7 @@ _COARSE_TOLERANCE = 1e-4
 """Tolerance of the solver on the coarse grid, whose own error is larger."""
 
 _FEWEST_INTERVALS = 8
-"""Fewest intervals of a coarse grid; where it would have fewer, there is none."""
+"""Fewest intervals of a coarse grid; with fewer there is none."""
 
 _REFINED = 2
 """Largest number of coarse solutions that are refined."""
@@ -128,12 +128,12 @@ _MORE_TICKS = (0, 1, 3, 7)
 
 @dataclass(frozen=True)
 class SearchBudget:
-    """How hard to search.
+    """Budget of a search.
 
     Attributes
     ----------
     duration
-        What a manoeuvre is to take, s; 0: the least time.
+        Wanted duration of the manoeuvre, s; 0: the least.
     longest
         Longest manoeuvre, s.
     starts, solutions
@@ -170,7 +170,7 @@ class Manoeuvre:
     duration
         s.
     solution_time
-        What it took before it was made into held commands, s.
+        Duration before it was made into held commands, s.
     starts
         Guesses that were tried.
     solutions
@@ -189,14 +189,14 @@ class Manoeuvre:
 
 @dataclass
 class _Progress:
-    """One search: what is looked for, and how far it has come.
+    """One search: its problem and its progress.
 
     Attributes
     ----------
     boundary, limits, quaternion, budget, cancellation, library
         As of :meth:`ManoeuvreSearch.search`.
     starts, rejection
-        Guesses that were tried, and why the last candidate was none.
+        Guesses that were tried, and the reason against the last candidate.
     shortest
         Duration of the fastest solution so far, s.
     """
@@ -226,15 +226,15 @@ class _Progress:
         """Whether the wall time is used up."""
         return self.stop_rule(found=found).expired(found=found)
 
-    def report(self, what: str, result: str, iterations: int) -> None:
-        """Log what came of a guess, and how far the search has come."""
+    def report(self, step: str, result: str, iterations: int) -> None:
+        """Log the result of a guess, and the progress of the search."""
         seconds = time.monotonic() - self._began
         # Where no guess led to anything on the coarse grid, some are tried on the full one as well.
         most = max(self.budget.starts, self.starts)
         log_progress(
             _LOG,
             SearchProgress(self.starts, most, self.shortest),
-            f"{what}: {result} after {seconds:.2f} s, {iterations} steps of the solver",
+            f"{step}: {result} after {seconds:.2f} s, {iterations} steps of the solver",
         )
 
     def agreed(self, solutions: list[Trajectory]) -> bool:
@@ -242,7 +242,7 @@ class _Progress:
         costs = np.array([self.cost(each) for each in solutions])
         agreeing = self.budget.agreeing
         if self.library is not None:
-            # What was found for goals nearby has been agreed upon before.
+            # Solutions for goals nearby have agreed before.
             agreeing = min(agreeing, _AGREEING_WITH_LIBRARY)
         same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _AGREEING)))
         return 0 < agreeing <= same
@@ -262,7 +262,7 @@ class ManoeuvreSearch:
     Parameters
     ----------
     model
-        What they must obey.
+        Model and constraints of the manoeuvres.
     compiling
         Whether searches are long enough for compiled functions to pay.
     """
@@ -354,7 +354,7 @@ class ManoeuvreSearch:
                 progress.rejection = _NOTHING
             else:
                 solutions.append(solution)
-            # What was cut short within its last start is no less so.
+            # A search that is cut short within its last start is cut short, too.
             cut_short = progress.cut_short(found=bool(solutions))
             going_on = len(solutions) < enough and not progress.agreed(solutions)
             if going_on and number < starts and not cut_short:
@@ -376,7 +376,7 @@ class ManoeuvreSearch:
         """Return manoeuvres made of the best solutions on a grid, after a step to the full one.
 
         Where the search ended because solutions agree, the next one is refined only if it promises
-        a shorter time than what became of the best.
+        a shorter time than the refined best one.
         """
         found: list[Manoeuvre] = []
         costs: list[float] = []
@@ -412,7 +412,7 @@ class ManoeuvreSearch:
     def solver(
         self, intervals: int, position: bool, tolerance: float = TOLERANCE
     ) -> MultipleShooting:
-        """Return what solves the problem on so many intervals, with or without a position."""
+        """Return the solver with a number of intervals, with or without a position."""
         key = intervals, position, tolerance
         if key not in self._solvers:
             of = partial(self._stages_of, position)
@@ -443,7 +443,7 @@ class ManoeuvreSearch:
         guess: Trajectory,
         stop: StopRule,
     ) -> Trajectory | None:
-        """Return what the solver makes of a guess, None if nothing."""
+        """Return the solution from a guess, None if there is none."""
         boundary, limits, budget = progress.boundary, progress.limits, progress.budget
         shortest = _FEWEST_TICKS * self._period
         if budget.gentle:
@@ -464,7 +464,7 @@ class ManoeuvreSearch:
             solution = solver.solve(boundary, limits, guess, stop, duration)
             if solution is None or solver.converged or self._constraints.base_rate > 0:
                 return solution
-            # What was cut short has time to spare.
+            # A solution that has not converged has time to spare.
             return self._slowed(solution.hurried(limits, shortest))
         guess = guess.retimed(T / guess.duration)
         solution = solver.solve(boundary, limits, guess, stop, DurationBounds(T, T))
@@ -502,9 +502,9 @@ class MotionSearch:
     Parameters
     ----------
     model
-        What they must obey.
+        Model and constraints of the manoeuvres.
     solver
-        Returns what solves the problem on so many intervals, with or without a position.
+        Returns the solver with a number of intervals, with or without a position.
     """
 
     def __init__(
@@ -527,7 +527,7 @@ class MotionSearch:
     ) -> Manoeuvre:
         """Return the fastest manoeuvre found from attitude ``quaternion`` (4,) of R_WB.
 
-        What remains of the motion so far is the first guess.
+        The rest of the motion so far is the first guess.
 
         Raises
         ------
@@ -555,7 +555,7 @@ class MotionSearch:
             cancellation.raise_if_requested()
             if len(candidates) >= budget.solutions or _agreed(candidates):
                 break
-        # What is left of a motion is short: the coarse grid is fine enough for it.
+        # The rest of a motion is short: the coarse grid is fine enough for it.
         fine = coarse if budget.solutions == 1 else full
         for candidate in sorted(candidates, key=lambda each: each.duration)[:_REFINED_IN_MOTION]:
             try:
@@ -664,7 +664,7 @@ class MotionSearch:
         solver: MultipleShooting,
         remaining: Array,
     ) -> Iterator[Trajectory]:
-        """Yield what remains of the motion so far, then guesses with loops, from its velocity."""
+        """Yield the rest of the motion so far, then guesses with loops, from its velocity."""
         velocity = np.broadcast_to(boundary.velocity, boundary.start.shape)
         guesses = _initial_guesses(self._robot, solver, solver.intervals)
         if len(remaining) > 1:

@@ -80,7 +80,7 @@ class Block:
 
     @property
     def rows(self) -> int:
-        """How many."""
+        """Number of rows."""
         return int(self.values.size1_out(0))
 
     @classmethod
@@ -137,7 +137,7 @@ class Stages:
         *,
         compiling: bool = False,
     ) -> Stages:
-        """Derive them, or take from the cache what was derived before.
+        """Derive them, or take them from the cache.
 
         Parameters
         ----------
@@ -148,7 +148,7 @@ class Stages:
         position
             Whether the centre of mass is to end at ``center`` in the base.
         constraints, inequalities
-            What the path must keep.
+            Constraints of the path.
         compiling
             Whether they are evaluated so often that compiling them pays.
         """
@@ -168,7 +168,7 @@ class Stages:
 
 
 def _dynamics(joints: int) -> int:
-    """Return how many rows of an interval are its dynamics."""
+    """Return the number of rows of an interval that are its dynamics."""
     return 2 * joints + 4
 
 
@@ -217,7 +217,7 @@ def _interval(
     rates = [rotation(point) for point in points]
     motion = ca.vertcat(v_next - v - h * a, s_next - s - h * v_next)
 
-    # The attitude, by the chain rule: only what goes through the robot's inertia is large.
+    # The attitude, by the chain rule: only the terms with the robot's inertia are large.
     w = [ca.SX.sym(f"w_{i}", 3) for i in range(len(GAUSS))]
     by_attitude = ca.SX.sym("lambda_X", 4)
     inner = ca.vertcat(X, *w)
@@ -236,8 +236,8 @@ def _interval(
     attitude_hess = inner_jac.T @ outer_hess @ inner_jac
     for point, P, W, mu in zip(points, point_jac, rate_jac, by_rate, strict=True):
         weight = ca.SX.sym("weight", 2 * n)
-        bent = ca.substitute(ca.hessian(ca.dot(weight, point), z)[0], weight, ca.densify(W.T @ mu))
-        attitude_hess += P.T @ rotation_hess(point, mu) @ P + bent
+        bend = ca.substitute(ca.hessian(ca.dot(weight, point), z)[0], weight, ca.densify(W.T @ mu))
+        attitude_hess += P.T @ rotation_hess(point, mu) @ P + bend
 
     kept = _path(n, constraints, inequalities, z, rates, direction)
     by_motion, by_path = ca.SX.sym("lambda_v", 2 * n), ca.SX.sym("lambda_g", kept.shape[0])
@@ -343,7 +343,7 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """How many."""
+        """Number of variables."""
         return 1 + self._knot * self.intervals + 4 + 2 * self.joints
 
     def knots(self) -> tuple[Indices, Indices, Indices, Indices]:
@@ -377,7 +377,7 @@ class _Placed:
     variables, rows
         Places (count, ...) of its variables in x, and of its rows in g; rows of -1 are left out.
     parameters
-        What it takes of p.
+        The part of p that it takes.
     """
 
     block: Block
