@@ -20,10 +20,10 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import suggestion
 
 SAMPLERS = ("random", "latin_hypercube", "sobol", "halton", "saltelli")
-"""How draws are spread: the last one, for indices of all orders, is SALib's, the others scipy's."""
+"""Samplers; the last one, for sensitivity indices of all orders, is SALib's, the others scipy's."""
 
 OF_ALL = ("latin_hypercube", "saltelli")
-"""Samplers whose draws depend on how many there are."""
+"""Samplers whose draws depend on the number of flights."""
 
 _KEYS = (
     *("scenario", "flights", "seed", "sampler", "method", "set", "longest", "disperse"),
@@ -31,21 +31,21 @@ _KEYS = (
 )
 _MOST_FLIGHTS = 10_000_000
 ENGINES = ("auto", "lanes", "flights", "ros")
-"""What may fly a campaign."""
+"""Names of the engines that may fly a campaign."""
 
 
 @dataclass(frozen=True)
 class Distribution:
-    """How a number is spread: a distribution of scipy.stats with its arguments, or a choice.
+    """Probability distribution of a value: one of scipy.stats, or a choice.
 
     Attributes
     ----------
     name
-        Of ``scipy.stats``, or ``choice``.
+        Name in ``scipy.stats``, or ``choice``.
     arguments
-        By name, as ``scipy.stats`` takes them.
+        Arguments by name, as ``scipy.stats`` takes them.
     choices
-        Values of which each is as likely as the others; of a ``choice`` only.
+        Equally likely values of a ``choice``.
     """
 
     name: str
@@ -53,11 +53,11 @@ class Distribution:
     choices: tuple[Any, ...] = ()
 
     def at(self, shares: Array) -> list[Any]:
-        """Return the values below which shares (N,), 0 to 1, of all lie."""
+        """Return the quantiles (N,) of cumulative probabilities (N,), 0 to 1."""
         if self.choices:
             last = len(self.choices) - 1
             return [self.choices[min(int(u * (last + 1)), last)] for u in shares.tolist()]
-        # What is infinite or no number is refused by the flight that draws it.
+        # Values that are not finite are refused by the flight that draws them.
         with np.errstate(all="ignore"):
             found = np.asarray(_scipy(self.name).ppf(shares, **self.arguments), dtype=float)
         return list(found.tolist())
@@ -71,20 +71,20 @@ class Distribution:
 
 @dataclass(frozen=True)
 class Dispersion:
-    """A quantity that differs from flight to flight, and its distribution."""
+    """A quantity that varies from flight to flight, and its distribution."""
 
     target: Target
     distribution: Distribution
 
     @property
     def name(self) -> str:
-        """Of the target."""
+        """Name of the quantity."""
         return self.target.name
 
 
 @dataclass(frozen=True)
 class Criterion:
-    """What is required of a metric: from ``minimum`` to ``maximum``."""
+    """Range that a metric must be in: from ``minimum`` to ``maximum``."""
 
     metric: str
     minimum: float = -math.inf
@@ -104,23 +104,23 @@ class Campaign:
     Attributes
     ----------
     name
-        Of its file.
+        Name of its file.
     scenario
-        What is flown, with the parameters that all flights have in common.
+        Scenario with the parameters that all flights share.
     flights, seed, sampler
-        How many draws, from what they are made, and how they are spread.
+        Number of draws, their seed, and their sampler.
     longest
         Simulated time after which a flight is interrupted, s.
     dispersions
-        What differs.
+        Quantities that vary.
     criteria
-        What is required beside a goal that is reached.
+        Requirements on metrics, beside a goal that is reached.
     engine
-        What flies it: ``auto``, ``lanes``, ``flights`` or ``ros``.
+        Name of the engine: ``auto``, ``lanes``, ``flights`` or ``ros``.
     description
-        For people.
+        Text for the reader of the report.
     section
-        The content of the file.
+        Content of the file.
     """
 
     name: str
@@ -137,18 +137,18 @@ class Campaign:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is drawn, in the order of the columns."""
+        """Names of the drawn quantities, in the order of the columns."""
         return tuple(dispersion.name for dispersion in self.dispersions)
 
 
 class _EveryKeyOnce(yaml.SafeLoader):
-    """Refuses a key that a mapping has twice: of two dispersions one would be lost."""
+    """Refuses duplicate keys, of which YAML would silently keep the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         known: set[str] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
-                continue  # It is refused as a key, in a sentence of its own.
+                continue  # It is refused as a key, with a message of its own.
             if key.value in known:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"the key '{key.value}' is there twice", key.start_mark
@@ -163,7 +163,7 @@ def load_campaign(path: Path, flights: int | None = None) -> Campaign:
     Raises
     ------
     ParameterError
-        It cannot be read, or something in it is refused; the sentence says what and where.
+        It cannot be read, or a value in it is refused; the message names the place.
     """
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), _EveryKeyOnce)
@@ -192,18 +192,18 @@ def parse_campaign(
     Parameters
     ----------
     name
-        Of the campaign.
+        Name of the campaign.
     section
-        What is under ``campaign:``.
+        Content of ``campaign:``.
     folder
-        Where the file of a scenario is looked for.
+        Folder in which the file of a scenario is looked for.
     scenario
-        What is flown, with what is under ``set``; None: what the section names.
+        Scenario with the parameters under ``set``; None: the one that the section names.
 
     Raises
     ------
     ParameterError
-        Something is refused; the sentence says what.
+        A key or value is refused.
     """
     for key in section:
         if key not in _KEYS:
@@ -227,7 +227,7 @@ def parse_campaign(
         )
     dispersions = _dispersions(_mapping(section, "disperse"), scenario)
     if sampler == "saltelli" and not dispersions:
-        raise ParameterError("the sampler 'saltelli' needs something that is dispersed.")
+        raise ParameterError("the sampler 'saltelli' needs at least one dispersion.")
     return Campaign(
         name=name,
         scenario=scenario,
@@ -295,7 +295,7 @@ def _real(key: str, value: Any, least: float = -math.inf) -> float:
     return number
 
 
-# -- what differs -----------------------------------------------------------------------------
+# -- dispersions ------------------------------------------------------------------------------
 
 
 def _dispersions(section: Mapping[str, Any], scenario: Scenario) -> tuple[Dispersion, ...]:
@@ -323,7 +323,7 @@ _WORDS = {
     "norm": "loc is its mean and scale its standard deviation",
     "uniform": "loc is its least value and scale its width",
 }
-"""What loc and scale are, for those who look for the mean, or for bounds."""
+"""Meaning of loc and scale in messages about unknown arguments."""
 
 
 def _distribution(target: Target, given: Any) -> Distribution:
@@ -381,7 +381,7 @@ def _choice(target: Target, value: Any) -> Any:
 
 
 def _require_taken(target: Target, value: Any, scenario: Scenario) -> None:
-    """Refuse a value that a node refuses, before it is flown thousands of times."""
+    """Refuse a value that a node would refuse in every flight."""
     flight = target.apply(DrawnFlight.of(scenario), value)
     for node in ("plant", *scenario.commanders):
         flight.scenario.config(node)
@@ -405,7 +405,7 @@ def _scipy(name: str) -> Any:
     return found
 
 
-# -- what is required -------------------------------------------------------------------------
+# -- criteria ---------------------------------------------------------------------------------
 
 
 def _criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Criterion, ...]:
@@ -421,16 +421,16 @@ def _criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Criterion
         least = _real(f"{name}: min", given["min"]) if "min" in given else -math.inf
         most = _real(f"{name}: max", given["max"]) if "max" in given else math.inf
         if least > most:
-            raise ParameterError(f"the criterion of '{name}' is met by nothing: {least} > {most}.")
+            raise ParameterError(f"the criterion of '{name}' has min {least} above max {most}.")
         found.append(Criterion(str(name), least, most))
     return tuple(found)
 
 
 def passed(criteria: Sequence[Criterion], outcome: str, metrics: Mapping[str, float]) -> bool:
-    """Whether a flight has reached its goal and met every criterion."""
+    """Return whether a flight has reached its goal and met every criterion."""
     return outcome == "reached" and all(meets(criterion, metrics) for criterion in criteria)
 
 
 def meets(criterion: Criterion, metrics: Mapping[str, float]) -> bool:
-    """Whether a metric is within its criterion; one that is not there is not."""
+    """Return whether a metric is there and within its criterion."""
     return criterion.minimum <= metrics.get(criterion.metric, math.nan) <= criterion.maximum

@@ -1,4 +1,4 @@
-"""The results of a campaign: a Parquet dataset that grows as flights end, and its campaign."""
+"""Dataset of a campaign: its files, and a Parquet row for each finished flight."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from spacerobot_ros.campaign.config import OF_ALL, Campaign, parse_campaign
-from spacerobot_ros.campaign.extras import needed
+from spacerobot_ros.campaign.draws import needed
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import ParameterError, RecordingError
@@ -28,12 +28,12 @@ from spacerobot_ros.resources import is_path
 from spacerobot_ros.version import __version__
 
 DRAWN = "draw."
-"""Before the names of columns that were drawn."""
+"""Prefix of the columns of drawn quantities."""
 
 _ABOUT, _CAMPAIGN, _SCENARIO, _FLIGHTS = "about.json", "campaign.yaml", "scenario.yaml", "flights"
 
 _FLUSH_PERIOD, _FLUSH_ROWS = 5.0, 2000
-"""Wall s, and number of rows, after which rows are written: a kill costs no more of them."""
+"""Wall time (s) and number of rows after which rows are written: a kill loses no more of them."""
 
 VERSIONS = json.dumps(
     {"spacerobot_ros": __version__, "numpy": np.__version__, "python": platform.python_version()}
@@ -41,13 +41,15 @@ VERSIONS = json.dumps(
 
 
 class Dataset:
-    """The folder of a campaign: ``campaign.yaml`` and ``scenario.yaml`` say what is flown,
-    ``flights/*.parquet`` has a row for each flight.
+    """The folder of a campaign.
+
+    ``campaign.yaml`` and ``scenario.yaml`` describe the flights, ``flights/*.parquet`` have a row
+    for each.
 
     Parameters
     ----------
     folder
-        The path of the folder.
+        Path of the folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -57,17 +59,17 @@ class Dataset:
         self._schema: Any = None
         self._part = 0
         self._descriptor = -1
-        """Of the folder, locked while this process flies into it."""
+        """Descriptor of the folder, locked while this process writes into it."""
 
-    # -- what it is of ------------------------------------------------------------------------
+    # -- description --------------------------------------------------------------------------
 
     def begin(self, campaign: Campaign) -> set[int]:
-        """Make the folder, or go on in it; return the numbers of the flights that are in it.
+        """Make the folder or resume it; return the numbers of the flights that it has.
 
         Raises
         ------
         ParameterError
-            It holds another campaign, another process flies into it, or a file in it is damaged.
+            It holds another campaign, another process writes into it, or a file in it is damaged.
         RecordingError
             It cannot be written.
         SpaceRobotError
@@ -82,7 +84,7 @@ class Dataset:
             (self.folder / _FLIGHTS).mkdir(parents=True, exist_ok=True)
             self._lock()
             for left in (self.folder / _FLIGHTS).glob(".*"):
-                left.unlink()  # What was being written when an earlier process ended.
+                left.unlink()  # An earlier process was killed while it wrote this.
             done = self.done()
             self._describe(campaign, max([campaign.flights, *(number + 1 for number in done)]))
             return done
@@ -94,21 +96,21 @@ class Dataset:
             raise
 
     def _require_same(self, campaign: Campaign) -> None:
-        """Refuse to go on with another campaign; the sentence says in what it differs."""
+        """Refuse another campaign than the one in the folder; the message names the differences."""
         facts = self._facts()
         if facts["fingerprint"] == _fingerprint(campaign):
             return
         known, wanted = _drawn_from(self.campaign()), _drawn_from(campaign)
         differing = [key for key in {**known, **wanted} if known.get(key) != wanted.get(key)]
-        what = " and ".join(f"another '{key}'" for key in differing)
-        what = what or "another scenario, or other parameters of it"
+        difference = " and ".join(f"another '{key}'" for key in differing)
+        difference = difference or "another scenario, or other parameters of it"
         raise ParameterError(
-            f"The folder {self.folder} holds another campaign: '{facts['name']}', with {what}. "
-            "Name another folder, or remove it."
+            f"The folder {self.folder} holds another campaign: '{facts['name']}', with "
+            f"{difference}. Name another folder, or remove it."
         )
 
     def _require_nothing_else(self) -> None:
-        """Refuse a folder with other things; what an earlier process was about to begin is none."""
+        """Refuse a folder with other files than those of a campaign that was about to begin."""
         if not self.folder.exists():
             return
         if not self.folder.is_dir():
@@ -121,9 +123,9 @@ class Dataset:
             )
 
     def _describe(self, campaign: Campaign, flights: int) -> None:
-        """Write what is flown; what makes the folder one of a campaign comes last.
+        """Write the files that describe the campaign; the last one marks the folder as complete.
 
-        ``flights``: how many there are to be, or were to be before.
+        ``flights``: the largest number of flights that was ever asked for.
         """
         section = {**campaign.section, "scenario": _SCENARIO, "flights": flights}
         for key in ("set", "method"):
@@ -140,18 +142,18 @@ class Dataset:
         self._write(_ABOUT, json.dumps(facts, indent=1))
 
     def _write(self, name: str, text: str) -> None:
-        """Replace a file as a whole or not at all: a full disk costs nothing that is there."""
+        """Replace a file as a whole or not at all: a full disk does not damage it."""
         path, new = self.folder / name, self.folder / f".{name}"
         new.write_text(text, encoding="utf-8")
         os.replace(new, path)
 
     def _lock(self) -> None:
-        """Keep other processes from flying into this folder; the lock goes with this one.
+        """Lock the folder against other processes, until this process ends.
 
         Raises
         ------
         ParameterError
-            Another process flies into it.
+            Another process has locked it.
         """
         descriptor = os.open(self.folder / _FLIGHTS, os.O_RDONLY | os.O_CLOEXEC)
         try:
@@ -173,7 +175,7 @@ class Dataset:
                 self._descriptor = -1
 
     def campaign(self) -> Campaign:
-        """Return the campaign that the folder is of.
+        """Return the campaign of the folder.
 
         Raises
         ------
@@ -323,14 +325,14 @@ def _record(row: Row) -> dict[str, Any]:
 
 
 def _fingerprint(campaign: Campaign) -> str:
-    """Return a hash that two campaigns share whose draws of one number are the same flight."""
+    """Return a hash, equal for campaigns whose draws of one number are the same flight."""
     text = json.dumps(_drawn_from(campaign), sort_keys=True, default=str)
     flown = scenario_text(self_contained(campaign).scenario)
     return hashlib.sha256(f"{text}{flown}".encode()).hexdigest()
 
 
 def _drawn_from(campaign: Campaign) -> dict[str, Any]:
-    """Return what, beside the scenario, the rows of a campaign follow from, by its key."""
+    """Return the settings that determine the rows of a campaign, beside the scenario."""
     own = {"flights", "engine", "description", "scenario", "set", "method"}
     section = {key: value for key, value in campaign.section.items() if key not in own}
     section |= {"seed": campaign.seed, "sampler": campaign.sampler, "longest": campaign.longest}
@@ -340,7 +342,7 @@ def _drawn_from(campaign: Campaign) -> dict[str, Any]:
 
 
 def self_contained(campaign: Campaign) -> Campaign:
-    """Return the campaign with robots as texts where they are files, which others do not have."""
+    """Return the campaign with the texts of its robots in place of files, for other machines."""
     scenario = campaign.scenario
     for node in ("plant", *scenario.commanders):
         config = scenario.config(node)

@@ -1,4 +1,4 @@
-"""The draws of a campaign: which values each flight has.
+"""Draws of a campaign: the random values of each flight.
 
 A draw is known by its number alone: it depends neither on the number of workers nor on the order in
 which flights end, and with the samplers ``random``, ``sobol`` and ``halton`` not on the number of
@@ -7,8 +7,9 @@ flights.
 
 from __future__ import annotations
 
+import importlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,15 +17,14 @@ import numpy as np
 
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.targets import DrawnFlight
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model.description import Array
 
 _SMALLEST = 1e-12
 """Least distance of shares from 0 and 1, where many distributions are infinite."""
 
-
 _BLOCK = 256
-"""Draws that are made at once."""
+"""Number of draws that are made together."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class Draws:
         self._block, self._made = -1, list[Draw]()
         """The block of draws that was made last."""
         self.shares = self._spread()
-        """(N, D) the shares of the distributions below the values; None with the sampler
-        ``random``, with which each flight draws from a generator of its own."""
+        """(N, D) cumulative probabilities of the values; None with the sampler ``random``, with
+        which each flight draws from a generator of its own."""
 
     def __len__(self) -> int:
         return self._campaign.flights if self.shares is None else len(self.shares)
@@ -76,10 +76,10 @@ class Draws:
         return self._made[place]
 
     def _drawn(self, first: int) -> list[Draw]:
-        """Return the draws of a block, whose values are computed at once.
+        """Return the draws of a block, whose values are computed together.
 
-        The block is whole even where the campaign ends within it: what a value is does not depend
-        on how many there are.
+        The block is whole even where the campaign ends within it: values do not depend on the
+        number of flights.
         """
         campaign = self._campaign
         numbers = range(first, first + _BLOCK)
@@ -127,8 +127,6 @@ class Draws:
         return np.asarray(engine.random(campaign.flights))
 
     def _saltelli(self, size: int) -> Array:
-        from spacerobot_ros.campaign.extras import salib, sobol_problem
-
         base = self._campaign.flights // (size + 2)
         if base < 2:
             raise ParameterError(
@@ -143,14 +141,14 @@ class Draws:
 
 
 def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = None) -> DrawnFlight:
-    """Return the flight of a draw; ``common`` is what :meth:`.DrawnFlight.of` has of the scenario.
+    """Return the flight of a draw; ``common`` is :meth:`.DrawnFlight.of` of the scenario, if known.
 
     Raises
     ------
     ParameterError
         A parameter refuses its value.
     RobotDescriptionError
-        No body weighs what was drawn.
+        A drawn mass or inertia is not that of a body.
     """
     flight = common or DrawnFlight.of(campaign.scenario)
     flight = replace(
@@ -159,9 +157,39 @@ def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = No
     for dispersion in campaign.dispersions:
         value = draw.values[dispersion.name]
         if not dispersion.target.text and not math.isfinite(value):
-            raise ParameterError(f"What was drawn of '{dispersion.name}' is {value}.")
+            raise ParameterError(f"The value drawn for '{dispersion.name}' is {value}.")
         flight = dispersion.target.apply(flight, value)
     inertial = flight.inertial
     if inertial is not None:
         inertial.require_physical([body.name for body in flight.nominal.bodies])
     return flight
+
+
+def needed(module: str) -> Any:
+    """Return a module of the extra ``campaign``.
+
+    Raises
+    ------
+    SpaceRobotError
+        It is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        name = module.partition(".")[0]
+        raise SpaceRobotError(
+            f"Campaigns need {name}, which is not installed: "
+            "pip install 'spacerobot_ros[campaign]'."
+        ) from None
+
+
+def salib(module: str) -> Any:
+    """Return a module of SALib; see :func:`needed`."""
+    return needed(f"SALib.{module}")
+
+
+def sobol_problem(names: Sequence[str]) -> dict[str, Any]:
+    """Return the problem definition of SALib: quantities of these names, from 0 to 1."""
+    # An array, because SALib 1.5 passes the names to pandas, and pandas 3 takes no list.
+    listed = np.array(list(names), dtype=object)
+    return {"num_vars": len(listed), "names": listed, "bounds": [[0, 1]] * len(listed)}

@@ -1,58 +1,28 @@
-"""Flies the draws of a campaign, here or on a cluster, and writes a row for each."""
+"""Runs a campaign into its dataset, and flies single flights of it again through the ROS stack."""
 
 from __future__ import annotations
 
-import logging
 import math
-import os
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
-from importlib.util import find_spec
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from spacerobot_ros.campaign.config import Campaign, parse_campaign
-from spacerobot_ros.campaign.dataset import Dataset, self_contained
-from spacerobot_ros.campaign.draws import Draw, Draws
+from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.dataset import Dataset
+from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight
 from spacerobot_ros.campaign.engines import chosen_engine, engine_called, fly_all
-from spacerobot_ros.campaign.extras import needed
-from spacerobot_ros.campaign.rows import FLIGHTS, Fallback, Row
-from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.files import warn_once
-from spacerobot_ros.version import __version__
-
-TASK_TIME = 2.0
-"""Wall s that a task shall take: the work of the scheduler for one is then small beside it."""
-
-_FIRST, _MOST = 4, 2000
-"""Numbers of flights in the first tasks, and in the largest."""
-
-_AHEAD = 2
-"""Tasks for each worker that are submitted before its present one ends, that one included."""
-
-_MOST_DEATHS = 2
-"""Workers that may die during a flight before it is reported and not flown again."""
-
-_PACKAGE = "spacerobot_ros"
-
-_LOOK_PERIOD = 0.2
-"""Longest wall s between two looks at tasks, signals and the dataset."""
-
-_ALONE = 5.0
-"""Wall s without a worker before a warning says so."""
-
-KILLED = "killed"
-"""The outcome of a flight during which a worker died twice."""
+from spacerobot_ros.campaign.rows import LANES, Row
+from spacerobot_ros.campaign.workers import THIS_PROCESS, Cluster, Distribution, workers_of
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.flight.reading import read_run
+from spacerobot_ros.measures import Outcome
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a campaign is.
+    """Progress of a campaign.
 
     Attributes
     ----------
@@ -75,32 +45,16 @@ class Progress:
         return (self.total - self.done) / self.rate if self.rate else float("inf")
 
 
-@dataclass(frozen=True)
-class Cluster:
-    """Where flights are flown.
-
-    Attributes
-    ----------
-    workers
-        Processes on this machine; 0: this process alone.
-    scheduler
-        Address of a scheduler of dask.distributed whose workers fly; empty: those of this machine.
-    """
-
-    workers: int = 0
-    scheduler: str = ""
-
-
 def run_campaign(
     campaign: Campaign,
     folder: Path,
     *,
     engine: str = "auto",
-    cluster: Cluster = Cluster(),
+    cluster: Cluster = THIS_PROCESS,
     show: Callable[[Progress], None] = lambda progress: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Progress:
-    """Fly every draw of a campaign that is not in its folder yet.
+    """Fly all draws of a campaign whose rows are not in its folder yet.
 
     Parameters
     ----------
@@ -115,8 +69,7 @@ def run_campaign(
     show
         Receives the progress after each task, and a few times a second.
     stopped
-        Returns whether to end; called a few times a second. Rows of flights that have ended are
-        kept.
+        Returns whether to end; called a few times a second. Finished flights are kept.
 
     Returns
     -------
@@ -161,20 +114,19 @@ def _rows(
     cluster: Cluster,
     stopped: Callable[[], bool],
 ) -> Iterator[list[Row]]:
-    """Yield the rows of draws as they are flown; none now and then, where others fly them."""
+    """Yield the rows of draws as they are flown, and empty lists while workers fly."""
     if not numbers:
         return
     if not cluster.workers and not cluster.scheduler:
         for row in fly_all(engine_called(engine), campaign, _Chosen(draws, numbers), stopped):
             yield [row]
         return
-    specification = _Specification(self_contained(campaign))
-    with _client(cluster, len(numbers)) as client:
-        yield from _Distribution(client, specification, draws, engine, stopped).rows(numbers)
+    with workers_of(cluster, len(numbers)) as workers:
+        yield from Distribution(workers, campaign, draws, engine, stopped).rows(numbers)
 
 
 class _Chosen(Sequence[Draw]):
-    """Some draws by their place in a list of numbers, each made when it is used."""
+    """The draws of a list of numbers, each made when it is used."""
 
     def __init__(self, draws: Draws, numbers: list[int]) -> None:
         self._draws, self._numbers = draws, numbers
@@ -188,327 +140,132 @@ class _Chosen(Sequence[Draw]):
         return self._draws[self._numbers[index]]
 
 
-# -- what a worker does -----------------------------------------------------------------------
-
-
-class _Specification:
-    """A campaign as it is sent to workers: the content of its file and its scenario."""
-
-    def __init__(self, campaign: Campaign) -> None:
-        self.name, self.section = campaign.name, dict(campaign.section)
-        self.scenario = campaign.scenario
-        self.version = __version__
-        self.key = os.urandom(8).hex()
-
-    def campaign(self) -> Campaign:
-        """Return the campaign, parsed once in each process."""
-        return _parsed(self)
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Specification) and other.key == self.key
-
-
-@lru_cache(maxsize=4)
-def _parsed(specification: _Specification) -> Campaign:
-    return parse_campaign(
-        specification.name, specification.section, scenario=specification.scenario
-    )
-
-
-def fly_task(
-    specification: _Specification, draws: list[Draw], engine: str, *, all_of_them: bool = False
-) -> list[Row | Fallback]:
-    """Fly some draws in a worker: a task of the scheduler.
-
-    Parameters
-    ----------
-    specification, draws, engine
-        What is flown by what.
-    all_of_them
-        What the engine leaves is flown here, too.
-
-    Raises
-    ------
-    SpaceRobotError
-        The worker has another version of this package.
-    """
-    if specification.version != __version__:
-        raise SpaceRobotError(
-            f"A worker has spacerobot_ros {__version__}, and this process {specification.version}: "
-            "all need the same."
-        )
-    flying, campaign = engine_called(engine), specification.campaign()
-    fly = partial(fly_all, flying) if all_of_them else flying.fly
-    return list(fly(campaign, draws, lambda: False))
-
-
-# -- the scheduler ----------------------------------------------------------------------------
-
-
-@contextmanager
-def _client(cluster: Cluster, flights: int) -> Iterator[Any]:
-    """Yield a client of dask.distributed, with workers on this machine unless there is a scheduler.
-
-    Raises
-    ------
-    SpaceRobotError
-        dask.distributed is not installed, or nobody is at the address.
-    """
-    needed("distributed")
-    import dask
-    from distributed import Client, LocalCluster
-
-    settings = {
-        "distributed.scheduler.allowed-failures": 0,  # Who is to blame is found out here.
-        "distributed.scheduler.worker-saturation": 1.0,
-        "distributed.worker.daemon": True,
-        "distributed.admin.tick.limit": "1h",
-        # Ctrl-C reaches the workers of a terminal, too: this process ends them.
-        "distributed.worker.preload": [
-            "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n"
-        ],
-    }
-    with dask.config.set(settings):
-        if cluster.scheduler:
-            # A sentence says what its tracebacks would.
-            logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
-            try:
-                client = Client(cluster.scheduler, timeout="20s")
-            except (OSError, TimeoutError, ValueError) as error:
-                raise SpaceRobotError(
-                    f"There is no scheduler at {cluster.scheduler}: {error}."
-                ) from error
-            with client:
-                yield client
-            return
-        # Compilers and linear algebra of several workers would fight for the cores.
-        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-        with (
-            LocalCluster(
-                n_workers=min(cluster.workers, max(1, flights)),
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                # Without an address they would listen to the whole network, on port 8787.
-                dashboard_address="127.0.0.1:0",
-                worker_dashboard_address="127.0.0.1:0",
-                memory_limit=_memory(cluster.workers),
-                env=threads,
-                silence_logs=50,
-            ) as workers,
-            Client(workers) as client,
-        ):
-            yield client
-
-
-def _memory(workers: int) -> int:
-    """Return the memory of a worker, bytes: of this machine half, shared by all of them."""
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return max(512 * 2**20, total // (2 * max(1, workers)))
-
-
-def _lost() -> SpaceRobotError:
-    return SpaceRobotError(
-        "The scheduler is gone. What was flown is kept: the same command goes on from there."
-    )
+TOLERANCE = 1e-9
+"""Largest deviation of equal flights, absolute below 1 (SI units) and relative above."""
 
 
 @dataclass(frozen=True)
-class _Task:
-    """Draws that a worker flies now, by number, and the engine that flies them."""
+class Rerun:
+    """A repeated flight, compared with its row in the dataset.
 
-    numbers: list[int]
-    engine: str
-
-
-class _Distribution:
-    """Deals draws out to workers.
-
-    What an engine leaves to the engine ``flights`` is dealt out anew, in tasks of fewer flights.
-
-    When a worker dies, the scheduler reports all tasks that it had: the one that killed it, and
-    others. Their flights are suspects: each is flown again in a task of its own, one suspect at a
-    time. If a worker dies during such a task, its flight has killed two workers, and is reported.
+    Attributes
+    ----------
+    row
+        The row of the repeated flight.
+    deviation
+        Largest deviation of a metric; None: the dataset does not have the flight.
+    at
+        The name of that metric.
+    outcome
+        Outcome in the dataset; empty: the dataset does not have the flight.
+    bag
+        Path of the bag.
+    note
+        Reason why the metrics may differ from the dataset; empty: they must not.
     """
 
-    def __init__(
-        self,
-        client: Any,
-        specification: _Specification,
-        draws: Draws,
-        engine: str,
-        stopped: Callable[[], bool],
-    ) -> None:
-        self._client, self._specification, self._draws = client, specification, draws
-        self._engine, self._stopped = engine, stopped
-        self._sizes = {
-            name: float(max(_FIRST, engine_called(name).least)) for name in (engine, FLIGHTS)
-        }
-        """Flights of a task, by what flies it."""
-        self._left: deque[int] = deque()
-        """Draws that the engine has left to the engine ``flights``."""
-        self._reasons: dict[int, str] = {}
-        """Why it has left each of them."""
-        self._running: dict[Any, _Task] = {}
-        self._suspects: deque[int] = deque()
-        self._deaths: Counter[int] = Counter()
-        self._fit: set[str] = set()
-        """Addresses of workers that have this package."""
-        self._alone_since = math.inf
-        """When it was seen that there is no worker, on the monotonic clock."""
-        self._suspected: Any = None
-        """The task of the suspect that is flown now."""
+    row: Row
+    deviation: float | None
+    at: str
+    outcome: str
+    bag: Path
+    note: str = ""
 
-    def rows(self, numbers: list[int]) -> Iterator[list[Row]]:
-        """Yield the rows of these draws as their tasks end."""
-        waiting = deque(numbers)
-        while (waiting or self._left or self._suspects or self._running) and not self._stopped():
-            self._submit(waiting)
-            ended = self._ended()
-            if not ended:
-                yield []
-            for future in ended:
-                yield self._taken(future)
-        if self._running:
-            self._client.cancel(list(self._running), force=True)
+    @property
+    def same(self) -> bool:
+        """Whether the metrics agree with the dataset, or cannot be compared with it."""
+        if self.deviation is None or self.note:
+            return True
+        return self.outcome == self.row.outcome and self.deviation <= TOLERANCE
 
-    def _submit(self, waiting: deque[int]) -> None:
-        """Keep the workers busy."""
-        if self._suspects and self._suspected is None:
-            self._suspected = self._task([self._suspects.popleft()], self._engine, alone=True)
-        workers = self._workers()
-        while (self._left or waiting) and len(self._running) < _AHEAD * workers:
-            queue, engine = (self._left, FLIGHTS) if self._left else (waiting, self._engine)
-            # The last tasks are smaller, so that no worker is alone at the end.
-            share = max(engine_called(engine).least, len(queue) / workers)
-            count = min(len(queue), max(1, round(min(self._sizes[engine], share))))
-            self._task([queue.popleft() for _ in range(count)], engine)
-
-    def _workers(self) -> int:
-        """Return how many workers there are, at least one: others may join later.
-
-        Raises
-        ------
-        SpaceRobotError
-            The scheduler is gone.
-        """
-        try:
-            if self._client.status != "running":
-                raise _lost()
-            threads = self._client.nthreads()
-            self._require_package(threads)
-        except (OSError, AttributeError) as error:  # The client was about to notice it.
-            raise _lost() from error
-        workers = sum(threads.values())
-        if workers:
-            self._alone_since = math.inf
-        elif time.monotonic() - self._alone_since > _ALONE:
-            warn_once("The scheduler has no worker: the flights wait for one.")
-        elif self._alone_since == math.inf:
-            self._alone_since = time.monotonic()
-        return max(1, workers)
-
-    def _require_package(self, workers: Iterable[str]) -> None:
-        """Refuse workers without this package, which a task would end again and again.
-
-        Raises
-        ------
-        SpaceRobotError
-            One that has joined has not got it.
-        """
-        joined = [address for address in workers if address not in self._fit]
-        if not joined:
-            return
-        # A function of the standard library, which every worker can load.
-        found = self._client.run(find_spec, _PACKAGE, workers=joined, on_error="return")
-        for address, spec in found.items():
-            if spec is None:
-                raise SpaceRobotError(
-                    f"The worker at {address} has no {_PACKAGE}: install it there."
-                )
-            if not isinstance(spec, Exception):  # It may be gone again.
-                self._fit.add(address)
-
-    def _task(self, numbers: list[int], engine: str, *, alone: bool = False) -> Any:
-        draws = [self._draws[number] for number in numbers]
-        future = self._client.submit(
-            *(fly_task, self._specification, draws, engine),
-            **{"all_of_them": alone, "pure": False, "retries": 0},
+    @property
+    def lines(self) -> list[str]:
+        """Lines of text for the user."""
+        row = self.row
+        drawn = ", ".join(
+            f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}"
+            for name, value in row.draw.values.items()
         )
-        self._running[future] = _Task(numbers, engine)
-        return future
-
-    def _ended(self) -> list[Any]:
-        """Return tasks that have ended, after a while none if there are none."""
-        from distributed import wait
-
-        try:
-            wait(list(self._running), timeout=_LOOK_PERIOD, return_when="FIRST_COMPLETED")
-        except TimeoutError:
-            return []
-        except CancelledError as error:
-            raise _lost() from error
-        return [future for future in self._running if future.done()]
-
-    def _taken(self, future: Any) -> list[Row]:
-        """Return the rows of a task; none where its worker died.
-
-        Raises
-        ------
-        SpaceRobotError
-            The scheduler is gone, or a worker cannot fly at all.
-        """
-        from distributed.scheduler import KilledWorker
-
-        task = self._running.pop(future)
-        alone = future is self._suspected
-        if alone:
-            self._suspected = None
-        try:
-            made: list[Row | Fallback] = future.result()
-        except KilledWorker:
-            return self._mourned(task.numbers, alone)
-        except CancelledError as error:
-            raise _lost() from error
-        except (ImportError, RuntimeError) as error:
-            # So dask.distributed calls what the scheduler cannot load.
-            if isinstance(error, RuntimeError) and "deserialization" not in str(error):
-                raise
-            raise SpaceRobotError(
-                "The scheduler or a worker cannot load what flies "
-                f"({str(error).splitlines()[0]}): all of them need {_PACKAGE}[campaign] "
-                f"{__version__}."
-            ) from error
-        rows = [each for each in made if isinstance(each, Row)]
-        left = [each for each in made if isinstance(each, Fallback)]
-        self._left += [each.draw.number for each in left]
-        self._reasons |= {each.draw.number: each.reason for each in left}
-        if not alone and rows:
-            took = sum(row.wall_time for row in rows if row.wall_time == row.wall_time)
-            if took > 0:
-                size = 0.5 * self._sizes[task.engine] + 0.5 * len(rows) * TASK_TIME / took
-                least = engine_called(task.engine).least
-                self._sizes[task.engine] = max(least, min(_MOST, size))
-        return [
-            replace(row, fallback=self._reasons[number])
-            if (number := row.draw.number) in self._reasons
-            else row
-            for row in rows
+        lines = [
+            f"flight {row.draw.number}: {row.outcome}. {row.reason}",
+            f"drawn       {drawn or 'nothing'}; seed {row.draw.seed}",
+            f"bag         {self.bag}",
         ]
+        if self.deviation is not None:
+            where = f" ({self.at})" if self.at else ""
+            deviation = f"largest deviation {self.deviation:.2g}{where}"
+            lines.append(f"dataset     {self.outcome}; {deviation}")
+        else:
+            lines.append("dataset     has no such flight yet")
+        if self.note:
+            lines.append(self.note)
+        return lines
 
-    def _mourned(self, numbers: list[int], alone: bool) -> list[Row]:
-        """Make suspects of the flights of a task whose worker died; return rows of the guilty."""
-        given_up = []
-        for number in numbers:
-            if alone or not self._deaths[number]:
-                self._deaths[number] += 1
-            if self._deaths[number] >= _MOST_DEATHS:
-                reason = f"The process that flew it died {_MOST_DEATHS} times."
-                row = Row(self._draws[number], KILLED, reason, engine=self._engine)
-                given_up.append(row)
-            else:
-                self._suspects.append(number)
-        return given_up
+
+def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
+    """Fly one draw of a campaign through the ROS stack.
+
+    Raises
+    ------
+    ParameterError
+        The folder holds no campaign, or it has no such flight.
+    SpaceRobotError
+        The drawn values are refused, or the bag cannot be written.
+    """
+    from spacerobot_ros.session.run import run_scenario  # Loads ROS.
+
+    dataset = Dataset(folder)
+    campaign = dataset.campaign()
+    draws = Draws(campaign)
+    if number >= len(draws):
+        raise ParameterError(
+            f"The campaign in {folder} has {len(draws)} flights, 0 to {len(draws) - 1}, and no "
+            f"flight {number}."
+        )
+    draw = draws[number]
+    scenario = drawn_flight(campaign, draw).finished().scenario
+    run_scenario(scenario, bag, longest=campaign.longest)
+    row = Row.of(campaign, draw, read_run(bag).measures, "ros")
+    known = known_flight(dataset, campaign, number)
+    if known is None:
+        return Rerun(row, None, "", "", bag)
+    outcome, engine, metrics = known
+    deviation, at = largest_deviation(metrics, row.metrics)
+    note = ""
+    if engine == LANES and campaign.scenario.plant.thrusters:
+        note = "It was flown in lanes: thrusters that are on or off multiply rounding."
+    elif outcome == Outcome.INTERRUPTED.value:
+        note = "It was interrupted: the stack flies on for up to a fifth of a second of wall time."
+    return Rerun(row, deviation, at, outcome, bag, note)
+
+
+def known_flight(
+    dataset: Dataset, campaign: Campaign, number: int
+) -> tuple[str, str, dict[str, float]] | None:
+    """Return outcome, engine and metrics of a flight in a dataset; None: it is not there."""
+    if number not in dataset.done():
+        return None
+    table = dataset.table()
+    (record,) = [row for row in table.to_pylist() if row["flight"] == number]
+    names = [
+        name
+        for name in table.column_names
+        if isinstance(record[name], float) and not name.startswith(("draw.", "wall_", "plan_"))
+    ]
+    return record["outcome"], record["engine"], {name: record[name] for name in names}
+
+
+def largest_deviation(
+    expected: Mapping[str, float], found: Mapping[str, float]
+) -> tuple[float, str]:
+    """Return the largest deviation of a metric (relative above 1) and the metric's name."""
+    largest, at = 0.0, ""
+    for name, value in expected.items():
+        other = found.get(name, math.nan)
+        if math.isnan(value) and math.isnan(other):
+            continue
+        deviation = abs(value - other) / max(1.0, abs(value)) if value != other else 0.0
+        deviation = math.inf if math.isnan(deviation) else deviation
+        if deviation > largest:
+            largest, at = deviation, name
+    return largest, at

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.campaign.extras import salib, sobol_problem
+from spacerobot_ros.campaign.draws import salib, sobol_problem
 from spacerobot_ros.model.description import Array
 
 Flags = npt.NDArray[np.bool_]

@@ -16,7 +16,8 @@ from spacerobot_ros.cli.options import PATH, DefaultGroup, bag_option, out_optio
 from spacerobot_ros.errors import ParameterError
 
 if TYPE_CHECKING:
-    from spacerobot_ros.campaign.running import Cluster, Progress
+    from spacerobot_ros.campaign.running import Progress
+    from spacerobot_ros.campaign.workers import Cluster
 
 _ENGINES = ("auto", "lanes", "flights", "ros")
 
@@ -91,7 +92,7 @@ def fly(
     A campaign that was interrupted is continued. Exit code 0: all flights were flown; 2: bad input;
     130: Ctrl-C, the flights so far are kept.
     """
-    from spacerobot_ros.campaign.running import Cluster
+    from spacerobot_ros.campaign.workers import Cluster
 
     cluster = Cluster(0 if scheduler else workers, scheduler)
     if compare:
@@ -124,7 +125,7 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
     Exit code 0: it is the flight of the dataset; 1: it is another one; 2: bad input.
     """
     from spacerobot_ros.bag import free_name
-    from spacerobot_ros.campaign.rerunning import rerun_flight
+    from spacerobot_ros.campaign.running import rerun_flight
 
     path = bag or free_name(folder / f"flight_{number}.mcap")
     result = rerun_flight(folder, number, path)

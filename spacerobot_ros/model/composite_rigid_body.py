@@ -43,10 +43,21 @@ import casadi as ca
 
 from spacerobot_ros.model.compilation import dense_function
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.dynamics import inertia_matrix
 from spacerobot_ros.model.inertial_parameters import rotational, symmetric
 from spacerobot_ros.model.kinematics import TreeKinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
+
+
+def inertia_matrix(mass: float | ca.SX, D: ca.SX, D_q: ca.SX, D_qq: ca.SX) -> ca.SX:
+    """Return ``H+`` (6 + n, 6 + n) from its blocks, eq. (15)."""
+    n = D_qq.shape[0]
+    return ca.blockcat(
+        [
+            [mass * ca.SX.eye(3), ca.SX(3, 3), ca.SX(3, n)],
+            [ca.SX(3, 3), D, D_q],
+            [ca.SX(n, 3), D_q.T, D_qq],
+        ]
+    )
 
 
 @dataclass(frozen=True)

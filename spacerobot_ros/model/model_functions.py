@@ -32,13 +32,16 @@ from spacerobot_ros.model.composite_rigid_body import (
     state_rate,
     state_slices,
 )
-from spacerobot_ros.model.connection import base_twist, connection, curvature, momentum_of_bodies
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.dynamics import (
     barycentric_inertia,
+    base_twist,
     bias,
+    connection,
+    curvature,
     forward_dynamics,
     generalised_forces,
+    momentum_of_bodies,
     point_jacobian,
 )
 from spacerobot_ros.model.inertial_parameters import (

@@ -19,9 +19,10 @@ import yaml
 from support.awaited import await_files
 from support.campaigns import campaign, section
 
-from spacerobot_ros.campaign import running
 from spacerobot_ros.campaign.dataset import Dataset
-from spacerobot_ros.campaign.running import Cluster, _client, run_campaign
+from spacerobot_ros.campaign.draws import Draws
+from spacerobot_ros.campaign.running import run_campaign
+from spacerobot_ros.campaign.workers import Cluster, Distribution, Specification, workers_of
 
 pytestmark = pytest.mark.slow
 
@@ -119,8 +120,8 @@ def test_a_scheduler_that_goes_away_is_said_and_takes_no_flight_with_it(tmp_path
                 scheduler.kill()
                 assert run.process.wait(timeout=_LONGEST) == 2
                 assert run.log.read_text() == (
-                    "The scheduler is gone. What was flown is kept: the same command goes on from "
-                    "there.\n"
+                    "The scheduler is gone. Finished flights are kept: the same command goes on "
+                    "from there.\n"
                 )
     found = rows(out)
     assert {row["outcome"] for row in found} == {"reached"}
@@ -197,17 +198,32 @@ def test_a_flight_that_kills_its_worker_twice_is_reported(tmp_path: Path) -> Non
     assert found[7]["reason"] == "The process that flew it died 2 times."
 
 
-def test_only_this_machine_can_reach_the_workers() -> None:
-    with _client(Cluster(workers=1), 1):
-        here = psutil.Process()
-        listening = [
-            connection.laddr.ip
+def test_workers_of_this_machine_listen_nowhere() -> None:
+    """No user of this machine can send them code: neither they nor this process have a port."""
+    here = psutil.Process()
+
+    def listening() -> list[Any]:
+        return [
+            connection.laddr
             for process in [here, *here.children(recursive=True)]
-            for connection in process.net_connections()
+            for connection in process.net_connections("all")
             if connection.status == psutil.CONN_LISTEN
+            or (connection.laddr and not connection.raddr)
         ]
-    assert len(listening) >= 3
-    assert set(listening) == {"127.0.0.1"}
+
+    before = listening()
+    specification = Specification(campaign(**{**GIVEN, "flights": 2}))
+    with workers_of(Cluster(workers=2), 2) as workers:
+        tasks = [
+            workers.submit(specification, [draw], "flights", all_of_them=True)
+            for draw in Draws(specification.campaign())
+        ]
+        ended: list[Any] = []
+        while len(ended) < len(tasks):
+            ended = workers.ended(tasks)
+        assert [workers.result(task)[0].draw.number for task in tasks] == [0, 1]
+        assert len(here.children()) >= 2
+        assert listening() == before
 
 
 def test_what_was_flown_is_kept_after_ctrl_c(tmp_path: Path) -> None:
@@ -224,6 +240,19 @@ def test_what_was_flown_is_kept_after_ctrl_c(tmp_path: Path) -> None:
     assert (out / "report.html").exists()
 
 
+def test_workers_end_with_a_campaign_that_is_killed(tmp_path: Path) -> None:
+    file, out = tmp_path / "many.yaml", tmp_path / "out"
+    file.write_text(yaml.safe_dump({"campaign": section(**GIVEN)}))
+    command = ("spacerobot_ros", "campaign", str(file), "--out", str(out), "--workers", "2")
+    with started(tmp_path, *command) as run:
+        until(out, 8, run)
+        workers = psutil.Process(run.process.pid).children(recursive=True)
+        assert len(workers) >= 2
+        run.kill()
+        _, alive = psutil.wait_procs(workers, timeout=60.0)
+    assert not alive
+
+
 def test_what_lanes_leave_is_flown_in_small_tasks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -233,13 +262,13 @@ def test_what_lanes_leave_is_flown_in_small_tasks(
         disperse={"mass.*": {"norm": {"loc": 1.0, "scale": 0.03}}}, flights=70, set=corrected
     )
     tasks: list[tuple[int, str]] = []
-    deal = running._Distribution._task
+    deal = Distribution._task
 
     def dealt(self: Any, numbers: list[int], engine: str, **options: Any) -> Any:
         tasks.append((len(numbers), engine))
         return deal(self, numbers, engine, **options)
 
-    monkeypatch.setattr(running._Distribution, "_task", dealt)
+    monkeypatch.setattr(Distribution, "_task", dealt)
     run_campaign(made, tmp_path / "here", engine="lanes")
     run_campaign(made, tmp_path / "there", engine="lanes", cluster=Cluster(workers=2))
     here, there = (

@@ -85,8 +85,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"criteria": {"position_eror_m": {"max": 1}}}, "no metric.*Did you mean 'position_error_m'"),
     ({"criteria": {"peak_rate.slider_9": {"max": 1}}}, "Did you mean 'peak_rate.slider_[123]'"),
     ({"criteria": {"duration_s": {"most": 1}}}, "must have 'min' or 'max'"),
-    ({"criteria": {"duration_s": {"min": 2, "max": 1}}}, "is met by nothing"),
-    ({"sampler": "saltelli"}, "needs something that is dispersed"),
+    ({"criteria": {"duration_s": {"min": 2, "max": 1}}}, "has min 2.0 above max 1.0"),
+    ({"sampler": "saltelli"}, "needs at least one dispersion"),
 ]
 
 

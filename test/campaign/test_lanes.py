@@ -15,9 +15,8 @@ from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.engines import chosen_engine, fly_all
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
-from spacerobot_ros.campaign.rerunning import TOLERANCE, largest_deviation
 from spacerobot_ros.campaign.rows import Row
-from spacerobot_ros.campaign.running import run_campaign
+from spacerobot_ros.campaign.running import TOLERANCE, largest_deviation, run_campaign
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.planning import Goal
 
@@ -169,7 +168,7 @@ def test_draws_that_are_no_robot_and_no_number_end_no_other_flight() -> None:
     lanes, _ = assert_same_flights(controlled(flights=6, disperse=nothing, longest=0.2))
     infinite = {"plant.sensors.seed": {"pareto": {"b": 0.001}}}
     lanes_of_none, _ = assert_same_flights(controlled(flights=4, disperse=infinite))
-    sentence = "What was drawn of 'plant.sensors.seed' is inf."
+    sentence = "The value drawn for 'plant.sensors.seed' is inf."
     assert sentence in {row.reason for row in lanes_of_none.values()}
     # Some are finite, and larger than a ROS parameter can be.
     assert any("a whole number of 64 bits" in row.reason for row in lanes_of_none.values())

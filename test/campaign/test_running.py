@@ -11,18 +11,23 @@ import pytest
 from click.testing import CliRunner
 from support.campaigns import campaign
 
-from spacerobot_ros.campaign import rerunning, running
+from spacerobot_ros.campaign import running, workers
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset
-from spacerobot_ros.campaign.draws import Draw, Draws
+from spacerobot_ros.campaign.draws import Draw, Draws, needed
 from spacerobot_ros.campaign.engines import fly_all
-from spacerobot_ros.campaign.extras import needed
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
 from spacerobot_ros.campaign.report import Results
-from spacerobot_ros.campaign.rerunning import TOLERANCE, Rerun, largest_deviation, rerun_flight
 from spacerobot_ros.campaign.rows import ERROR, Fallback, Row
-from spacerobot_ros.campaign.running import Progress, run_campaign
+from spacerobot_ros.campaign.running import (
+    TOLERANCE,
+    Progress,
+    Rerun,
+    largest_deviation,
+    rerun_flight,
+    run_campaign,
+)
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 
@@ -208,7 +213,7 @@ def test_a_flight_is_flown_again_as_often_as_one_likes(
         bag.touch()
         return Rerun(Row(Draw(number, 1, {}), "reached", "."), None, "", "", bag)
 
-    monkeypatch.setattr(rerunning, "rerun_flight", fly)
+    monkeypatch.setattr(running, "rerun_flight", fly)
     for _ in range(2):
         assert CliRunner().invoke(main, ["campaign", "rerun", str(tmp_path), "3"]).exit_code == 0
     assert [bag.name for bag in bags] == ["flight_3.mcap", "flight_3-1.mcap"]
@@ -216,20 +221,20 @@ def test_a_flight_is_flown_again_as_often_as_one_likes(
 
 def test_a_worker_of_another_version_flies_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     made = small(flights=1)
-    specification = running._Specification(made)
-    assert len(running.fly_task(specification, [_draw(made, 0)], "flights")) == 1
-    monkeypatch.setattr(running, "__version__", "9.9")
+    specification = workers.Specification(made)
+    assert len(workers.fly_task(specification, [_draw(made, 0)], "flights")) == 1
+    monkeypatch.setattr(workers, "__version__", "9.9")
     with pytest.raises(SpaceRobotError, match=r"A worker has spacerobot_ros 9\.9, and this"):
-        running.fly_task(specification, [_draw(made, 0)], "flights")
+        workers.fly_task(specification, [_draw(made, 0)], "flights")
 
 
 def test_a_task_of_lanes_leaves_what_others_fly_unless_all_of_it_is_asked_for() -> None:
     """What is flown at once is sent back before flights that take long."""
     settings = {"planner.attitude_tolerance": 0.002, "planner.max_corrections": 3}
     made = campaign(flights=8, set=settings, disperse={"mass.*": {"norm": [1.0, 0.03]}}, seed=8)
-    specification, draws = running._Specification(made), list(Draws(made))
-    part = running.fly_task(specification, draws, "lanes")
-    whole = running.fly_task(specification, draws, "lanes", all_of_them=True)
+    specification, draws = workers.Specification(made), list(Draws(made))
+    part = workers.fly_task(specification, draws, "lanes")
+    whole = workers.fly_task(specification, draws, "lanes", all_of_them=True)
     assert all(isinstance(each, Row) for each in whole)
     left = {each.draw.number: each.reason for each in part if isinstance(each, Fallback)}
     assert 0 < len(left) < 8

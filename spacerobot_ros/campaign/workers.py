@@ -1,0 +1,596 @@
+"""Workers of a campaign: processes of this machine behind pipes, or a cluster of dask.distributed.
+
+:func:`distributed_rows` gives the draws to the workers in tasks of about :data:`TASK_TIME`, and
+yields the rows as tasks end.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import multiprocessing
+import os
+import signal
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from importlib.util import find_spec
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from threading import Thread
+from typing import Any, Protocol
+
+from spacerobot_ros.campaign.config import Campaign, parse_campaign
+from spacerobot_ros.campaign.dataset import self_contained
+from spacerobot_ros.campaign.draws import Draw, Draws, needed
+from spacerobot_ros.campaign.engines import engine_called, fly_all
+from spacerobot_ros.campaign.rows import FLIGHTS, Fallback, Row
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.files import warn_once
+from spacerobot_ros.version import __version__
+
+TASK_TIME = 2.0
+"""Wall time that a task should take, s: the overhead of its distribution is small beside it."""
+
+_FIRST, _MOST = 4, 2000
+"""Numbers of flights in the first tasks, and in the largest."""
+
+_AHEAD = 2
+"""Tasks per worker that are submitted at a time, the running one included."""
+
+_MOST_DEATHS = 2
+"""Workers that may die during a flight; then it is reported as killed and not repeated."""
+
+_PACKAGE = "spacerobot_ros"
+
+_LOOK_PERIOD = 0.2
+"""Longest wall time between two looks at tasks, signals and the dataset, s."""
+
+_NO_WORKER_WARNING = 5.0
+"""Wall time without a worker after which a warning is printed, s."""
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+"""Environment variables for the number of threads of a worker."""
+
+KILLED = "killed"
+"""The outcome of a flight during which a worker died twice."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """The workers that fly a campaign.
+
+    Attributes
+    ----------
+    workers
+        Number of processes on this machine; 0: this process alone.
+    scheduler
+        Address of a scheduler of dask.distributed whose workers fly; empty: this machine.
+    """
+
+    workers: int = 0
+    scheduler: str = ""
+
+
+THIS_PROCESS = Cluster()
+
+
+# -- a task in a worker -----------------------------------------------------------------------
+
+
+class Specification:
+    """A campaign as it is sent to workers: the content of its file and its scenario."""
+
+    def __init__(self, campaign: Campaign) -> None:
+        self.name, self.section = campaign.name, dict(campaign.section)
+        self.scenario = campaign.scenario
+        self.version = __version__
+        self.key = os.urandom(8).hex()
+
+    def campaign(self) -> Campaign:
+        """Return the campaign, parsed once in each process."""
+        return _parsed(self)
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Specification) and other.key == self.key
+
+
+@lru_cache(maxsize=4)
+def _parsed(specification: Specification) -> Campaign:
+    return parse_campaign(
+        specification.name, specification.section, scenario=specification.scenario
+    )
+
+
+def fly_task(
+    specification: Specification, draws: list[Draw], engine: str, *, all_of_them: bool = False
+) -> list[Row | Fallback]:
+    """Fly some draws: a task of a worker.
+
+    Parameters
+    ----------
+    specification, draws, engine
+        Campaign, draws and name of the engine.
+    all_of_them
+        Fly the fallbacks of the engine in this task, too.
+
+    Raises
+    ------
+    SpaceRobotError
+        The worker has another version of this package.
+    """
+    if specification.version != __version__:
+        raise SpaceRobotError(
+            f"A worker has spacerobot_ros {__version__}, and this process {specification.version}: "
+            "all need the same."
+        )
+    flying, campaign = engine_called(engine), specification.campaign()
+    fly = partial(fly_all, flying) if all_of_them else flying.fly
+    return list(fly(campaign, draws, lambda: False))
+
+
+# -- workers ----------------------------------------------------------------------------------
+
+
+class WorkerDeath(Exception):  # noqa: N818
+    """A worker died during a task."""
+
+
+class Workers(Protocol):
+    """Processes that run :func:`fly_task`."""
+
+    def count(self) -> int:
+        """Return the number of workers, at least 1: others may join later."""
+
+    def submit(self, *task: Any, all_of_them: bool) -> Any:
+        """Queue a task with arguments of :func:`fly_task`; return a handle of it."""
+
+    def ended(self, tasks: list[Any]) -> list[Any]:
+        """Return those of the tasks that have ended, after a while also none."""
+
+    def result(self, task: Any) -> list[Row | Fallback]:
+        """Return the result of a task that has ended.
+
+        Raises
+        ------
+        WorkerDeath
+            The worker died.
+        SpaceRobotError
+            The workers cannot fly at all.
+        """
+
+    def cancel(self, tasks: list[Any]) -> None:
+        """Stop tasks that have not ended."""
+
+
+class _LocalTask:
+    """Arguments of :func:`fly_task`, and its result or exception once it has ended."""
+
+    def __init__(self, arguments: tuple[Any, ...], *, all_of_them: bool) -> None:
+        self.arguments, self.all_of_them = arguments, all_of_them
+        self.answer: Any = None
+        self.ended = False
+
+
+class _LocalWorker:
+    """A process that flies one task at a time."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, other = context.Pipe()
+        self.process = context.Process(target=_work, args=(other,), daemon=True)
+        self.task: _LocalTask | None = None
+        # Compilers and linear algebra of several workers would compete for the cores.
+        before = {name: os.environ.get(name) for name in _THREADS}
+        os.environ.update(dict.fromkeys(_THREADS, "1"))
+        # A worker never takes the Ctrl-C of a terminal: this process ends it. The resource tracker
+        # would unblock the signal when it starts.
+        resource_tracker.ensure_running()
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self.process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+            for name, value in before.items():
+                os.environ.pop(name)
+                if value is not None:
+                    os.environ[name] = value
+            other.close()
+
+    def begin(self, task: _LocalTask) -> None:
+        """Send a task to the process."""
+        self.task = task
+        with suppress(OSError):  # It has died since: the end of its pipe says so.
+            self.connection.send((task.arguments, task.all_of_them))
+
+    def finish(self) -> None:
+        """Receive the answer to the task."""
+        assert self.task is not None
+        try:
+            self.task.answer = self.connection.recv()
+        except (EOFError, OSError):
+            self.task.answer = WorkerDeath()
+            self.process.join()
+        self.task.ended, self.task = True, None
+
+    def close(self) -> None:
+        """End the process."""
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
+
+
+class LocalWorkers:
+    """Processes on this machine, each behind an anonymous pipe: nobody else can reach them.
+
+    Each has one task at a time, so a death has one cause. Together they may use half of the memory
+    of the machine; a worker that uses more than its share is killed.
+
+    Parameters
+    ----------
+    count
+        The number of processes.
+    """
+
+    def __init__(self, count: int) -> None:
+        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        self._memory = max(512 * 2**20, total // (2 * count))
+        self._queue: deque[_LocalTask] = deque()
+        self._workers = [_LocalWorker() for _ in range(count)]
+
+    def count(self) -> int:
+        """Return the number of workers."""
+        return len(self._workers)
+
+    def submit(self, *task: Any, all_of_them: bool) -> _LocalTask:
+        """Queue a task."""
+        made = _LocalTask(task, all_of_them=all_of_them)
+        self._queue.append(made)
+        self._assign()
+        return made
+
+    def ended(self, tasks: list[_LocalTask]) -> list[_LocalTask]:
+        """Return those of the tasks that have ended, after a while also none."""
+        busy = {worker.connection: worker for worker in self._workers if worker.task is not None}
+        for ready in wait(list(busy), timeout=_LOOK_PERIOD):
+            busy.pop(ready).finish()  # type: ignore[call-overload]
+        for worker in busy.values():
+            if _resident_bytes(worker.process.pid) > self._memory:
+                worker.process.kill()
+        self._assign()
+        return [task for task in tasks if task.ended]
+
+    def result(self, task: _LocalTask) -> list[Row | Fallback]:
+        """Return the result of a task that has ended, or raise its exception."""
+        if isinstance(task.answer, BaseException):
+            raise task.answer
+        result: list[Row | Fallback] = task.answer
+        return result
+
+    def cancel(self, tasks: list[_LocalTask]) -> None:
+        """Stop tasks: :meth:`close` ends the processes."""
+
+    def close(self) -> None:
+        """End the processes."""
+        for worker in self._workers:
+            worker.close()
+
+    def _assign(self) -> None:
+        """Send waiting tasks to idle workers."""
+        for place, worker in enumerate(self._workers):
+            if worker.task is None and self._queue:
+                if not worker.process.is_alive():
+                    worker.close()
+                    self._workers[place] = _LocalWorker()
+                self._workers[place].begin(self._queue.popleft())
+
+
+def _work(connection: Connection) -> None:
+    """Fly the tasks that come through a pipe until it is closed."""
+    Thread(target=_end_with_parent, daemon=True).start()
+    with suppress(EOFError, OSError):
+        while True:
+            arguments, all_of_them = connection.recv()
+            try:
+                answer: Any = fly_task(*arguments, all_of_them=all_of_them)
+            except Exception as error:  # Raised again in the parent.
+                answer = error
+            connection.send(answer)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _resident_bytes(process: int | None) -> int:
+    with suppress(OSError, ValueError, IndexError):
+        pages = Path(f"/proc/{process}/statm").read_text("ascii").split()[1]
+        return int(pages) * os.sysconf("SC_PAGE_SIZE")
+    return 0
+
+
+class DaskWorkers:
+    """Workers of a scheduler of dask.distributed.
+
+    A scheduler runs the code of anyone who reaches its port: only a private network or TLS
+    protects it.
+
+    Parameters
+    ----------
+    client
+        A client of dask.distributed.
+    """
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self._checked: set[str] = set()
+        """Addresses of workers that have this package."""
+        self._empty_since = math.inf
+        """Monotonic time since which the scheduler has no worker; infinite while it has."""
+
+    def count(self) -> int:
+        """Return the number of workers, at least 1: others may join later.
+
+        Raises
+        ------
+        SpaceRobotError
+            The scheduler is gone, or a worker does not have this package.
+        """
+        try:
+            if self._client.status != "running":
+                raise _lost()
+            threads = self._client.nthreads()
+            self._require_package(threads)
+        except (OSError, AttributeError) as error:  # The client was about to notice it.
+            raise _lost() from error
+        workers = sum(threads.values())
+        now = time.monotonic()
+        self._empty_since = math.inf if workers else min(self._empty_since, now)
+        if now - self._empty_since > _NO_WORKER_WARNING:
+            warn_once("The scheduler has no worker: the flights wait for one.")
+        return max(1, workers)
+
+    def submit(self, *task: Any, all_of_them: bool) -> Any:
+        """Queue a task."""
+        return self._client.submit(fly_task, *task, all_of_them=all_of_them, pure=False, retries=0)
+
+    def ended(self, tasks: list[Any]) -> list[Any]:
+        """Return those of the tasks that have ended, after a while also none."""
+        import distributed
+
+        try:
+            distributed.wait(tasks, timeout=_LOOK_PERIOD, return_when="FIRST_COMPLETED")
+        except TimeoutError:
+            return []
+        except CancelledError as error:
+            raise _lost() from error
+        return [task for task in tasks if task.done()]
+
+    def result(self, task: Any) -> list[Row | Fallback]:
+        """Return the result of a task that has ended; see :meth:`Workers.result`."""
+        from distributed.scheduler import KilledWorker
+
+        try:
+            made: list[Row | Fallback] = task.result()
+        except KilledWorker as error:
+            raise WorkerDeath from error
+        except CancelledError as error:
+            raise _lost() from error
+        except (ImportError, RuntimeError) as error:
+            # dask.distributed raises these for a task that cannot be loaded.
+            if isinstance(error, RuntimeError) and "deserialization" not in str(error):
+                raise
+            raise SpaceRobotError(
+                "The scheduler or a worker cannot load the task "
+                f"({str(error).splitlines()[0]}): all of them need {_PACKAGE}[campaign] "
+                f"{__version__}."
+            ) from error
+        return made
+
+    def cancel(self, tasks: list[Any]) -> None:
+        """Stop tasks that have not ended."""
+        self._client.cancel(tasks, force=True)
+
+    def _require_package(self, workers: Iterable[str]) -> None:
+        """Refuse workers without this package, which would die of every task."""
+        joined = [address for address in workers if address not in self._checked]
+        if not joined:
+            return
+        # A function of the standard library, which every worker can load.
+        found = self._client.run(find_spec, _PACKAGE, workers=joined, on_error="return")
+        for address, spec in found.items():
+            if spec is None:
+                raise SpaceRobotError(
+                    f"The worker at {address} has no {_PACKAGE}: install it there."
+                )
+            if not isinstance(spec, Exception):  # It may be gone again.
+                self._checked.add(address)
+
+
+def _lost() -> SpaceRobotError:
+    return SpaceRobotError(
+        "The scheduler is gone. Finished flights are kept: the same command goes on from there."
+    )
+
+
+@contextmanager
+def workers_of(cluster: Cluster, flights: int) -> Iterator[Workers]:
+    """Yield the workers of a cluster, at most as many processes as there are flights.
+
+    Raises
+    ------
+    SpaceRobotError
+        dask.distributed is not installed, or there is no scheduler at the address.
+    """
+    if not cluster.scheduler:
+        local = LocalWorkers(min(cluster.workers, max(1, flights)))
+        try:
+            yield local
+        finally:
+            local.close()
+        return
+    needed("distributed")
+    import dask
+    from distributed import Client
+
+    # Deaths of workers are counted here.
+    settings = {
+        "distributed.scheduler.allowed-failures": 0,
+        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.admin.tick.limit": "1h",
+    }
+    # The errors below take the place of its tracebacks.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    with dask.config.set(settings):
+        try:
+            client = Client(cluster.scheduler, timeout="20s")
+        except (OSError, TimeoutError, ValueError) as error:
+            raise SpaceRobotError(
+                f"There is no scheduler at {cluster.scheduler}: {error}."
+            ) from error
+        with client:
+            yield DaskWorkers(client)
+
+
+# -- distribution -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Task:
+    """Numbers of the draws that a worker flies now, and the name of the engine."""
+
+    numbers: list[int]
+    engine: str
+
+
+class Distribution:
+    """Distributes draws to workers.
+
+    Fallbacks of an engine are distributed again, in tasks of fewer flights for the engine
+    ``flights``.
+
+    When a worker dies, each flight of its task is flown again alone, in a task of its own, one such
+    task at a time. If a worker dies again, that flight has killed two workers and is reported. (A
+    scheduler of dask reports all tasks of a worker that died, not only the one that ran.)
+
+    Parameters
+    ----------
+    workers
+        The workers.
+    campaign, draws, engine
+        The campaign, its draws, and the name of the engine.
+    stopped
+        Returns whether to end; called a few times a second.
+    """
+
+    def __init__(
+        self,
+        workers: Workers,
+        campaign: Campaign,
+        draws: Draws,
+        engine: str,
+        stopped: Callable[[], bool],
+    ) -> None:
+        self._workers, self._specification = workers, Specification(self_contained(campaign))
+        self._draws, self._engine, self._stopped = draws, engine, stopped
+        self._sizes = {
+            name: float(max(_FIRST, engine_called(name).least)) for name in (engine, FLIGHTS)
+        }
+        """Flights of a task, by the engine."""
+        self._fallbacks: deque[int] = deque()
+        """Draws that the engine passes on to the engine ``flights``."""
+        self._reasons: dict[int, str] = {}
+        """The reason of each of them."""
+        self._running: dict[Any, _Task] = {}
+        self._retry_alone: deque[int] = deque()
+        """Draws of tasks whose worker died."""
+        self._deaths: Counter[int] = Counter()
+        self._alone: Any = None
+        """The running task of one of them."""
+
+    def rows(self, numbers: list[int]) -> Iterator[list[Row]]:
+        """Yield the rows of these draws as their tasks end, and empty lists in between."""
+        waiting = deque(numbers)
+        while (
+            waiting or self._fallbacks or self._retry_alone or self._running
+        ) and not self._stopped():
+            self._submit(waiting)
+            ended = self._workers.ended(list(self._running))
+            if not ended:
+                yield []
+            for task in ended:
+                yield self._taken(task)
+        if self._running:
+            self._workers.cancel(list(self._running))
+
+    def _submit(self, waiting: deque[int]) -> None:
+        """Keep the workers busy."""
+        if self._retry_alone and self._alone is None:
+            self._alone = self._task([self._retry_alone.popleft()], self._engine, alone=True)
+        workers = self._workers.count()
+        while (self._fallbacks or waiting) and len(self._running) < _AHEAD * workers:
+            queue, engine = (
+                (self._fallbacks, FLIGHTS) if self._fallbacks else (waiting, self._engine)
+            )
+            # The last tasks are smaller, so that no worker is alone at the end.
+            share = max(engine_called(engine).least, len(queue) / workers)
+            count = min(len(queue), max(1, round(min(self._sizes[engine], share))))
+            self._task([queue.popleft() for _ in range(count)], engine)
+
+    def _task(self, numbers: list[int], engine: str, *, alone: bool = False) -> Any:
+        draws = [self._draws[number] for number in numbers]
+        task = self._workers.submit(self._specification, draws, engine, all_of_them=alone)
+        self._running[task] = _Task(numbers, engine)
+        return task
+
+    def _taken(self, ended: Any) -> list[Row]:
+        """Return the rows of a task; none if its worker died."""
+        task = self._running.pop(ended)
+        alone = ended is self._alone
+        if alone:
+            self._alone = None
+        try:
+            made = self._workers.result(ended)
+        except WorkerDeath:
+            return self._on_worker_death(task.numbers, alone=alone)
+        rows = [each for each in made if isinstance(each, Row)]
+        passed_on = [each for each in made if isinstance(each, Fallback)]
+        self._fallbacks += [each.draw.number for each in passed_on]
+        self._reasons |= {each.draw.number: each.reason for each in passed_on}
+        if not alone and rows:
+            took = sum(row.wall_time for row in rows if not math.isnan(row.wall_time))
+            if took > 0:
+                size = 0.5 * self._sizes[task.engine] + 0.5 * len(rows) * TASK_TIME / took
+                least = engine_called(task.engine).least
+                self._sizes[task.engine] = max(least, min(_MOST, size))
+        return [
+            replace(row, fallback=self._reasons[number])
+            if (number := row.draw.number) in self._reasons
+            else row
+            for row in rows
+        ]
+
+    def _on_worker_death(self, numbers: list[int], *, alone: bool) -> list[Row]:
+        """Have the flights of a task flown again alone; return rows of those that died twice."""
+        given_up = []
+        for number in numbers:
+            if alone or not self._deaths[number]:
+                self._deaths[number] += 1
+            if self._deaths[number] >= _MOST_DEATHS:
+                reason = f"The process that flew it died {_MOST_DEATHS} times."
+                row = Row(self._draws[number], KILLED, reason, engine=self._engine)
+                given_up.append(row)
+            else:
+                self._retry_alone.append(number)
+        return given_up
