@@ -27,16 +27,16 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     PathConstraints,
     Trajectory,
 )
-from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch, SearchBudget
+from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
 from spacerobot_ros.planning.methods.optimal.transcription import Stages
 
 PERIOD = 0.05
 INTERVALS = 80
-BUDGET = SearchBudget(
+BUDGET = OptimalOptions(
     duration=0.0,
     longest=60.0,
     starts=24,
-    solutions=5,
+    answers=5,
     agreeing=3,
     iterations=300,
     time_budget=0.0,

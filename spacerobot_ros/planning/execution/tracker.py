@@ -50,29 +50,12 @@ class TakeOver:
     shapes
         (K + 1, n) from the tick now to that tick, m or rad.
     motion
-        How the joints move then.
+        Motion of the joints at that tick.
     """
 
     stamp_ns: int
     shapes: Array
     motion: InitialMotion
-
-    @classmethod
-    def of(
-        cls, schedule: GaitSchedule, start_ns: int, stamp_ns: int, after: float
-    ) -> TakeOver | None:
-        """Return the first tick that is ``after`` s or later than now.
-
-        None where the schedule, which began at ``start_ns``, is over by then.
-        """
-        period_ns = round(schedule.control_period * SECOND)
-        now = max((stamp_ns - start_ns) // period_ns, 0)
-        tick = now + max(1, math.ceil(after / schedule.control_period - 1e-9))
-        if tick >= schedule.ticks:
-            return None
-        positions = schedule.positions
-        motion = InitialMotion(schedule.velocities[tick - 1], positions[tick:])
-        return cls(start_ns + tick * period_ns, positions[now : tick + 1].copy(), motion)
 
 
 class ScheduleFollower:
@@ -119,8 +102,15 @@ class ScheduleFollower:
         return self._start_ns <= stamp_ns <= self._end_ns + _LONGEST_SETTLING * SECOND
 
     def take_over(self, stamp_ns: int, after: float) -> TakeOver | None:
-        """Return the tick ``after`` s from now or later; None where the schedule is over then."""
-        return TakeOver.of(self.schedule, self._start_ns, stamp_ns, after)
+        """Return the first tick ``after`` s from now or later; None if the schedule is over then."""
+        now = max((stamp_ns - self._start_ns) // self._period_ns, 0)
+        tick = now + max(1, math.ceil(after / self.schedule.control_period - 1e-9))
+        if tick >= self._last_tick:
+            return None
+        positions = self._positions
+        motion = InitialMotion(self.schedule.velocities[tick - 1], positions[tick:])
+        shapes = positions[now : tick + 1].copy()
+        return TakeOver(self._start_ns + tick * self._period_ns, shapes, motion)
 
     def braking(self, stamp_ns: int, duration: float) -> BrakingFollower:
         """Return a follower that brakes along this schedule to rest within ``duration`` s."""

@@ -57,7 +57,6 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 from spacerobot_ros.planning.methods.optimal.search import (
     ManoeuvreSearch,
     MotionSearch,
-    SearchBudget,
 )
 from spacerobot_ros.version import __version__
 
@@ -192,9 +191,10 @@ class OptimalGait(GaitMethod):
             limits,
             state.quaternion,
             self._intervals(correction),
-            self._budget(correction),
+            replace(self.options, duration=0.0, answers=1) if correction else self.options,
             cancellation,
             library=None if correction else self._library,
+            gentle=correction,
         )
         notes: Notes = {
             "starts": float(found.starts),
@@ -232,10 +232,10 @@ class OptimalGait(GaitMethod):
             # The same manoeuvre goes on, and is to be over when it was.
             duration = (len(motion.remaining) - 1) * self.control_period
         budget = replace(
-            self._budget(correction=False),
+            chosen,
             duration=duration,
             starts=1 if again else min(chosen.starts, _STARTS_IN_MOTION),
-            solutions=1 if again else chosen.answers,
+            answers=1 if again else chosen.answers,
         )
         found = self._motion_search.search(
             boundary,
@@ -254,19 +254,6 @@ class OptimalGait(GaitMethod):
     def _intervals(self, correction: bool) -> int:
         intervals = self.options.intervals
         return min(intervals, _CORRECTION_INTERVALS) if correction else intervals
-
-    def _budget(self, correction: bool) -> SearchBudget:
-        chosen = self.options
-        return SearchBudget(
-            duration=0.0 if correction else chosen.duration,
-            longest=chosen.longest,
-            starts=chosen.starts,
-            solutions=1 if correction else chosen.answers,
-            agreeing=chosen.agreeing,
-            iterations=chosen.iterations,
-            time_budget=chosen.time_budget,
-            gentle=correction,
-        )
 
     def _is_reached(self, state: RobotState, goal: Goal) -> bool:
         error = PoseError.between(state.position, state.quaternion, goal, state.q)

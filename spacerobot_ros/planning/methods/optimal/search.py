@@ -45,6 +45,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     CandidateError,
     MotionLimits,
+    OptimalOptions,
     Trajectory,
 )
 from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages
@@ -127,39 +128,6 @@ _MORE_TICKS = (0, 1, 3, 7)
 
 
 @dataclass(frozen=True)
-class SearchBudget:
-    """Budget of a search.
-
-    Attributes
-    ----------
-    duration
-        Wanted duration of the manoeuvre, s; 0: the least.
-    longest
-        Longest manoeuvre, s.
-    starts, solutions
-        Guesses that are tried at most, and solutions that are enough.
-    agreeing
-        Solutions that are the best one and enough; 0: no number is.
-    iterations
-        Steps of the solver from each guess at most.
-    time_budget
-        Wall time, s; 0: no limit, and the result depends on the counts above alone.
-    gentle
-        Prefer the path of least effort, whose turn of the base depends least on masses that are
-        not quite known.
-    """
-
-    duration: float
-    longest: float
-    starts: int
-    solutions: int
-    agreeing: int
-    iterations: int
-    time_budget: float
-    gentle: bool = False
-
-
-@dataclass(frozen=True)
 class Manoeuvre:
     """A manoeuvre that was found.
 
@@ -193,7 +161,7 @@ class _Progress:
 
     Attributes
     ----------
-    boundary, limits, quaternion, budget, cancellation, library
+    boundary, limits, quaternion, options, cancellation, library
         As of :meth:`ManoeuvreSearch.search`.
     starts, rejection
         Guesses that were tried, and the reason against the last candidate.
@@ -204,9 +172,10 @@ class _Progress:
     boundary: BoundaryConditions
     limits: MotionLimits
     quaternion: Array
-    budget: SearchBudget
+    options: OptimalOptions
     cancellation: Cancellation
-    library: SolutionLibrary | None = None
+    library: SolutionLibrary | None
+    gentle: bool
     starts: int = 0
     rejection: str = ""
     shortest: float = math.inf
@@ -215,12 +184,12 @@ class _Progress:
     def stop_rule(self, *, found: bool) -> StopRule:
         """Return when the solver stops; until something is found it may go on for longer."""
         deadline = last_call = math.inf
-        if self.budget.time_budget > 0:
+        if self.options.time_budget > 0:
             deadline, last_call = (
-                self._began + x * self.budget.time_budget for x in (1.0, _LAST_CALL)
+                self._began + x * self.options.time_budget for x in (1.0, _LAST_CALL)
             )
         last = deadline if found else last_call
-        return StopRule(self.budget.iterations, self.cancellation, deadline, last)
+        return StopRule(self.options.iterations, self.cancellation, deadline, last)
 
     def cut_short(self, *, found: bool) -> bool:
         """Whether the wall time is used up."""
@@ -230,7 +199,7 @@ class _Progress:
         """Log the result of a guess, and the progress of the search."""
         seconds = time.monotonic() - self._began
         # Where no guess led to anything on the coarse grid, some are tried on the full one as well.
-        most = max(self.budget.starts, self.starts)
+        most = max(self.options.starts, self.starts)
         log_progress(
             _LOG,
             SearchProgress(self.starts, most, self.shortest),
@@ -240,7 +209,7 @@ class _Progress:
     def agreed(self, solutions: list[Trajectory]) -> bool:
         """Whether the best solution was found often enough."""
         costs = np.array([self.cost(each) for each in solutions])
-        agreeing = self.budget.agreeing
+        agreeing = self.options.agreeing
         if self.library is not None:
             # Solutions for goals nearby have agreed before.
             agreeing = min(agreeing, _AGREEING_WITH_LIBRARY)
@@ -249,7 +218,7 @@ class _Progress:
 
     def cost(self, trajectory: Trajectory) -> float:
         """Return the cost: the duration, or the effort where the duration is given."""
-        if self.budget.duration == 0:
+        if self.options.duration == 0:
             return trajectory.duration
         scale = np.where(np.isfinite(self.limits.velocity), self.limits.velocity, 1.0)
         change = np.diff(trajectory.velocities, axis=0) / trajectory.step / scale
@@ -281,13 +250,16 @@ class ManoeuvreSearch:
         limits: MotionLimits,
         quaternion: Array,
         intervals: int,
-        budget: SearchBudget,
+        options: OptimalOptions,
         cancellation: Cancellation = NEVER,
         library: SolutionLibrary | None = None,
+        *,
+        gentle: bool = False,
     ) -> Manoeuvre:
         """Return the fastest manoeuvre found from attitude ``quaternion`` (4,) of R_WB.
 
-        The nearest manoeuvres of a library are the first guesses.
+        The nearest manoeuvres of a library are the first guesses. A ``gentle`` manoeuvre takes the
+        path of least effort, whose turn of the base depends least on errors of masses.
 
         Raises
         ------
@@ -298,27 +270,27 @@ class ManoeuvreSearch:
         PlanningCancelled
             The search was cancelled.
         """
-        if budget.longest < _FEWEST_TICKS * self._period:
+        if options.longest < _FEWEST_TICKS * self._period:
             raise PlanningError(
                 f"Manoeuvres take at least {_FEWEST_TICKS} control periods of {self._period:g} s, "
-                f"more than optimal.longest = {budget.longest:g} s."
+                f"more than optimal.longest = {options.longest:g} s."
             )
-        progress = _Progress(boundary, limits, quaternion, budget, cancellation, library)
+        progress = _Progress(boundary, limits, quaternion, options, cancellation, library, gentle)
         full = self.solver(intervals, boundary.center is not None)
         coarser = intervals // _COARSER
         found: list[Manoeuvre] = []
         # A single answer is had at less cost without a detour.
-        if budget.solutions > 1 and coarser >= _FEWEST_INTERVALS:
+        if options.answers > 1 and coarser >= _FEWEST_INTERVALS:
             coarse = self.solver(coarser, boundary.center is not None, _COARSE_TOLERANCE)
-            found = self._manoeuvres(progress, coarse, full, budget.starts)
+            found = self._manoeuvres(progress, coarse, full, options.starts)
             if not found and not progress.cut_short(found=False):
-                found = self._manoeuvres(progress, full, full, min(budget.starts, _FULL_STARTS))
+                found = self._manoeuvres(progress, full, full, min(options.starts, _FULL_STARTS))
         else:
-            found = self._manoeuvres(progress, full, full, budget.starts)
+            found = self._manoeuvres(progress, full, full, options.starts)
         cut_short = progress.cut_short(found=bool(found))
         if not found:
-            within = f" within optimal.time_budget {budget.time_budget:g} s" if cut_short else ""
-            limit = "duration" if budget.duration > 0 else "longest"
+            within = f" within optimal.time_budget {options.time_budget:g} s" if cut_short else ""
+            limit = "duration" if options.duration > 0 else "longest"
             longer = "A longer optimal.time_budget, more" if cut_short else "More"
             raise NotFoundError(
                 f"No manoeuvre to the goal was found from {progress.starts} start(s){within}: "
@@ -340,7 +312,7 @@ class ManoeuvreSearch:
             near = progress.library.nearest(boundary, limits)
             of_boundary = itertools.chain((guesses.through(x, limits) for x in near), of_boundary)
         solutions: list[Trajectory] = []
-        enough = progress.budget.solutions
+        enough = progress.options.answers
         for number, guess in enumerate(itertools.islice(of_boundary, starts), 1):
             stop = progress.stop_rule(found=bool(solutions))
             solution = self._solution(progress, grid, guess, stop)
@@ -444,23 +416,23 @@ class ManoeuvreSearch:
         stop: StopRule,
     ) -> Trajectory | None:
         """Return the solution from a guess, None if there is none."""
-        boundary, limits, budget = progress.boundary, progress.limits, progress.budget
+        boundary, limits, options = progress.boundary, progress.limits, progress.options
         shortest = _FEWEST_TICKS * self._period
-        if budget.gentle:
+        if progress.gentle:
             shortest = max(shortest, min(_GENTLE_TICKS * self._period, _GENTLE_TIME))
         guess = self._constraints.slowed(guess)
-        if budget.duration > 0:
+        if options.duration > 0:
             limits = replace(
                 limits,
                 velocity=_ROOM_IN_GIVEN_TIME * limits.velocity,
                 acceleration=_ROOM_IN_GIVEN_TIME * limits.acceleration,
             )
-            T = max(round(budget.duration / self._period), 1) * self._period
-        elif budget.gentle:
+            T = max(round(options.duration / self._period), 1) * self._period
+        elif progress.gentle:
             guess = self._slowed(guess)
             T = max(_UNHURRIED * guess.duration, shortest)
         else:
-            duration = DurationBounds(shortest, budget.longest)
+            duration = DurationBounds(shortest, options.longest)
             solution = solver.solve(boundary, limits, guess, stop, duration)
             if solution is None or solver.converged or self._constraints.base_rate > 0:
                 return solution
@@ -468,7 +440,7 @@ class ManoeuvreSearch:
             return self._slowed(solution.hurried(limits, shortest))
         guess = guess.retimed(T / guess.duration)
         solution = solver.solve(boundary, limits, guess, stop, DurationBounds(T, T))
-        if solution is None or not budget.gentle:
+        if solution is None or not progress.gentle:
             return solution
         return self._slowed(solution.hurried(limits, shortest))
 
@@ -486,7 +458,7 @@ class ManoeuvreSearch:
         """
         if trajectory is None:
             raise CandidateError(_NOTHING)
-        fixed = progress.budget.duration > 0
+        fixed = progress.options.duration > 0
         held = self._holder.hold(trajectory, progress.boundary, progress.limits, fixed=fixed)
         if held is None:
             raise CandidateError(_NOT_HELD)
@@ -521,7 +493,7 @@ class MotionSearch:
         limits: MotionLimits,
         quaternion: Array,
         intervals: int,
-        budget: SearchBudget,
+        options: OptimalOptions,
         motion: InitialMotion,
         cancellation: Cancellation = NEVER,
     ) -> Manoeuvre:
@@ -541,25 +513,25 @@ class MotionSearch:
         coarse = full
         if intervals >= _COARSER_IN_MOTION * _FEWEST_INTERVALS_IN_MOTION:
             coarse = self._solver(intervals // _COARSER_IN_MOTION, boundary.center is not None)
-        stop = StopRule(budget.iterations, cancellation)
+        stop = StopRule(options.iterations, cancellation)
         candidates: list[Trajectory] = []
         starts, rejection = 0, _NOTHING
         guesses = self._guesses(boundary, limits, coarse, motion.remaining)
-        for guess in itertools.islice(guesses, budget.starts):
+        for guess in itertools.islice(guesses, options.starts):
             starts += 1
-            if budget.duration > 0:
+            if options.duration > 0:
                 candidates.append(guess)
             else:
-                solution = self._fastest(coarse, boundary, limits, guess, stop, budget)
+                solution = self._fastest(coarse, boundary, limits, guess, stop, options)
                 candidates += [] if solution is None else [solution]
             cancellation.raise_if_requested()
-            if len(candidates) >= budget.solutions or _agreed(candidates):
+            if len(candidates) >= options.answers or _agreed(candidates):
                 break
         # The rest of a motion is short: the coarse grid is fine enough for it.
-        fine = coarse if budget.solutions == 1 else full
+        fine = coarse if options.answers == 1 else full
         for candidate in sorted(candidates, key=lambda each: each.duration)[:_REFINED_IN_MOTION]:
             try:
-                held = self._commanded(fine, boundary, limits, candidate, motion, budget, stop)
+                held = self._commanded(fine, boundary, limits, candidate, motion, options, stop)
                 attitudes = quaternion_multiply(quaternion, held.quaternions)
                 self._constraints.check(held.positions, attitudes, self._period)
             except CandidateError as reason:
@@ -596,11 +568,11 @@ class MotionSearch:
         limits: MotionLimits,
         guess: Trajectory,
         stop: StopRule,
-        budget: SearchBudget,
+        options: OptimalOptions,
     ) -> Trajectory | None:
         """Return the fastest trajectory near a guess, None if there is none."""
-        shortest = min(_FEWEST_TICKS_IN_MOTION * self._period, budget.longest)
-        duration = DurationBounds(shortest, budget.longest)
+        shortest = min(_FEWEST_TICKS_IN_MOTION * self._period, options.longest)
+        duration = DurationBounds(shortest, options.longest)
         for room in _ROOMS:
             narrowed = self._narrowed(limits, room)
             solution = solver.solve(boundary, narrowed, guess, stop, duration)
@@ -619,7 +591,7 @@ class MotionSearch:
         limits: MotionLimits,
         candidate: Trajectory,
         motion: InitialMotion,
-        budget: SearchBudget,
+        options: OptimalOptions,
         stop: StopRule,
     ) -> HeldCommands:
         """Return a candidate as held commands.
@@ -630,10 +602,10 @@ class MotionSearch:
             There are none that reach the goal within the limits.
         """
         guesses = _initial_guesses(self._robot, solver, solver.intervals)
-        guess, duration = guesses.refined(candidate), budget.duration
+        guess, duration = guesses.refined(candidate), options.duration
         most = 1 if duration > 0 else len(_MORE_TICKS)
         if duration == 0:
-            finer = self._fastest(solver, boundary, limits, guess, stop, budget)
+            finer = self._fastest(solver, boundary, limits, guess, stop, options)
             guess = guess if finer is None else finer
             duration = guess.duration
         ticks = max(1, math.ceil(duration / self._period - 1e-6))
