@@ -228,7 +228,7 @@ def plans(
     method = OptimalGait(robot, _PERIOD, options=OptimalOptions(**chosen))
     goals = list(requests(robot, chosen_case, count + 1, seed))
     if library:
-        made = method.made_library(requests(robot, chosen_case, library, seed + 1))
+        made = method.build_library(requests(robot, chosen_case, library, seed + 1))
         assert made is not None
         with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
             file = Path(folder, "library.npz")

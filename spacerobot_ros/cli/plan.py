@@ -270,11 +270,11 @@ def library_command(
     goals = _goals(problem, count, within)
     with click.progressbar(goals, label=problem.name, file=sys.stderr) as bar:
         state, tolerance = state_of(problem.plant()), problem.config.tolerance
-        library = method.made_library(PlanRequest(state, goal, tolerance) for goal in bar)
+        library = method.build_library(PlanRequest(state, goal, tolerance) for goal in bar)
     if library is None:
         fail("None of the goals could be reached.")
     if out is None:
-        where = method.keep_library(library)
+        where = method.store_library(library)
     else:
         # Of this user alone: plans begin with it, and refuse one that others may write.
         write_output(out, library.to_bytes(), mode=0o600)

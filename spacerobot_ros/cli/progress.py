@@ -97,9 +97,9 @@ def display(label: str) -> Iterator[Display]:
         if not sys.stderr.isatty():
             yield shown
             return
-        from spacerobot_ros.planning.core.progress import reported
+        from spacerobot_ros.planning.core.progress import report_progress
 
-        with reported(shown.search, shown.announce):
+        with report_progress(shown.search, shown.announce):
             yield shown
     finally:
         shown.close()

@@ -39,7 +39,7 @@ from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.goal import RobotState, Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
-from spacerobot_ros.planning.core.progress import reported
+from spacerobot_ros.planning.core.progress import report_progress
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import PlannerState
@@ -498,7 +498,7 @@ def main() -> None:
 
         threading.Thread(target=read, daemon=True).start()
         planner, number = Planner(), 0
-        with reported(lambda progress: say(number=number, progress=progress.message)):
+        with report_progress(lambda progress: say(number=number, progress=progress.message)):
             while True:
                 question, cancellation = last.take()
                 number = question["number"]

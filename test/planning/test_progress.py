@@ -11,7 +11,7 @@ from spacerobot_ros import plan
 from spacerobot_ros.cli.progress import Display, display
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model.compilation import ANNOUNCEMENT
-from spacerobot_ros.planning.core.progress import SearchProgress, log_progress, reported
+from spacerobot_ros.planning.core.progress import SearchProgress, log_progress, report_progress
 
 _LOG = logging.getLogger("spacerobot_ros.planning.somewhere")
 
@@ -25,7 +25,7 @@ class Terminal(io.StringIO):
 
 def test_a_search_reports_every_start_and_the_best_so_far() -> None:
     seen: list[SearchProgress] = []
-    with reported(seen.append):
+    with report_progress(seen.append):
         gait = plan(
             "sliding_masses", position=(0.2, -0.1, 0.05), rotvec=(0.1, 0.0, 0.1), starts=3,
             answers=3, agreeing=0, intervals=16, control_period=0.1,
@@ -41,14 +41,14 @@ def test_a_search_reports_every_start_and_the_best_so_far() -> None:
     count = len(seen)
     with pytest.raises(PlanningError):
         plan("sliding_masses", position=(9.0, 0.0, 0.0), starts=1)
-    assert len(seen) == count, "nothing is reported afterwards"
+    assert len(seen) == count, "nothing is report_progress afterwards"
 
 
 def test_listening_changes_nothing_for_others() -> None:
     package = logging.getLogger("spacerobot_ros")
     before, handlers = package.level, list(package.handlers)
     sentences: list[str] = []
-    with reported(lambda progress: None, sentences.append):
+    with report_progress(lambda progress: None, sentences.append):
         _LOG.info("something")
         _LOG.info("It takes long.", extra={ANNOUNCEMENT: True})
         log_progress(_LOG, SearchProgress(1, 2), "start 1")

@@ -25,7 +25,7 @@ POSE: frozenset[Controlled] = frozenset({"position", "attitude"})
 """The parts of a goal that are the pose of the base."""
 
 
-ALMOST = 0.5
+POSITION_SLACK = 0.5
 """Share of its tolerance by which a plan may miss a position that is out of reach."""
 
 _FARTHEST = 1e12

@@ -1,6 +1,6 @@
 """Progress of searches, and announcements of other long work.
 
-A search writes its progress into the log, in a record that :func:`reported` finds. So progress
+A search writes its progress into the log, in a record that :func:`report_progress` finds. So it
 passes through methods that do not know of it, and out of the threads in which plans are made.
 """
 
@@ -50,10 +50,10 @@ def log_progress(logger: logging.Logger, progress: SearchProgress, line: str) ->
 
 
 @contextmanager
-def reported(
+def report_progress(
     show: Callable[[SearchProgress], None], announce: Callable[[str], None] = lambda message: None
 ) -> Iterator[None]:
-    """Have functions called in the threads of those that work in here.
+    """Call functions with the progress of the searches that run in this context, in any thread.
 
     Parameters
     ----------

@@ -102,7 +102,7 @@ class ScheduleFollower:
         return self._start_ns <= stamp_ns <= self._end_ns + _LONGEST_SETTLING * SECOND
 
     def take_over(self, stamp_ns: int, after: float) -> TakeOver | None:
-        """Return the first tick ``after`` s from now or later; None if the schedule is over then."""
+        """Return the first tick ``after`` s from now or later; None after the last tick."""
         now = max((stamp_ns - self._start_ns) // self._period_ns, 0)
         tick = now + max(1, math.ceil(after / self.schedule.control_period - 1e-9))
         if tick >= self._last_tick:

@@ -77,7 +77,7 @@ class AutoGait(GaitMethod):
             one of them proves it, and else a `NotFoundError` where one of them searched.
         """
         refusals = dict(self._unsuitable)
-        names = self._standing(refusals)
+        names = self._comparable(refusals)
         if request.motion is not None:
             for name in names:
                 if not self._candidates[name].method.starts_in_motion:
@@ -116,7 +116,7 @@ class AutoGait(GaitMethod):
         message = f"No method plans this goal of robot '{self.robot.description.name}'. {reasons}"
         return refusal_of_all(message, of_goal)
 
-    def _standing(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
+    def _comparable(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
         """Return the methods to compare; add the refusals of the others.
 
         The others do not control a part of the pose that one of the methods controls.

@@ -36,7 +36,7 @@ from spacerobot_ros.planning.core.controllability import (
     sliding_masses,
     slot_matrix,
 )
-from spacerobot_ros.planning.core.goal import ALMOST, Goal, RobotState
+from spacerobot_ros.planning.core.goal import POSITION_SLACK, Goal, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
@@ -110,7 +110,7 @@ class LieBracketGait(GaitMethod):
         cancellation.raise_if_requested()
         state, goal = request.state, request.goal
         self._require_rest(state)
-        z_f = self.final_shape(state, goal, ALMOST * request.tolerance.position)
+        z_f = self.final_shape(state, goal, POSITION_SLACK * request.tolerance.position)
         slide = self._slide(state.q, z_f)
         t1 = (len(slide) - 1) * self.control_period or self.options.t1
         attitudes = self._prediction.attitudes(slide, state.quaternion, state.angular_momentum)

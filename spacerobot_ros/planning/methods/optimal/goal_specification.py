@@ -39,7 +39,7 @@ from spacerobot_ros.planning.core.controllability import (
     slot_matrix,
     tilted_goal,
 )
-from spacerobot_ros.planning.core.goal import ALMOST, Controlled
+from spacerobot_ros.planning.core.goal import POSITION_SLACK, Controlled
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -205,7 +205,9 @@ class GoalSpecification:
                     Proof.MOMENTUM,
                 )
             return BoundaryConditions(state.q, turn, shape, shape, None, direction)
-        likely = shape_for_center(robot, limits, state.q, center, ALMOST * tolerance.position)
+        likely = shape_for_center(
+            robot, limits, state.q, center, POSITION_SLACK * tolerance.position
+        )
         center = robot.center_of_mass(likely)
         # Three coordinates have few shapes for one centre of mass, or one.
         if robot.n <= 3:

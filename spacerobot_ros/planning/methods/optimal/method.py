@@ -122,7 +122,7 @@ class OptimalGait(GaitMethod):
         )
         self._library = load_library(chosen.library, self._library_key)
 
-    def made_library(self, requests: Iterable[PlanRequest]) -> SolutionLibrary | None:
+    def build_library(self, requests: Iterable[PlanRequest]) -> SolutionLibrary | None:
         """Return the manoeuvres of all requests that can be reached; None if none can.
 
         They are planned without a library.
@@ -138,7 +138,7 @@ class OptimalGait(GaitMethod):
             return None
         return SolutionLibrary.of(self._library_key, schedules, np.array(turns))
 
-    def keep_library(self, library: SolutionLibrary) -> Path | None:
+    def store_library(self, library: SolutionLibrary) -> Path | None:
         """Put a library where plans find it; return where, None if that is not possible."""
         cache, name = library_file(self._library_key)
         return cache.store(name, self._library_key, library.to_bytes())
@@ -209,7 +209,7 @@ class OptimalGait(GaitMethod):
         schedule = self._schedule(state, goal, found.held.positions, notes)
         # The result of a busy machine is not to be flown on a quiet one.
         if self._cache is not None and key is not None and not found.cut_short:
-            kept_plan = _KeptPlan(schedule.positions, notes)
+            kept_plan = _CachedPlan(schedule.positions, notes)
             self._cache.store(_file(key), key, kept_plan.to_bytes())
         return schedule
 
@@ -327,7 +327,7 @@ class OptimalGait(GaitMethod):
         if kept is None:
             return None
         try:
-            plan = _KeptPlan.from_bytes(kept[1])
+            plan = _CachedPlan.from_bytes(kept[1])
             self._require_manoeuvre(plan.positions, request, boundary, limits)
         except (ValueError, CandidateError) as reason:
             cache.discard(_file(key), str(reason))
@@ -385,7 +385,7 @@ def _file(key: str) -> str:
 
 
 @dataclass(frozen=True)
-class _KeptPlan:
+class _CachedPlan:
     """A cached schedule: shapes (N + 1, n) at the ticks, and the notes."""
 
     positions: Array
@@ -399,7 +399,7 @@ class _KeptPlan:
         return file.getvalue()
 
     @classmethod
-    def from_bytes(cls, content: bytes) -> _KeptPlan:
+    def from_bytes(cls, content: bytes) -> _CachedPlan:
         """Return it from an archive.
 
         Raises

@@ -313,7 +313,7 @@ class Trajectory:
         """Return the same path, travelled in ``factor`` times the time."""
         return replace(self, step=self.step * factor, velocities=self.velocities / factor)
 
-    def hurried(self, limits: MotionLimits, shortest: float) -> Trajectory:
+    def at_full_speed(self, limits: MotionLimits, shortest: float) -> Trajectory:
         """Return the same path, as fast as the limits allow, in ``shortest`` seconds or more."""
         speed = float((np.abs(self.velocities) / limits.velocity).max())
         change = np.abs(np.diff(self.velocities, axis=0)) / self.step / limits.acceleration

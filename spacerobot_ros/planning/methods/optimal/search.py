@@ -437,12 +437,12 @@ class ManoeuvreSearch:
             if solution is None or solver.converged or self._constraints.base_rate > 0:
                 return solution
             # A solution that has not converged has time to spare.
-            return self._slowed(solution.hurried(limits, shortest))
+            return self._slowed(solution.at_full_speed(limits, shortest))
         guess = guess.retimed(T / guess.duration)
         solution = solver.solve(boundary, limits, guess, stop, DurationBounds(T, T))
         if solution is None or not progress.gentle:
             return solution
-        return self._slowed(solution.hurried(limits, shortest))
+        return self._slowed(solution.at_full_speed(limits, shortest))
 
     def _slowed(self, trajectory: Trajectory) -> Trajectory:
         """Return the same path, slow enough for the efforts of the joints."""
