@@ -1,10 +1,9 @@
 """MCAP bags that any ROS 2 tool opens: writing, reading, replaying and verifying them."""
 
+from spacerobot_ros.bag.mcap_file import LATCHED, QosProfile
 from spacerobot_ros.bag.playback import Playback, ReplayMessage, ReplayTopic, Timeline
-from spacerobot_ros.bag.reader import Bag, iterate_raw, read_bag
-from spacerobot_ros.bag.recorded_robot import RecordedRobot
+from spacerobot_ros.bag.reader import Bag, RecordedRobot, iterate_raw, read_bag
 from spacerobot_ros.bag.recording import Recording, RecordingState
-from spacerobot_ros.bag.rosbag2 import LATCHED, QosProfile
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.bag.writer import BagWriter, free_name
 from spacerobot_ros.errors import RecordingError

@@ -6,8 +6,8 @@ import math
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from spacerobot_ros.bag.mcap_file import QosProfile
 from spacerobot_ros.bag.reader import Bag
-from spacerobot_ros.bag.rosbag2 import QosProfile
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.times import SECOND
 

@@ -1,4 +1,4 @@
-"""Reads a bag as time series."""
+"""Reads a bag as time series, and of these the topics of one robot."""
 
 from __future__ import annotations
 
@@ -15,27 +15,30 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata
 from numpy.typing import NDArray
 
-from spacerobot_ros.bag.export import to_pandas, to_xarray
+from spacerobot_ros.bag.mcap_file import QosProfile
 from spacerobot_ros.bag.mcap_reading import (
     RawMessage,
+    file_size,
     indexed_records,
     messages_in_file_order,
     messages_in_time_order,
+    open_bag,
+    parsed,
     read_summary,
 )
-from spacerobot_ros.bag.mcap_records import file_size, open_bag, parsed
-from spacerobot_ros.bag.rosbag2 import QosProfile
 from spacerobot_ros.bag.series import TopicSeries
-from spacerobot_ros.bag.tables import TopicTable, table_of
+from spacerobot_ros.bag.tables import TopicTable, table_of, to_pandas, to_xarray
 from spacerobot_ros.errors import RecordingError, RobotDescriptionError
 from spacerobot_ros.messages.definitions import MessageTypes
 from spacerobot_ros.resources import suggestion
 from spacerobot_ros.times import SECOND
+from spacerobot_ros.topics import TOPICS
 
 if TYPE_CHECKING:
     import pandas
     import xarray
 
+Array = NDArray[np.float64]
 _Default = TypeVar("_Default")
 
 _TEXT = "std_msgs/msg/String"
@@ -448,3 +451,119 @@ def _bag_file(path: str | os.PathLike[str]) -> Path:
     if len(files) != 1:
         raise RecordingError(f"The folder {given} holds {len(files)} MCAP files: name one of them.")
     return files[0]
+
+
+# -- one robot --------------------------------------------------------------------------------
+
+
+def columns(topic: str, path: str) -> list[str]:
+    """Return the paths of the numbers of a state topic below a path, for ``TopicSeries.table``."""
+    return next(field.columns for field in TOPICS[topic].state if field.path == path)
+
+
+class RecordedRobot:
+    """The topics of one robot in a bag, by their names without its namespace.
+
+    Parameters
+    ----------
+    bag
+        What was recorded.
+    namespace
+        Of the robot's topics, such as ``/robot_1``; empty for none.
+    """
+
+    def __init__(self, bag: Bag, namespace: str = "") -> None:
+        self.bag = bag
+        self.namespace = namespace
+
+    def get(self, name: str) -> TopicSeries | None:
+        """Return a topic of the stack; None where it has no message, or is of another type."""
+        topic = f"{self.namespace}/{name}"
+        if self.bag.topics.get(topic) != TOPICS[name].type or not self.bag.message_count(topic):
+            return None
+        # What the summary counts need not be there.
+        return self.bag[topic] if len(self.bag[topic]) else None
+
+    def __getitem__(self, name: str) -> TopicSeries:
+        """Return a topic of the stack.
+
+        Raises
+        ------
+        RecordingError
+            It has no message, is of another type, or is damaged.
+        """
+        series = self.get(name)
+        if series is None:
+            topic = f"{self.namespace}/{name}"
+            raise RecordingError(f"The bag {self.bag.path} holds no state: nothing is on {topic}.")
+        return series
+
+    def truth(self, name: str, fields: list[str], width: int | None = None) -> tuple[Array, Array]:
+        """Return what ``odom`` or ``joint_states`` would be with perfect sensors.
+
+        That is ``<name>_true``, which a plant publishes while its sensors err, and ``name`` before
+        that begins.
+
+        Parameters
+        ----------
+        name
+            ``odom`` or ``joint_states``.
+        fields, width
+            See :meth:`TopicSeries.table`.
+
+        Returns
+        -------
+        Stamps (N,) in s, numbers (N, width).
+
+        Raises
+        ------
+        RecordingError
+            Neither has a message, or one is damaged.
+        """
+        true = self.get(f"{name}_true")
+        if true is None:
+            return self[name].stamp, self[name].table(fields, width)
+        measured = self.get(name)
+        if measured is None:
+            return true.stamp, true.table(fields, width)
+        before = measured.stamp < true.stamp[0]
+        return (
+            np.concatenate([measured.stamp[before], true.stamp]),
+            np.concatenate([measured.table(fields, width)[before], true.table(fields, width)]),
+        )
+
+    @property
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Metadata records of the bag by name, those of this robot's nodes as ``parameters/NODE``.
+
+        A recorder in the namespace of the robot calls them so itself.
+        """
+        before = f"parameters{self.namespace}/"
+        return {
+            **self.bag.metadata,
+            **{
+                f"parameters/{name.removeprefix(before)}": values
+                for name, values in self.bag.metadata.items()
+                if self.namespace and name.startswith(before)
+            },
+        }
+
+    @property
+    def joint_names(self) -> list[str]:
+        """Names of the joints in the order of ``joint_states``; none where that is missing."""
+        return self.names("joint_states")
+
+    def names(self, topic: str) -> list[str]:
+        """Return the names in the first joint states of a topic; none where it is missing."""
+        series = self.get(topic)
+        return list(map(str, next(series.messages())[1].name)) if series is not None else []
+
+    @property
+    def urdf(self) -> bytes | None:
+        """The description of the robot: the attached file, or else the last message about it."""
+        name = f"{self.namespace}/robot_description".strip("/").replace("/", ".")
+        attached = self.bag.attachments.get(f"{name}.urdf")
+        if attached is not None:
+            return attached
+        series = self.get("robot_description")
+        return None if series is None else str(series.field("data")[-1]).encode()

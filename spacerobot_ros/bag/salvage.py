@@ -1,38 +1,49 @@
-"""Makes a complete bag of one that was cut off or is damaged."""
+"""Recovers bags that were cut off or damaged: a complete bag, or the last state in one."""
 
 from __future__ import annotations
 
 import os
 import struct
+import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from spacerobot_ros.bag.mcap_file import McapFile, encode
-from spacerobot_ros.bag.mcap_reading import messages_in_file_order, read_summary
-from spacerobot_ros.bag.mcap_records import (
+from spacerobot_ros.bag.mcap_file import (
+    METADATA_NAME,
+    McapFile,
+    QosProfile,
+    RecordedTopic,
+    encode,
+    metadata_record,
+)
+from spacerobot_ros.bag.mcap_reading import (
     DAMAGE,
     RECORD_HEADER,
     Allowance,
     chunk_size,
     file_size,
+    messages_in_file_order,
     open_bag,
     open_file,
     parsed,
+    read_summary,
     records,
     records_in,
     unpacked,
 )
-from spacerobot_ros.bag.rosbag2 import METADATA_NAME, QosProfile, RecordedTopic, metadata_record
+from spacerobot_ros.bag.reader import Array, RecordedRobot, columns, read_bag
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.times import SECOND
 
+_STATE = ("odom", "joint_states", "momentum")
 _CHUNK_SIZE = 65536
 _CHANNEL_AND_TIME = struct.Struct("<H4xQ")
 """What a message begins with; between them is its sequence number."""
@@ -252,3 +263,81 @@ class _Copy:
                 )
         file = self._file
         file.append_metadata(metadata_record(file.path.name, topics, file.start_ns, file.end_ns))
+
+
+# -- the state to resume from -----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LastState:
+    """The last recorded state of a robot.
+
+    Attributes
+    ----------
+    time_ns
+        Its stamp.
+    position, quaternion
+        Of the base link in the world: (3,) m and (x, y, z, w).
+    joint_names, joints, rates
+        Names, positions and velocities (n,) of the joints.
+    momenta
+        Linear over angular momentum in the world (6,).
+    """
+
+    time_ns: int
+    position: Array
+    quaternion: Array
+    joint_names: list[str]
+    joints: Array
+    rates: Array
+    momenta: Array
+
+
+def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
+    """Read the last state of which everything was recorded.
+
+    Of a bag that was cut off, what can be read counts; ``namespace`` is that of the plant's topics.
+
+    Raises
+    ------
+    RecordingError
+        There is no such bag, or no state in it.
+    """
+    source = Path(path)
+    if is_complete(source):
+        return _last_state(RecordedRobot(read_bag(source), namespace))
+    with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
+        whole = Path(folder, source.name)
+        salvage_bag(source, whole)
+        return _last_state(RecordedRobot(read_bag(whole), namespace))
+
+
+def _last_state(robot: RecordedRobot) -> LastState:
+    odom, joints, momentum = (robot[name] for name in _STATE)
+    # Momenta have no stamp; a state is published momenta first, and logged at its time.
+    common = np.intersect1d(odom.stamp_ns, joints.stamp_ns)
+    if not len(common):
+        raise RecordingError(
+            f"The bag {robot.bag.path} holds no state of which all parts are there."
+        )
+    k, j = (int(np.flatnonzero(series.stamp_ns == common[-1])[-1]) for series in (odom, joints))
+    pose = odom.table(columns("odom", "pose.pose"))[k]
+    names = robot.joint_names
+    positions = np.asarray(joints.field("position")[j])
+    rates = np.asarray(joints.field("velocity")[j])
+    momenta = np.asarray(momentum.field("data")[min(k, len(momentum) - 1)])[:6]
+    numbers = np.concatenate([pose, positions, rates, momenta])
+    whole = len(positions) == len(rates) == len(names) and len(momenta) == 6
+    if not (whole and np.isfinite(numbers).all()):
+        raise RecordingError(
+            f"The last state in the bag {robot.bag.path} lacks numbers, or they are not finite."
+        )
+    return LastState(
+        time_ns=int(common[-1]),
+        position=pose[:3],
+        quaternion=pose[3:],
+        joint_names=names,
+        joints=positions,
+        rates=rates,
+        momenta=momenta,
+    )

@@ -14,8 +14,14 @@ from types import TracebackType
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from spacerobot_ros.bag.mcap_file import BagExistsError, McapFile, encode
-from spacerobot_ros.bag.rosbag2 import QosProfile, RecordedTopic, metadata_record
+from spacerobot_ros.bag.mcap_file import (
+    BagExistsError,
+    McapFile,
+    QosProfile,
+    RecordedTopic,
+    encode,
+    metadata_record,
+)
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.messages.definitions import message_definition, type_hash
 

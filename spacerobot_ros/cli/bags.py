@@ -38,7 +38,7 @@ def export_command(bag: Path, format_name: str, out: Path | None, topics: tuple[
     Existing files and folders are not overwritten.
     """
     from spacerobot_ros.bag import read_bag
-    from spacerobot_ros.bag.export import ExportFormat, export
+    from spacerobot_ros.bag.tables import ExportFormat, export
 
     opened = read_bag(bag)
     stem = opened.path.with_suffix("")

@@ -1,16 +1,154 @@
-"""Messages of the stack made from plain values: states, goals, plans, predicted paths."""
+"""Messages of the stack from plain values: states, goals, plans, predicted paths, frames."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from spacerobot_ros.messages.layout import encode, encode_list, times_of
+from spacerobot_ros.errors import CommandError
+from spacerobot_ros.messages.layout import ENCAPSULATION, encode, encode_list, layout_of, times_of
+from spacerobot_ros.messages.readers import ODOMETRY, JointReader, TemplateReader
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.kinematics import ForwardKinematics, Frames
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
 from spacerobot_ros.times import LATEST_NS, SECOND
 from spacerobot_ros.topics import Topic
+
+TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
+TRANSFORMS, STATIC_TRANSFORMS = "/tf", "/tf_static"
+"""Names of the topics where no remap moves them."""
+
+_NUMBERS = 7
+_POSE = "pose.pose.position.x"
+
+
+class TransformTemplate:
+    """A serialised tf2_msgs/TFMessage whose stamps and numbers are written in place.
+
+    Parameters
+    ----------
+    frames
+        Names of the parent and the child of each transform.
+    """
+
+    def __init__(self, frames: Frames) -> None:
+        transforms = [
+            {"header": {"frame_id": parent}, "child_frame_id": child} for parent, child in frames
+        ]
+        raw = encode(TRANSFORM_TYPE, {"transforms": transforms})
+        leaves = layout_of(raw, TRANSFORM_TYPE, elements=True).leaves
+
+        def offsets(path: str) -> NDArray[np.intp]:
+            found = [leaves[f"transforms[{i}].{path}"].offset for i in range(len(frames))]
+            return np.array(found, dtype=np.intp) - ENCAPSULATION
+
+        self._buffer = bytearray(raw)
+        count = (len(raw) - ENCAPSULATION) // 8
+        self._times = np.frombuffer(self._buffer, np.uint32, 2 * count, ENCAPSULATION)
+        self._doubles = np.frombuffer(self._buffer, np.float64, count, ENCAPSULATION)
+        self._stamps = offsets("header.stamp.sec") // 4
+        first = offsets("transform.translation.x") // 8
+        self._numbers = first[:, np.newaxis] + np.arange(_NUMBERS)
+
+    def serialised(self, time_ns: int, poses: Array) -> bytes:
+        """Return the message with the poses (k, 7), all of one time."""
+        self._times[self._stamps], self._times[self._stamps + 1] = divmod(time_ns, SECOND)
+        self._doubles[self._numbers] = poses
+        return bytes(self._buffer)
+
+
+class RobotTransforms:
+    """The transforms of a robot as messages.
+
+    Parameters
+    ----------
+    description
+        The robot.
+    world_frame
+        Name of the inertial frame.
+    prefix
+        Goes before the names of the links, as robot_state_publisher's ``frame_prefix``.
+    links
+        Whether all links are in it, or the base link alone.
+    """
+
+    def __init__(
+        self, description: RobotDescription, world_frame: str, prefix: str, *, links: bool
+    ) -> None:
+        self._links = ForwardKinematics(description) if links else None
+        moving, fixed = ((), ()) if self._links is None else (self._links.moving, self._links.fixed)
+        frames = ((world_frame, prefix + description.base_link), *_prefixed(moving, prefix))
+        self._template = TransformTemplate(frames)
+        self._poses = np.zeros((len(frames), _NUMBERS))
+        self._fixed = _prefixed(fixed, prefix)
+
+    def message(self, time_ns: int, pose: Array, q: Array) -> bytes:
+        """Return the message of a pose (7,) of the base link and positions (n,) of the joints."""
+        self._poses[0] = pose
+        if self._links is not None:
+            self._links.update(q)
+            self._poses[1:] = self._links.transforms
+        return self._template.serialised(time_ns, self._poses)
+
+    def static_message(self, time_ns: int) -> bytes | None:
+        """Return the message of the links that do not move in their parents, if there are any."""
+        if self._links is None or not self._fixed:
+            return None
+        return TransformTemplate(self._fixed).serialised(time_ns, self._links.fixed_transforms)
+
+
+def _prefixed(frames: Iterable[tuple[str, str]], prefix: str) -> Frames:
+    return tuple((prefix + parent, prefix + child) for parent, child in frames)
+
+
+class StateFrames:
+    """Reads the frames of a robot from its odom and joint_states."""
+
+    def __init__(self, description: RobotDescription) -> None:
+        self._description = description
+        self._odom = TemplateReader(ODOMETRY, {_POSE: _NUMBERS})
+        self._joints = JointReader(description.joint_names, ["position"], complete=True)
+
+    def accept(self, odom: bytes, joint_states: bytes) -> None:
+        """Make these the state.
+
+        Raises
+        ------
+        CommandError
+            They are not of this robot.
+        """
+        self._joints.accept(joint_states)
+        self._odom.accept(odom)
+        self.world = self._odom.text("header.frame_id")
+        base = self._odom.text("child_frame_id")
+        if not base.endswith(self._description.base_link):
+            raise CommandError(f"its child frame is '{base}'")
+        self.prefix = base.removesuffix(self._description.base_link)
+
+    @property
+    def pose(self) -> Array:
+        """Pose of the base link (7,)."""
+        return self._odom.floats(_POSE)
+
+    @property
+    def q(self) -> Array:
+        """Positions of the joints (n,), m or rad."""
+        return self._joints.values["position"]
+
+
+def robot_frames(description: RobotDescription, state: StateFrames) -> dict[str, tuple[str, Array]]:
+    """Return, by name of a link, its parent and its pose (7,) in that, in a measured state."""
+    links, prefix = ForwardKinematics(description), state.prefix
+    links.update(state.q)
+    frames = {prefix + description.base_link: (state.world, state.pose)}
+    for names, poses in ((links.moving, links.transforms), (links.fixed, links.fixed_transforms)):
+        for (parent, child), pose in zip(names, poses, strict=True):
+            frames[prefix + child] = prefix + parent, pose
+    return frames
+
 
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 

@@ -28,20 +28,20 @@ from spacerobot_ros.errors import (
     SpaceRobotError,
 )
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.messages.readers import read_text
-from spacerobot_ros.messages.transforms import (
+from spacerobot_ros.messages.builders import (
     STATIC_TRANSFORMS,
     TRANSFORM_TYPE,
     TRANSFORMS,
     RobotTransforms,
     StateFrames,
 )
+from spacerobot_ros.messages.readers import read_text
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.common.remote_parameters import RemoteParameters
+from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
 from spacerobot_ros.nodes.common.streams import RawInput, RawStream, Take
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns, set_stamp

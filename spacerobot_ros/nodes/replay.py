@@ -23,7 +23,7 @@ from spacerobot_ros.bag import Playback, QosProfile, ReplayMessage, read_bag
 from spacerobot_ros.bag.config import ReplayConfig
 from spacerobot_ros.bag.playback import ReaderWait, ReplayStatus, renamed
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
-from spacerobot_ros.messages.transforms import TRANSFORM_TYPE
+from spacerobot_ros.messages.builders import TRANSFORM_TYPE
 from spacerobot_ros.model.visuals import MeshFolder, carries_meshes
 from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode

@@ -28,7 +28,7 @@ from spacerobot_ros.flight.scenario import COMMANDERS, Kill, Scenario
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
-from spacerobot_ros.nodes.common.connections import Connections, unconnected
+from spacerobot_ros.nodes.common.streams import Connections, unconnected
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.session.mission_client import MissionClient

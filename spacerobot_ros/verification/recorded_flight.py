@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spacerobot_ros.bag.reader import Bag
-from spacerobot_ros.bag.recorded_robot import RecordedRobot
+from spacerobot_ros.bag.reader import Bag, RecordedRobot
 from spacerobot_ros.errors import CommandError, ParameterError, RecordingError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import parse_robot

@@ -22,9 +22,9 @@ from std_msgs.msg import UInt8, UInt8MultiArray
 from support.made_bags import joint_states, made_bag
 
 from spacerobot_ros.bag import BagWriter, QosProfile, RecordingError, TopicSeries, read_bag
+from spacerobot_ros.bag.mcap_file import INFINITE_NS
 from spacerobot_ros.bag.mcap_reading import messages_in_time_order
 from spacerobot_ros.bag.playback import Playback
-from spacerobot_ros.bag.rosbag2 import INFINITE_NS
 from spacerobot_ros.bag.salvage import salvage_bag
 
 STRING = "std_msgs/msg/String"

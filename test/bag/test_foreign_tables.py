@@ -30,7 +30,7 @@ from support.command_line import CliRunner
 from support.flight_bags import urdf_of
 
 from spacerobot_ros.bag import Bag, BagWriter, read_bag
-from spacerobot_ros.bag.export import ExportFormat, export
+from spacerobot_ros.bag.tables import ExportFormat, export
 from spacerobot_ros.cli.main import main
 
 WALL = 1_763_817_000_123_456_789

@@ -18,9 +18,8 @@ from support.hostile_bags import QUICK
 
 import spacerobot_ros
 from spacerobot_ros.bag import BagWriter, RecordingError, iterate_raw, read_bag
-from spacerobot_ros.bag.mcap_records import LIMIT_VARIABLE
-from spacerobot_ros.bag.recorded_robot import last_state
-from spacerobot_ros.bag.salvage import salvage_bag
+from spacerobot_ros.bag.mcap_reading import LIMIT_VARIABLE
+from spacerobot_ros.bag.salvage import last_state, salvage_bag
 from spacerobot_ros.cli.main import main
 
 

@@ -10,7 +10,7 @@ from std_msgs.msg import String
 from support.made_bags import Say, array, joint_states, made_bag, odometry
 
 from spacerobot_ros.bag import RecordedRobot, RecordingError, read_bag
-from spacerobot_ros.bag.recorded_robot import last_state
+from spacerobot_ros.bag.salvage import last_state
 
 NAMES = ["elbow", "wrist"]
 STILL = (0.0,) * 6

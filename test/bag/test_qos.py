@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from spacerobot_ros.bag import LATCHED, QosProfile, RecordingError
-from spacerobot_ros.bag.rosbag2 import INFINITE_NS
+from spacerobot_ros.bag.mcap_file import INFINITE_NS
 
 # As rosbag2 of Humble wrote it: rmw's numbers, an infinite duration as the largest numbers.
 HUMBLE = """- history: 1

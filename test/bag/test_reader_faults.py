@@ -19,7 +19,7 @@ from spacerobot_ros.bag import (
     message_definition,
     read_bag,
 )
-from spacerobot_ros.bag.mcap_records import open_file
+from spacerobot_ros.bag.mcap_reading import open_file
 
 STRING = "std_msgs/msg/String"
 

@@ -20,10 +20,10 @@ from mcap.writer import MCAP0_MAGIC
 from rosbags.interfaces import Nodetype
 
 from spacerobot_ros.bag import RecordingError, read_bag
-from spacerobot_ros.bag.mcap_reading import _check_entries
-from spacerobot_ros.bag.mcap_records import (
+from spacerobot_ros.bag.mcap_reading import (
     LIMIT_VARIABLE,
     Allowance,
+    _check_entries,
     record_at,
     records,
     records_in,

@@ -24,8 +24,7 @@ from support.command_line import CliRunner
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import Bag, BagWriter, RecordingError, read_bag
-from spacerobot_ros.bag.export import ExportFormat, export
-from spacerobot_ros.bag.tables import TopicTable
+from spacerobot_ros.bag.tables import ExportFormat, TopicTable, export
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.resources import share_directory
 

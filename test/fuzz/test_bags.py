@@ -15,8 +15,7 @@ from mcap.writer import CompressionType, Writer
 from support.fuzzing import NUMBERS, VALUES, attempt, damaged, fuzz
 
 from spacerobot_ros.bag import Playback, iterate_raw, read_bag
-from spacerobot_ros.bag.recorded_robot import last_state
-from spacerobot_ros.bag.salvage import salvage_bag
+from spacerobot_ros.bag.salvage import last_state, salvage_bag
 from spacerobot_ros.parameters import declared
 from spacerobot_ros.report import write_report
 from spacerobot_ros.resources import share_directory

@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 from support.ros_harness import Harness
 
 from spacerobot_ros.nodes import PlantNode
-from spacerobot_ros.nodes.common.connections import Connections, unconnected
+from spacerobot_ros.nodes.common.streams import Connections, unconnected
 
 PLANT = Connections((("/odom", 2), ("/clock", 1)), (("/joint_commands", 1),))
 PLANNER = Connections((("/joint_commands", 2),), (("/odom", 1),))

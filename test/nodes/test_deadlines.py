@@ -11,7 +11,7 @@ from sensor_msgs.msg import JointState
 from support.ros_harness import DEEP, Harness
 
 from spacerobot_ros.nodes import PlantNode
-from spacerobot_ros.nodes.plant.diagnostics import timing_status
+from spacerobot_ros.nodes.plant.publisher import timing_status
 from spacerobot_ros.simulation.time_modes import RealTime
 
 MS = 1_000_000

@@ -22,8 +22,7 @@ from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.nodes.common.messages import goal_markers, goal_of, shape_marker, shape_of
-from spacerobot_ros.nodes.plant.diagnostics import PlantReport, timing_status
-from spacerobot_ros.nodes.plant.publisher import LinkMarkers
+from spacerobot_ros.nodes.plant.publisher import LinkMarkers, PlantReport, timing_status
 from spacerobot_ros.planning import BasePath, Goal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant

@@ -8,7 +8,7 @@ from typing import Any
 from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, ListParameters
 
-from spacerobot_ros.nodes.common.remote_parameters import RemoteParameters
+from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
 
 
 class Future:

@@ -17,9 +17,9 @@ from support.ros_harness import Harness, nanoseconds
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag, type_hash
-from spacerobot_ros.bag.recorded_robot import columns
+from spacerobot_ros.bag.reader import columns
+from spacerobot_ros.messages.builders import TRANSFORM_TYPE, TransformTemplate
 from spacerobot_ros.messages.definitions import _OWN_DEFINITIONS
-from spacerobot_ros.messages.transforms import TRANSFORM_TYPE, TransformTemplate
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot

@@ -45,7 +45,7 @@ def read(path: Path) -> None:
 
 
 def resume(path: Path) -> None:
-    from spacerobot_ros.bag.recorded_robot import last_state
+    from spacerobot_ros.bag.salvage import last_state
 
     last_state(path)
 
@@ -217,7 +217,7 @@ def outcomes(folder: Path, operations: list[str], words: str = "") -> Iterator[O
 def main() -> None:
     folder, operations, *words = sys.argv[1:]
     # What every case would import is there before the processes part.
-    import spacerobot_ros.bag.recorded_robot
+    import spacerobot_ros.bag.salvage
 
     if operations != "everything":
         import spacerobot_ros.cli.main

@@ -24,8 +24,8 @@ from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
+from spacerobot_ros.messages.builders import StateFrames, robot_frames
 from spacerobot_ros.messages.statuses import read_status
-from spacerobot_ros.messages.transforms import StateFrames, robot_frames
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.shared_parameters import robot_from_text, robot_of

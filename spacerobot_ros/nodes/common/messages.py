@@ -16,8 +16,8 @@ from sensor_msgs.msg import JointState
 from visualization_msgs.msg import Marker, MarkerArray
 
 from spacerobot_ros.errors import PlanningError, RecordingError, SpaceRobotError, printable
+from spacerobot_ros.messages.builders import STATIC_TRANSFORMS, TRANSFORM_TYPE, TRANSFORMS
 from spacerobot_ros.messages.definitions import message_definition
-from spacerobot_ros.messages.transforms import STATIC_TRANSFORMS, TRANSFORM_TYPE, TRANSFORMS
 from spacerobot_ros.model.description import Array, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_multiply
 from spacerobot_ros.planning import BasePath, Goal

@@ -31,10 +31,9 @@ from std_srvs.srv import Trigger
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.nodes.common.connections import Connections
 from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
-from spacerobot_ros.nodes.common.streams import RawInput, RawOutput, RawStream, Take
+from spacerobot_ros.nodes.common.streams import Connections, RawInput, RawOutput, RawStream, Take
 from spacerobot_ros.nodes.common.watchdog import Liveness, Pulse, Role, Silence
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
 

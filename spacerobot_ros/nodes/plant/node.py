@@ -17,7 +17,7 @@ from rclpy.timer import Timer
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from spacerobot_ros.bag.recorded_robot import last_state
+from spacerobot_ros.bag.salvage import last_state
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.messages.readers import CommandReader
 from spacerobot_ros.model import SpaceRobot
@@ -27,9 +27,9 @@ from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, descri
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.streams import RawInput
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
-from spacerobot_ros.nodes.plant.diagnostics import PlantReport
 from spacerobot_ros.nodes.plant.publisher import (
     LinkMarkers,
+    PlantReport,
     StatePublisher,
     TransformPublisher,
 )

@@ -30,7 +30,7 @@ from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.node import EVENTS, LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.common.remote_parameters import RemoteParameters
+from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
 from spacerobot_ros.nodes.viewer.listener import Listener
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
