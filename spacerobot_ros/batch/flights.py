@@ -1,7 +1,7 @@
-"""What many flights have in common, what differs, and what comes of them.
+"""A batch of flights: the numbers that all share, those of each flight, and the results.
 
-Rows are samples. A row says what :class:`.PlantConfig`, :class:`.InitialState` and
-:class:`.SensorConfig` say of one flight; the same numbers give the same flight there and here.
+Rows are flights. A row has the numbers of :class:`.PlantConfig`, :class:`.InitialState` and
+:class:`.SensorConfig` for one flight; the same numbers give the same flight in the plant.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ NOISES = (
     "joint_noise",
     "joint_rate_noise",
 )
-"""The parameters of :class:`SensorConfig` that the columns of :attr:`SensorErrors.noise` are."""
+"""Parameters of :class:`.SensorConfig` in the columns of :attr:`SensorErrors.noise`."""
 
 
 @dataclass(frozen=True)
 class Starts:
-    """Where flights start, a row each; see :class:`.InitialState`.
+    """Initial states, one row per flight; see :class:`.InitialState`.
 
     Attributes
     ----------
     position
-        (N, 3) of the base link in W, m; where ``of_center``, of the system's centre of mass.
+        (N, 3) of the base link in W, m; with ``of_center``, of the system's centre of mass.
     quaternion
         (N, 4) of ``R_WB`` (x, y, z, w), unit quaternions.
     q, qdot
@@ -72,7 +72,7 @@ class Starts:
         Raises
         ------
         ParameterError
-            One of them is refused, as the plant would refuse it.
+            The plant would refuse one of them.
         """
         centers = [each.center_of_mass for each in initial]
         return cls(
@@ -92,12 +92,12 @@ class Starts:
 
     @classmethod
     def alike(cls, robot: SpaceRobot, initial: InitialState, count: int) -> Starts:
-        """Return ``count`` equal rows; replace the columns that differ.
+        """Return ``count`` equal rows, of which the caller may change columns.
 
         Raises
         ------
         ParameterError
-            The initial state is refused, as the plant would refuse it.
+            The plant would refuse the initial state.
         """
         one = cls.of(robot, [initial])
         return cls(
@@ -113,7 +113,7 @@ class Starts:
         return len(self.position)
 
     def initial_state(self, index: int) -> InitialState:
-        """Return one row as the plant takes it."""
+        """Return one row as an initial state of the plant."""
         of_center = bool(self.of_center[index])
         state = InitialState(
             quaternion=self.quaternion[index],
@@ -128,7 +128,7 @@ class Starts:
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """How sensors err, a row a flight; see :class:`.SensorConfig`.
+    """Errors of sensors, one row per flight; see :class:`.SensorConfig`.
 
     Attributes
     ----------
@@ -140,7 +140,7 @@ class SensorErrors:
     joint_bias
         (N, n) of the joint positions, m or rad.
     seeds
-        (N,) of the noise: a flight whose sensors err draws what :class:`.Sensors` draws.
+        (N,) of the noise, which is the same as that of :class:`.Sensors` with this seed.
     """
 
     noise: Array
@@ -173,7 +173,7 @@ class SensorErrors:
         return len(self.seeds)
 
     def config(self, index: int) -> SensorConfig:
-        """Return one row as the plant takes it."""
+        """Return one row as a configuration of the plant's sensors."""
         return SensorConfig(
             **dict(zip(NOISES, self.noise[index].tolist(), strict=True)),
             position_bias=tuple(self.pose_bias[index, :3].tolist()),
@@ -184,7 +184,7 @@ class SensorErrors:
 
     @property
     def used(self) -> npt.NDArray[np.bool_]:
-        """(N,) whether what is measured differs from the truth: only then noise is drawn."""
+        """(N,) whether measurements differ from the truth: only then noise is drawn."""
         return np.asarray(
             self.noise.any(axis=1) | self.pose_bias.any(axis=1) | self.joint_bias.any(axis=1)
         )
@@ -192,12 +192,12 @@ class SensorErrors:
 
 @dataclass(frozen=True)
 class FollowedSchedule:
-    """Velocity commands of the planner's tracker along a schedule (:class:`.ScheduleFollower`).
+    """Velocity commands of the planner's :class:`.ScheduleFollower` along a schedule.
 
     Attributes
     ----------
     positions
-        (T + 1, n) shapes at the ticks, or (N, T + 1, n) of each flight; the last is held.
+        (T + 1, n) shapes at the ticks, or (N, T + 1, n) for each flight; the last is held.
     shape_gain
         Feedback from measured shape errors to velocities, 1/s; 0: open loop.
     deadband
@@ -218,7 +218,7 @@ class FollowedSchedule:
 
 @dataclass(frozen=True)
 class HeldCommands:
-    """Commands a tick, whatever is measured.
+    """Commands by tick, independent of measurements.
 
     Attributes
     ----------
@@ -241,16 +241,16 @@ class Controlled:
     config
         Its parameters, the same for all flights; its gains where ``gains`` gives none.
     base, end_effector
-        Goals in W, (7,) or (N, 7): position (m) and quaternion; None: it is held where it is.
+        Goals in W, (7,) or (N, 7): position (m) and quaternion; None: the initial pose is held.
     joints
-        Shapes to end in, (n,) or (N, n); None: those at the start.
+        Last shapes, (n,) or (N, n); None: the initial ones.
     gains
-        Those of each flight; none: of the configuration.
+        Gains of each flight; empty: those of the configuration.
     robot
-        The robot as the controller believes it; None: the nominal one of the flights.
+        The controller's model of the robot; None: the nominal one of the flights.
     until_decided
-        Whether a flight ends with the decision about its goal: a tick later, as its command is
-        still obeyed. Otherwise it goes on, and holds the goal.
+        Whether a flight ends with the decision about its goal: a tick later, after the command for
+        that state. Otherwise it goes on, and holds the goal.
     """
 
     config: ControllerConfig
@@ -267,12 +267,12 @@ FlightProgram = FollowedSchedule | HeldCommands | Controlled
 
 @dataclass(frozen=True)
 class Flights:
-    """N flights of one robot that differ in numbers.
+    """N flights of one robot that differ in numbers alone.
 
     Attributes
     ----------
     robot
-        The robot; its masses where ``inertial`` gives none.
+        The robot.
     actuation
         ``velocity`` or ``effort``.
     control_period
@@ -280,27 +280,26 @@ class Flights:
     ticks
         Ticks of each flight.
     starts
-        Where they start: its rows are the flights.
+        Initial states; the rows are the flights.
     program
-        What is commanded.
+        Source of the commands.
     inertial
         Masses, centres and inertias, (N, ...); None: those of the robot.
     sensors
-        How sensors err; None: not at all.
+        Errors of sensors; None: none.
     integration_step
         Longest Runge-Kutta step, s; 0: by the actuation.
     instants
-        Ticks after which the state is reported, ascending, 0 the start; the last is the end unless
-        given.
+        Ticks after which the state is reported, ascending; 0 is the start. Empty: the end alone.
     thrusters
-        What gives a controller's wrench, in pulses; None: it is given as it is commanded.
+        Thrusters that realise a controller's wrench in pulses; None: it acts as commanded.
 
     Raises
     ------
     ParameterError
-        The parts do not go together; the sentence says which.
+        Some values do not match; the message names them.
     RobotDescriptionError
-        What the bodies weigh is not possible.
+        A mass or an inertia is not physical.
     """
 
     robot: SpaceRobot
@@ -320,7 +319,7 @@ class Flights:
         if self.actuation not in PLANTS:
             raise ParameterError(f"The actuation is '{self.actuation}', not velocity or effort.")
         if self.ticks < 1:
-            raise ParameterError(f"A flight of {self.ticks} ticks is none.")
+            raise ParameterError(f"A flight of {self.ticks} ticks is too short; it needs one.")
         if not self.instants:
             object.__setattr__(self, "instants", (self.ticks,))
         self._require_program()
@@ -341,31 +340,31 @@ class Flights:
                 )
             self.inertial.require_physical([body.name for body in bodies])
         if self.sensors is not None and len(self.sensors) != count:
-            raise ParameterError(f"Sensors of {len(self.sensors)} flights are not of {count}.")
+            raise ParameterError(f"There are sensors of {len(self.sensors)} flights, not {count}.")
         if self.actuation == "velocity" and self.starts.qdot.any():
-            raise ParameterError("Joints under velocity commands start at rest.")
+            raise ParameterError("Joints under velocity commands must start at rest.")
 
     def _require_program(self) -> None:
         count, n = len(self), self.robot.n
         if self.thrusters is not None and not isinstance(self.program, Controlled):
-            raise ParameterError("Thrusters give the wrench of a controller only.")
+            raise ParameterError("Only the wrench of a controller can come from thrusters.")
         match self.program:
             case FollowedSchedule(positions=positions):
                 if self.actuation != "velocity":
-                    raise ParameterError("A schedule is followed under velocity actuation only.")
+                    raise ParameterError("A schedule needs velocity actuation.")
                 _require_rows("joints", positions, count, n)
             case HeldCommands(joints=joints, wrench=wrench):
                 if wrench is not None and self.actuation != "effort":
-                    raise ParameterError("A wrench pushes the base under effort actuation only.")
+                    raise ParameterError("A wrench on the base needs effort actuation.")
                 _require_rows("joints", joints, count, n)
                 _require_rows("wrench", wrench, count, 6)
             case Controlled(config=config, gains=gains):
                 if self.actuation != "effort":
-                    raise ParameterError("A controller flies under effort actuation only.")
+                    raise ParameterError("A controller needs effort actuation.")
                 if round(config.control_period * SECOND) != round(self.control_period * SECOND):
-                    raise ParameterError("The controller commands at another rate than the plant.")
+                    raise ParameterError("The controller has another rate than the plant.")
                 if gains and len(gains) != count:
-                    raise ParameterError(f"Gains of {len(gains)} flights are not of {count}.")
+                    raise ParameterError(f"There are gains of {len(gains)} flights, not {count}.")
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -388,25 +387,25 @@ class Flights:
         return self.robot.with_inertial(self.inertial[index])
 
 
-def _require_rows(what: str, array: Array | None, count: int, width: int) -> None:
+def _require_rows(name: str, array: Array | None, count: int, width: int) -> None:
     if array is None:
         return
     if array.ndim not in (2, 3) or array.shape[-1] != width or array.shape[-2] < 1:
-        raise ParameterError(f"The {what} are {array.shape}, not (ticks, {width}).")
+        raise ParameterError(f"The {name} are {array.shape}, not (ticks, {width}).")
     if array.ndim == 3 and len(array) != count:
-        raise ParameterError(f"The {what} of {len(array)} flights are not of {count}.")
+        raise ParameterError(f"There are {name} of {len(array)} flights, not {count}.")
     if not np.all(np.isfinite(array)):
-        raise ParameterError(f"The {what} hold a number that is not finite.")
+        raise ParameterError(f"The {name} have a number that is not finite.")
 
 
 @dataclass(frozen=True)
 class BatchResult:
-    """What came of N flights, at I instants.
+    """Results of N flights, at I instants.
 
     Attributes
     ----------
     engine
-        What flew them, for people.
+        Name of the engine that flew them.
     time
         (I,) s.
     pose
@@ -418,38 +417,38 @@ class BatchResult:
     momentum
         (N, I, 7) linear and angular momentum in W, kinetic energy.
     measured_pose, measured_q
-        (N, I, 7) and (N, I, n) what the sensors measured then.
+        (N, I, 7) and (N, I, n) measurements of the sensors.
     peak_rate
         (N, n) largest joint rate at the end of a tick, m/s or rad/s.
     peak_effort
         (N, n) largest effort of a joint in a tick, N or N m; zero under velocity actuation.
     peak_wrench
-        (N, 2) largest force (N) and torque (N m) that were commanded on the base.
+        (N, 2) largest force (N) and torque (N m) commanded on the base.
     impulse
-        (N, 2) integrals of the sizes of these over time, N s and N m s.
+        (N, 2) integrals of their norms over time, N s and N m s.
     propellant
-        (N,) what thrusters have used, kg; NaN without.
+        (N,) propellant used, kg; NaN without thrusters.
     limited
-        (N, n) ticks in which each joint was limited, by what limited it, as the plant counts.
+        (N, n) numbers of ticks in which each joint was limited, by the limit, as the plant counts.
     fallback_ticks
-        (N,) ticks that the scalar plant flew because lanes cannot.
+        (N,) numbers of ticks of which a step was done outside the lanes.
     lowest, highest
-        (N, n) ends of the ranges of the joint positions, over the states at all ticks.
+        (N, n) ranges of the joint positions, over the states at all ticks.
     decision
-        (N,) :class:`Decision` of a controller about its goal, the first one.
+        (N,) first :class:`.Decision` about the goal of a controller.
     decided_tick
-        (N,) the tick whose state it was made at; -1: there was none.
+        (N,) tick of the state of that decision; -1: there was none.
     decided_distance
-        (N, 3) the :class:`.OutputDistance` to the goal then; NaN likewise.
+        (N, 3) the :class:`.OutputDistance` to the goal at that state; NaN without a decision.
     end_tick
-        (N,) how many ticks were flown.
+        (N,) number of flown ticks.
     end_state
         (N, 2 n + 20) the state then: q, qdot, pose, twist and momentum; NaN without a controller.
     momentum_drift
         (N, 2) largest change of linear and angular momentum that thrust does not explain; NaN
         without a controller.
     failures
-        Sentences of the flights that did not end, by their row; their later numbers are NaN.
+        Messages of the flights that failed, by their row; their later numbers are NaN.
     """
 
     engine: str
@@ -480,7 +479,7 @@ class BatchResult:
 
     @classmethod
     def empty(cls, flights: Flights) -> BatchResult:
-        """Return the memory of a result, to be filled."""
+        """Return a result for the flights to fill."""
         N, instants, n = len(flights), len(flights.instants), flights.robot.n
         first = {"velocity": "rate", "effort": "effort"}[flights.actuation]
 

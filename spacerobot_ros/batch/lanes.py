@@ -469,7 +469,7 @@ class SensorNoise:
 
     @property
     def commanded_by(self) -> bool:
-        """Whether commands follow from what is measured with errors: schedules look at joints."""
+        """Whether commands depend on errors: along schedules, on those of joints."""
         errors = self._errors
         if errors is None:
             return False
@@ -477,9 +477,11 @@ class SensorNoise:
         return bool(self._whole or joints)
 
     def drawn(self, begin: int, end: int, alive: Array) -> Array | None:
-        """Draw for the states at the ticks from ``begin`` to before ``end``; return what falls to
-        joint positions, (groups, ticks, n, lanes), or with a controller to everything. None where
-        no command follows from it. ``alive`` (groups, lanes): others need none any more.
+        """Draw the noise of the ticks from ``begin`` to before ``end``.
+
+        ``alive`` (groups, lanes): whether flights are still under way. Returns the noise that the
+        commands depend on: that of joint positions, (groups, ticks, n, lanes), or with a controller
+        all of it; None if commands do not depend on noise.
         """
         if self._errors is None:
             return None
@@ -504,7 +506,7 @@ class SensorNoise:
         return np.ascontiguousarray(np.moveaxis(grouped, 1, 3))
 
     def measured(self, pose: Array, q: Array) -> tuple[Array, Array]:
-        """Return what is measured of poses (count, I, 7) and shapes (count, I, n)."""
+        """Return the measurements of poses (count, I, 7) and shapes (count, I, n)."""
         if self._errors is None:
             return pose, q
         rows, count = self._rows[: len(pose)], len(pose)

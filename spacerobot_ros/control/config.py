@@ -17,7 +17,7 @@ from spacerobot_ros.parameters import group, parameter, registered
 
 @dataclass(frozen=True)
 class ErrorMargin:
-    """By how much the errors of a goal may exceed twice what it asks for before it is given up."""
+    """Margin beyond twice the distance of a goal at which growing errors abort it."""
 
     position: float = parameter(
         1.0,
@@ -33,13 +33,13 @@ class ErrorMargin:
     )
 
     def as_errors(self) -> Errors:
-        """Return the margins, infinite where an error is none; joints have ends of their own."""
+        """Return the margins: infinite for 0, and for joints, which have limits of their own."""
         return Errors(self.position or math.inf, self.attitude or math.inf, math.inf)
 
 
 @dataclass(frozen=True)
 class ControllerConfig(CommanderConfig):
-    """What a controller controls, by which law, and when a goal is reached."""
+    """Parameters of a controller: outputs, law, limits, and the decision about goals."""
 
     law: str = parameter("transposed_jacobian", "control law", choices=tuple(LAWS))
     tick_rate: float = parameter(
@@ -63,8 +63,7 @@ class ControllerConfig(CommanderConfig):
     )
     joint_rates: float = parameter(
         1.0,
-        "part of the joint rates of the URDF that joints are kept within by their efforts; 0: "
-        "whatever rates",
+        "share of the joint rates of the URDF that joint efforts keep joints within; 0: no limit",
         minimum=0.0,
         maximum=1000.0,
     )

@@ -1,4 +1,4 @@
-"""The controller without its topics: goals, reference, law, limits, loss of measurements."""
+"""The controller without topics: goals, references, law, limits, and missing measurements."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ import numpy as np
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.estimator import DeadReckoning
-from spacerobot_ros.control.joint_rates import JointRateLimits
 from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
 from spacerobot_ros.control.laws.law import ControlLaw, Gains
 from spacerobot_ros.control.laws.registry import LAWS
-from spacerobot_ros.control.limits import ActuatorLimits, MotionLimits, Saturated
+from spacerobot_ros.control.limits import ActuatorLimits, JointRateLimits, MotionLimits, Saturated
 from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
 from spacerobot_ros.control.reference import PROFILES, Errors, ReferenceProfile, StepReference
 from spacerobot_ros.control.state import (
@@ -34,11 +33,11 @@ _BRAKE_RATE = 2.0
 
 
 _MOST_PERIODS = 20
-"""Control periods between two commands beyond which time has jumped."""
+"""Largest number of control periods between two commands; a longer gap is a jump of time."""
 
 
 class Mode(str, Enum):
-    """How the controller knows the state of the base."""
+    """Source of the base's state."""
 
     MEASURED = "measured"
     ESTIMATED = "estimated"
@@ -46,26 +45,26 @@ class Mode(str, Enum):
 
 
 class CoordinatedController:
-    """Flies spacecraft and arm together, a command for every state.
+    """Controls spacecraft and arm together, with a command for every state.
 
-    Until a goal is given the robot holds the pose it has at its first state. A goal starts a new
-    reference profile from the present reference, for the base and the end-effector together.
+    Until a goal is given the robot holds the pose of its first state. A goal starts a new reference
+    profile from the present reference, for the base and the end-effector together.
 
     Parameters
     ----------
     law
         The control law, with its outputs.
     limits
-        Of thrusters and joints; what a command loses to them is reported.
+        Limits of thrusters and joint efforts; the loss of a command to them is reported.
     rates
-        Of the joints; what a command loses to them is reported as well.
+        Limits of joint rates; the loss to them is reported as well.
     profile, motion
-        How references move to goals; accelerations that the thrusters cannot give are lowered.
+        Profile and limits of references; accelerations beyond the thrust are lowered.
     control_period
         Time between two commands, s.
     estimation_time
-        For how long the base may be estimated by integration when its measurements stop (paper 4,
-        section IV), s. After that the thrusters are off and the joints are brought to rest.
+        Longest time for which the base is estimated by integration when its measurements stop
+        (paper 4, section IV), s. Then the thrusters are off and the joints are brought to rest.
     """
 
     def __init__(
@@ -92,7 +91,7 @@ class CoordinatedController:
         self._estimator: DeadReckoning | None = None
         self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
         self.coming_to_rest = False
-        """Whether the robot is brought to rest, wherever that is."""
+        """Whether the robot is being brought to rest, at any pose."""
 
     def reset(self) -> None:
         """Drop goals and measurements; the next state counts as the first."""
@@ -114,9 +113,9 @@ class CoordinatedController:
         end_effector: PoseReference | None = None,
         joints: Array | None = None,
     ) -> None:
-        """Start towards new goals; a part whose goal is not given keeps its earlier one.
+        """Start towards new goals; a group without a new goal keeps its earlier one.
 
-        A robot that was brought to rest has none: it keeps what is not given where it is.
+        A robot that was brought to rest has no earlier goals: such a group stays where it is.
         """
         if self.coming_to_rest:
             self._profile, self.coming_to_rest = None, False
@@ -139,20 +138,20 @@ class CoordinatedController:
         self.set_goals(time, state, base=goal.base, end_effector=goal.end_effector, joints=joints)
 
     def hold_here(self, time: float, state: ControlState) -> None:
-        """Hold everything where it is: the reference does not come from where it was before."""
+        """Hold the measured pose and shape; the earlier reference is dropped."""
         self._profile = None
         self.set_goals(time, state)
 
     def come_to_rest(self) -> None:
-        """Bring the whole robot to rest, wherever that is, until there is something to follow."""
+        """Bring the whole robot to rest, at any pose, until there is a new goal or reference."""
         self.coming_to_rest = True
 
     def shift_time(self, seconds: float) -> None:
-        """Let the reference go on from where it is when time has jumped by some s."""
+        """Continue the reference as if time had not jumped by some s."""
         self._began += seconds
 
     def follow(self, reference: Reference) -> None:
-        """Track a reference from outside at the next command; the profile gives what it lacks."""
+        """Track an external reference at the next command; the profile serves groups it lacks."""
         self._followed = reference
         self.coming_to_rest = False
 
@@ -161,8 +160,8 @@ class CoordinatedController:
     ) -> Saturated:
         """Return the actuation at ``time`` (s), within limits.
 
-        ``measured`` is the state, None where the base was not measured; ``q`` and ``qdot`` (n,) are
-        the joints, which are always.
+        ``measured`` is the state, None if the base was not measured; ``q`` and ``qdot`` (n,) are
+        the joints, which are always measured.
 
         Raises
         ------
@@ -190,7 +189,7 @@ class CoordinatedController:
         return result
 
     def limited(self, state: ControlState, commanded: Actuation, periods: int = 1) -> Saturated:
-        """Return the realised part of a command at a state, which is held for so many periods."""
+        """Return the realised part of a command that is held for some control periods."""
         result = self._limits.apply(commanded)
         kept = self._rates.apply(state, result.realised, self._limits.effort, periods)
         return result if kept is result.realised else Saturated.of(commanded, kept)
@@ -198,8 +197,8 @@ class CoordinatedController:
     def limited_expression(
         self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX
     ) -> tuple[ca.SX, ca.SX]:
-        """Return what the actuators realise of ``[f; n; tau]`` (6 + n,), and whether the limits of
-        joint rates change that: then it is for :meth:`limited` to say how.
+        """Return the part of ``[f; n; tau]`` (6 + n,) within the actuators' limits, and whether the
+        limits of joint rates lower it further, which only :meth:`limited` can do.
         """
         realised = self._limits.expression(actuation)
         return realised, self._rates.lowered(omega, q, qdot, realised)
@@ -211,16 +210,16 @@ class CoordinatedController:
 
     @property
     def goal(self) -> Reference:
-        """Where the references of all that is controlled come to rest; empty at first."""
+        """Pose and shape in which the references come to rest; empty before the first state."""
         return Reference() if self._profile is None else self._profile.goal
 
     @property
     def joint_rates(self) -> Array:
-        """The rates (n,) that joints are kept within, m/s or rad/s; infinite: none."""
+        """Largest joint rates (n,), m/s or rad/s; infinite: no limit."""
         return self._rates.rates
 
     def largest_rate_share(self, qdot: Array) -> float:
-        """Return the largest of rates (n,) in parts of what joints are kept within."""
+        """Return the largest of rates (n,) as a share of its limit."""
         return self._rates.largest_share(qdot)
 
     @property
@@ -257,11 +256,12 @@ class CoordinatedController:
         return dict(zip(self.law.outputs.labels, self.law.error.tolist(), strict=True))
 
     def error_bounds(self, margins: Errors) -> Array:
-        """Return bounds (m,) on the errors of the outputs in a sound flight to the present goals.
+        """Return the errors (m,) of the outputs beyond which control is lost.
 
-        Call it after the first command towards them. The bound is the same for all outputs of a
-        kind: twice the larger of the distance that the reference travels and the largest error now
-        (with the error that its rate adds until it is damped), and a margin (m, rad) beyond.
+        Call it after the first command towards the present goals. The bound is the same for all
+        outputs of a kind: a margin (m, rad) beyond twice the larger of the distance that the
+        reference travels and the largest present error, with the error that its rate adds until it
+        is damped.
         """
         assert self._profile is not None
         law, far = self.law, self._profile.distances()
@@ -277,15 +277,15 @@ class CoordinatedController:
     # -- parts --------------------------------------------------------------------------------
 
     def _periods_held(self, time: float) -> int:
-        """Return how many control periods the last command was held, as this one probably will be:
-        on a machine that is too busy not every state is answered.
+        """Return for how many control periods the last command was held, as this one probably will
+        be: on a machine that is too busy not every state is answered.
         """
         before, self._commanded_at = self._commanded_at, time
         periods = (time - before) / self._control_period
         return round(periods) if 1.0 < periods < _MOST_PERIODS else 1
 
     def _present(self, time: float, state: ControlState) -> Reference:
-        """Where the reference is now; at first, where the robot is."""
+        """Return the present reference; before the first one, the pose of the robot."""
         if self._profile is not None:
             return self._profile.at(time - self._began)
         link = self.law.outputs.selection.end_effector_link
@@ -323,7 +323,7 @@ class CoordinatedController:
         return self._estimator.step(self._sent, q, qdot)
 
     def _stopping(self, q: Array, qdot: Array) -> Actuation:
-        """Thrusters off, joints to rest: what can be done without knowing where the base is."""
+        """Return a command with thrusters off and joints to rest, whatever the pose of the base."""
         robot = self.law.robot
         if self._brake is None:
             outputs = ComputedTorqueLaw.default_outputs(robot, "")
@@ -333,7 +333,7 @@ class CoordinatedController:
             self._brake = ComputedTorqueLaw(robot, outputs, gains), reference
         law, reference = self._brake
         rest = np.zeros(3)
-        # Forces between base and arm depend on the base's rotation alone; taken as none.
+        # Forces between base and arm depend on the rotation of the base alone; assumed to be zero.
         state = ControlState(rest, np.array([0.0, 0.0, 0.0, 1.0]), rest, rest, q, qdot)
         return law.command(state, reference)
 

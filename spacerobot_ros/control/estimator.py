@@ -1,4 +1,4 @@
-"""The state without inertial measurements: the equations of motion, integrated as commanded."""
+"""Dead reckoning without measurements of the base: integrated equations of motion."""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ class DeadReckoning:
     """Paper 4, end of section IV: the state by integration of eq. (19) under the commands sent.
 
     It starts at the last measured state and steps a control period at a time under held actuation,
-    by Runge-Kutta 4. What the model and the real robot differ in accumulates: see :attr:`elapsed`.
+    by Runge-Kutta 4. Differences between the model and the real robot accumulate over the time
+    :attr:`elapsed`.
 
-    While the joints are still measured they need not be predicted. The predicted shape is then
-    replaced by the measured one and the base moved as that difference moves it: the centre of mass
-    and both momenta, which no joint effort changes, stay as predicted, and the attitude follows by
-    the connection ``A``. Only the effect of the thrusters is left to accumulate errors.
+    Joints that are measured are not predicted. The predicted shape is replaced by the measured one,
+    and the base moves by the difference: the centre of mass and both momenta, which no joint effort
+    changes, stay as predicted, and the attitude follows by the connection ``A``. Then only the
+    effect of the thrusters accumulates errors.
 
     Parameters
     ----------
@@ -101,8 +102,8 @@ def _split(x: ca.SX, n: int) -> list[ca.SX]:
 def _effort_step(robot: SpaceRobot, substeps: int) -> ca.Function:
     """Return ``(x, wrench_B, tau, h) -> x`` of a stacked :class:`ControlState`, RK4.
 
-    What is integrated is ``y``, in which position and velocity are those of the centre of mass
-    (``r_cm`` in W, ``v_cm`` in base components), as eq. (19) has them.
+    The integrated state is ``y``, in which position and velocity are those of the centre of mass
+    (``r_cm`` in W, ``v_cm`` in base components), as in eq. (19).
     """
     x, h = ca.MX.sym("x", 13 + 2 * robot.n), ca.MX.sym("h")
     held = ca.MX.sym("wrench_B", 6), ca.MX.sym("tau", robot.n)

@@ -28,7 +28,7 @@ GOAL_KEYS = (BASE, END_EFFECTOR)
 
 
 class ControlExecutive:
-    """Decides which goals a :class:`CoordinatedController` pursues, and reports their outcome.
+    """Gives a :class:`CoordinatedController` its goals, and reports their outcome.
 
     For every state the owner calls :meth:`command`, sends the result to the actuators, and then
     calls :meth:`evaluate`. The state of the goal is one of
@@ -36,7 +36,7 @@ class ControlExecutive:
     * ``HOLDING``: no goal was accepted; the robot holds the pose of its first state.
     * ``TRACKING``: a goal is pursued. ``REACHED`` once all errors have stayed within the tolerances
       for the settling time after the reference has come to rest; ``FAILED`` if that does not happen
-      within the time limit. Either way the robot goes on to hold the goal.
+      within the time limit. In both cases the robot then holds the goal.
     * ``ABORTED``: the goal was given up; the robot holds the pose of the next measured state. After
       a loss of control (a joint is far beyond its rate against its motor, or the errors of a goal
       grow instead of shrinking), the robot is brought to rest instead.
@@ -56,7 +56,7 @@ class ControlExecutive:
         Called with every status: whenever the state changes, when commands begin or cease to be
         limited, and every ``status_period``.
     goal_file
-        Where the present goals are saved for a controller that is restarted.
+        File of the present goals, from which a controller that is restarted resumes.
     warn
         Called with a message if the goals cannot be saved.
     report_event
@@ -87,12 +87,12 @@ class ControlExecutive:
         self._hold_here = False
         """Whether the robot holds the pose of the next measured state, without a goal."""
         self._begin_anew = False
-        """Whether the goal is started again at the next measured state."""
+        """Whether the goal begins anew at the next measured state."""
         self.plant_blocked = False
         """Whether the plant ignores commands, set by the owner. Each command then holds the pose of
         its state, so that none of them moves the robot when the plant obeys again."""
         self._abort_sentence = ""
-        """The sentence of the status while the state is aborted."""
+        """The message of the status while the state is aborted."""
         self._pending: dict[str, IdentifiedGoal] = {}
         """Goals that are accepted and wait for the next measured state."""
         self._abort_requested = False
@@ -128,12 +128,12 @@ class ControlExecutive:
     def submit(self, key: str, goal: IdentifiedGoal) -> None:
         """Accept a goal of the ``base`` or the ``end_effector``, pursued from the next state on.
 
-        What is controlled beside it keeps its goal.
+        The other one keeps its goal.
 
         Raises
         ------
         PlanningError
-            The law does not control it, or its shape has another number of joints.
+            The law does not control it, or the goal's shape has another number of joints.
         """
         law = self.controller.law
         if not getattr(law.outputs.selection, key):
@@ -144,14 +144,14 @@ class ControlExecutive:
         shape = goal.goal.joint_positions
         if shape is not None and len(shape) != law.robot.n:
             raise PlanningError(
-                f"A shape of {len(shape)} joints is no goal of robot "
-                f"'{law.robot.description.name}', which has {law.robot.n}."
+                f"The goal has a shape of {len(shape)} joints; robot "
+                f"'{law.robot.description.name}' has {law.robot.n}."
             )
         self._pending.pop(key, None)
         self._pending[key] = goal
 
     def refuse(self, sentence: str, goal_id: str = "") -> None:
-        """Report that a goal is refused; an earlier one is still pursued."""
+        """Report the refusal of a goal; an earlier goal is still pursued."""
         self._publish(ControllerState.REFUSED, sentence, goal_id)
         self._decided(EventKind.GOAL_REFUSED, sentence, ControllerState.REFUSED, goal_id)
 
@@ -161,7 +161,7 @@ class ControlExecutive:
         Raises
         ------
         ParameterError
-            They are goals of another robot or law; none is accepted.
+            The goals are those of another robot or law; none is accepted.
         """
         try:
             for key, goal in saved.items():
@@ -173,24 +173,24 @@ class ControlExecutive:
             ) from error
 
     def abort(self) -> None:
-        """Give up every goal; from the next measured state on the robot holds where it is then."""
+        """Give up every goal; the robot holds the pose of the next measured state."""
         self._give_up("Aborted on request; the robot holds.")
         self._abort_requested = True
 
     def plant_stopped(
         self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
     ) -> bool:
-        """Give up every goal at once: the plant does not obey commands any more.
+        """Give up every goal at once, because the plant ignores commands from now on.
 
         Parameters
         ----------
         why
-            The sentence of the plant; it becomes part of the status.
+            The message of the plant; it becomes part of the status.
         commanded_until_ns
             For a plant that rests because commands did not come: the stamp of the last one that it
-            had. Goals that were begun later go on. None: it obeys nothing.
+            received. Goals that were begun later go on. None: the plant obeys nothing.
         rests_since_ns
-            Since when it rests then, ns; every goal that was begun before is given up.
+            Time since which it rests then, ns; the executive of the planner needs it.
 
         Returns
         -------
@@ -213,22 +213,20 @@ class ControlExecutive:
         return True
 
     def plant_obeys_again(self) -> None:
-        """Hold where the robot is at the next measured state, not where it was before."""
+        """Hold the pose of the next measured state, not an earlier one."""
         self._hold_here = True
 
     def plant_reset(self) -> None:
-        """Begin the goal anew from where the robot is at the next measured state; without one hold
-        it there: where it was to be before is nowhere that it was sent to from there.
-        """
+        """Begin the goal anew at the next measured state; without a goal, hold its pose."""
         if self._goal_state is ControllerState.TRACKING:
             self._begin_anew = True
         else:
             self._hold_here = True
 
     def _give_up(self, sentence: str) -> None:
-        """Drop every goal and its file; the sentence is the status from now on."""
+        """Drop every goal and its file; the message is that of the status from now on."""
         pursued = self._pending or self._goal_state is ControllerState.TRACKING
-        # A goal that is decided stays so: without another one the abort is about none.
+        # A decided goal stays decided: without another one the abort is about no goal.
         self._goal_id = self._latest_id() if pursued else ""
         self._pending.clear()
         self._abort_sentence = sentence
@@ -246,7 +244,7 @@ class ControlExecutive:
     ) -> Saturated:
         """Return the actuation for a state; see :meth:`CoordinatedController.command`.
 
-        ``reference`` is what a planner gives for this state; what it lacks is held.
+        ``reference`` is that of a planner for this state; groups that it lacks are held.
 
         Raises
         ------
@@ -335,13 +333,13 @@ class ControlExecutive:
         self._decided(EventKind.GOAL_ABORTED, self._abort_sentence, ControllerState.ABORTED)
 
     def _shift_time(self, seconds: float) -> None:
-        """Continue the goal as if time had not jumped: the jump does not count as time flown."""
+        """Continue the goal as if time had not jumped."""
         self.controller.shift_time(seconds)
         self._monitor.shift_time(seconds)
         self._next_report += seconds
 
     def _hold(self, time: float, state: ControlState) -> None:
-        """Hold everything where it is, after an abort or when the plant obeys again."""
+        """Hold the measured pose, after an abort or when the plant obeys again."""
         self.controller.hold_here(time, state)
         if self._abort_requested:
             self._goal_state = self._reported_state = ControllerState.ABORTED
@@ -373,10 +371,10 @@ class ControlExecutive:
         try:
             self._file.save(self._pursued())
         except ParameterError as error:
-            self._warn(f"{error} The goal is pursued, but would not be resumed.")
+            self._warn(f"{error} The goal is pursued, but not resumed after a restart.")
 
     def _pursued(self) -> dict[str, IdentifiedGoal]:
-        """Return where the controller brings all that it controls: whole goals to resume with."""
+        """Return the goals of all controlled poses, to resume with."""
         goal, selection = self.controller.goal, self.controller.law.outputs.selection
         shape = goal.joints.q if goal.joints is not None and selection.joints else None
         poses = {BASE: goal.base, END_EFFECTOR: goal.end_effector}
@@ -387,7 +385,7 @@ class ControlExecutive:
         }
 
     def _latest_id(self) -> str:
-        """Return the id of the goal that was accepted last."""
+        """Return the id of the last accepted goal."""
         return next(reversed(self._pending.values())).goal_id if self._pending else self._goal_id
 
     # -- status -------------------------------------------------------------------------------
@@ -431,7 +429,7 @@ def decided_message(state: ControllerState, distance: OutputDistance) -> str:
 
 
 _GAP, _GAP_PERIODS = 1.0, 10
-"""Longest time between two states beyond which time has jumped: s, or control periods."""
+"""Longest time between two states, s, or in control periods; a longer one is a jump of time."""
 
 _DECIDED = {
     Decision.REACHED: (ControllerState.REACHED, EventKind.GOAL_REACHED),

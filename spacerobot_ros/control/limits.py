@@ -1,4 +1,9 @@
-"""What the actuators can give, and how fast references may move so that they can follow."""
+"""Limits of actuators, of joint rates, and of references, which actuators must be able to follow.
+
+A law commands forces, whatever speeds follow. While a goal is far away, a measurement is late or a
+thruster is stuck open, joints would become faster than their motors allow, and faster than commands
+that are held for a control period can follow: :class:`JointRateLimits` lowers their efforts.
+"""
 
 from __future__ import annotations
 
@@ -8,28 +13,47 @@ from dataclasses import dataclass, fields, replace
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.control.state import Actuation
+from spacerobot_ros.control.state import Actuation, ControlState
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import BufferedFunction, dense_function
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.dynamics import solve_positive_definite
+from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
 
 _SHARE = 0.5
-"""Part of the thrust that a reference may ask for; the feedback, and masses that are not quite as
-believed, need the rest."""
+"""Share of the thrust for references; feedback and errors of the masses need the rest."""
+
+
+_PERIODS = 2
+"""Shortest time in which a joint may reach its largest rate, in control periods: neither the held
+efforts nor the next ones may carry it beyond, even if the model is slightly wrong."""
+
+_FREE = 0.5
+"""Share of a joint's largest rate up to which, after the next period, its dynamics are not
+evaluated."""
+
+_SHAPES = 16
+"""Number of random shapes for the estimate of each joint's largest mobility."""
+
+_REST_RATE = 2.0
+"""Decay rate of joint rates and momenta while a robot is brought to rest, 1/s."""
+
+_REST_RATE_PER_PERIOD = 0.5
+"""Largest product of that decay rate and the control period."""
 
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """The fastest a reference moves: speeds and accelerations of poses and of joints.
+    """Largest speeds and accelerations of references, of poses and of joints.
 
-    ``joint_speed`` and ``joint_acceleration`` hold for every joint (m or rad, s); they are no
+    ``joint_speed`` and ``joint_acceleration`` hold for every joint (m or rad, s); they are not
     parameters of the controller node, whose goals are poses.
 
     Raises
     ------
     ParameterError
-        A limit is not positive; the sentence names it.
+        A limit is not positive; the message names it.
     """
 
     speed: float = parameter(0.1, "largest speed of a reference", unit="m/s", minimum=1e-06)
@@ -52,12 +76,12 @@ class MotionLimits:
                 raise ParameterError(f"The limit '{limit.name}' is {value}; it must be positive.")
 
     def within_thrust(self, actuators: ActuatorLimits, robot: SpaceRobot, q: Array) -> MotionLimits:
-        """Return the limits with accelerations lowered to what the thrusters give at a shape.
+        """Return the limits with accelerations lowered to those that the thrusters can produce.
 
-        The whole robot is taken as one body at the shape ``q`` (n,): force over total mass; torque
-        over its largest moment of inertia about the center of mass; and the force, which acts at
-        the base, needs torque too where the center of mass is elsewhere. A spacecraft without
-        thrusters is left as it is.
+        The robot is treated as one rigid body of the shape ``q`` (n,): force over total mass;
+        torque over the largest moment of inertia about the centre of mass; and the torque that the
+        force at the base needs if the centre of mass is elsewhere. Without thrusters nothing is
+        lowered.
         """
         torque = _SHARE * actuators.torque
         lever = float(np.linalg.norm(robot.center_of_mass(q)))
@@ -74,20 +98,22 @@ class MotionLimits:
 
 @dataclass(frozen=True)
 class Saturated:
-    """``realised``: what the actuators give; ``loss``: commanded minus realised."""
+    """A command within the limits of the actuators: ``realised``, and ``loss``, commanded minus
+    realised.
+    """
 
     realised: Actuation
     loss: Actuation
 
     @classmethod
     def of(cls, commanded: Actuation, realised: Actuation) -> Saturated:
-        """Return what is realised of a command, and what is lost."""
+        """Return the realised actuation together with its difference from the command."""
         wrench = commanded.wrench_B - realised.wrench_B
         return cls(realised, Actuation(wrench, commanded.tau - realised.tau))
 
     @property
     def limited(self) -> bool:
-        """Whether anything was limited."""
+        """Whether any limit was active."""
         return bool(self.loss.wrench_B.any() or self.loss.tau.any())
 
 
@@ -95,11 +121,10 @@ class Saturated:
 class ActuatorLimits:
     """Limits of the thrusters and of the joints.
 
-    The thrusters give any force up to ``force`` (N) and any torque up to ``torque`` (N m), both in
-    Euclidean norm and independently of each other. Beyond, the force is scaled to its limit, and
-    so is the torque: each keeps its direction, so that a limited spacecraft is pushed where it is
-    wanted, only less. Each joint gives up to its ``effort`` (n,), N m or N, by itself. Infinite
-    where there is no limit.
+    The thrusters produce any force up to ``force`` (N) and any torque up to ``torque`` (N m), both
+    in Euclidean norm and independently of each other. A larger force or torque is scaled to its
+    limit and keeps its direction. Each joint produces up to its ``effort`` (n,), N m or N. A limit
+    that does not exist is infinite.
 
     Raises
     ------
@@ -124,7 +149,7 @@ class ActuatorLimits:
             )
 
     def apply(self, commanded: Actuation) -> Saturated:
-        """Return what the actuators give of a command, and what is lost."""
+        """Return the command within the limits."""
         wrench = np.concatenate(
             [
                 _scaled(commanded.wrench_B[:3], self.force),
@@ -135,7 +160,7 @@ class ActuatorLimits:
         return Saturated.of(commanded, Actuation(wrench, tau))
 
     def expression(self, actuation: ca.SX) -> ca.SX:
-        """Return what :meth:`apply` realises of a command ``[f; n; tau]`` (6 + n,)."""
+        """Return the realised part of a command ``[f; n; tau]`` (6 + n,), as :meth:`apply` does."""
         parts = []
         for vector, limit in ((actuation[:3], self.force), (actuation[3:6], self.torque)):
             size = ca.sqrt(ca.dot(vector, vector))
@@ -151,3 +176,164 @@ def _scaled(vector: Array, limit: float) -> Array:
 
 def _smallest(accelerations: list[float]) -> float:
     return min(a for a in accelerations if a > 0 and math.isfinite(a))
+
+
+class JointRateLimits:
+    """Keeps the rates of joints within limits, by the dynamics over the next control periods.
+
+    The joints obey ``Js(q) qddot + Fs = tau + G(q) wrench``: the last rows of paper 4, eq. (19),
+    with the base's acceleration eliminated. A commanded acceleration that would bring a joint
+    beyond its rate within some control periods is lowered to one that does not, and the efforts
+    are those of the lowered accelerations. If motors are too weak to hold joints against the
+    thrust of the base, the thrust is lowered and keeps its direction.
+
+    Parameters
+    ----------
+    robot
+        The model, as the controller believes it.
+    rates
+        Largest rates (n,), m/s or rad/s; zero or infinite: no limit.
+    control_period
+        Time for which a command is held, s.
+    """
+
+    def __init__(self, robot: SpaceRobot, rates: Array, control_period: float) -> None:
+        limited = (rates > 0) & np.isfinite(rates)
+        self.rates = np.where(limited, rates, np.inf)
+        """Largest rates (n,); infinite: no limit."""
+        self._robot = robot
+        self._control_period = control_period
+        self._rest_rate = min(_REST_RATE, _REST_RATE_PER_PERIOD / control_period)
+        self._dynamics = BufferedFunction(_joint_dynamics(robot))
+        self._per_rate = 1 / (_FREE * self.rates)
+        self._inverse = (1 / self.rates).tolist()
+        self._per_effort = self._mobilities() * control_period * self._per_rate
+
+    def apply(
+        self, state: ControlState, given: Actuation, effort: Array, periods: int = 1
+    ) -> Actuation:
+        """Return a command that keeps the rates: the given one, if it does.
+
+        ``effort`` (n,) are the largest joint efforts, N m or N, which ``given`` keeps; ``periods``
+        is the number of control periods for which it will probably be held.
+        """
+        gained = np.abs(given.tau) * (periods * self._per_effort)
+        if not (np.abs(state.qdot) * self._per_rate + gained).max(initial=0.0) > 1.0:
+            return given
+        Js, Fs, G = self._at(state)
+        pushed = G @ given.wrench_B
+        qddot = np.linalg.solve(Js, given.tau + pushed - Fs)
+        soonest = _PERIODS * periods * self._control_period
+        lowest = (-self.rates - state.qdot) / soonest
+        highest = (self.rates - state.qdot) / soonest
+        if np.all((lowest <= qddot) & (qddot <= highest)):
+            return given
+        wanted = Js @ np.clip(qddot, lowest, highest) + Fs
+        share = _largest_share(wanted, pushed, effort)
+        tau = np.clip(wanted - share * pushed, -effort, effort)
+        return Actuation(share * given.wrench_B, tau)
+
+    def lowered(self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX) -> ca.SX:
+        """Return whether :meth:`apply` changes the command ``[f; n; tau]`` (6 + n,)."""
+        if not np.isfinite(self.rates).any():
+            return ca.SX(0)
+        n, tau = self._robot.n, actuation[6:]
+        gained = ca.fabs(tau) * self._per_effort
+        fast = ca.fabs(qdot) * self._per_rate + gained
+        near = ca.sum1(fast > 1.0)
+        flat, Fs, columns = self._dynamics.function(q, omega, qdot)
+        Js, G = ca.reshape(flat, n, n).T, ca.reshape(columns, 6, n).T
+        qddot = solve_positive_definite(Js, tau + G @ actuation[:6] - Fs)
+        soonest = _PERIODS * self._control_period
+        beyond = []
+        for i, rate in enumerate(self.rates.tolist()):
+            if np.isfinite(rate):
+                lowest, highest = (-rate - qdot[i]) / soonest, (rate - qdot[i]) / soonest
+                beyond.append(ca.logic_or(qddot[i] < lowest, qddot[i] > highest))
+        return ca.logic_and(near > 0, ca.sum1(ca.vertcat(*beyond)) > 0)
+
+    def largest_share(self, qdot: Array) -> float:
+        """Return the largest of rates (n,) as a share of its limit."""
+        # Python numbers: arrays of a few joints take longer, and every state calls this.
+        share = 0.0
+        for rate, inverse in zip(qdot.tolist(), self._inverse, strict=True):
+            share = max(share, abs(rate * inverse))
+        return share
+
+    def to_rest(self, state: ControlState) -> Actuation:
+        """Return the command, not limited, under which joint rates and momenta decay.
+
+        The thrusters remove both total momenta, which joint efforts do not change, and the motors
+        the joint rates: each decays independently, at any pose of the base.
+        """
+        robot, r = self._robot, self._rest_rate
+        J = robot.jacobian(robot.base_link, state.q)
+        v_cm = state.v_WB_B - J[:3, 3:6] @ state.omega_WB_B - J[:3, 6:] @ state.qdot
+        H = robot.inertia_matrix(state.q)
+        force = -r * robot.total_mass * v_cm
+        torque = -r * (H[3:6, 3:6] @ state.omega_WB_B + H[3:6, 6:] @ state.qdot)
+        # A force at the base has a moment about the center of mass.
+        wrench = np.concatenate([force, torque + np.cross(robot.center_of_mass(state.q), force)])
+        Js, Fs, G = self._at(state)
+        return Actuation(wrench, -r * (Js @ state.qdot) + Fs - G @ wrench)
+
+    def _at(self, state: ControlState) -> tuple[Array, Array, Array]:
+        inputs = self._dynamics.inputs
+        inputs[0][:], inputs[1][:], inputs[2][:] = state.q, state.omega_WB_B, state.qdot
+        self._dynamics.evaluate()
+        Js, Fs, G = self._dynamics.outputs
+        n = self._robot.n
+        return Js.reshape((n, n)), Fs, G.reshape((n, 6))
+
+    def _mobilities(self) -> Array:
+        """Return the largest acceleration (n,) of each joint by an effort of one of its own."""
+        n, rng = self._robot.n, np.random.default_rng(1)
+        lower = np.maximum(self._robot.lower, -np.pi)
+        upper = np.maximum(np.minimum(self._robot.upper, np.pi), lower)
+        zero, largest = np.zeros(3), np.zeros(n)
+        for shape in rng.uniform(0.0, 1.0, (_SHAPES, n)):
+            q = lower + shape * (upper - lower)
+            Js, _, _ = self._at(ControlState(zero, zero, zero, zero, q, np.zeros(n)))
+            largest = np.maximum(largest, np.diag(np.linalg.inv(Js)))
+        return largest
+
+
+def _largest_share(wanted: Array, pushed: Array, effort: Array) -> float:
+    """Return the largest share in [0, 1] of a push with which ``wanted`` is within efforts.
+
+    Zero if there is none: motors that cannot brake joints are not loaded further.
+    """
+    low, high = 0.0, 1.0
+    for tau, push, limit in zip(wanted.tolist(), pushed.tolist(), effort.tolist(), strict=True):
+        if push == 0.0:
+            if abs(tau) > limit:
+                return 0.0
+            continue
+        ends = (tau - limit) / push, (tau + limit) / push
+        low, high = max(low, min(ends)), min(high, max(ends))
+    return high if low <= high else 0.0
+
+
+def _joint_dynamics(robot: SpaceRobot) -> ca.Function:
+    """Return ``(q, omega_WB_B, qdot) -> (Js, Fs, G)``, which do not depend on the base's velocity.
+
+    It is not compiled: it is called only if a joint is fast, and takes microseconds.
+    """
+    q, qdot = ca.SX.sym("q", robot.n), ca.SX.sym("qdot", robot.n)
+    omega = ca.SX.sym("omega", 3)
+    H = robot.function("inertia_matrix", compile=False)(q)
+    C = robot.function("bias", compile=False)(q, ca.SX(3, 1), omega, qdot)
+    J = robot.function(f"jacobian:{robot.base_link}", compile=False)(q)
+    D, D_q, D_qq = H[3:6, 3:6], H[3:6, 6:], H[6:, 6:]
+    # Generalised forces on omega and q of a force and torque at the origin of the base.
+    to_omega = ca.horzcat(J[:3, 3:6].T, ca.SX.eye(3))
+    to_joints = ca.horzcat(J[:3, 6:].T, ca.SX(robot.n, 3))
+    solved = solve_positive_definite(D, ca.horzcat(D_q, C[3:6], to_omega))
+    n = robot.n
+    outputs = {
+        # CasADi stores columns; transposed, numpy reads rows.
+        "Js": ca.reshape((D_qq - D_q.T @ solved[:, :n]).T, n * n, 1),
+        "Fs": C[6:] - D_q.T @ solved[:, n],
+        "G": ca.reshape((to_joints - D_q.T @ solved[:, n + 1 :]).T, 6 * n, 1),
+    }
+    return dense_function("joint_dynamics", {"q": q, "omega": omega, "qdot": qdot}, outputs)

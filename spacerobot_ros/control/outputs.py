@@ -1,4 +1,4 @@
-"""The outputs z1 that a law drives: which they are, and as symbols (paper 4, eqs 22, 23, 26).
+"""The outputs z1 of a law: their selection and their symbols (paper 4, eqs 22, 23, 26).
 
 The independent velocities are the paper's ``z0dot = [v_cm; omega; qdot]`` (eq. 8), the first two
 in base components. The outputs are components in W of poses, and joints. The Jacobian here is eq.
@@ -6,8 +6,8 @@ in base components. The outputs are components in W of poses, and joints. The Ja
 the velocity of an attitude output is a component of the angular velocity. So the representation
 has no singularity, and ``J_z`` loses rank only where the manipulator does.
 
-With that, the rate of an attitude error is understood as ``omega_des - omega``. About one fixed
-axis (every planar robot) it is the derivative of the error; in general it is so to first order.
+The rate of an attitude error is ``omega_des - omega``. About one fixed axis (every planar robot)
+it is the derivative of the error; in general it is so to first order.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class OutputSelection:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A name for each output: ``base.x``, ``end_effector.rz``, ``joint.elbow``."""
+        """Names of the outputs: ``base.x``, ``end_effector.rz``, ``joint.elbow``."""
         return (
             *(f"base.{axis}" for axis in self.base),
             *(f"end_effector.{axis}" for axis in self.end_effector),
@@ -227,8 +227,8 @@ class _Group:
 class OutputVector:
     """The selected outputs of a robot, as expressions for a law to build its function from.
 
-    ``m`` outputs, ``N = 6 + n`` degrees of freedom. The symbols ``state`` and ``reference`` are
-    what :meth:`pack` writes; the expressions, all functions of the two:
+    ``m`` outputs, ``N = 6 + n`` degrees of freedom. The expressions are functions of the symbols
+    ``state`` and ``reference`` (see :meth:`pack_state` and :meth:`pack_reference`):
 
     ``model``
         Calls the robot's functions by name.
@@ -250,7 +250,7 @@ class OutputVector:
     robot
         The model.
     selection
-        Which outputs.
+        The outputs.
 
     Raises
     ------
@@ -303,7 +303,7 @@ class OutputVector:
         self.bias = ca.vertcat(*(group.bias for group in groups))
 
     def pack_state(self, state: ControlState, memory: Array) -> None:
-        """Write a state into the memory (13 + 2 n,) of the symbol ``state``.
+        """Write a state into memory (13 + 2 n,) for the symbol ``state``.
 
         Raises
         ------
@@ -316,7 +316,7 @@ class OutputVector:
         _require_finite("state", memory)
 
     def pack_reference(self, reference: Reference, memory: Array) -> None:
-        """Write a reference into the memory of the symbol ``reference``.
+        """Write a reference into memory for the symbol ``reference``.
 
         Raises
         ------

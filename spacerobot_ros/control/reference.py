@@ -46,11 +46,11 @@ class ReferenceProfile(ABC):
     Parameters
     ----------
     start
-        Where the controlled things are; its velocities are not used.
+        Present poses and joint positions; its velocities are not used.
     goal
-        Where they are to be; what it lacks is not controlled.
+        Desired poses and joint positions; groups that it lacks are not controlled.
     limits
-        How fast it may go.
+        Largest speeds and accelerations.
 
     Raises
     ------
@@ -64,8 +64,8 @@ class ReferenceProfile(ABC):
         for group in fields(goal):
             wanted = getattr(goal, group.name) is not None
             if wanted and getattr(start, group.name) is None:
-                what = group.name.replace("_", "-")
-                raise TargetNotSetError(f"The {what} has a goal and no start to go there from.")
+                name = group.name.replace("_", "-")
+                raise TargetNotSetError(f"The {name} has a goal, but no pose to start from.")
         self.start = start
         self.goal = goal
         self.limits = limits
@@ -77,7 +77,7 @@ class ReferenceProfile(ABC):
         """Return the reference ``time`` s after its start."""
 
     def distances(self) -> Errors:
-        """Return how far the goal is from the start."""
+        """Return the distances between start and goal."""
         start, goal, joints = self.start, self.goal, 0.0
         if start.joints is not None and goal.joints is not None:
             joints = float(np.abs(goal.joints.q - start.joints.q).max(initial=0.0))
@@ -110,8 +110,8 @@ class QuinticReference(ReferenceProfile):
     """Positions along straight lines, attitudes along geodesics (one fixed axis), in W.
 
     All share one profile, ``s = 10 u^3 - 15 u^4 + 6 u^5`` of ``u = t / T``: rest to rest, without
-    a jump in acceleration. T is the shortest time in which nothing exceeds its limits, so that the
-    one that needs longest sets the pace and all reach their goals together.
+    a jump in acceleration. T is the shortest time in which all are within their limits: the one
+    that needs longest sets the pace, and all reach their goals together.
     """
 
     name: ClassVar[str] = "quintic"
@@ -161,11 +161,11 @@ def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n
     Parameters
     ----------
     profile
-        A profile whose goal has the groups that are asked for.
+        A profile whose goal has the controlled groups.
     base, end_effector
-        Whether these poses are among them.
+        Whether these poses are controlled.
     n
-        Joints whose references are among them; 0: none.
+        Number of joints with references; 0: joints are not controlled.
     """
     start, goal = profile.start, profile.goal
     poses = (base, start.base, goal.base), (end_effector, start.end_effector, goal.end_effector)
@@ -181,7 +181,7 @@ def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n
 def profile_expression(
     numbers: ca.SX, time: ca.SX, base: bool, end_effector: bool, n: int
 ) -> ca.SX:
-    """Return what a profile's :meth:`ReferenceProfile.at` gives, as a law's function takes it.
+    """Return the reference of :meth:`ReferenceProfile.at` as the argument of a law's function.
 
     ``numbers`` are those of :func:`profile_numbers`, ``time`` is since the start, s.
     """
@@ -264,7 +264,7 @@ class _PoseLine:
 
     @property
     def numbers(self) -> list[npt.ArrayLike]:
-        """All that it is, and the pose of its end."""
+        """All numbers of the line, and the pose of its end."""
         line = [self._start.position, self._d, self._start.quaternion, self._half_turn]
         return [*line, self._turn_W, [self.angle], self._goal.position, self._goal.quaternion]
 

@@ -1,4 +1,4 @@
-"""What a control law is given, what it returns, and what it refuses."""
+"""Inputs and outputs of control laws: states, references, actuations, and their errors."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def _zero() -> Array:
 
 
 class TargetNotSetError(SpaceRobotError):
-    """A controlled output has no reference; the sentence says which."""
+    """A controlled output has no reference; the message names it."""
 
 
 class NotFiniteError(SpaceRobotError):
-    """A state or reference holds a number that is not finite; no command follows from it."""
+    """A state or reference has a number that is not finite, so that there is no command."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class ControlState:
 
     @classmethod
     def unstack(cls, memory: Array) -> ControlState:
-        """Return a copy of what :meth:`stack` has written."""
+        """Return a copy of the state in the memory of :meth:`stack`."""
         x = memory.copy()
         joints = 13 + (len(x) - 13) // 2
         return cls(x[:3], x[3:7], x[7:10], x[10:13], x[13:joints], x[joints:])
@@ -69,7 +69,7 @@ class ControlState:
 
 @dataclass(frozen=True)
 class PoseReference:
-    """Where a frame is to be, in W: position (m), attitude (unit quaternion x, y, z, w), and their
+    """Desired pose of a frame in W: position (m), attitude (unit quaternion x, y, z, w), and their
     velocities and accelerations (m, rad, s), all in world components; zero unless given.
     """
 
@@ -99,13 +99,13 @@ class JointReference:
 
     @classmethod
     def at_rest(cls, q: Array) -> JointReference:
-        """Return a shape to hold."""
+        """Return the reference that holds a shape."""
         return cls(q, np.zeros(len(q)), np.zeros(len(q)))
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What the outputs are to follow; None where nothing of the kind is controlled."""
+    """Reference of the outputs; None for a group that is not controlled."""
 
     base: PoseReference | None = None
     end_effector: PoseReference | None = None
@@ -113,7 +113,7 @@ class Reference:
 
     @classmethod
     def present(cls, robot: SpaceRobot, state: ControlState, end_effector: str = "") -> Reference:
-        """Return the reference that keeps everything where it is, at rest.
+        """Return the present poses and joint positions as a reference at rest.
 
         ``end_effector`` names the link of the end-effector; empty: the robot has none.
 

@@ -1,4 +1,4 @@
-"""What a controller reports: what became of its goal, and how well its last command was defined."""
+"""Status of a controller: the state of its goal, and how well its last command was defined."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ControllerState(str, Enum):
 
     @property
     def decided(self) -> bool:
-        """Whether nothing more will happen for the goal that the status is about."""
+        """Whether the state of the goal is final."""
         return self in (
             ControllerState.REACHED,
             ControllerState.FAILED,
@@ -48,7 +48,7 @@ class ControllerState(str, Enum):
 
 @dataclass(frozen=True)
 class CommandReport:
-    """How a command came about.
+    """Report on one command of the controller.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class CommandReport:
     singular, smallest_singular_value, damping
         See :class:`spacerobot_ros.control.LawStatus`.
     lost_force_N, lost_torque_Nm, lost_effort
-        What the actuators' limits took from it: norms for the thrusters, the largest of the joints
+        Part of the command beyond the limits: norms for the thrusters, the largest of the joints
         (N or N m).
     errors
         Error of each output by its label, m or rad.
@@ -80,13 +80,13 @@ class ControllerStatus:
     Attributes
     ----------
     state
-        What became of the goal.
+        State of the goal.
     message
         The text for the user.
     goal_id
-        Which goal the status is about; empty: none, or one whose id is not known.
+        Id of the goal of this status; empty: no goal, or one without an id.
     command
-        About the last command; None before the first.
+        Report on the last command; None before the first.
     """
 
     state: ControllerState
@@ -110,12 +110,12 @@ class ControllerStatus:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "") -> ControllerStatus:
-        """Return the status that :meth:`to_values` has turned into these pairs.
+        """Return the status of the pairs of :meth:`to_values`.
 
         Raises
         ------
         SpaceRobotError
-            They are no status of a controller.
+            The pairs are not those of a controller.
         """
         try:
             command = None
@@ -147,13 +147,12 @@ _NUMBERS = (
 
 
 def tracking_time(states: Iterable[tuple[float, ControllerState]]) -> float | None:
-    """Return how long a controller flew, s: from the first state that it tracked to the last end
-    of a goal that it named.
+    """Return the time from the first tracked state to the last decision about a goal, s.
 
     Parameters
     ----------
     states
-        Time (s) and state of its statuses. None of them need be there; then it is None.
+        Time (s) and state of the controller's statuses; without either of them the result is None.
     """
     given = list(states)
     began = [time for time, state in given if state is ControllerState.TRACKING]

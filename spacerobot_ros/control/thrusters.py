@@ -30,13 +30,13 @@ from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_rpy
 
 STANDARD_GRAVITY = 9.80665
-"""What a specific impulse in seconds is counted in, m/s^2."""
+"""Acceleration that relates a specific impulse in seconds to an exhaust velocity, m/s^2."""
 
 IN_URDF = "urdf"
-"""Source of a table that is in no file of its own."""
+"""Source of a table in the robot's URDF."""
 
 _LARGEST = 1e12
-"""Largest number that a table may have, in SI units."""
+"""Largest number in a table, in SI units."""
 
 _AXES = ("force along x", "force along y", "force along z", *(f"torque about {x}" for x in "xyz"))
 _KEYS = {"name", "link", "position", "rpy", "direction", "force", "min_on_time", "isp"}
@@ -66,9 +66,9 @@ _UNMET = 1e-6
 class ThrusterTable:
     """Thrusters on the base, m of them.
 
-    ``r_B`` (m, 3) is where each pushes, from the origin of the base link, m; ``direction_B`` (m, 3)
-    the unit vector of its force on the base, against its plume; ``force`` (m,) its thrust, N;
-    ``min_on_time`` (m,) its shortest pulse, s; ``isp`` (m,) its specific impulse, s.
+    ``r_B`` (m, 3) are the points of application from the origin of the base link, m;
+    ``direction_B`` (m, 3) the unit vectors of the forces on the base, against the plumes; ``force``
+    (m,) thrusts, N; ``min_on_time`` (m,) shortest pulses, s; ``isp`` (m,) specific impulses, s.
     """
 
     names: tuple[str, ...]
@@ -80,24 +80,24 @@ class ThrusterTable:
 
     @property
     def wrenches(self) -> Array:
-        """Columns (6, m): force (N) over torque (N m) of each at full thrust, at the origin of the
-        base link, in base components.
+        """Wrenches (6, m) at full thrust, force (N) over torque (N m), at the origin of the base
+        link, in base components.
         """
         thrust_B = self.direction_B * self.force[:, None]
         return np.vstack([thrust_B.T, np.cross(self.r_B, thrust_B).T])
 
     @property
     def mass_flow(self) -> Array:
-        """Propellant that each takes while it is on (m,), kg/s: ``F / (g0 Isp)``."""
+        """Mass flow of each open thruster (m,), kg/s: ``F / (g0 Isp)``."""
         return self.force / (STANDARD_GRAVITY * self.isp)
 
     def index(self, name: str) -> int:
-        """Return the place of a thruster in the table.
+        """Return the index of a thruster in the table.
 
         Raises
         ------
         ParameterError
-            There is none of that name.
+            There is no thruster of that name.
         """
         if name not in self.names:
             raise ParameterError(
@@ -106,10 +106,10 @@ class ThrusterTable:
         return self.names.index(name)
 
     def missing(self, without: Sequence[str] = ()) -> str:
-        """Say which wrenches the thrusters, but for some names, cannot give; empty for none.
+        """Return the names of the wrenches that thrusters ``without`` some cannot produce; or "".
 
-        They give every wrench if, with factors of zero or more, they give both ways along the six
-        axes: what they give is a convex cone.
+        They produce every wrench if they produce both directions of the six axes with factors of
+        zero or more, because their wrenches form a convex cone.
         """
         # Imported where it is used: scipy.optimize loads slowly.
         from scipy.optimize import linprog
@@ -174,7 +174,7 @@ def thrusters_of_urdf(robot: RobotDescription) -> ThrusterTable:
 
 
 def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
-    """Read a YAML file: a list ``thrusters`` and, for what they have in common, ``defaults``.
+    """Read a YAML file: a list ``thrusters`` and, for common values, ``defaults``.
 
     Raises
     ------
@@ -190,11 +190,11 @@ def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
     defaults = content.get("defaults", {}) if isinstance(content, dict) else {}
     if not (isinstance(entries, list) and entries and isinstance(defaults, dict)):
         raise ParameterError(
-            f"The thruster file {path} has no list 'thrusters', or its 'defaults' are no mapping."
+            f"The thruster file {path} needs a list 'thrusters'; 'defaults' must be a mapping."
         )
     try:
         if not all(isinstance(entry, dict) for entry in entries):
-            raise ParameterError("An entry of 'thrusters' is no mapping.")
+            raise ParameterError("An entry of 'thrusters' is not a mapping.")
         return thruster_table([{**defaults, **entry} for entry in entries], robot)
     except SpaceRobotError as error:
         raise ParameterError(f"{path}: {error}") from error
@@ -203,9 +203,9 @@ def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
 def thruster_table(entries: Sequence[Mapping[str, Any]], robot: RobotDescription) -> ThrusterTable:
     """Check thrusters and express them in the base link.
 
-    Each has ``name``, ``position`` (m) and ``direction`` of its force, both in the frame that
-    ``link`` (the base link unless given) and ``rpy`` (rad) define, ``force`` (N), ``isp`` (s) and
-    ``min_on_time`` (s, 0 unless given). A direction is x unless given, as the axis of a joint is.
+    Each has ``name``, ``position`` (m) in the frame of ``link`` (default: the base link),
+    ``direction`` of its force (default: x, like the axis of a joint) in that frame turned by
+    ``rpy`` (rad), ``force`` (N), ``isp`` (s) and ``min_on_time`` (s, default: 0).
 
     Raises
     ------
@@ -437,9 +437,9 @@ class ThrusterModulator:
         for name in excluded:
             self.exclude(name)
         self.unmet = np.zeros(6)
-        """Part of the wrench wanted in the last period that the thrusters cannot give, N, N m."""
+        """Part of the last wanted wrench that the thrusters could not produce, N, N m."""
         self.unmet_periods = 0
-        """Number of periods in which a part of the wrench was not given."""
+        """Number of periods in which they could not produce a part of the wrench."""
         self.begun = np.zeros(count, dtype=np.bool_)
         """Whether a pulse of each thruster (m,) began with the last period."""
         self.pulses = np.zeros(count, dtype=np.int64)
@@ -450,7 +450,7 @@ class ThrusterModulator:
 
     @property
     def missing(self) -> str:
-        """Names of the wrenches that the thrusters in use cannot give; empty if there are none."""
+        """Names of the wrenches that the thrusters in use cannot produce; empty: none."""
         return self.table.missing(self._excluded)
 
     @property
@@ -459,7 +459,7 @@ class ThrusterModulator:
         return float(self.table.mass_flow @ self.on_time)
 
     def exclude(self, name: str) -> None:
-        """Fire a (broken) thruster no more; the others give the wrench, if they can.
+        """Stop using a (broken) thruster; the others produce the wrench, if they can.
 
         Raises
         ------

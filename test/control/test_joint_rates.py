@@ -22,7 +22,7 @@ from spacerobot_ros.control import Actuation, ControlState, PoseReference, Refer
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import ControlExecutive
-from spacerobot_ros.control.joint_rates import JointRateLimits, _largest_share
+from spacerobot_ros.control.limits import JointRateLimits, _largest_share
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot

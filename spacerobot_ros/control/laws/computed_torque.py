@@ -18,10 +18,10 @@ class ComputedTorqueLaw(ControlLaw):
 
     Here ``u = qddot_ref + Kd (qdot_ref - qdot) + Kp (q_ref - q)`` (Kp in 1/s^2, Kd in 1/s). The
     base answers by ``omegadot = -D^-1 (D_q u + C_omega)``, the rows of eq. (19) of paper 4 without
-    a wrench; put into its rows of the joints that leaves ``Js = D_qq - D_q' D^-1 D_q`` and
+    a wrench; inserted into its rows of the joints this gives ``Js = D_qq - D_q' D^-1 D_q`` and
     ``Fs = C_q - D_q' D^-1 C_omega``. Written so it holds for any tree in space and any momentum;
     the paper's case is a planar chain without angular momentum. No wrench is commanded, so that
-    both momenta stay what they are.
+    both momenta are conserved.
     """
 
     name: ClassVar[str] = "computed_torque"
@@ -34,13 +34,12 @@ class ComputedTorqueLaw(ControlLaw):
         Raises
         ------
         ParameterError
-            The outputs are anything but all the joints: with free joints, or an aim for the base,
-            the shape is not this law's to command.
+            The outputs are not exactly all the joints: this law commands the whole shape.
         """
         if outputs.base or outputs.end_effector or set(outputs.joints) != set(robot.joint_names):
             raise ParameterError(
-                f"The law '{cls.name}' drives all joints and nothing else; its outputs are the "
-                f"joints {', '.join(robot.joint_names)}."
+                f"The law '{cls.name}' controls all joints and nothing else; its outputs must be "
+                f"the joints {', '.join(robot.joint_names)}."
             )
         return OutputSelection(joints=robot.joint_names)
 

@@ -1,4 +1,4 @@
-"""What every control law is: a state and a reference in, a wrench and joint efforts out."""
+"""Base class of control laws, from a state and a reference to a wrench and joint efforts."""
 
 from __future__ import annotations
 
@@ -100,11 +100,10 @@ class Gains:
 
 @dataclass(frozen=True)
 class LawStatus:
-    """How well the last command was defined.
+    """Conditioning of the last command.
 
     ``smallest_singular_value`` of ``J_z`` in SI units; ``singular``: it is below the law's
-    threshold; ``damping``: the damping in effect, added to that singular value in quadrature (zero
-    where none is needed, and with laws that need none).
+    threshold; ``damping``: added to that singular value in quadrature, zero if none is needed.
     """
 
     smallest_singular_value: float
@@ -138,7 +137,7 @@ class ControlLaw(ABC):
     robot
         The model, as the controller believes it.
     outputs
-        What is controlled; :meth:`default_outputs` chooses by the robot.
+        The controlled outputs; :meth:`default_outputs` selects them by the robot.
     gains
         Diagonals of Kp and Kd by group, in the law's units (:class:`GainPair`).
     options
@@ -193,17 +192,17 @@ class ControlLaw(ABC):
 
     @classmethod
     def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:
-        """Return the outputs where none are chosen; see :func:`default_selection`."""
+        """Return the outputs if none are selected; see :func:`default_selection`."""
         return default_selection(robot.description, end_effector_link)
 
     @classmethod
     def accepted_outputs(cls, robot: SpaceRobot, outputs: OutputSelection) -> OutputSelection:
-        """Return the outputs as the law drives them.
+        """Return the outputs in the form that the law controls.
 
         Raises
         ------
         ParameterError
-            The law cannot drive these outputs of the robot.
+            The law cannot control these outputs of the robot.
         """
         return outputs
 
@@ -243,7 +242,7 @@ class ControlLaw(ABC):
         return self._out["error"].copy()
 
     def largest_error_share(self, bounds: Array) -> float:
-        """Return the largest error at the last command in parts of bounds (m,), which are > 0."""
+        """Return the largest error at the last command as a share of its bound (m,), > 0."""
         return float(np.abs(self._out["error"] / bounds).max(initial=0.0))
 
     @property
@@ -253,7 +252,7 @@ class ControlLaw(ABC):
 
     @property
     def status(self) -> LawStatus:
-        """How well the last command was defined."""
+        """Conditioning of the last command."""
         smallest = float(np.linalg.svd(self._out["J_z"], compute_uv=False)[-1])
         singular = smallest < self.singular_value_threshold
         return LawStatus(smallest, singular, self._damping(smallest))
@@ -263,26 +262,26 @@ class ControlLaw(ABC):
         return 0.0
 
     def _inputs(self) -> Mapping[str, npt.ArrayLike]:
-        """Return what the law's function takes beside state, reference and gains, by name.
+        """Return the law's own arguments of its function, by name, with their initial values.
 
-        The values are those at first; :meth:`_actuation` may change them, in ``self._in``.
+        They follow state, reference and gains; :meth:`_actuation` may change them, in ``self._in``.
         """
         return {}
 
     @property
     def fixed_inputs(self) -> Mapping[str, npt.ArrayLike] | None:
-        """What its function takes beside state, reference and gains in every flight; None: it
-        depends on the flight.
+        """Arguments of :attr:`function` beside state, reference and gains that are the same in
+        every flight; None: some depend on the flight.
         """
         return {**self._inputs(), **self.robot.mass_arguments}
 
     def defined(self, results: Mapping[str, ca.SX]) -> ca.SX:
-        """Return whether results of :attr:`function` are the command, without further thought."""
+        """Return whether the results of :attr:`function` are the command as they are."""
         return ca.SX(1)
 
     @abstractmethod
     def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        """Return what the law's function gives beside the errors and ``J_z``, by name.
+        """Return the results of the law's function beside the errors and ``J_z``, by name.
 
         ``actuation`` (6 + n,) is the command: force (N) and torque (N m) at the origin of the base
         link in base components, then the joint efforts; other results are the law's own.

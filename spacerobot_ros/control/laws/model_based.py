@@ -24,7 +24,7 @@ class ModelBasedOptions(LawOptions):
 
     null_space_damping: float = parameter(
         1.0,
-        "rate at which motion that moves no output dies out",
+        "decay rate of motion that moves no output",
         unit="1/s",
         minimum=0.0,
         maximum=1000000000.0,
@@ -46,18 +46,18 @@ class ModelBasedLaw(ControlLaw):
 
         Q = J_z' F + H+ xi + C+,    (J_z H+^-1 J_z') F = a - Jdot_z z0dot - J_z xi
 
-    This also serves fewer outputs than degrees of freedom: the motion that is left over moves no
-    output, and ``xi`` is the acceleration wanted of it: damping of all velocities and, where
-    asked for, a pull of the joints to the joint reference. For a square J_z it cancels.
+    This also serves fewer outputs than degrees of freedom: ``xi`` is the desired acceleration in
+    the null space of ``J_z``, which moves no output: damping of all velocities and, optionally, a
+    pull of the joints to the joint reference. For a square J_z it cancels.
 
     Near a singularity of J_z (smallest singular value ``s`` below the threshold ``t``) no bounded
     force accelerates the singular direction ``u`` of the outputs. There the law is damped:
 
-    * The mobility along u, ``s^2 v' H+^-1 v`` with ``J_z' u = s v``, is raised to what it would be
-      with ``t`` for ``s``: damping ``d = sqrt(t^2 - s^2)``, which sets in from zero at the
-      threshold. Accelerations along v stay bounded; the other directions are not touched.
-    * What velocity along v no longer shows in the outputs, and so escapes their Kd, is damped
-      directly, with the largest Kd.
+    * The mobility along u, ``s^2 v' H+^-1 v`` with ``J_z' u = s v``, is raised to its value with
+      ``t`` for ``s``: damping ``d = sqrt(t^2 - s^2)``, which starts from zero at the threshold.
+      Accelerations along v stay bounded; other directions are unaffected.
+    * Velocity along v that the outputs no longer show, so that their Kd does not act on it, is
+      damped directly, with the largest Kd.
 
     Eq. (28) then holds for the other directions only, and :attr:`status` reports it.
 

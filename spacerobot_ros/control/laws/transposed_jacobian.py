@@ -19,7 +19,7 @@ class TransposedJacobianOptions(LawOptions):
 
     joint_damping: float = parameter(
         0.0,
-        "friction that the joint efforts imitate; brings to rest what moves no output",
+        "viscous friction imitated by the joint efforts; damps motion that moves no output",
         unit="N m s/rad",
         minimum=0.0,
         maximum=1000000000.0,
@@ -30,11 +30,11 @@ class TransposedJacobianLaw(ControlLaw):
     """Paper 4, eqs (29) and (30): ``[f; n; tau] = J_q^-T J_z' (Kp e + Kd edot)``.
 
     The product ``J_z J_q^-1`` maps the base twist and the joint rates to the output rates: the
-    masses cancel, and the law knows the robot's geometry alone. Nothing is inverted that can be
-    singular, so where ``J_z`` is, the command stays as bounded as the errors are. It has no
+    masses cancel, and the law needs the robot's geometry alone. It inverts no matrix that can be
+    singular: near a singularity of ``J_z`` the command is as bounded as the errors are. It has no
     acceleration feedforward.
 
-    With fewer outputs than degrees of freedom eq. (29) leaves the other motion alone: arms go on
+    With fewer outputs than degrees of freedom eq. (29) does not act on the other motion: arms go on
     swinging. ``joint_damping`` subtracts ``joint_damping * qdot`` from the joint efforts.
 
     Parameters
