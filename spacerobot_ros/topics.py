@@ -85,8 +85,6 @@ class Topic:
         What the arrays of a state topic have entries for: ``joints`` or ``thrusters``.
     every_tick
         Whether a state topic is published in every tick, or every ``base_pose_period``.
-    verified
-        Whether the re-simulation of a bag compares its numbers.
     """
 
     name: str
@@ -99,7 +97,6 @@ class Topic:
     frame: str = "world"
     of: str = "joints"
     every_tick: bool = True
-    verified: bool = True
 
     @property
     def short_type(self) -> str:
@@ -176,7 +173,6 @@ _TABLE = (
         "the truth beside what odom then measures",
         when="the sensors err",
         state=_odometry("true"),
-        verified=False,
     ),
     Topic(
         "joint_states_true",
@@ -186,7 +182,6 @@ _TABLE = (
         when="the sensors err",
         state=_joint_states("true"),
         frame="base",
-        verified=False,
     ),
     Topic(
         "odom",
@@ -211,7 +206,6 @@ _TABLE = (
         when="`thrusters` is set",
         state=(StateField("wrench", "thruster_wrench", _WRENCH),),
         frame="base",
-        verified=False,
     ),
     Topic(
         "thrusters",
@@ -227,8 +221,6 @@ _TABLE = (
         ),
         frame="base",
         of="thrusters",
-        # On-times go on from before the first state of a bag.
-        verified=False,
     ),
     Topic(
         "/tf",

@@ -19,6 +19,7 @@ from spacerobot_ros.batch.flights import (
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.state import ControlState, Reference
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import Goal
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
@@ -93,8 +94,7 @@ def _fly(
             plant.step(*commands)
             _account(plant, commands, period, result, row)
             if controller is not None:
-                change = (_unexplained(plant) - momenta).reshape(2, 3)
-                drift = np.maximum(drift, np.linalg.norm(change, axis=1))
+                drift = np.maximum(drift, momentum_change(_unexplained(plant), momenta))
         if controller is not None:
             parts = plant.q, plant.qdot, plant.pose, plant.twist, plant.momentum
             result.end_state[row] = np.concatenate(parts)

@@ -261,16 +261,19 @@ def salvage_command(bag: Path, out: Path | None) -> None:
 def verify_command(bag: Path, tolerance: float) -> None:
     """Re-simulate a BAG from its commands, and compare the states.
 
-    Exit code 0: every recorded state follows from the commands; 1: one does not; 2: bad input.
+    Exit code 0: every recorded state follows from the commands; 1: one does not, or the bag lacks
+    states by its own counts; 2: bad input.
     """
-    from spacerobot_ros.verification.comparison import verify_bag
+    from spacerobot_ros.flight.verification import verify_bag
 
     result = verify_bag(bag, tolerance)
     click.echo(f"flown again {result.ticks} ticks, {result.duration:.9g} s")
-    click.echo(f"compared    {result.messages} messages")
+    click.echo(f"compared    {result.messages} messages on {', '.join(result.topics)}")
     where = result.largest_at
     place = f", {where.field} of {where.topic} at {where.time:.9g} s" if where else ""
     click.echo(f"largest     {result.largest:.3g}{place}")
     if result.difference is not None:
         fail(f"The bag differs: {result.difference}")
+    if result.missing:
+        fail(f"The bag is not whole: {result.missing}")
     click.echo("verified    every published state follows from the commands")

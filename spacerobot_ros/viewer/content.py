@@ -10,6 +10,7 @@ from html import escape
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.planning.execution.status import PlannerState
@@ -248,8 +249,8 @@ def momentum_drift(momenta: Momenta, first: Array) -> tuple[float, float]:
     It is measured from the expected momenta; if the plant publishes none, from ``first`` (6,).
     """
     expected = first if momenta.expected is None else momenta.expected
-    difference = momenta.actual - expected
-    return float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))
+    linear, angular = momentum_change(momenta.actual, expected).tolist()
+    return linear, angular
 
 
 def has_tool(state: StackState) -> bool:

@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 from support.oracles import PinocchioOracle
 
 from spacerobot_ros.bag import RecordedRobot, read_bag
+from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.verification.comparison import verify_bag
 
 ROOT = Path(__file__).parents[2]
 ROBOTS = (

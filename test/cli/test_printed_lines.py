@@ -20,10 +20,10 @@ from spacerobot_ros.bag.salvage import Salvaged
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.cli.options import numbers
 from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.flight.verification import Difference, Verification
 from spacerobot_ros.planning import METHODS, BasePath, GaitSchedule, Goal, PoseError
 from spacerobot_ros.session.run import RunResult
 from spacerobot_ros.simulation.trials import PlanEvaluation, Problem, Record
-from spacerobot_ros.verification.comparison import Difference, Verification
 
 SUMMARY: dict[str, Any] = {
     "scenario": "sliding_masses",
@@ -376,16 +376,16 @@ def test_random_goals_that_are_missed_are_exit_1(
 
 
 def verified(patch: pytest.MonkeyPatch, *words: str, **changes: Any) -> Result:
-    from spacerobot_ros.verification import comparison
+    from spacerobot_ros.flight import verification
 
     at = Difference(1.25, "/odom", "pose.pose.position.y", 0.5, 0.25)
-    whole = Verification(340, 34.0, 1705, 1.5e-13, at, None)
+    whole = Verification(340, 34.0, 1705, 1.5e-13, at, None, ("/joint_states", "/odom"))
 
     def verify(path: Path, tolerance: float) -> Verification:
         assert (str(path), tolerance) == ("a.mcap", changes.pop("tolerance", 1e-9))
         return replace(whole, **changes)
 
-    patch.setattr(comparison, "verify_bag", verify)
+    patch.setattr(verification, "verify_bag", verify)
     return CliRunner().invoke(main, ["verify", "a.mcap", *words])
 
 
@@ -394,7 +394,7 @@ def test_the_lines_of_a_verification(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.exit_code == 0
     assert result.stdout == (
         "flown again 340 ticks, 34 s\n"
-        "compared    1705 messages\n"
+        "compared    1705 messages on /joint_states, /odom\n"
         "largest     1.5e-13, pose.pose.position.y of /odom at 1.25 s\n"
         "verified    every published state follows from the commands\n"
     )
@@ -413,6 +413,12 @@ def test_a_difference_is_exit_1_and_a_sentence(monkeypatch: pytest.MonkeyPatch) 
         "The bag differs: /odom at 2.5 s: twist.twist.linear.x is 0.5 in the bag "
         "and 0.25 by its commands (a remark).\n"
     )
+
+
+def test_states_that_a_bag_lacks_are_exit_1_and_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = verified(monkeypatch, missing="it holds less.")
+    assert (result.exit_code, result.stderr) == (1, "The bag is not whole: it holds less.\n")
+    assert "verified" not in result.stdout
 
 
 def test_the_lines_of_a_salvage(monkeypatch: pytest.MonkeyPatch) -> None:

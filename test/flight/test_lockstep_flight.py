@@ -14,9 +14,9 @@ from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.flight.reading import read_run, recorded_scenario
 from spacerobot_ros.flight.scenario import Scenario, load_scenario
+from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.session.run import run_scenario
-from spacerobot_ros.verification.comparison import verify_bag
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -125,13 +125,25 @@ def test_what_is_saved_is_verified_and_read_back(tmp_path: Path) -> None:
         flight.save(tmp_path / "saved.mcap")
 
 
-def test_a_saved_flight_with_another_number_is_not_verified(tmp_path: Path) -> None:
-    flight = fly_scenario(chain())
-    flight.q[20, 1] += 1e-6
+@pytest.mark.parametrize(
+    ("quantity", "noise", "topic"),
+    [
+        ("q", 0.0, "/joint_states"),
+        ("q", 1e-7, "/joint_states_true"),
+        ("measured_q", 1e-7, "/joint_states"),
+        ("twist", 1e-7, "/odom_true"),
+        ("expected_momenta", 1e-7, "/momentum_expected"),
+    ],
+)
+def test_a_saved_flight_with_another_number_is_not_verified(
+    quantity: str, noise: float, topic: str, tmp_path: Path
+) -> None:
+    flight = fly_scenario(chain(**{"sensors.joint_noise": noise}), longest=2.0)
+    flight.signal(quantity).values[20, 1] += 1e-6
     flight.save(tmp_path / "saved.mcap")
     difference = verify_bag(tmp_path / "saved.mcap").difference
     assert difference is not None
-    assert (difference.topic, difference.time) == ("/joint_states", 20 / 25)
+    assert (difference.topic, difference.time) == (topic, 20 / 25)
 
 
 @pytest.mark.parametrize(

@@ -16,11 +16,11 @@ from support.fuzzing import NUMBERS, VALUES, attempt, damaged, fuzz
 
 from spacerobot_ros.bag import Playback, iterate_raw, read_bag
 from spacerobot_ros.bag.salvage import last_state, salvage_bag
+from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.parameters import declared
 from spacerobot_ros.report import write_report
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.verification.comparison import verify_bag
 
 WHOLE = (share_directory() / "bags" / "sliding_masses.mcap").read_bytes()
 _MESSAGES = 120

@@ -11,13 +11,13 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from support.fuzzing import NUMBERS, TEXTS, damaged, fuzz
 
+from spacerobot_ros.flight.verification import read_command
 from spacerobot_ros.messages.readers import CommandReader
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Reason
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.verification.recorded_flight import read_command
 
 NAMES = st.one_of(
     st.sampled_from(["slider_1", "slider_2", "slider_3"]),

@@ -21,7 +21,7 @@ from support.colcon import colcon_program, run
 from support.ros_harness import Harness
 
 from spacerobot_ros.bag import read_bag
-from spacerobot_ros.verification.comparison import verify_bag
+from spacerobot_ros.flight.verification import verify_bag
 
 ROOT = Path(__file__).resolve().parents[2]
 START = 120.0

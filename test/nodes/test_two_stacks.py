@@ -15,8 +15,8 @@ from std_msgs.msg import Float64
 from support.ros_harness import Harness, Probe, nanoseconds
 
 from spacerobot_ros.bag import RecordedRobot, read_bag
+from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.nodes import PlannerNode, PlantNode, RecorderNode
-from spacerobot_ros.verification.comparison import verify_bag
 
 # Plants whose time and shape tell them apart.
 ROBOTS: dict[str, dict[str, Any]] = {

@@ -17,8 +17,8 @@ from support.recorded_stack import parameters_of
 from support.ros_harness import Harness
 
 from spacerobot_ros.bag import RecordingError
+from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.nodes import PlantNode, RecorderNode
-from spacerobot_ros.verification.comparison import verify_bag
 
 SLIDERS = ["slider_1", "slider_2", "slider_3"]
 VELOCITY = {

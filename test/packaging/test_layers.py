@@ -25,7 +25,6 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("session",),
         ("nodes",),
         ("flight",),  # above the bag and the plant, beside no ROS
-        ("verification",),
         ("commanding",),  # commanders without ROS: of flights, and of nodes
         ("batch",),
         ("viewer",),
@@ -190,7 +189,7 @@ MUTABLE = {
     "spacerobot_ros.planning.methods.optimal.search._Progress",
     "spacerobot_ros.report.solids.Solids",
     "spacerobot_ros.simulation.trials.Record",
-    "spacerobot_ros.verification.comparison._Resimulation",
+    "spacerobot_ros.flight.verification._Resimulation",
 }
 """Dataclasses that change: records in the making. All others are values."""
 

@@ -12,10 +12,10 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.scenario import load_scenario, parse_kills
+from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.session.processes import KillTimeline
 from spacerobot_ros.session.run import run_scenario
-from spacerobot_ros.verification.comparison import verify_bag
 
 # Whether the goal is met, and to how many m and rad of the truth; None: not the method's to meet.
 EXPECTED: dict[str, tuple[bool, float | None, float | None]] = {

@@ -15,9 +15,9 @@ import rclpy
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.scenario import load_scenario
+from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.session.stack import InProcessStack, checked_namespace
-from spacerobot_ros.verification.comparison import verify_bag
 
 ROOT = Path(__file__).parents[2]
 COMMAND = (sys.executable, "-m", "spacerobot_ros.cli.main")

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.scenario import load_scenario
+from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.session.run import run_scenario
-from spacerobot_ros.verification.comparison import verify_bag
 
 MILLIMETRE = 1e-3
 TENTH_OF_A_DEGREE = np.radians(0.1)

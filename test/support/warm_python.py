@@ -74,7 +74,7 @@ def _import_everything() -> None:
             *("matplotlib.pyplot", "scipy.optimize", "spacerobot_ros.nodes"),
             *("spacerobot_ros.session.run", "spacerobot_ros.session.processes"),
             *("spacerobot_ros.session.live", "spacerobot_ros.report"),
-            "spacerobot_ros.verification",
+            "spacerobot_ros.flight.verification",
         ):
             import_module(name)
         for command in import_module("spacerobot_ros.cli.main").COMMANDS:

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from support.altered_bags import altered
 
+from spacerobot_ros.flight.verification import Difference, verify_bag
 from spacerobot_ros.resources import share_directory
-from spacerobot_ros.verification.comparison import Difference, verify_bag
 
 BAGS = share_directory() / "bags"
 BAG = BAGS / "sliding_masses.mcap"

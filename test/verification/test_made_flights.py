@@ -17,14 +17,15 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from support.made_bags import array, made_bag, odometry, stamped
 
+from spacerobot_ros.bag import BagWriter, iterate_raw, read_bag
 from spacerobot_ros.errors import RecordingError, SpaceRobotError
+from spacerobot_ros.flight import verification
+from spacerobot_ros.flight.verification import Verification, verify_bag
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.verification import comparison
-from spacerobot_ros.verification.comparison import Verification, verify_bag
 
 NAMES = ["slider_1", "slider_2", "slider_3"]
 TICK = 0.1
@@ -216,7 +217,7 @@ def test_states_after_the_end_of_its_plant_are_differences(
         monkeypatch.setattr(plant, "step", stop)
         return plant
 
-    monkeypatch.setattr(comparison, "build_plant", failing)
+    monkeypatch.setattr(verification, "build_plant", failing)
     result = verify_bag(bag)
     assert result.ticks == 5
     assert result.difference is not None
@@ -295,3 +296,72 @@ def test_a_message_between_two_ticks_is_refused_with_its_time(tmp_path: Path) ->
     words = "is stamped 0.25 s, between the ticks of the plant in it"
     with pytest.raises(RecordingError, match=words):
         verify_bag(path)
+
+
+def test_how_much_was_verified_is_told(tmp_path: Path) -> None:
+    result = verified(tmp_path, [RATES] * 10, without_pose=(3, 4))
+    assert result.topics == ("/joint_states", "/odom", "/momentum")
+    assert result.messages == 11 + 9 + 11
+    assert (result.ticks, result.missing) == (10, "")
+
+
+@pytest.mark.parametrize("kept", [1, 2, 6])
+def test_a_bag_whose_states_were_removed_is_not_verified(tmp_path: Path, kept: int) -> None:
+    """Its commands are all there: each answers a state."""
+    whole = Made([RATES] * 10).write(tmp_path / "whole.mcap")
+    bag = without_states(whole, tmp_path / "a.mcap", since=kept)
+    if kept == 1:
+        with pytest.raises(RecordingError, match="the states of one tick: there is nothing"):
+            verify_bag(bag)
+        return
+    result = verify_bag(bag)
+    assert result.difference is None
+    assert result.ticks == kept - 1
+    first = f"the first of {kept * TICK:g} s."
+    assert result.missing == f"it holds commands for {10 - kept} states that are not in it, {first}"
+
+
+def without_states(bag: Path, out: Path, since: int) -> Path:
+    """Copy a bag without the states of a tick and later."""
+    with BagWriter(out) as writer:
+        for name, values in read_bag(bag).metadata.items():
+            writer.add_metadata(name, values)
+        for name, data in read_bag(bag).attachments.items():
+            writer.add_attachment(name, data, "application/xml", 0)
+        for topic, kind, time_ns, _, raw in iterate_raw(bag):
+            if topic == "/joint_commands" or time_ns < (since - 0.5) * TICK * 1e9:
+                writer.write(writer.add_topic(topic, kind), raw, time_ns, time_ns)
+    return out
+
+
+@pytest.mark.parametrize(("counted", "lost"), [(42, 0), (43, 0), (43, 5)])
+def test_a_bag_with_fewer_messages_than_its_recorder_wrote_is_not_whole(
+    tmp_path: Path, counted: int, lost: int
+) -> None:
+    with made_bag(tmp_path / "a.mcap") as (bag, say):
+        Made([RATES] * 10).add(bag, say)
+        counts = {"messages": str(counted), "messages_lost": str(lost)}
+        bag.add_metadata("recorder", counts)
+    held = read_bag(tmp_path / "a.mcap").message_count()
+    assert held == 3 * 11 + 10
+    result = verify_bag(tmp_path / "a.mcap")
+    assert result.missing == ""
+    with made_bag(tmp_path / "b.mcap") as (bag, say):
+        Made([RATES] * 10).add(bag, say)
+        bag.add_metadata("recorder", {"messages": str(held + 1), "messages_lost": str(lost)})
+    missing = verify_bag(tmp_path / "b.mcap").missing
+    assert missing == f"its recorder wrote {held + 1} messages, and it holds {held}."
+
+
+def test_a_state_that_was_lost_on_its_way_to_the_recorder_is_counted(tmp_path: Path) -> None:
+    for lost, missing in ((1, False), (0, True)):
+        path = tmp_path / f"{lost}.mcap"
+        with made_bag(path) as (bag, say):
+
+            def heard(topic: str, message: Any, time: float, say: Any = say) -> None:
+                if not (topic == "/joint_states" and time == 5 * TICK):
+                    say(topic, message, time)
+
+            Made([RATES] * 10).add(bag, heard)
+            bag.add_metadata("recorder", {"messages": "1", "messages_lost": str(lost)})
+        assert bool(verify_bag(path).missing) is missing

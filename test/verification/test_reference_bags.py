@@ -13,8 +13,8 @@ from sensor_msgs.msg import JointState
 from support.altered_bags import altered
 
 from spacerobot_ros.bag import iterate_raw, read_bag
+from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.resources import resource_names, share_directory
-from spacerobot_ros.verification.comparison import verify_bag
 
 BAGS = share_directory() / "bags"
 NAMES = resource_names("config", ".yaml")

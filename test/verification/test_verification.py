@@ -17,8 +17,8 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.resources import share_directory
-from spacerobot_ros.verification.comparison import verify_bag
 
 BAG = share_directory() / "bags" / "sliding_masses.mcap"
 TICK = 0.1
@@ -71,6 +71,28 @@ def test_an_altered_state_is_found(tmp_path: Path, topic: str, field: str) -> No
     assert difference.time == pytest.approx(read_bag(BAG)[topic].stamp[33])
     assert difference.recorded - difference.expected == pytest.approx(1e-6, rel=1e-6)
     assert verify_bag(bag, tolerance=2e-6).difference is None
+
+
+def moved_thrust(message: Any) -> Any:
+    if isinstance(message, JointState):
+        message.effort[3] += 1e-6
+    else:
+        message.wrench.torque.y += 1e-6
+    return message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("topic", "field"),
+    [("/thrusters", "effort of plus_x_4"), ("/base_wrench_realised", "wrench.torque.y")],
+)
+def test_an_altered_thrust_is_found(tmp_path: Path, topic: str, field: str) -> None:
+    source = BAG.with_name("servicer_thrusters.mcap")
+    bag = altered(source, tmp_path / "b.mcap", topic, 33, moved_thrust)
+    difference = verify_bag(bag).difference
+    assert difference is not None
+    assert (difference.topic, difference.field) == (topic, field)
+    assert difference.recorded - difference.expected == pytest.approx(1e-6, rel=1e-6)
 
 
 def test_another_robot_is_found(tmp_path: Path) -> None:

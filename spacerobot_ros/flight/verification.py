@@ -2,22 +2,36 @@
 
 from __future__ import annotations
 
+import json
 import os
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spacerobot_ros.bag.reader import read_bag
-from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
+from spacerobot_ros.errors import CommandError, ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.flight.reading import namespaces
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.urdf import parse_robot
+from spacerobot_ros.parameters import configured
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.actuators import build_plant
-from spacerobot_ros.simulation.commands import CommandValidator, Refusal
+from spacerobot_ros.simulation.commands import (
+    CommandSource,
+    CommandValidator,
+    Refusal,
+    joint_order,
+    require_frame,
+    require_values,
+)
+from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.sensors import ReportedState
-from spacerobot_ros.times import SECOND
+from spacerobot_ros.times import SECOND, stamp_to_ns
 from spacerobot_ros.topics import Topic, state_topics
-from spacerobot_ros.verification.recorded_flight import RecordedFlight, read_flight
 
 TOLERANCE = 1e-9
 """Deviation that is no difference, absolute below 1 (SI units) and relative above."""
@@ -64,14 +78,16 @@ class Difference:
 
 @dataclass(frozen=True)
 class Verification:
-    """What comes of a bag.
+    """The result of a verification.
 
     Attributes
     ----------
     ticks, duration
-        How much was re-simulated; the duration in s of simulated time.
-    messages
-        How many messages were compared.
+        The part that was re-simulated; the duration in s of simulated time.
+    messages, topics
+        Number of messages that were compared, and the topics that they are on.
+    missing
+        A sentence on states that the bag lacks, by its own counts; empty: it lacks none.
     largest, largest_at
         The largest deviation before the first difference, as a share of max(1, expected value), and
         where it is.
@@ -85,6 +101,8 @@ class Verification:
     largest: float
     largest_at: Difference | None
     difference: Difference | None
+    topics: tuple[str, ...] = ()
+    missing: str = ""
 
 
 def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Verification:
@@ -104,10 +122,14 @@ def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Ve
     SpaceRobotError
         Its robot or its plant's parameters are refused.
     """
-    flight = read_flight(read_bag(path))
+    flight = _RecordedPlant.of(read_bag(path))
     published = _published(flight)
     first = min(int(p.ticks.min()) for p in published)
     last = max(int(p.ticks.max()) for p in published)
+    if first == last:
+        raise RecordingError(
+            f"The bag {flight.path} holds the states of one tick: there is nothing to verify."
+        )
     states = sum(len(p.ticks) for p in published)
     if first < 0 or last - first > _MOST_SILENT_TICKS + _MOST_TICKS_A_STATE * states:
         raise RecordingError(
@@ -116,15 +138,160 @@ def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Ve
             "has a state in every tick."
         )
     resimulation = _resimulate(flight, _initial(first, published, flight), first, last)
-    published = [p for p in published if p.topic in resimulation.topics]
+    published = [p for p in published if p.follows_from(resimulation.states)]
+    missing = _missing(flight, published, resimulation)
     if first > 0:
         # What the flight begins from is given, and what moved it there is not in the bag.
         published = [p.after(first) for p in published]
     _require_no_reset(flight, published, resimulation)
-    return _Comparison(flight, published, resimulation, tolerance).result()
+    found = _Comparison(flight, published, resimulation, tolerance).result()
+    return replace(found, missing=missing)
 
 
 # -- what the bag holds -----------------------------------------------------------------------
+
+
+RecordedCommand = NDArray[np.float64] | CommandError
+"""The values of a command, or the reason why its message is malformed."""
+
+
+@dataclass(frozen=True)
+class _RecordedPlant:
+    """The plant of a bag that was flown in lockstep.
+
+    Attributes
+    ----------
+    recorded
+        The topics of its robot.
+    config
+        Its parameters; those that an earlier version did not have are at their defaults.
+    robot
+        The model.
+    injections
+        The faults that were injected in each tick.
+    """
+
+    recorded: RecordedRobot
+    config: PlantConfig
+    robot: SpaceRobot
+    injections: dict[int, list[str]]
+
+    @classmethod
+    def of(cls, bag: Bag) -> _RecordedPlant:
+        """Read the plant of a bag.
+
+        Raises
+        ------
+        RecordingError
+            The bag holds no flight of one plant in lockstep, or is damaged.
+        RobotDescriptionError
+            Its URDF is refused.
+        """
+        recorded = _recorded(bag)
+        config = _config(recorded)
+        urdf = recorded.urdf
+        if urdf is None:
+            raise RecordingError(f"The bag {bag.path} holds no description of its robot.")
+        injections: dict[int, list[str]] = {}
+        # Faults have no stamp: they came in the tick of their log time.
+        series = recorded.get("fault_injection")
+        for time_ns, message in series.messages() if series is not None else ():
+            injections.setdefault(time_ns // config.period_ns, []).append(message.data)
+        description = parse_robot(urdf.decode(errors="replace"))
+        names = recorded.joint_names
+        if names != list(description.joint_names):
+            # Before equations are derived of whatever robot there is.
+            raise RecordingError(
+                f"The joint states in the bag {bag.path} are of {', '.join(names)}; its robot has "
+                f"{', '.join(description.joint_names)}."
+            )
+        return cls(recorded, config, SpaceRobot(config.believed(description)), injections)
+
+    def commands(self, source: CommandSource) -> dict[int, RecordedCommand]:
+        """Return the first command of each tick; later ones and those between ticks are stale.
+
+        Raises
+        ------
+        RecordingError
+            A message is damaged.
+        """
+        commands: dict[int, RecordedCommand] = {}
+        series = self.recorded.get(source.topic)
+        for _, message in series.messages() if series is not None else ():
+            stamp = message.header.stamp
+            tick, rest = divmod(stamp_to_ns(stamp), self.config.period_ns)
+            if not rest and tick not in commands:
+                prefix = self.config.frame_prefix
+                commands[tick] = read_command(message, source, self.robot, prefix)
+        return commands
+
+    @property
+    def path(self) -> Path:
+        """The bag."""
+        return self.recorded.bag.path
+
+
+def read_command(
+    message: Any, source: CommandSource, robot: SpaceRobot, frame_prefix: str = ""
+) -> RecordedCommand:
+    """Return what a decoded message commands, in the order of the robot's joints.
+
+    Joints that it does not name are commanded nothing; ``frame_prefix`` is of the robot's frames.
+    """
+    try:
+        if source.quantity == "wrench":
+            require_frame(message.header.frame_id, robot.base_link, frame_prefix)
+            force, torque = message.wrench.force, message.wrench.torque
+            return np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
+        order = joint_order(robot.joint_names, message.name)
+        given = getattr(message, source.quantity)
+        require_values(message.name, source.quantity, len(given))
+    except CommandError as error:
+        return error
+    values = np.zeros(robot.n)
+    values[order] = given
+    return values
+
+
+def _recorded(bag: Bag) -> RecordedRobot:
+    """Return the one robot of which the bag holds odom and joint_states."""
+    candidates = [RecordedRobot(bag, name) for name in namespaces(bag)]
+    found = [each for each in candidates if each.get("odom") and each.get("joint_states")]
+    if len(found) != 1:
+        names = ", ".join(each.namespace for each in found)
+        plants = f"{len(found)} plants ({names})" if found else "no plant"
+        raise RecordingError(
+            f"The bag {bag.path} holds the states of {plants}: to verify it takes one that "
+            "published odom and joint_states."
+        )
+    return found[0]
+
+
+def _config(recorded: RecordedRobot) -> PlantConfig:
+    bag, texts = recorded.bag, recorded.metadata.get("parameters/plant")
+    if texts is None:
+        raise RecordingError(
+            f"The bag {bag.path} does not say what its plant was: bags of 'spacerobot run' hold "
+            "the plant's parameters."
+        )
+    try:
+        values = {name: json.loads(text) for name, text in texts.items()}
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(
+            f"The plant's parameters in the bag {bag.path} cannot be read: {error}."
+        ) from error
+    try:
+        config = configured(PlantConfig, values)
+    except ParameterError as error:
+        raise RecordingError(
+            f"The plant's parameters in the bag {bag.path} cannot be used: {error}"
+        ) from error
+    if config.time_mode != "lockstep":
+        raise RecordingError(
+            f"The bag {bag.path} was flown in real time, where nothing records which command the "
+            "plant held in which tick: only flights in lockstep can be verified."
+        )
+    return config
 
 
 @dataclass(frozen=True)
@@ -138,9 +305,20 @@ class _Published:
     labels: list[str]
 
     def after(self, tick: int) -> _Published:
-        """Leave out what came until then."""
+        """Leave out the messages until a tick, from which on-times of thrusters count."""
         kept = self.ticks > tick
-        return replace(self, ticks=self.ticks[kept], values=self.values[kept])
+        values = self.values[kept]
+        if self.topic.of == "thrusters" and not kept.all():
+            count = self.values.shape[1] // len(self.topic.state)
+            values[:, :count] -= self.values[~kept][-1, :count]
+        return replace(self, ticks=self.ticks[kept], values=values)
+
+    def follows_from(self, states: dict[str, Floats]) -> bool:
+        """Whether a re-simulation has all quantities of the topic, of the same sizes."""
+        names = [each.quantity for each in self.topic.state]
+        if not all(name in states for name in names):
+            return False
+        return sum(states[name].shape[1] for name in names) == self.values.shape[1]
 
     def expected(self, states: dict[str, Floats], rows: NDArray[np.int64]) -> Floats:
         """Return what the re-simulation has for each message, shaped as the values.
@@ -158,13 +336,13 @@ class _Published:
         return expected
 
 
-def _published(flight: RecordedFlight) -> list[_Published]:
+def _published(flight: _RecordedPlant) -> list[_Published]:
     """Read the state topics; the plant stamps those without a header like its odometry."""
     recorded, period, names = flight.recorded, flight.config.period_ns, flight.robot.joint_names
     published: list[_Published] = []
     clock = recorded["odom"].stamp_ns
     for topic in sorted(state_topics(), key=_rank):
-        series = recorded.get(topic.name) if topic.verified else None
+        series = recorded.get(topic.name)
         if series is None:
             continue
         stamps = series.stamp_ns
@@ -177,7 +355,8 @@ def _published(flight: RecordedFlight) -> list[_Published]:
                 f"A message on {series.topic} of the bag {flight.path} is stamped "
                 f"{stamps[between[0]] / SECOND:.9g} s, between the ticks of the plant in it."
             )
-        labels = [each.labels(names) for each in topic.state]
+        named = recorded.names(topic.name) if topic.of == "thrusters" else names
+        labels = [each.labels(named) for each in topic.state]
         table = np.hstack(
             [
                 series.table(each.columns, len(words))
@@ -191,12 +370,41 @@ def _published(flight: RecordedFlight) -> list[_Published]:
     return published
 
 
+def _missing(
+    flight: _RecordedPlant, published: list[_Published], resimulation: _Resimulation
+) -> str:
+    """Return a sentence on states that the bag lacks; empty for none.
+
+    Every command answers a state, and a recorder counts its messages: those that it wrote, and
+    those that never reached it.
+    """
+    recorded = flight.recorded
+    counts = recorded.metadata.get("recorder", {})
+    written, lost = (_count(counts.get(name)) for name in ("messages", "messages_lost"))
+    held = recorded.bag.message_count()
+    if resimulation.first == 0 and written > held:
+        return f"its recorder wrote {written} messages, and it holds {held}."
+    states = {int(t) for p in published if p.topic.name == "joint_states" for t in p.ticks}
+    lacking = {tick for tick in resimulation.given if tick >= resimulation.first} - states
+    if len(lacking) > lost:
+        time = min(lacking) * flight.config.period_ns / SECOND
+        return (
+            f"it holds commands for {len(lacking)} states that are not in it, the first of "
+            f"{time:.9g} s."
+        )
+    return ""
+
+
+def _count(text: str | None) -> int:
+    return int(text) if text is not None and text.isdecimal() else 0
+
+
 def _rank(topic: Topic) -> int:
     return _EXPLAINING.index(topic.name) if topic.name in _EXPLAINING else len(_EXPLAINING)
 
 
 def _initial(
-    first: int, published: list[_Published], flight: RecordedFlight
+    first: int, published: list[_Published], flight: _RecordedPlant
 ) -> InitialState | None:
     """Return the first state in the bag; None, for the parameters, if it is the very first."""
     if first == 0:
@@ -232,7 +440,6 @@ class _Resimulation:
     ``refusals`` those whose command was refused, with its topic.
     """
 
-    topics: list[Topic]
     first: int
     end: int
     states: dict[str, Floats]
@@ -243,7 +450,7 @@ class _Resimulation:
 
 
 def _resimulate(
-    flight: RecordedFlight, initial: InitialState | None, first: int, last: int
+    flight: _RecordedPlant, initial: InitialState | None, first: int, last: int
 ) -> _Resimulation:
     """Step the plant of a flight from tick ``first`` to tick ``last``, or as far as it goes.
 
@@ -264,17 +471,15 @@ def _resimulate(
         )
     plant.tick = first
     recorded = [flight.commands(source) for source in commands.sources]
-    topics = [topic for topic in state.topics if topic.verified]
-    states = {
-        each.quantity: np.empty((last - first + 1, state.quantities[each.quantity].size))
-        for topic in topics
-        for each in topic.state
-    }
-    done = _Resimulation(topics, first, last, states, frozenset(recorded[0]))
+    states: dict[str, Floats] = {}
+    done = _Resimulation(first, last, states, frozenset(recorded[0]))
     for tick in range(first, last + 1):
-        state.update()
-        for quantity, rows in states.items():
-            rows[tick - first] = state.quantities[quantity]
+        if state.update() or tick == first:
+            # Sensors that begin to err add the true states.
+            for quantity, values in state.quantities.items():
+                states.setdefault(quantity, np.full((last - first + 1, values.size), np.nan))
+        for quantity, values in state.quantities.items():
+            states[quantity][tick - first] = values
         if tick == last:
             break
         for text in flight.injections.get(tick, ()):
@@ -299,7 +504,7 @@ def _resimulate(
 
 
 def _require_no_reset(
-    flight: RecordedFlight, published: list[_Published], resimulation: _Resimulation
+    flight: _RecordedPlant, published: list[_Published], resimulation: _Resimulation
 ) -> None:
     """Refuse a bag in which a state is published a second time, and is the initial one again."""
     for p in published:
@@ -325,7 +530,7 @@ class _Comparison:
 
     def __init__(
         self,
-        flight: RecordedFlight,
+        flight: _RecordedPlant,
         published: list[_Published],
         resimulation: _Resimulation,
         tolerance: float,
@@ -351,6 +556,7 @@ class _Comparison:
             ticks=ticks,
             duration=ticks * self._period / SECOND,
             messages=sum(len(p.ticks) for p, _, _ in self._pairs),
+            topics=tuple(p.name for p, _, _ in self._pairs),
             largest=largest,
             largest_at=largest_at,
             difference=difference,

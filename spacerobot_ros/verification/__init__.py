@@ -1,1 +1,0 @@
-"""Verification: the plant of a bag re-simulated under the commands in the bag."""
