@@ -7,13 +7,15 @@ would be singular are refused.
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
+import os
 import re
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 from xml.etree.ElementTree import Element, ParseError, fromstring
@@ -21,6 +23,7 @@ from xml.etree.ElementTree import Element, ParseError, fromstring
 import numpy as np
 
 from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.model import xacro_files
 from spacerobot_ros.model.description import (
     Array,
     Inertia,
@@ -44,11 +47,15 @@ _LARGEST = 1e12
 
 _MOST_LINKS = 200
 
-_XACRO = re.compile(r"<xacro:|\$\{")
+_CPU_TIME = 10
+"""Limit of processor time for the expansion of a xacro file, s; six times as much wall time."""
+
+_ENVIRONMENT = ("PATH", "PYTHONPATH", "AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH", "ROS_DISTRO", "LANG")
+"""Environment variables that xacro files may read."""
 
 
 def load_robot(path: str | Path) -> RobotDescription:
-    """Read the robot of a URDF file, or of a xacro file, which is expanded.
+    """Read the robot of a URDF file, or of a xacro file (by its suffix), which is expanded.
 
     Paths of meshes that are relative to the file, or in a package that is not installed and is a
     folder around the file, become absolute in the text that the robot keeps.
@@ -67,33 +74,51 @@ def load_robot(path: str | Path) -> RobotDescription:
         raise RobotDescriptionError(
             f"The URDF {path} cannot be read: it is no text in UTF-8 ({error}). Save it as UTF-8."
         ) from error
-    if path.suffix == ".xacro" or _XACRO.search(text):
+    if path.suffix == ".xacro":
         text = _expanded(path)
     try:
         folder = path.resolve().parent
         return parse_robot(with_mesh_files(text, lambda mesh: mesh_beside(mesh, folder)))
     except RobotDescriptionError as error:
-        raise RobotDescriptionError(f"{path}: {error}") from error
+        remedy = ""
+        if path.suffix != ".xacro" and ("<xacro:" in text or "${" in text):
+            remedy = f" To have the xacro in it expanded, name it {path.stem}.xacro."
+        raise RobotDescriptionError(f"{path}: {error}{remedy}") from error
 
 
 def _expanded(path: Path) -> str:
-    """Return the URDF text that a xacro file expands to."""
-    try:
-        import xacro
-    except ImportError:
+    """Return the URDF text of a xacro file, which a confined process expands.
+
+    Robot files are exchanged between strangers: see :mod:`spacerobot_ros.model.xacro_files`.
+    """
+    by_hand = f"`xacro {path.name} > {path.name.split('.')[0]}.urdf`"
+    if find_spec("xacro") is None:
         raise RobotDescriptionError(
             f"{path} is a xacro file, and the package xacro is not installed: `pip install xacro`, "
-            f"or expand it where it is: `xacro {path.name} > {path.name.split('.')[0]}.urdf`."
-        ) from None
-    # xacro reports on standard error where it was when it failed: the message says it.
-    with contextlib.redirect_stderr(io.StringIO()):
-        try:
-            return str(xacro.process_file(str(path)).toxml())
-        except Exception as error:  # Of xacro, its expressions, the XML parser
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise RobotDescriptionError(
-                f"The xacro file {path} cannot be expanded: {reason}."
-            ) from error
+            f"or expand it where it is: {by_hand}."
+        )
+    environment = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
+    try:
+        done = subprocess.run(
+            [sys.executable, xacro_files.__file__, str(path), f"{_CPU_TIME}"],
+            env={**environment, "PYTHONIOENCODING": "utf-8"},
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            timeout=6 * _CPU_TIME,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        reason = f"it takes longer than {6 * _CPU_TIME} s"
+    else:
+        if done.returncode == 0:
+            return done.stdout
+        reasons = [line for line in done.stderr.splitlines() if line.startswith("REASON ")]
+        reason = reasons[-1][7:] if reasons else "it needs too much time or memory"
+    raise RobotDescriptionError(
+        f"The xacro file {path} cannot be expanded: {reason.rstrip('.')}. If you trust it, expand "
+        f"it yourself: {by_hand}."
+    )
 
 
 def parse_robot(text: str) -> RobotDescription:

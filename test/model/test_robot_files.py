@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError
-from spacerobot_ros.model import SpaceRobot, load_robot
+from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.meshes import mesh_file
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.session.own_robot import remarks
@@ -37,7 +37,7 @@ def file_with(tmp_path: Path, text: str, name: str = "probe.urdf") -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["probe.urdf.xacro", "probe.xacro", "probe.urdf"])
+@pytest.mark.parametrize("name", ["probe.urdf.xacro", "probe.xacro"])
 def test_a_xacro_file_is_expanded(tmp_path: Path, name: str) -> None:
     heading = ' xmlns:xacro="http://www.ros.org/wiki/xacro"'
     text = urdf(mass="${3 * unit}", attribute=heading)
@@ -51,6 +51,69 @@ def test_a_xacro_file_that_cannot_be_expanded_is_refused(tmp_path: Path) -> None
     heading = ' xmlns:xacro="http://www.ros.org/wiki/xacro"'
     path = file_with(tmp_path, urdf(mass="${no_such}", attribute=heading), "probe.xacro")
     with pytest.raises(RobotDescriptionError, match=r"cannot be expanded: .*no_such"):
+        load_robot(path)
+
+
+HEADING = ' xmlns:xacro="http://www.ros.org/wiki/xacro"'
+
+
+def test_xacro_in_a_urdf_file_and_in_a_text_is_not_expanded(tmp_path: Path) -> None:
+    text = urdf(mass="${3 * 14}", attribute=HEADING)
+    with pytest.raises(RobotDescriptionError, match=r"name it probe\.xacro\.$"):
+        load_robot(file_with(tmp_path, text, "probe.urdf"))
+    with pytest.raises(RobotDescriptionError, match=r"'value' of the <mass> of link 'hull' has"):
+        parse_robot(text)
+
+
+def test_a_xacro_file_takes_macros_properties_lists_and_files_of_its_package(
+    tmp_path: Path,
+) -> None:
+    folder, config = tmp_path / "urdf", tmp_path / "config"
+    folder.mkdir()
+    config.mkdir()
+    (tmp_path / "package.xml").write_text("<package/>")
+    (config / "masses.yaml").write_text("hull: {mass: 40.0}\nextra: [1.0, 2.0]\n")
+    (folder / "parts.xacro").write_text(
+        f'<robot{HEADING}><xacro:macro name="read" params="file:=masses">'
+        '<xacro:property name="m" scope="parent"'
+        " value=\"${xacro.load_yaml('../config/' + file + '.yaml')}\"/></xacro:macro></robot>"
+    )
+    text = urdf(mass="${m.hull.mass + max(m['extra']) * (1 if pi > 3 else 0)}", attribute=HEADING)
+    head = '<xacro:include filename="parts.xacro"/><xacro:read/>'
+    text = text.replace("  <link", f"{head}\n  <link", 1)
+    assert load_robot(file_with(folder, text, "probe.xacro")).bodies[0].inertia.mass == 42.0
+
+
+ATTACKS = {
+    "a lambda": ("${(lambda: 1)()}", "has a Lambda"),
+    "a comprehension": ("${[x for x in [1]][0]}", "has a ListComp"),
+    "a generator": ("${sum(x for x in [1])}", "has a GeneratorExp"),
+    "an assignment": ("${(a := 1)}", "has a NamedExpr"),
+    "classes": ("${().__class__.__base__.__subclasses__()}", "has the name '__"),
+    "format": ("${'%s' % 'a'.format}", "has the name 'format'"),
+    "a type": ("${python.type(1)}", "has the name 'type'"),
+    "in an expression of substitution": ("$(eval [x for x in [1]])", "has a ListComp"),
+    "an expression that an expression makes": ("${'$' + '{().__class__}'}", "cannot be expanded"),
+    "a password file": ("${xacro.load_yaml('/etc/passwd')}", "outside of its package"),
+    "a hidden file": ("${xacro.load_yaml('.netrc')}", "no robot or YAML file"),
+    "another file": ("${xacro.load_yaml('probe.txt')}", "no robot or YAML file"),
+    "the environment": ("$(env SECRET_OF_TEST)", "SECRET_OF_TEST. is not set"),
+    "a number without end": ("${9**9**9}", "needs too much time or memory"),
+    "a text without end": ("${len('a' * 10**11)}", "cannot be expanded"),
+}
+
+
+@pytest.mark.parametrize(("expression", "reason"), ATTACKS.values(), ids=ATTACKS)
+def test_a_xacro_file_is_no_program(
+    tmp_path: Path, expression: str, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It computes with numbers and texts, for a second, and reads its package alone."""
+    monkeypatch.setenv("SECRET_OF_TEST", "42")
+    monkeypatch.setattr("spacerobot_ros.model.urdf._CPU_TIME", 1)
+    for name in (".netrc", "probe.txt"):
+        (tmp_path / name).write_text("42")
+    path = file_with(tmp_path, urdf(mass=expression, attribute=HEADING), "probe.xacro")
+    with pytest.raises(RobotDescriptionError, match=reason):
         load_robot(path)
 
 
