@@ -21,7 +21,9 @@ _MODULES = {
 }
 """Modules of this folder, and the commands in each: NAME is its attribute ``NAME_command``."""
 
-COMMANDS = {name: module for module, names in _MODULES.items() for name in names}
+COMMANDS: dict[str, str] = dict(
+    sorted((name, module) for module, names in _MODULES.items() for name in names)
+)
 """Modules by the names of their commands."""
 
 
@@ -30,7 +32,7 @@ class CommandGroup(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands."""
-        return sorted(COMMANDS)
+        return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return a command by its name, None where there is none."""

@@ -77,8 +77,8 @@ def _import_everything() -> None:
             "spacerobot_ros.flight.verification",
         ):
             import_module(name)
-        for command in import_module("spacerobot_ros.cli.main").COMMANDS:
-            import_module(f"spacerobot_ros.cli.{command}")
+        for module in set(import_module("spacerobot_ros.cli.main").COMMANDS.values()):
+            import_module(f"spacerobot_ros.cli.{module}")
 
 
 def _serve(path: str) -> None:
