@@ -76,7 +76,8 @@ def test_classes_that_the_page_of_the_architecture_names_exist() -> None:
 def test_tests_that_the_page_of_faults_names_exist() -> None:
     text = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
     source = (ROOT / "test" / "nodes" / "test_faults_flight.py").read_text(encoding="utf-8")
-    names = re.findall(r"(?:F |, )`(\w+)(?:\.\.\.)?`", text[text.index("## Response of the stack") :])
+    table = text[text.index("## Response of the stack") :]
+    names = re.findall(r"(?:F |, )`(\w+)(?:\.\.\.)?`", table)
     flights = [name for name in names if not (ROOT / "config" / "faults" / f"{name}.yaml").exists()]
     assert len(flights) > 10
     assert [name for name in flights if f"def test_{name}" not in source] == []
