@@ -209,7 +209,7 @@ def up_command(
     from spacerobot_ros.flight.scenario import scenario_or_robot
 
     chosen = scenario_or_robot(scenario).in_real_time(rate).with_settings(settings)
-    from spacerobot_ros.session.live import keep_up
+    from spacerobot_ros.session.run import keep_up
 
     with viewing_if(view, chosen.parameters("viewer"), namespace):
         recorded = keep_up(chosen, bag, click.echo, processes=processes, namespace=namespace)
@@ -249,7 +249,7 @@ def goal_command(
     if rpy_deg:
         wanted = Goal.from_rpy(pose[:3], rpy_deg)
     from spacerobot_ros.measures import Outcome
-    from spacerobot_ros.session.live import send_goal
+    from spacerobot_ros.session.run import send_goal
 
     outcome = send_goal(wanted, click.echo, namespace=namespace, timeout=timeout)
     end_if_requested()

@@ -1,8 +1,8 @@
 """The nodes: thin ROS 2 wrappers, parameters in, topics out."""
 
 from spacerobot_ros.nodes.common.node import FlightNode
-from spacerobot_ros.nodes.controller.node import CoordinatedControlNode
-from spacerobot_ros.nodes.planner.node import PlannerNode
+from spacerobot_ros.nodes.controller import CoordinatedControlNode
+from spacerobot_ros.nodes.planner import PlannerNode
 from spacerobot_ros.nodes.plant.node import PlantNode
 from spacerobot_ros.nodes.recorder import RecorderNode
 from spacerobot_ros.nodes.replay import ReplayNode

@@ -452,7 +452,7 @@ def test_only_a_goal_that_is_reached_is_exit_0(
     monkeypatch: pytest.MonkeyPatch, outcome: str, code: int
 ) -> None:
     from spacerobot_ros.measures import Outcome
-    from spacerobot_ros.session import live
+    from spacerobot_ros.session import run
 
     sent: list[Any] = []
 
@@ -461,7 +461,7 @@ def test_only_a_goal_that_is_reached_is_exit_0(
         show("A sentence.")
         return Outcome(outcome)
 
-    monkeypatch.setattr(live, "send_goal", send)
+    monkeypatch.setattr(run, "send_goal", send)
     runner = CliRunner()
     words = ["--namespace", "/a", "--timeout", "7"]
     result = runner.invoke(main, ["goal", "1", "-2", "3", *words])

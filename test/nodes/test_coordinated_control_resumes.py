@@ -229,7 +229,7 @@ def test_a_process_with_a_broken_file_ends_with_one_sentence(
 ) -> None:
     file.write_text("{")
     words = (
-        *("-m", "spacerobot_ros.nodes.controller.node", "--ros-args"),
+        *("-m", "spacerobot_ros.nodes.controller", "--ros-args"),
         *("-p", "robot:=planar_manipulator", "-p", f"resume_file:={file}"),
     )
     environment = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain)}

@@ -30,7 +30,8 @@ def main():
 def module_of(node: str) -> str:
     """Return the module that an executable runs."""
     modules = {
-        "coordinated_control": "controller.node",
+        "coordinated_control": "controller",
+        "planner": "planner",
         "recorder": "recorder",
         "replay": "replay",
     }

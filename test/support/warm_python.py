@@ -73,7 +73,7 @@ def _import_everything() -> None:
         for name in (
             *("matplotlib.pyplot", "scipy.optimize", "spacerobot_ros.nodes"),
             *("spacerobot_ros.session.run", "spacerobot_ros.session.processes"),
-            *("spacerobot_ros.session.live", "spacerobot_ros.report"),
+            "spacerobot_ros.report",
             "spacerobot_ros.flight.verification",
         ):
             import_module(name)

@@ -139,7 +139,7 @@ class CommanderNode(FlightNode):
         """Give up the goals for a silent plant, where that is asked for."""
         super().on_silence(silence)
         if self.config.watchdog_action == "abort" and not silence.over:
-            self.commander.plant_silent(silence.sentence)
+            self.commander.plant_silent(silence.message)
 
     # -- the host of the commander ------------------------------------------------------------
 

@@ -382,11 +382,11 @@ class FlightNode(LifecycleNode):
         kind = EventKind.NODE_BACK if silence.over else EventKind.NODE_SILENT
         level, logger = (0 if silence.over else 2), self.get_logger()
         if silence.over:
-            logger.info(silence.sentence)
+            logger.info(silence.message)
         else:
-            logger.error(silence.sentence)
+            logger.error(silence.message)
         about = {"node": silence.name, "silent_s": f"{silence.seconds:.3f}"}
-        self.report_event(Event(kind, silence.sentence, level, about=about))
+        self.report_event(Event(kind, silence.message, level, about=about))
 
     @contextmanager
     def long_work(self) -> Iterator[None]:

@@ -36,7 +36,7 @@ _HEARTBEATS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class Role(str, Enum):
-    """What others depend on a node for; the value is the ``hardware_id`` of its heartbeats."""
+    """The part of a node in the stack; the value is the ``hardware_id`` of its heartbeats."""
 
     PLANT = "plant"
     COMMANDER = "commander"
@@ -63,7 +63,7 @@ class Silence:
     name
         Its full name.
     seconds
-        For how long nothing came from it, wall s.
+        Duration without a heartbeat, wall s.
     over
         Whether it is back.
     """
@@ -73,8 +73,8 @@ class Silence:
     over: bool = False
 
     @property
-    def sentence(self) -> str:
-        """The same for people."""
+    def message(self) -> str:
+        """The text for the user."""
         if self.over:
             return f"Node '{self.name}' is back after {self.seconds:.2g} s."
         return f"Node '{self.name}' is silent for {self.seconds:.2g} s."
@@ -142,9 +142,9 @@ class Liveness:
     Parameters
     ----------
     node
-        Whose they are.
+        The node that sends them.
     role
-        Its own.
+        Its role.
     depends_on
         The roles that it watches.
     on_silence

@@ -1,1 +1,0 @@
-"""The coordinated-control node."""
