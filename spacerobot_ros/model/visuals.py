@@ -1,16 +1,15 @@
-"""What a robot looks like, for whatever draws it: triangles of every visual, and its sharp edges.
+"""The visuals of a robot as triangles and sharp edges, for pictures, pages and the viewer.
 
-Pictures, pages and viewers choose colours, cameras and backgrounds; which solid or mesh is where is
-here. Meshes travel in bags as :func:`carried_meshes` makes them, and come from there again by
-:func:`meshes_in`, or as files by :class:`MeshFolder`; on the machine of the robot,
-:func:`~spacerobot_ros.model.meshes.shape_mesh` reads their files.
+Those choose colours, cameras and backgrounds. Meshes come from files (:func:`meshes_from_files`) or
+from a bag (:func:`meshes_in`), which carries those of :func:`carried_meshes`; :class:`MeshFolder`
+writes them to files again.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -31,14 +30,17 @@ from spacerobot_ros.model.meshes import (
 )
 
 _AROUND = 24
-"""Facets around a cylinder or sphere."""
+"""Facets around a cylinder or a sphere."""
 
 _ROD = 0.05
-"""Thinner than this part of its length, a box is a rod: without edges, its outline a line."""
+"""Ratio of thickness to length below which a box counts as a rod, drawn as a line."""
 
 _SHARP = math.cos(math.radians(30.0))
 _CARRIED = 20_000
-"""Faces of a mesh that is carried in a bag: 1 MB."""
+"""Largest number of faces of a mesh in a bag: 1 MB."""
+
+_BALL, _BAR = 0.05, 0.02
+"""Radii of the balls and bars that stand for the links and joints of a robot without visuals, m."""
 
 _BOX = (
     *((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)),
@@ -61,11 +63,11 @@ class Visual:
     Attributes
     ----------
     link
-        The link that it belongs to.
+        Name of its link.
     body
-        Number of the moving body that the link is a part of; 0: the base.
+        Index of the body that the link is part of; 0: the base.
     shape
-        What the URDF says of it.
+        Its description in the URDF.
     mesh
         Its triangles in the frame of the link.
     """
@@ -77,19 +79,19 @@ class Visual:
 
     @cached_property
     def edges(self) -> Edges:
-        """Its sharp edges in the frame of the link; none where it is too thin to draw them."""
+        """Sharp edges in the frame of the link; a rod has none."""
         none = np.empty((0, 2, 3))
         return Edges(none, none) if self.is_rod else sharp_edges(self.mesh)
 
     @property
     def is_rod(self) -> bool:
-        """Whether it is a box too thin to draw its edges."""
+        """Whether it is a box too thin to show edges."""
         size = sorted(self.shape.size)
         return self.shape.kind == "box" and size[1] < _ROD * size[2]
 
     @property
     def outline(self) -> Array:
-        """Lines (K, 2, 3) in the frame of the link that show it without hiding things behind it."""
+        """Lines (K, 2, 3) in the frame of the link that outline it without hiding other parts."""
         shape = self.shape
         if self.is_rod:
             longest = int(np.argmax(shape.size))
@@ -107,15 +109,16 @@ def visuals_of(
 ) -> tuple[Visual, ...]:
     """Return all visuals of a robot that can be drawn.
 
+    If there are none, a ball stands for each link and a bar for each offset of a joint.
+
     Parameters
     ----------
     robot
         The robot.
     meshes
-        Triangles of meshes by their URIs, in their own frames. Meshes that are not there are left
-        out.
+        Triangles of meshes by their URIs, in their own frames; other meshes are left out.
     most
-        Faces that a mesh has at most: finer ones are made coarser.
+        Largest number of faces of a mesh; finer ones are simplified.
     """
     found = []
     for link in robot.links:
@@ -128,7 +131,22 @@ def visuals_of(
                 mesh = meshes[shape.resource].coarsened(most).moved(shape.pose, shape.size)
             if mesh is not None and len(mesh.faces):
                 found.append(Visual(link.name, body, shape, mesh))
-    return tuple(found)
+    return tuple(found) or _stand_ins(robot)
+
+
+def _stand_ins(robot: RobotDescription) -> tuple[Visual, ...]:
+    shapes = [(link.name, Shape("sphere", (_BALL,), Pose())) for link in robot.links]
+    for joint in robot.joints:
+        length = float(np.linalg.norm(joint.origin.r))
+        if length > 1e-6:
+            z = joint.origin.r / length
+            x = np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))])
+            x /= np.linalg.norm(x)
+            pose = Pose(np.column_stack([x, np.cross(z, x), z]), joint.origin.r / 2)
+            shapes.append((joint.parent, Shape("cylinder", (_BAR, length), pose)))
+    return tuple(
+        Visual(link, robot.frames[link][0], shape, solid_mesh(shape)) for link, shape in shapes
+    )
 
 
 def solid_mesh(shape: Shape) -> TriangleMesh:
@@ -152,7 +170,7 @@ def _corners() -> Array:
 
 
 def _turned(radii: list[float], heights: Array) -> TriangleMesh:
-    """Return the surface that a profile in the plane of x and z makes, turned about z."""
+    """Return the surface of revolution of a profile in the plane of x and z about z."""
     angles = np.linspace(0.0, 2 * np.pi, _AROUND, endpoint=False)
     circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(_AROUND)])
     rings = [r * circle + [0.0, 0.0, z] for r, z in zip(radii, heights, strict=True)]
@@ -187,25 +205,40 @@ def sharp_edges(mesh: TriangleMesh) -> Edges:
 _PREFIX = "mesh/"
 
 
-def carried_meshes(robot: RobotDescription) -> dict[str, bytes]:
-    """Return the meshes of a robot for a bag: names of attachments, and STL of at most 1 MB each.
+def meshes_from_files(
+    robot: RobotDescription, most: int, on_error: Callable[[str], None] = lambda message: None
+) -> dict[str, TriangleMesh]:
+    """Return the meshes of a robot that can be read on this machine, by their URIs.
 
-    Those whose files are not found or cannot be read are left out.
+    Parameters
+    ----------
+    robot
+        The robot.
+    most
+        Largest number of faces of a mesh; finer ones are simplified.
+    on_error
+        Called with a message about each mesh that cannot be read.
     """
     found = {}
     for resource in _resources(robot):
         try:
-            mesh = shape_mesh(Shape("mesh", (1.0,) * 3, Pose(), resource=resource), _CARRIED)
-        except MeshError:
-            continue
-        found[f"{_PREFIX}{resource}"] = stl_of(mesh)
+            shape = Shape("mesh", (1.0,) * 3, Pose(), resource=resource)
+            found[resource] = shape_mesh(shape, most)
+        except MeshError as error:
+            on_error(str(error))
     return found
+
+
+def carried_meshes(robot: RobotDescription) -> dict[str, bytes]:
+    """Return the meshes of a robot for a bag, by attachment name, as STL of at most 1 MB each."""
+    meshes = meshes_from_files(robot, _CARRIED)
+    return {f"{_PREFIX}{resource}": stl_of(mesh) for resource, mesh in meshes.items()}
 
 
 def meshes_in(robot: RobotDescription, attachments: Mapping[str, bytes]) -> dict[str, TriangleMesh]:
     """Return the meshes of a robot that are among the attachments of a bag, by their URIs.
 
-    No file is read: a bag that a stranger has written names whatever it likes.
+    No file is read: a stranger's bag may name any file of this machine.
     """
     found = {}
     for resource in _resources(robot):
@@ -218,17 +251,17 @@ def meshes_in(robot: RobotDescription, attachments: Mapping[str, bytes]) -> dict
 
 
 class MeshFolder:
-    """A folder with meshes of bags that are not on this machine, for programs that read files.
+    """A folder with those meshes of a bag that this machine lacks, for programs that read files.
 
     Parameters
     ----------
     attachments
-        Of the bag, as :func:`carried_meshes` makes them.
+        Attachments of the bag, as of :func:`carried_meshes`.
 
     Raises
     ------
     OSError
-        There is no room for a folder.
+        The folder cannot be created.
     """
 
     def __init__(self, attachments: Mapping[str, bytes]) -> None:
@@ -237,9 +270,9 @@ class MeshFolder:
         self._files: dict[str, Path | None] = {}
 
     def described(self, urdf: str) -> str:
-        """Return the text of a URDF with the files of the meshes that only the bag has.
+        """Return the text of a URDF in which meshes that only the bag has are files of this folder.
 
-        Those that are found on this machine, or that the bag does not carry, keep their names.
+        Other meshes keep their names.
         """
         return with_mesh_files(urdf, self._file)
 
@@ -256,7 +289,7 @@ class MeshFolder:
             mesh = mesh_of_stl(data, resource).coarsened(_CARRIED)
         except MeshError:
             return None
-        # Its name is none of the bag's, and what is written is what was understood.
+        # Neither the name nor the bytes of the bag: a stranger may have written both.
         path = Path(self._folder.name, f"{len(self._files)}.stl")
         path.write_bytes(stl_of(mesh))
         return path

@@ -403,11 +403,7 @@ def _robot(robot: RobotDescription, meshes: Mapping[str, TriangleMesh]) -> list[
     visuals = visuals_of(robot, meshes, _faces(meshes))
     for joint in robot.joints:
         commands.append(set_transform(paths[joint.child], matrix_of(joint.origin)))
-        if not visuals:
-            ends = np.array([np.zeros(3), joint.origin.r])
-            path = f"{paths[joint.parent]}/line to {paths[joint.child].rpartition('/')[2]}"
-            commands.append(segments(path, ends, body_color(robot.frames[joint.parent][0])))
-    for number, visual in enumerate(visuals or _balls(robot)):
+    for number, visual in enumerate(visuals):
         path = f"{paths[visual.link]}/visual {number}"
         commands += solid(path, visual, body_color(visual.body))
     return commands
@@ -416,16 +412,6 @@ def _robot(robot: RobotDescription, meshes: Mapping[str, TriangleMesh]) -> list[
 def _faces(meshes: Mapping[str, TriangleMesh]) -> int:
     """Return how many faces each mesh may have, so that the page stays small."""
     return _MOST_FACES // max(len(meshes), 1)
-
-
-def _balls(robot: RobotDescription) -> list[Visual]:
-    """Return a small ball for each link of a robot that has no visuals."""
-    return [_ball(link.name, robot.frames[link.name][0], 0.03) for link in robot.links]
-
-
-def _ball(link: str, body: int, radius: float) -> Visual:
-    shape = Shape("sphere", (radius,), Pose())
-    return Visual(link, body, shape, solid_mesh(shape))
 
 
 def _motion(flight: FlightReport, drawn: SolidRobot, indices: Indices) -> Command:
@@ -474,7 +460,8 @@ def _ghosts(flight: FlightReport, robot: RobotDescription, radius: float) -> lis
         pose = Pose(matrix_from_quaternion(target.goal.quaternion), target.goal.position)
         path = f"{WORLD}/end-effector goal"
         commands.append(set_transform(path, matrix_of(pose)))
-        commands += solid(f"{path}/mark", _ball("", 0, 0.03 * radius), GHOST, 0.4)
+        ball = Shape("sphere", (0.03 * radius,), Pose())
+        commands += solid(f"{path}/mark", Visual("", 0, ball, solid_mesh(ball)), GHOST, 0.4)
         if set(flight.controls("end_effector")) & {3, 4, 5}:
             for name, unit, tint in zip("xyz", np.eye(3), _AXES, strict=True):
                 ends = np.array([np.zeros(3), 0.12 * radius * unit])

@@ -218,15 +218,12 @@ class SolidRobot:
         return {link: base @ Pose(R, r) for link, R, r in poses}
 
     def at(self, q: Array, base: Pose) -> Solids:
-        """Return the robot at joint positions ``q`` (n,), its base at a pose in the world.
-
-        A robot without visuals is drawn as lines between its bodies.
-        """
+        """Return the robot at joint positions ``q`` (n,), its base at a pose in the world."""
         poses = self.link_poses(q, base)
         solids = Solids()
         for visual in self._visuals:
             solids.add(visual, poses[visual.link], _rgb(body_color(visual.body)))
-        return solids if solids.faces else _skeleton(self.robot, poses)
+        return solids
 
     def base_outlines(self, base: Pose) -> list[Array]:
         """Return the edges of what is rigidly on the base link, as lines (k, 3) in the world."""
@@ -251,13 +248,3 @@ def body_color(body: int) -> str:
 def _cross(pose: Pose) -> list[Array]:
     """A small cross (three lines) in the place of what cannot be drawn."""
     return [pose.r + 0.1 * np.array([-axis, axis]) @ pose.R.T for axis in np.eye(3)]
-
-
-def _skeleton(robot: RobotDescription, poses: dict[str, Pose]) -> Solids:
-    """Lines from each body to those it carries, and a cross at the base."""
-    nowhere = np.empty((0, 2, 3))
-    edges = [Edge(line, nowhere, _rgb(EDGE)) for line in _cross(poses[robot.base_link])]
-    for index, body in enumerate(robot.bodies[1:]):
-        ends = np.array([poses[robot.bodies[body.parent].name].r, poses[body.name].r])
-        edges.append(Edge(ends, nowhere, _rgb(colour(index))))
-    return Solids(edges=edges)

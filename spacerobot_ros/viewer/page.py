@@ -18,12 +18,10 @@ import numpy as np
 from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.planning import Goal
 from spacerobot_ros.simulation.faults import KINDS, Targets
 from spacerobot_ros.viewer import content, scene
 from spacerobot_ros.viewer.content import History, Trail
 from spacerobot_ros.viewer.goal_editor import Defer, GoalEditor
-from spacerobot_ros.viewer.reachability import Check
 from spacerobot_ros.viewer.server import ViewerConfig
 from spacerobot_ros.viewer.state import (
     Action,
@@ -31,7 +29,6 @@ from spacerobot_ros.viewer.state import (
     Inject,
     Measured,
     Notice,
-    Part,
     Request,
     Seek,
     StackState,
@@ -386,6 +383,11 @@ class Page:
         Server of the page.
     config
         Its parameters.
+
+    Attributes
+    ----------
+    editor, faults
+        The goal editor, and the menu of faults.
     """
 
     def __init__(self, server: viser.ViserServer, config: ViewerConfig) -> None:
@@ -411,16 +413,16 @@ class Page:
         self._bar: Any = gui.add_progress_bar(0.0, visible=False)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Goal"):
-            self._editor = GoalEditor(self._server, defer, self._refuse)
+            self.editor = GoalEditor(self._server, defer, self._refuse)
         with tabs.add_tab("Plots"):
             self._plots = Plots(gui)
         with tabs.add_tab("Joints"):
             self._joints = gui.add_html("")
         with tabs.add_tab("Faults"):
-            self._faults = Faults(gui, defer, self._request, self._refuse)
+            self.faults = Faults(gui, defer, self._request, self._refuse)
         with tabs.add_tab("Log"):
             self._log = Log(gui)
-        self._editor.on_to_robot(self._goal_to_robot)
+        self.editor.on_to_robot(self._goal_to_robot)
         look = gui.add_button(
             "Look at the robot", color="gray", hint="Turn the camera of this browser to the robot."
         )
@@ -458,7 +460,7 @@ class Page:
         self._server.scene.reset()
         reach = 1.0 if robot is None else scene.reach_of(robot)
         self._reach, self._trail = reach, Trail(0.003 * reach)
-        self._editor.show_robot(robot, reach)
+        self.editor.show_robot(robot, reach)
         self._plots.show_robot(robot)
         if robot is None:
             return
@@ -471,31 +473,9 @@ class Page:
         """Set the thrusters, which are known later than the robot."""
         self._table = table
 
-    def offer_faults(self, targets: Targets) -> None:
-        """Offer the faults of a plant with these targets."""
-        self._faults.offer(targets)
-
     def note(self, notice: Notice) -> None:
         """Add a line to the log."""
         self._log.add(notice)
-
-    def show_check(self, check: Check) -> None:
-        """Show the result of a check of the goal, unless the goal is being moved."""
-        if not self._editor.moving:
-            self._editor.show_check(check)
-
-    def goals_to_check(self, now: float) -> dict[Part, Goal] | None:
-        """Return the goals once after every change, when they have come to rest; else None."""
-        return self._editor.goals_at_rest(now)
-
-    @property
-    def goal_moves(self) -> bool:
-        """Whether the goal has changed since it was last checked."""
-        return self._editor.moving
-
-    def touch_goal(self, now: float) -> None:
-        """Request another check of the goal, because its preconditions have changed."""
-        self._editor.touch(now)
 
     # -- drawing --------------------------------------------------------------------------------
 
@@ -507,8 +487,8 @@ class Page:
             replays = state.replay is not None
             if replays != (before.replay is not None):
                 self._buttons.show(visible=not replays)
-                self._editor.show(visible=not replays)
-                self._faults.show_menu(visible=not replays)
+                self.editor.show(visible=not replays)
+                self.faults.show_menu(visible=not replays)
             if self._drawing is not None and state.measured is not None:
                 self._draw_robot(state, state.measured)
             self._time_line.show(state, now)
@@ -537,9 +517,9 @@ class Page:
         drawing.base.visible = True
         drawing.place(measured.pose)
         drawing.set_joint_positions(measured.q)
-        if not self._editor.placed and state.replay is None:
-            self._editor.place(measured.pose, None, measured.q, self._now)
-        self._editor.robot_is_at(measured.pose, measured.q)
+        if not self.editor.placed and state.replay is None:
+            self.editor.place(measured.pose, None, measured.q, self._now)
+        self.editor.robot_is_at(measured.pose, measured.q)
         self._plots.add(state)
         self._trail.add(measured.time_s, measured.pose[:3])
         if self._is_due("paths", _PATHS_S):
@@ -558,13 +538,13 @@ class Page:
             self._status.content = text
         self._bar.visible = content.time_to_go(state) is not None
         self._bar.value = round(100 * content.progress(state), 1)
-        self._faults.show(state)
+        self.faults.show(state)
         self._log.draw()
         has_tool = content.has_tool(state)
-        if has_tool and state.measured is not None and not self._editor.has_tool:
-            self._editor.add_tool(state.tool)
-        self._editor.show_tool(there=has_tool and state.replay is None)
-        self._editor.show_shape(there=state.planner is not None and state.replay is None)
+        if has_tool and state.measured is not None and not self.editor.has_tool:
+            self.editor.add_tool(state.tool)
+        self.editor.show_tool(there=has_tool and state.replay is None)
+        self.editor.show_shape(there=state.planner is not None and state.replay is None)
 
     def _draw_joints(self, robot: RobotDescription, state: StackState) -> None:
         last = state.measured
@@ -600,7 +580,7 @@ class Page:
 
     def _fly(self) -> None:
         try:
-            goals = self._editor.goals()
+            goals = self.editor.goals()
         except GoalError as error:
             self._refuse(str(error))
             return
@@ -613,7 +593,7 @@ class Page:
         measured = self._state.measured
         if measured is not None and self._robot is not None:
             tool = self._state.tool if content.has_tool(self._state) else None
-            self._editor.place(measured.pose, tool, measured.q, self._now)
+            self.editor.place(measured.pose, tool, measured.q, self._now)
 
     def _refuse(self, message: str) -> None:
         self.note(Notice(message, 2, self._time_s, "page"))

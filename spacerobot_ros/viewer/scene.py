@@ -13,11 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spacerobot_ros.control.thrusters import ThrusterTable
-from spacerobot_ros.errors import MeshError
-from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
+from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics, joints_outward
-from spacerobot_ros.model.meshes import shape_mesh
-from spacerobot_ros.model.visuals import solid_mesh
+from spacerobot_ros.model.visuals import Visual, meshes_from_files, visuals_of
 
 if TYPE_CHECKING:
     import viser
@@ -40,9 +38,6 @@ _GRID: tuple[Color, Color] = (150, 150, 155), (120, 120, 128)
 
 _MOST_TRIANGLES = 20_000
 """Largest number of triangles of a mesh; finer ones are simplified."""
-
-_SCALE = 0.05
-"""Radius of the spheres drawn at the joints of a robot without shapes, m."""
 
 
 def wxyz(quaternion: Array) -> Array:
@@ -69,7 +64,7 @@ class RobotDrawing:
     color
         Color of all parts; None: the colors of the URDF.
     on_note
-        Called with a message about each shape that cannot be drawn.
+        Called with a message about each mesh that cannot be drawn.
     """
 
     def __init__(
@@ -81,7 +76,7 @@ class RobotDrawing:
         color: Color | None = None,
         on_note: Callable[[str], None] = lambda message: None,
     ) -> None:
-        self._scene, self._path, self._color, self._on_note = scene, path, color, on_note
+        self._scene, self._path, self._color = scene, path, color
         self._kinematics = kinematics = ForwardKinematics(robot)
         self.base = scene.add_frame(path, show_axes=False)
         paths = self._paths(robot)
@@ -95,12 +90,11 @@ class RobotDrawing:
                     paths[child], show_axes=False, position=pose[:3], wxyz=wxyz(pose[3:])
                 )
         self._moving = [frames[child] for _, child in kinematics.moving]
-        self._solids: list[Any] = []
-        for link in robot.links:
-            for number, shape in enumerate(self._shapes(robot, link.name)):
-                solid = self._solid(f"{paths[link.name]}/{number}", shape)
-                if solid is not None:
-                    self._solids.append(solid)
+        meshes = meshes_from_files(robot, _MOST_TRIANGLES, on_note)
+        self._solids = [
+            self._solid(f"{paths[visual.link]}/{number}", visual)
+            for number, visual in enumerate(visuals_of(robot, meshes, _MOST_TRIANGLES))
+        ]
 
     def _paths(self, robot: RobotDescription) -> dict[str, str]:
         """Return the path of the scene node of every link."""
@@ -109,28 +103,16 @@ class RobotDrawing:
             paths[joint.child] = f"{paths[joint.parent]}/link{len(paths)}"
         return paths
 
-    def _shapes(self, robot: RobotDescription, link: str) -> list[Shape]:
-        shapes = next(each.shapes for each in robot.links if each.name == link)
-        if any(each.shapes for each in robot.links):
-            return list(shapes)
-        ball = Shape("sphere", (_SCALE,), Pose())
-        bars = [_bar(joint.origin.r) for joint in robot.joints if joint.parent == link]
-        return [ball, *(bar for bar in bars if bar is not None)]
-
-    def _solid(self, path: str, shape: Shape) -> Any | None:
-        """Draw a visual in the frame of its link; None if it cannot be drawn."""
-        try:
-            mesh = shape_mesh(shape, _MOST_TRIANGLES) if shape.kind == "mesh" else solid_mesh(shape)
-        except MeshError as error:
-            self._on_note(str(error))
-            return None
-        red, green, blue, alpha = shape.rgba
+    def _solid(self, path: str, visual: Visual) -> Any:
+        """Draw a visual in the frame of its link."""
+        red, green, blue, alpha = visual.shape.rgba
         look: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
         look["color"] = self._color or tuple(round(255 * x) for x in (red, green, blue))
         if self._color is not None:
             look["opacity"] = GHOST_OPACITY
         elif alpha < 1.0:
             look["opacity"] = alpha
+        mesh = visual.mesh
         faces = mesh.faces.astype(np.uint32)
         return self._scene.add_mesh_simple(path, mesh.vertices, faces, flat_shading=True, **look)
 
@@ -152,18 +134,6 @@ class RobotDrawing:
         for frame, pose in zip(self._moving, self._kinematics.transforms, strict=True):
             frame.position = pose[:3]
             frame.wxyz = wxyz(pose[3:])
-
-
-def _bar(end: Array) -> Shape | None:
-    """Return a thin cylinder from the origin to a point; None if that is the origin."""
-    length = float(np.linalg.norm(end))
-    if length < 1e-6:
-        return None
-    z = end / length
-    x = np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))])
-    x /= np.linalg.norm(x)
-    R = np.column_stack([x, np.cross(z, x), z])
-    return Shape("cylinder", (0.4 * _SCALE, length), Pose(R, end / 2))
 
 
 def reach_of(robot: RobotDescription) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -131,7 +132,7 @@ def test_no_file_is_read_that_a_bag_names(surveyor: RobotDescription) -> None:
     assert meshes_in(surveyor, {}) == {}
     damaged = {name: data[:100] for name, data in carried_meshes(surveyor).items()}
     assert meshes_in(surveyor, damaged) == {}
-    assert visuals_of(surveyor, {}, 100) == ()
+    assert all(each.shape.kind != "mesh" for each in visuals_of(surveyor, {}, 100))
 
 
 def test_stl_holds_the_triangles() -> None:
@@ -140,3 +141,22 @@ def test_stl_holds_the_triangles() -> None:
     assert len(again.faces) == 12
     assert len(again.vertices) == 8
     assert volume(again) == pytest.approx(0.105, rel=1e-6)
+
+
+def test_a_robot_without_visuals_has_balls_at_links_and_bars_to_its_joints() -> None:
+    urdf = re.sub(r"<visual>.*?</visual>", "", load_robot(robot_file("servicer")).urdf, flags=re.S)
+    robot = parse_robot(urdf)
+    visuals = visuals_of(robot, {}, 100)
+    balls = [each for each in visuals if each.shape.kind == "sphere"]
+    bars = [each for each in visuals if each.shape.kind == "cylinder"]
+    assert [each.link for each in balls] == [link.name for link in robot.links]
+    joints = [joint for joint in robot.joints if np.linalg.norm(joint.origin.r) > 0]
+    assert [each.link for each in bars] == [joint.parent for joint in joints]
+    for bar, joint in zip(bars, joints, strict=True):
+        ends, r = bar.mesh.vertices, joint.origin.r
+        along = ends @ r / np.linalg.norm(r)
+        assert along.min() == pytest.approx(0.0, abs=1e-12)
+        assert along.max() == pytest.approx(np.linalg.norm(r))
+        across = np.linalg.norm(np.cross(ends, r / np.linalg.norm(r)), axis=1)
+        assert across.max() < 0.03
+        assert bar.body == robot.frames[joint.parent][0]

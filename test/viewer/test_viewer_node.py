@@ -128,7 +128,7 @@ class Stack:
 
     def drag(self, pose: np.ndarray) -> None:
         """Move the gizmo of the base as a browser does."""
-        gizmo = self.page._editor._gizmos["/goal"]
+        gizmo = self.page.editor._gizmos["/goal"]
         target = type("Target", (), {"position": pose[:3], "wxyz": pose[[6, 3, 4, 5]]})()
         event = type("Event", (), {"target": target, "phase": "update", "client": object()})()
         for callback in gizmo._impl_aux.update_cb:
@@ -153,7 +153,7 @@ def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness
 
     def moved() -> bool:
         stack.move(0.25, names)
-        return bool(page._editor.placed and page._drawing.base.visible)
+        return bool(page.editor.placed and page._drawing.base.visible)
 
     stack.until(moved, "the robot is where it is")
     assert page._drawing.base.position[0] == 0.25
@@ -166,12 +166,12 @@ def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness
     p = stack.probe.last("/goal_pose").pose.position
     assert (p.x, p.y, p.z) == (1.0, 2.0, 3.0)
     stack.drag(np.array([np.nan, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]))
-    page._editor._position._impl.value = (float("nan"), 0.0, 0.0)
-    stack.press(page._editor._position)
+    page.editor._position._impl.value = (float("nan"), 0.0, 0.0)
+    stack.press(page.editor._position)
     stack.until(lambda: "is not finite" in stack.log(), "a refusal")
-    assert page._editor._position.value == (1.0, 2.0, 3.0)
-    page._editor._position._impl.value = (0.5, 0.0, 0.0)
-    stack.press(page._editor._position)
+    assert page.editor._position.value == (1.0, 2.0, 3.0)
+    page.editor._position._impl.value = (0.5, 0.0, 0.0)
+    stack.press(page.editor._position)
     stack.press(page._buttons._fly)
     stack.until(lambda: stack.probe.count("/goal_pose") == 2, "another goal")
     assert stack.probe.last("/goal_pose").pose.position.x == 0.5
@@ -194,10 +194,10 @@ def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness
     stack.until(
         lambda: "No planner or controller offers the service 'abort' now." in stack.log(), "nobody"
     )
-    stack.press(page._faults._clear)
+    stack.press(page.faults._clear)
     stack.until(lambda: stack.probe.count("/fault_injection") == 1, "clear")
     assert stack.probe.last("/fault_injection").data == "clear"
-    stack.press(page._faults._inject)
+    stack.press(page.faults._inject)
     stack.until(lambda: "The fault '- -' is refused" in stack.log(), "no fault is known yet")
 
 
@@ -212,14 +212,14 @@ def test_a_goal_has_the_joint_positions_that_the_page_shows(harness: Harness) ->
     planner.publish(DiagnosticStatus(name="/planner", values=values, message=status.message))
     harness.connect()
     stack.describe()
-    final = stack.page._editor._final
+    final = stack.page.editor._final
 
     def fly(count: int) -> None:
         stack.press(stack.page._buttons._fly)
         stack.until(lambda: stack.probe.count("/goal_pose") == count, "a goal")
 
     stack.until(lambda: stack.move(0.0, names) or final._asked.visible, "a planner is there")
-    stack.until(lambda: stack.move(0.0, names) or stack.page._editor.placed, "a goal is shown")
+    stack.until(lambda: stack.move(0.0, names) or stack.page.editor.placed, "a goal is shown")
     # Somebody may have had an earlier goal end in joint positions, which the page does not show.
     fly(1)
     stack.until(lambda: len(shapes) == 1, "any")
@@ -247,7 +247,7 @@ def test_a_viewer_survives_what_is_wrong(harness: Harness) -> None:
     sliders = names_of(load_robot(robot_file("sliding_masses")))
     stack.describe()
     stack.until(lambda: page._drawing is not None, "the robot")
-    stack.until(lambda: stack.move(0.1, sliders) or page._editor.placed, "its state")
+    stack.until(lambda: stack.move(0.1, sliders) or page.editor.placed, "its state")
     # Numbers and messages that are none.
     strange = Odometry()
     strange.pose.pose.position.x = float("nan")
@@ -263,9 +263,9 @@ def test_a_viewer_survives_what_is_wrong(harness: Harness) -> None:
     before = page._drawing
     stack.describe(ARM.urdf)
     stack.until(lambda: page._drawing is not before, "another robot")
-    assert not page._editor.placed
+    assert not page.editor.placed
     arm = names_of(ARM)
-    stack.until(lambda: stack.move(0.3, arm) or page._editor.placed, "its state")
+    stack.until(lambda: stack.move(0.3, arm) or page.editor.placed, "its state")
     stack.drag(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
     # Time goes by.
     stack.viewer._listener._came_at -= 5.0
@@ -292,8 +292,8 @@ def test_a_replay_has_a_time_line(harness: Harness) -> None:
     assert (line._slider.min, line._slider.max) == (0.0, 20.0)
     assert line._folder.visible
     assert not page._buttons._fly.visible, "a recording takes no goals"
-    assert page._editor._none_taken.visible
-    assert not any(h.visible for h in (page._faults._inject, page._faults._value))
+    assert page.editor._none_taken.visible
+    assert not any(h.visible for h in (page.faults._inject, page.faults._value))
     stack.press(line._slider, 7.5)
     stack.until(lambda: stack.probe.count("/replay/seek") == 1, "the jump")
     assert stack.probe.last("/replay/seek").data == 7.5
@@ -313,20 +313,20 @@ def test_the_parameters_of_a_plant_decide_on_its_faults(harness: Harness) -> Non
     values = {"actuation": json.dumps("effort"), "thrusters": json.dumps("")}
     stack.viewer._remote_values["plant"] = values
     stack.viewer._show_plant()
-    kinds = stack.page._faults._kind.options
+    kinds = stack.page.faults._kind.options
     assert "thruster_off" in kinds
     assert "nozzle_open" not in kinds
     stack.viewer._remote_values["plant"] = {**values, "thrusters": json.dumps("none.yaml")}
     stack.viewer._show_plant()
     stack.until(lambda: "none.yaml" in stack.log(), "what is wrong with it")
-    stack.page._faults._kind._impl.value = "joint_slow"
-    stack.press(stack.page._faults._kind)
-    stack.until(lambda: stack.page._faults._value.visible, "its factor")
-    stack.page._faults._value._impl.value = float("nan")
-    stack.press(stack.page._faults._inject)
+    stack.page.faults._kind._impl.value = "joint_slow"
+    stack.press(stack.page.faults._kind)
+    stack.until(lambda: stack.page.faults._value.visible, "its factor")
+    stack.page.faults._value._impl.value = float("nan")
+    stack.press(stack.page.faults._inject)
     stack.until(lambda: "not a finite number" in stack.log(), "a refusal")
-    stack.page._faults._value._impl.value = 0.5
-    stack.press(stack.page._faults._inject)
+    stack.page.faults._value._impl.value = 0.5
+    stack.press(stack.page.faults._inject)
     stack.until(lambda: stack.probe.count("/fault_injection") == 1, "a fault")
     assert stack.probe.last("/fault_injection").data.split()[0] == "joint_slow"
 
@@ -352,8 +352,8 @@ def test_a_robot_that_changes_after_a_check_is_shown(
     stack = Stack(harness)
     page, sliders = stack.page, names_of(load_robot(robot_file("sliding_masses")))
     stack.describe()
-    stack.until(lambda: stack.move(0.1, sliders) or page._editor.placed, "a goal")
-    page.show_check(Check(Verdict.REACHABLE, "Reachable in 1 s.", 1.0, shape=np.zeros(3)))
+    stack.until(lambda: stack.move(0.1, sliders) or page.editor.placed, "a goal")
+    page.editor.show_check(Check(Verdict.REACHABLE, "Reachable in 1 s.", 1.0, shape=np.zeros(3)))
     # A plan for the robot of before is not to be answered any more.
     cancelled: list[bool] = []
 
@@ -364,9 +364,9 @@ def test_a_robot_that_changes_after_a_check_is_shown(
     monkeypatch.setattr(stack.viewer._checker, "cancel", cancel)
     stack.describe(load_robot(robot_file("servicer")).urdf)
     servicer = names_of(load_robot(robot_file("servicer")))
-    stack.until(lambda: not page._editor.placed, "its scene is empty")
+    stack.until(lambda: not page.editor.placed, "its scene is empty")
     assert cancelled
-    stack.until(lambda: stack.move(0.3, servicer) or page._editor.placed, "its state")
+    stack.until(lambda: stack.move(0.3, servicer) or page.editor.placed, "its state")
     stack.until(lambda: stack.move(0.4, servicer) or page._last.pose[0] == 0.4, "and the next")
     assert stack.viewer.is_active
 

@@ -208,24 +208,25 @@ class ViewerNode(FlightNode):
         if planner_state is not self._planner_state:
             self._planner_state = planner_state
             if planner_state not in (PlannerState.PLANNING, PlannerState.EXECUTING):
-                self._page.touch_goal(now)  # The robot is elsewhere, or nobody plans.
+                self._page.editor.touch(now)  # The robot is elsewhere, or nobody plans.
         self._send_goals(state, now)
         self._check_goal(state, now)
 
     def _check_goal(self, state: StackState, now: float) -> None:
-        if self._page.goal_moves:
+        editor = self._page.editor
+        if editor.moving:
             self._checker.cancel()
-        goals = self._page.goals_to_check(now)
+        goals = editor.goals_at_rest(now)
         if goals is not None:
             question = self._question(state, goals)
             if isinstance(question, Question):
                 self._checker.ask(question)
             else:
                 self._checker.cancel()
-                self._page.show_check(Check(Verdict.UNCHECKED, question))
+                editor.show_check(Check(Verdict.UNCHECKED, question))
         check = self._checker.look()
-        if check is not None:
-            self._page.show_check(check)
+        if check is not None and not editor.moving:
+            editor.show_check(check)
 
     def _question(self, state: StackState, goals: Mapping[Part, Goal]) -> Question | str:
         """Return the check of goals, or the reason why they are not checked."""
@@ -319,19 +320,19 @@ class ViewerNode(FlightNode):
             if key == "plant":
                 self._show_plant()
             else:
-                self._page.touch_goal(time.monotonic())
+                self._page.editor.touch(time.monotonic())
 
     def _show_plant(self) -> None:
         """Update the faults that can be injected, and the thrusters."""
         values = self._remote_values.get("plant")
         if self._robot is None or values is None:
-            self._page.offer_faults(Targets())
+            self._page.faults.offer(Targets())
             return
         effort = json.loads(values.get("actuation", '""')) == "effort"
         table = self._table(json.loads(values.get("thrusters", '""')))
         nozzles = () if table is None else table.names
         self._page.show_thrusters(table)
-        self._page.offer_faults(Targets(self._robot.joint_names, effort, nozzles))
+        self._page.faults.offer(Targets(self._robot.joint_names, effort, nozzles))
 
     def _table(self, source: str) -> ThrusterTable | None:
         if not source or self._robot is None:
@@ -411,8 +412,9 @@ class ViewerNode(FlightNode):
             self._note("Goal sent.", source="page")
             goal_id = GoalIds().of(sec, nanosec)
             self._unanswered = goal_id, time.monotonic() + _LONGEST_ANSWER
-        if self._checker.cancel():
-            self._page.show_check(Check(Verdict.UNCHECKED, "It was sent before it was checked."))
+        editor = self._page.editor
+        if self._checker.cancel() and not editor.moving:
+            editor.show_check(Check(Verdict.UNCHECKED, "It was sent before it was checked."))
 
     def _send_shape(self, goal: Goal) -> None:
         """Send the final joint positions of the goal that follows; empty for any.
