@@ -1,4 +1,4 @@
-"""Two designs on the same draws: what differs, with intervals."""
+"""Comparison of two campaigns with the same draws: paired differences with intervals."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from spacerobot_ros.report.page_parts import facts, html_page, table
 
 
 def require_same_draws(first: Campaign, second: Campaign) -> None:
-    """Refuse two campaigns whose flights are not drawn alike.
+    """Check that two campaigns have the same draws.
 
     Raises
     ------
     ParameterError
-        Seed, sampler, number of flights or what is dispersed differs; the sentence says which.
+        Seed, sampler, number of flights or a dispersion differs.
     """
 
     def drawn(campaign: Campaign) -> dict[str, object]:
@@ -38,7 +38,7 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
     for key, value in ours.items():
         if theirs[key] != value:
             raise ParameterError(f"{sentence}'{key}' is {value} and {theirs[key]}.")
-    # One after the other: the third number of a draw is that of the third name.
+    # In order, because the third number of a draw is that of the third dispersion.
     for ours_is, theirs_is in zip_longest(first.dispersions, second.dispersions):
         a, b = (
             "nothing" if each is None else f"{each.name}: {each.distribution}"
@@ -50,7 +50,7 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
 
 
 def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
-    """Write the report of two datasets with the same draws; return lines for people.
+    """Write the report of two datasets with the same draws; return lines for the terminal.
 
     Raises
     ------
@@ -66,10 +66,10 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
     rows_b = np.searchsorted(second.numbers, common)
     if not common.size:
         raise ParameterError(
-            f"'{first.campaign.name}' and '{second.campaign.name}' have no draw "
-            "that both have flown."
+            f"'{first.campaign.name}' and '{second.campaign.name}' have flown no common draw: fly "
+            "more flights of one of them."
         )
-    # What one of them requires is compared, too, where both have it.
+    # Metrics that only one of them requires are compared too, if both have them.
     names = list(dict.fromkeys([*first.shown, *second.shown]))
     names = [name for name in names if name in first.columns and name in second.columns]
     found = []
@@ -87,7 +87,7 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
     with drawing():
         body = [
             f"<header><h1>{escape(a)} and {escape(b)}</h1>",
-            facts([f"{len(common)} draws that both have flown"]),
+            facts([f"{len(common)} common draws"]),
             f'<p class="outcome">{escape(sentence)}</p></header>',
             "<h2>Paired differences</h2>",
             _table(found, a, b),
@@ -137,4 +137,4 @@ def _figure(
         panel.locator_params(nbins=5)
         panel.set_xlabel(f"{first.campaign.name}: {name}")
         panel.set_ylabel(second.campaign.name)
-    return picture(figure, "pairs", "Every draw in both designs; dotted: no difference.")
+    return picture(figure, "pairs", "Each draw in both campaigns; dotted: no difference.")

@@ -41,15 +41,15 @@ MADE_BY = f"Made by spacerobot_ros {__version__}."
 
 _WORST = 10
 _FAR = 100.0
-"""Standard deviations beyond which distances from a bound make no difference."""
+"""Distance from a bound at which the order of the worst flights saturates, standard deviations."""
 
 _SHOWN = 6
-"""Metrics with figures of their own."""
+"""Largest number of metrics with a histogram."""
 
 Flags = npt.NDArray[np.bool_]
 
 _SHARES = (0.01, 0.5, 0.99)
-"""Shares of all draws below the values that tell what a distribution is."""
+"""Quantiles shown of each distribution."""
 
 _TEXTS = ("outcome", "reason", "engine", "fallback", "versions")
 
@@ -63,15 +63,15 @@ class Results:
     Attributes
     ----------
     campaign
-        What was flown.
+        The campaign.
     folder
-        Where the dataset is.
+        Folder of the dataset.
     numbers
-        (N,) of the flights.
+        (N,) numbers of the flights.
     columns
-        Every column by name: arrays of numbers, lists of texts.
+        Columns by name: arrays of numbers, lists of texts.
     total
-        How many flights there are to be.
+        Number of flights of the whole campaign.
     """
 
     campaign: Campaign
@@ -105,10 +105,9 @@ class Results:
 
     @property
     def bias(self) -> str:
-        """Why the numbers are not those of the whole campaign, as a sentence; empty if they are.
+        """Warning that missing flights bias the numbers; empty if none are missing.
 
-        Draws that take long come late: among the flights of a campaign that is not complete there
-        may be too few of them.
+        Flights that take long finish late and are underrepresented in an incomplete campaign.
         """
         missing = int(self.numbers.max()) + 1 - len(self) if len(self) else 0
         if not missing:
@@ -121,40 +120,40 @@ class Results:
 
     @property
     def passed(self) -> Flags:
-        """(N,) whether each flight has reached its goal and met every criterion."""
+        """(N,) whether each flight reached its goal and met every criterion."""
         return np.asarray(self.columns["passed"] > 0)
 
     @property
     def success(self) -> Share:
-        """The share of those."""
+        """Share of flights that passed."""
         return share(int(self.passed.sum()), len(self))
 
     @property
     def drawn(self) -> dict[str, Array]:
-        """(N,) what was drawn, by name; numbers only."""
+        """(N,) drawn values, by name of the dispersion; numbers only."""
         names = [each.name for each in self.campaign.dispersions]
         found = {name: self.columns[f"{DRAWN}{name}"] for name in names}
         return {name: x for name, x in found.items() if isinstance(x, np.ndarray)}
 
     @property
     def shown(self) -> list[str]:
-        """The metrics that matter here: those with a criterion, and others that vary."""
+        """Metrics of the report: those with a criterion, and the main ones that have values."""
         names = [criterion.metric for criterion in self.campaign.criteria]
         names += [name for name in _ALWAYS if name not in names]
         return [name for name in names if np.isfinite(self.columns[name]).any()]
 
     def metrics(self) -> dict[str, Array]:
-        """Return the columns of those metrics."""
+        """Return the columns of the metrics of the report."""
         return {name: self.columns[name] for name in self.shown}
 
     def requirement(self, criterion: Criterion) -> Share:
-        """Return how many flights meet a criterion."""
+        """Return the share of flights that meet a criterion."""
         values = self.columns[criterion.metric].tolist()
         met = sum(meets(criterion, {criterion.metric: value}) for value in values)
         return share(met, len(self))
 
     def influences(self) -> list[Influence]:
-        """Return what drives the metrics, the strongest first; Sobol indices where they can be."""
+        """Return the sensitivities, the strongest first, with Sobol indices if available."""
         found = influences(self.drawn, self.metrics())
         whole = self.campaign.sampler == "saltelli" and len(self) == self.total
         if whole and len(self.drawn) == len(self.campaign.dispersions):
@@ -170,9 +169,9 @@ class Results:
         return sorted(found, key=lambda each: -each.strength)
 
     def worst(self) -> list[int]:
-        """Return the rows of the worst flights: those that were not flown or did not pass first.
+        """Return the rows of the worst flights: first those that failed, then those that missed.
 
-        Flights that pass are as bad as they are near a bound, in standard deviations.
+        Flights that passed are ordered by their distance from a bound, in standard deviations.
         """
         badness = np.full(len(self), -_FAR)
         for criterion in self.campaign.criteria:
@@ -180,7 +179,7 @@ class Results:
             spread = x[np.isfinite(x)].std() if np.isfinite(x).any() else 1.0
             spread = spread or 1.0
             over = np.maximum(x - criterion.maximum, criterion.minimum - x) / spread
-            # A metric that is missing is beyond its bounds.
+            # A missing metric counts as beyond its bounds.
             badness = np.maximum(badness, np.clip(np.nan_to_num(over, nan=_FAR), -_FAR, _FAR))
         if not self.campaign.criteria:
             badness = np.nan_to_num(self.columns["position_error_m"])
@@ -195,7 +194,7 @@ def _is_text(values: Sequence[Any]) -> bool:
 
 
 def write_campaign_report(folder: Path, path: Path) -> list[str]:
-    """Write the report of a dataset; return lines for people.
+    """Write the report of a dataset; return lines for the terminal.
 
     Raises
     ------
@@ -221,7 +220,7 @@ def picture(drawn: Figure, name: str, caption: str) -> str:
 
 
 def panels(count: int, across: int, height: float = 2.2) -> tuple[Figure, list[Any]]:
-    """Return a figure of so many panels."""
+    """Return a figure and its axes, ``across`` in a row."""
     rows = -(-count // across)
     figure = Figure(figsize=(9.6, height * rows + 0.2), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
@@ -232,7 +231,7 @@ def panels(count: int, across: int, height: float = 2.2) -> tuple[Figure, list[A
 
 
 def named(metric: str) -> str:
-    """Return a metric with its unit."""
+    """Return the name of a metric with its unit, unless the name has it."""
     unit = METRICS[metric.partition(".")[0]].unit
     return (
         metric
@@ -260,14 +259,14 @@ def _body(results: Results) -> list[str]:
             "<h2>Distributions</h2>",
             _percentiles(results),
             _histograms(results),
-            "<h2>What drives the result</h2>",
+            "<h2>Drivers of the result</h2>",
             _drivers(results, found),
             _scatter(results, found),
             "<h2>The worst flights</h2>",
             _worst_table(results),
             "<h2>Convergence</h2>",
             _convergence(results),
-            "<h2>What was dispersed</h2>",
+            "<h2>Dispersions</h2>",
             _dispersed(campaign),
         ]
 
@@ -325,7 +324,7 @@ def _outcomes(results: Results) -> str:
         kinds.setdefault(outcome, []).append(reason or "")
     rows = []
     for outcome, reasons in sorted(kinds.items(), key=lambda item: -len(item[1])):
-        # Sentences differ in their numbers alone.
+        # Messages that differ in their numbers only are one kind.
         counts = Counter(re.sub(r"-?\d[\d.e+-]*", "…", reason) for reason in reasons)
         for sentence, count in counts.most_common(4):
             rows.append([outcome, f"{count}", sentence])
@@ -349,7 +348,7 @@ def _percentiles(results: Results) -> str:
         there = values[np.isfinite(values)]
         numbers = [there.min(), *percentiles(values), there.max(), there.mean(), there.std()]
         rows.append([named(name), *(f"{x:.4g}" for x in numbers)])
-    head = ["metric", "least", *(f"{p:g} %" for p in PERCENTILES), "most", "mean", "std"]
+    head = ["metric", "minimum", *(f"{p:g} %" for p in PERCENTILES), "maximum", "mean", "std"]
     return table("percentiles", head, rows)
 
 
@@ -374,14 +373,14 @@ def _histograms(results: Results) -> str:
         panel.set_xlabel(named(name))
         panel.set_ylabel("flights")
     caption = (
-        "Distributions of the metrics; dotted: 5, 50 and 95 percentiles, orange: what is required."
+        "Distributions of the metrics; dotted: percentiles 5, 50 and 95, orange: requirements."
     )
     return picture(figure, "distributions", caption)
 
 
 def _drivers(results: Results, found: Sequence[Influence]) -> str:
     if not found:
-        return '<p class="missing">Nothing that was drawn as a number varies with a metric.</p>'
+        return '<p class="missing">No drawn number varies with a metric.</p>'
     sobol = any(each.total is not None for each in found)
     rows = []
     for each in found[:15]:
@@ -391,10 +390,17 @@ def _drivers(results: Results, found: Sequence[Influence]) -> str:
             for index in (each.first, each.total):
                 cells.append("" if index is None else f"{index[0]:.3f} ± {index[1]:.3f}")
         rows.append(cells)
-    head = ["drawn", "metric", "rank correlation", "p", "of the distance from the median", "p"]
+    head = [
+        "drawn",
+        "metric",
+        "rank correlation",
+        "p",
+        "correlation with the distance from the median",
+        "p",
+    ]
     head += ["Sobol, first order", "Sobol, total"] if sobol else []
-    note = "Spearman's rank correlations, the strongest first; p: as large by chance. What grows "
-    note += "to both sides correlates with the distance from the median."
+    note = "Spearman's rank correlations, the strongest first; p: probability by chance. A metric "
+    note += "that grows to both sides correlates with the distance of the draw from its median."
     if not sobol:
         note += " The sampler 'saltelli' adds Sobol indices."
     return f'<p class="facts">{escape(note)}</p>' + table("drivers", head, rows)
@@ -406,7 +412,7 @@ def _scatter(results: Results, found: Sequence[Influence]) -> str:
         return ""
     figure, axes = panels(len(chosen), 3, 2.4)
     passed = results.passed
-    # A page shows no more points than these.
+    # The largest number of points on a page.
     few = np.random.default_rng(0).permutation(len(results))[:2000]
     for panel, each in zip(axes, chosen, strict=True):
         x, y = results.drawn[each.cause][few], results.columns[each.metric][few]
@@ -428,7 +434,7 @@ def _worst_table(results: Results) -> str:
         values = [f"{results.columns[name][row]:.4g}" for name in names]
         command = f"spacerobot campaign rerun {shlex.quote(str(results.folder))} {number}"
         rows.append([str(number), command, results.columns["outcome"][row], *values])
-    head = ["flight", "to fly it again, with a bag", "outcome", *map(named, names)]
+    head = ["flight", "command to repeat it and record a bag", "outcome", *map(named, names)]
     return table("worst", head, rows)
 
 
@@ -458,7 +464,7 @@ def _convergence(results: Results) -> str:
         panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         panel.xaxis.set_minor_formatter(NullFormatter())
-    return picture(figure, "convergence", "How the numbers settle with the number of flights.")
+    return picture(figure, "convergence", "Convergence of the numbers with the number of flights.")
 
 
 def _dispersed(campaign: Campaign) -> str:
@@ -469,6 +475,6 @@ def _dispersed(campaign: Campaign) -> str:
             numbers = [f"{value:.4g}" for value in each.distribution.at(np.array(_SHARES))]
         rows.append([each.name, str(each.distribution), each.target.unit or "", *numbers])
     if not rows:
-        return '<p class="missing">Nothing but the noise: every flight has another seed.</p>'
-    head = ["what", "distribution", "unit", *(f"{100 * share:g} %" for share in _SHARES)]
+        return '<p class="missing">No dispersions: flights differ in their noise only.</p>'
+    head = ["parameter", "distribution", "unit", *(f"{100 * share:g} %" for share in _SHARES)]
     return table("dispersed", head, rows)

@@ -1,4 +1,4 @@
-"""What many flights say: shares with intervals, percentiles, what drives what."""
+"""Statistics of many flights: shares with intervals, percentiles, sensitivities, comparisons."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from spacerobot_ros.model.description import Array
 Flags = npt.NDArray[np.bool_]
 
 CONFIDENCE = 0.95
-"""Of every interval."""
+"""Confidence level of every interval."""
 
 PERCENTILES = (5.0, 50.0, 95.0, 99.0)
 
 
 @dataclass(frozen=True)
 class Share:
-    """A share of flights with its interval of confidence.
+    """A share of flights with its confidence intervals.
 
-    ``low`` and ``high`` are Wilson's; ``exact`` those of Clopper and Pearson.
+    ``low`` to ``high`` is the interval of Wilson, ``exact`` that of Clopper and Pearson.
     """
 
     count: int
@@ -34,7 +34,7 @@ class Share:
 
     @property
     def value(self) -> float:
-        """The share itself."""
+        """The share, 0 to 1; NaN without flights."""
         return self.count / self.total if self.total else float("nan")
 
     def __str__(self) -> str:
@@ -45,7 +45,7 @@ class Share:
 
 
 def share(count: int, total: int) -> Share:
-    """Return a share with its intervals; all of 0 to 1 where nothing was flown."""
+    """Return a share with its intervals, which are 0 to 1 without flights."""
     if not total:
         return Share(0, 0, 0.0, 1.0, (0.0, 1.0))
     from scipy.stats import binomtest
@@ -64,21 +64,21 @@ def share(count: int, total: int) -> Share:
 
 @dataclass(frozen=True)
 class Influence:
-    """How much a dispersion drives a metric.
+    """Sensitivity of a metric to a dispersion.
 
     Attributes
     ----------
     cause, metric
-        Names.
+        Names of the dispersion and of the metric.
     correlation
         Spearman's rank correlation.
     p
-        Probability of one as large by chance.
+        Probability of a correlation at least as large by chance.
     departure, p_departure
-        Likewise, of the distance of what is drawn from its median: an error that grows to both
-        sides correlates with no side.
+        The same for the distance of the drawn value from its median, with which a metric correlates
+        that grows to both sides.
     first, total
-        Sobol indices with their intervals (half widths), where the sampler allows for them.
+        Sobol indices with the half widths of their intervals, if the sampler provides them.
     """
 
     cause: str
@@ -92,7 +92,7 @@ class Influence:
 
     @property
     def strength(self) -> float:
-        """What influences are sorted by: the total index, or the larger correlation."""
+        """Key for sorting: the total index, or the larger correlation."""
         if self.total is not None:
             return self.total[0]
         return max(abs(self.correlation), abs(self.departure))
@@ -107,9 +107,9 @@ class Influence:
 
 
 def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> list[Influence]:
-    """Return how dispersions (N,) and metrics (N,) go together, flight by flight.
+    """Return the sensitivity of each metric (N,) to each dispersion (N,).
 
-    Flights without a metric are left out; what does not vary has no correlation.
+    Flights without the metric are left out, and so are pairs of which one does not vary.
     """
     from scipy.stats import spearmanr
 
@@ -136,10 +136,10 @@ def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> lis
 def sobol_indices(
     names: Sequence[str], values: Array
 ) -> dict[str, tuple[float, float, float, float]]:
-    """Return first-order and total indices with their intervals, by the name of the dispersion.
+    """Return first-order and total Sobol indices with their intervals, by name of the dispersion.
 
-    ``values`` (N,) are those of a Saltelli sample, in its order; a metric that is missing in a
-    flight has none.
+    ``values`` (N,) are those of a Saltelli sample, in its order. The result is empty if a flight
+    lacks the metric.
     """
     if not np.all(np.isfinite(values)) or np.ptp(values) == 0.0:
         return {}
@@ -151,7 +151,7 @@ def sobol_indices(
 
 
 def percentiles(values: Array) -> list[float]:
-    """Return :data:`PERCENTILES` of what is there; NaN where nothing is."""
+    """Return the :data:`PERCENTILES` of the finite values; NaN without any."""
     there = values[np.isfinite(values)]
     if not there.size:
         return [float("nan")] * len(PERCENTILES)
@@ -160,7 +160,7 @@ def percentiles(values: Array) -> list[float]:
 
 @dataclass(frozen=True)
 class Paired:
-    """A difference of two designs on the same draws: its mean, and an interval of that."""
+    """Paired difference of a metric between two campaigns: its mean, and the interval of that."""
 
     metric: str
     count: int
@@ -172,14 +172,14 @@ class Paired:
 
     @property
     def certain(self) -> bool:
-        """Whether the interval leaves out zero."""
+        """Whether the interval excludes zero."""
         return self.low > 0.0 or self.high < 0.0
 
 
 def paired(metric: str, first: Array, second: Array) -> Paired | None:
-    """Return how a metric (N,) of a second design differs from that of a first one, draw by draw.
+    """Return the paired difference of a metric (N,) of a second campaign from a first one.
 
-    The interval is Student's, of the mean of the differences; None for fewer than two pairs.
+    The interval is that of Student for the mean of the differences; None for fewer than two pairs.
     """
     there = np.isfinite(first) & np.isfinite(second)
     count = int(there.sum())
@@ -202,7 +202,7 @@ def paired(metric: str, first: Array, second: Array) -> Paired | None:
 
 
 def paired_success(first: Flags, second: Flags) -> tuple[int, int, float]:
-    """Return how many draws only the first and only the second passes, and McNemar's exact p."""
+    """Return the counts of draws that only the first or second passes, and McNemar's exact p."""
     from scipy.stats import binomtest
 
     only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())

@@ -36,46 +36,46 @@ PALETTE = (*_OKABE_ITO, *_TOL)
 """Colours that people with any colour vision tell apart."""
 
 GHOST = PALETTE[3]
-"""Of goals in space."""
+"""Colour of goals in space."""
 
 WIDTH = 9.6
 """Width of a figure of a page, inches."""
 
 _NARROW = 6.0
-"""Inches for letters of 8.5 points."""
+"""Width of a figure below which it is drawn for one column of a paper, inches."""
 
 COLUMNS = 960
 """Slices of time across a figure in which a dense trace is summed up."""
 
 SLICES = 240
-"""Slices of time in which what matters is the largest value."""
+"""Slices of time of a trace drawn by the largest value of each."""
 
 _UNSEEN = 5e-4
-"""Of the height of a panel, what a line may leave out."""
+"""Largest error of a simplified line, as a share of the height of its panel."""
 
 _PATH_DATA = re.compile(rb' d="[^"]*"')
 _DECIMALS = re.compile(rb"(\.\d\d)\d+")
 
 _FONT_SIZE = 8.5
-"""Points, for which the distances of these modules are meant."""
+"""Font size that the distances of these modules are made for, points."""
 
 _FONT_SIZES = (3.0, 30.0)
-"""Least and largest letters of a style file, points."""
+"""Least and largest font size of a style file, points."""
 
 _KEPT: Any = {
-    # Names of joints are shown as they are, dollars included.
+    # Names of joints may contain dollar signs.
     "text.parse_math": False,
-    # A figure is as wide as was asked for, and its panels are placed by these modules.
+    # Figures keep their requested width; these modules place the panels.
     "savefig.bbox": None,
     "figure.autolayout": False,
     "figure.constrained_layout.use": False,
 }
-"""Settings that no style file changes."""
+"""Settings that style files cannot change."""
 
 
 _width = ContextVar("_width", default=WIDTH)
 _scale = ContextVar("_scale", default=1.0)
-"""How large letters are beside those of 8.5 points."""
+"""Ratio of the font size to 8.5 points."""
 
 
 @contextmanager
@@ -85,17 +85,16 @@ def drawing(width: float = WIDTH, style: str = "report", own: Path | None = None
     Parameters
     ----------
     width
-        Of a figure, inches.
+        Width of a figure, inches.
     style
-        A style file of this package: ``report`` for pages, ``paper`` for papers.
+        Style file of this package: ``report`` for pages, ``paper`` for papers.
     own
-        A style file of matplotlib's, or the name of one of its own styles, whose settings come
-        after.
+        Style file of the user, or name of a style of matplotlib; it overrides ``style``.
 
     Raises
     ------
     SpaceRobotError
-        The style file cannot be read, or nothing can be drawn with it.
+        The style file cannot be read, or its font settings cannot be used.
     """
     shipped = Path(str(files("spacerobot_ros.report").joinpath(f"{style}.mplstyle")))
     with mpl.rc_context():
@@ -114,20 +113,20 @@ def drawing(width: float = WIDTH, style: str = "report", own: Path | None = None
 
 
 def _use(path: Path) -> None:
-    with _listening() as said:
+    with _collected_warnings() as warnings:
         try:
             settings = _settings(path)
         except (OSError, ValueError, KeyError) as error:
             why = getattr(error, "strerror", None) or error
             raise SpaceRobotError(f"The style file {path} cannot be read: {why}.") from error
-    if said.sentences:
-        raise SpaceRobotError(f"The style file {path} is refused: {said.sentences[0]}.")
+    if warnings.messages:
+        raise SpaceRobotError(f"The style file {path} is refused: {warnings.messages[0]}.")
     mpl.rcParams.update(settings)
 
 
 def _settings(path: Path) -> mpl.RcParams:
     if not path.exists():
-        # Reads all of its styles.
+        # The import reads all styles of matplotlib.
         import matplotlib.style as styles
 
         if str(path) in styles.library:
@@ -139,7 +138,7 @@ def _settings(path: Path) -> mpl.RcParams:
 
 
 def _require_fonts(path: Path) -> None:
-    """Refuse what nothing can be drawn with, or only in another font than the one asked for."""
+    """Check that the font settings of a style file can be used."""
     size = float(mpl.rcParams["font.size"])
     if not _FONT_SIZES[0] <= size <= _FONT_SIZES[1]:
         raise SpaceRobotError(
@@ -158,12 +157,12 @@ def _require_fonts(path: Path) -> None:
             f"The style file {path} is refused: of the fonts that it names "
             f"({', '.join(families)}) none is installed."
         )
-    # Which comes with matplotlib, and has the signs that many fonts lack: 10⁻¹⁵, p₀.
+    # DejaVu Sans comes with matplotlib and has signs that many fonts lack: 10⁻¹⁵, p₀.
     mpl.rcParams["font.family"] = list(dict.fromkeys([*found, "DejaVu Sans"]))
 
 
 def _installed(family: str) -> bool:
-    with _listening():
+    with _collected_warnings():
         try:
             findfont(FontProperties(family=[family]), fallback_to_default=False)
         except ValueError:
@@ -172,31 +171,31 @@ def _installed(family: str) -> bool:
 
 
 @contextmanager
-def _listening() -> Iterator[_Said]:
-    """Keep what matplotlib would log."""
-    said = _Said()
+def _collected_warnings() -> Iterator[_Warnings]:
+    """Collect the warnings that matplotlib logs while the block lasts."""
+    warnings = _Warnings()
     loggers = [logging.getLogger(name) for name in ("matplotlib", "matplotlib.font_manager")]
     for logger in loggers:
-        logger.addFilter(said)
+        logger.addFilter(warnings)
     try:
-        yield said
+        yield warnings
     finally:
         for logger in loggers:
-            logger.removeFilter(said)
+            logger.removeFilter(warnings)
 
 
-class _Said(logging.Filter):
-    """Keeps what matplotlib logs and does not raise, such as a line that it does not understand."""
+class _Warnings(logging.Filter):
+    """Collects warnings of matplotlib, such as a line of a style file that it does not know."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.sentences: list[str] = []
+        self.messages: list[str] = []
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Keep the first line of a warning instead of showing it."""
+        """Store the first line of a warning and keep it from being shown."""
         if record.levelno < logging.WARNING:
             return True
-        self.sentences.append(record.getMessage().strip().splitlines()[0].rstrip("."))
+        self.messages.append(record.getMessage().strip().splitlines()[0].rstrip("."))
         return False
 
 
@@ -211,7 +210,7 @@ def narrow() -> bool:
 
 
 def inches(length: float) -> float:
-    """Return a length that suits letters of 8.5 points for the letters that are drawn, inches."""
+    """Return a length made for letters of 8.5 points, scaled to the font size, inches."""
     return length * _scale.get()
 
 
@@ -233,7 +232,7 @@ def sheet(
     """
     scale = _scale.get()
     if narrow() and left > 0.5:
-        # Panels are small, and their numbers have as many digits.
+        # Panels are small, so tick labels have few digits.
         left = max(left, 0.95)
     left, right, bottom, gap = (scale * x for x in (left, right, bottom + lane, gap + lane))
     heights = [scale * each for each in heights]
@@ -261,25 +260,25 @@ def sheet(
 
 
 def new_figure(height: float) -> Figure:
-    """Return an empty figure of so many inches."""
+    """Return an empty figure of a height in inches."""
     figure = Figure(figsize=(width(), height), facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 
 
 def panel(figure: Figure, x: float, y: float, width: float, height: float) -> Axes:
-    """Add axes to a figure: the place of their lower left corner and their size, in inches."""
+    """Add axes to a figure, by their lower left corner and size in inches."""
     across, up = figure.get_size_inches()
     return figure.add_axes((x / across, y / up, width / across, height / up))
 
 
 def room_for(names: Sequence[str]) -> float:
-    """Return the width of the longest name right of a panel, inches."""
+    """Return the width of the longest name, for the margin right of a panel, inches."""
     return 0.15 + 0.075 * max(map(len, names), default=0)
 
 
 class PictureFormat(str, Enum):
-    """A kind of picture file, by the end of its name."""
+    """Format of a picture file, by its suffix."""
 
     PNG = "png"
     SVG = "svg"
@@ -292,7 +291,7 @@ class PictureFormat(str, Enum):
         Raises
         ------
         SpaceRobotError
-            Its name ends otherwise.
+            The suffix is of no such format.
         """
         try:
             return cls(path.suffix[1:].lower())
@@ -322,7 +321,7 @@ def picture_of(figure: Figure, format: PictureFormat, pixels: int = 1600) -> byt
     )
     if format is not PictureFormat.SVG:
         return stream.getvalue()
-    # A hundredth of a point is finer than any screen.
+    # No screen shows less than a hundredth of a point.
     return _PATH_DATA.sub(lambda found: _DECIMALS.sub(rb"\1", found[0]), stream.getvalue())
 
 
@@ -334,14 +333,14 @@ def colour(index: int) -> str:
 def draw_traces(
     axes: Axes, signal: Signal, colours: Sequence[str], share: float = 1.0, factor: float = 1.0
 ) -> bool:
-    """Draw every column of a signal; return whether any was summed up as a band.
+    """Draw every column of a signal; return whether any is drawn as a band.
 
-    A line leaves out samples that nobody could see beside it. Where it would still have more of
-    them than the panel, ``share`` of a figure's width, has room for, a band spans the smallest and
-    the largest value in each slice of time.
+    A line leaves out samples that make no visible difference. If more samples are left than the
+    panel, ``share`` of a figure's width, can show, a band spans the smallest and the largest value
+    in each slice of time.
     """
     if not len(signal):
-        # Of a close-up in which nothing was measured.
+        # A close-up without samples.
         return False
     columns = max(int(COLUMNS * share), 20)
     low, high = axes.get_ylim()
@@ -375,7 +374,7 @@ def draw_traces(
 
 
 def _shakes(signal: Signal, columns: int) -> bool:
-    """Whether a signal, in tolerances, is mostly off the line through so many of its samples."""
+    """Whether a signal, in tolerances, is mostly off the line through ``columns`` samples."""
     nodes = np.linspace(0, len(signal) - 1, columns + 1).astype(int)
     values = signal.values[:, 0]
     line = np.interp(signal.time, signal.time[nodes], values[nodes])
@@ -383,7 +382,7 @@ def _shakes(signal: Signal, columns: int) -> bool:
 
 
 def upper_edge(signal: Signal, column: int) -> tuple[Array, Array]:
-    """Return times and values to draw: the largest in each slice of time where it is dense."""
+    """Return times and values of a column; of a dense one the largest in each slice of time."""
     if len(signal) <= 2 * SLICES:
         return signal.time, signal.values[:, column]
     time, _, high = envelope(signal, column, SLICES)
@@ -391,10 +390,10 @@ def upper_edge(signal: Signal, column: int) -> tuple[Array, Array]:
 
 
 def set_range(axes: Axes, values: Array, extra: Sequence[float] = (), least: float = 0.0) -> None:
-    """Set the y axis to hold values with a margin, and those of ``extra`` that are not far off.
+    """Set the y axis to the range of values with a margin, and nearby values of ``extra``.
 
-    The axis spans at least ``least``, and 0.1 where nothing changes, so that rounding errors are
-    not blown up.
+    The axis spans at least ``least``, or 0.1 if the values are constant, so that rounding errors
+    are not magnified.
     """
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
@@ -419,7 +418,7 @@ def set_time(axes: Axes, start: float, end: float, label: bool = True) -> None:
 
 
 def end_labels(axes: Axes, labels: Sequence[tuple[float, str, str]]) -> None:
-    """Write (value, text, colour) right of the axes, each at its value and none over another."""
+    """Write (value, text, colour) right of the axes at their values, without overlaps."""
     low, high = axes.get_ylim()
     ordered = sorted(labels)
     wanted = np.clip([(value - low) / (high - low) for value, _, _ in ordered], 0.0, 1.0)
@@ -439,7 +438,7 @@ def end_labels(axes: Axes, labels: Sequence[tuple[float, str, str]]) -> None:
 
 
 def _spread(wanted: Array, gap: float) -> Array:
-    """Move ascending places (n,) in 0..1 apart until neighbours keep a gap."""
+    """Move ascending positions (n,) in 0..1 apart until neighbours keep a gap."""
     at = wanted.copy()
     for _ in range(200):
         lacking = gap - np.diff(at)
@@ -461,7 +460,7 @@ def key(tint: str, label: str, dashes: tuple[float, ...] = ()) -> Line2D:
 
 
 def legend_above(axes: Axes, keys: Sequence[Line2D]) -> None:
-    """Put a legend above the axes, at the right, where it covers nothing."""
+    """Add a legend above the axes, at the right."""
     if keys:
         axes.legend(
             handles=keys,
@@ -480,7 +479,7 @@ def short(name: str) -> str:
 
 
 def scaled(unit: str, largest: float) -> tuple[float, str]:
-    """Return factor and unit in which values of at most ``largest`` read well."""
+    """Return factor and unit that suit values of at most ``largest``."""
     if unit not in ("m", "rad") or largest == 0.0 or largest >= 0.05:
         return 1.0, unit
     return (1e3, f"m{unit}") if largest >= 5e-5 else (1e6, f"µ{unit}")
@@ -488,24 +487,24 @@ def scaled(unit: str, largest: float) -> tuple[float, str]:
 
 @dataclass(frozen=True)
 class TraceGroup:
-    """Traces that share a panel, called by ``names``, ``label`` and ``unit``.
+    """Traces of one unit that share a panel.
 
     Attributes
     ----------
-    signal, names, label, unit, colours
-        The traces.
+    signal, names, colours
+        The traces, and the name and colour of each.
+    label, unit
+        Label of the axis, and unit of the values.
     goals
-        (start, end, trace, value) of each.
+        (start, end, trace, value) of each goal.
     limits
-        (trace, value) of each.
+        (trace, value) of each limit.
     window
-        Lower and upper end of the axis where some peaks are far beyond what can be read beside
-        them; None: all is shown.
+        Lower and upper end of the axis, if high peaks are left out; None: all values are shown.
     decades
-        So many powers of ten below the largest value are shown, on a logarithmic axis; 0: a linear
-        one.
+        Powers of ten shown below the largest value, on a logarithmic axis; 0: a linear axis.
     rows
-        Whether each trace has a row of its own, one high: how much of the time something is on.
+        Whether each trace has a row of its own of height one, for duty cycles from 0 to 1.
     """
 
     signal: Signal
@@ -522,10 +521,18 @@ class TraceGroup:
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """A figure: a short name, its heading, what is to be seen, and the picture.
+    """A figure of a report, as a picture and, if it is over time, as data of charts.
 
-    ``groups`` are its panels where they are over the time of the flight, each over all of it;
-    ``of_picture`` is the part of the caption that is about the picture and no chart of them.
+    Attributes
+    ----------
+    name, heading, caption
+        Short name (the id on a page), heading, and caption.
+    figure
+        The picture.
+    groups
+        The traces of its panels over the whole flight; none if the figure is not over time.
+    of_picture
+        The part of the caption that applies to the picture and not to its charts.
     """
 
     name: str

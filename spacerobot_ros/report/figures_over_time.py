@@ -53,7 +53,7 @@ SHOWN_CYCLES = 3
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 
 _ROW = 0.8
-"""Height of a trace that is always on, in its row."""
+"""Height of a duty cycle of one, in its row."""
 
 BAND = (
     "Where a trace has more samples than the picture has columns, the band spans the smallest and "
@@ -61,12 +61,12 @@ BAND = (
 )
 
 EVENTS = (
-    "Below the time axis, what happened: goals and plans above, the robot and its faults below."
+    "Below the time axis, events: goals and plans in the upper row, robot and faults in the lower."
 )
 
 
 def draw_whole(axes: Axes, flight: FlightReport, group: TraceGroup, share: float = 1.0) -> bool:
-    """Draw a group over the whole flight; return whether traces were summed up as bands."""
+    """Draw traces over the whole flight; return whether any is drawn as a band."""
     if group.rows:
         return _draw_rows(axes, flight, group, share)
     colours = group.colours
@@ -103,11 +103,11 @@ def draw_whole(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
 
 
 def time_figure(
-    flight: FlightReport, name: str, heading: str, what: str, groups: list[TraceGroup]
+    flight: FlightReport, name: str, heading: str, caption: str, groups: list[TraceGroup]
 ) -> ReportFigure:
-    """Return groups over time, one panel each, with close-ups where there are cycles.
+    """Return a figure with a panel for each group, and close-ups of a gait of equal cycles.
 
-    ``what`` is the first words of the caption.
+    ``caption`` is its beginning.
     """
     cycles = flight.cycles
     rows, heights = [[1.0]], [2.3]
@@ -137,7 +137,6 @@ def time_figure(
     if flight.events:
         for axes in (each for row in panels for each in row):
             draw_events(axes, flight.events)
-    caption = f"{what}"
     if any(group.goals for group in groups):
         caption += "; dashed, the goal"
     if any(group.limits for group in groups):
@@ -147,7 +146,7 @@ def time_figure(
     if cycles is not None:
         aside += (
             f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
-            f"what comes before them, and {_close_up(cycles)}."
+            f"the part before them, and {_close_up(cycles)}."
         )
     aside += f" {BAND}" if any(dense) else ""
     caption += aside + (f" {EVENTS}" if flight.events else "")
@@ -164,7 +163,7 @@ def _draw_rows(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
         if dense:
             time, _, high = envelope(signal, index, columns)
         foot = count - 1 - index
-        # From the sample before, which the value reaches back to.
+        # A value holds from the sample before.
         on = high > 0
         on[:-1] |= on[1:]
         axes.fill_between(time, foot, foot + _ROW * high, on, step="pre", color=tint, linewidth=0.3)
@@ -182,7 +181,7 @@ def _close_up(cycles: Cycles) -> str:
 
 
 def _first_part(axes: Axes, group: TraceGroup, cycles: Cycles) -> bool:
-    """Draw what comes before the cycles, or the first cycles where nothing does."""
+    """Draw the part before the cycles; the first cycles if there is none."""
     end = cycles.start if cycles.start > 0 else SHOWN_CYCLES * cycles.period
     part = group.signal.between(0.0, end)
     whole = group.signal.values
@@ -215,7 +214,7 @@ def _last_cycles(axes: Axes, group: TraceGroup, cycles: Cycles) -> None:
 
 JOINTS_A_PANEL = 6
 
-NO_STATES = "The bag holds no base poses (odom), so there is no picture of them."
+NO_STATES = "The bag holds no base poses (odom); figures of the base are missing."
 
 NO_JOINTS = "The bag holds no joint positions (joint_states)."
 
@@ -232,7 +231,7 @@ def position_group(flight: FlightReport) -> TraceGroup:
 
 
 def attitude_group(flight: FlightReport) -> TraceGroup:
-    """Return the base attitude as exponential coordinates, and its goals."""
+    """Return the base attitude as rotation vector, and its goals."""
     goals = [
         (t.start, t.end, i, x)
         for t in flight.targets
@@ -244,7 +243,7 @@ def attitude_group(flight: FlightReport) -> TraceGroup:
 
 
 def shape_groups(flight: FlightReport) -> list[TraceGroup]:
-    """Return the joint positions, those of one unit and at most six joints together."""
+    """Return the joint positions, in groups of one unit and at most six joints."""
 
     def bounds(joint: Joint) -> list[float]:
         return [joint.limits.lower, joint.limits.upper]
@@ -285,7 +284,7 @@ def joint_groups(
 
 
 def axis_groups(signal: Signal, parts: Sequence[tuple[str, str]]) -> list[TraceGroup]:
-    """Return a group of x, y and z for each label and unit, from columns side by side."""
+    """Return a group of x, y and z for each label and unit; they are columns side by side."""
     return [
         TraceGroup(
             Signal(signal.time, signal.values[:, 3 * k : 3 * k + 3]),
@@ -302,30 +301,30 @@ def position_figure(flight: FlightReport) -> ReportFigure | str:
     """Base position against the goal."""
     if not len(flight.position):
         return NO_STATES
-    what = "Position of the base link in the world frame"
-    return time_figure(flight, "position", "Base position", what, [position_group(flight)])
+    caption = "Position of the base link in the world frame"
+    return time_figure(flight, "position", "Base position", caption, [position_group(flight)])
 
 
 def pose_figure(flight: FlightReport) -> ReportFigure | str:
     """Base position over base attitude, against the goal."""
     if not len(flight.position):
         return NO_STATES
-    what = "Position of the base link in the world frame, and its attitude as a rotation vector"
+    caption = "Position of the base link in the world frame, and its attitude as a rotation vector"
     groups = [position_group(flight), attitude_group(flight)]
-    return time_figure(flight, "pose", "Base pose", what, groups)
+    return time_figure(flight, "pose", "Base pose", caption, groups)
 
 
 def attitude_figure(flight: FlightReport) -> ReportFigure | str:
     """Base attitude against the goal."""
     if not len(flight.attitude):
         return NO_STATES
-    what = (
+    caption = (
         "Attitude of the base link as exponential coordinates: the rotation vector, of the length "
         "of the angle turned, about the axis of rotation"
     )
     if np.linalg.norm(flight.attitude.values, axis=1).max() > np.pi:
-        what += ", counted on continuously beyond half a turn"
-    return time_figure(flight, "attitude", "Base attitude", what, [attitude_group(flight)])
+        caption += ", counted on continuously beyond half a turn"
+    return time_figure(flight, "attitude", "Base attitude", caption, [attitude_group(flight)])
 
 
 def shape_figure(flight: FlightReport) -> ReportFigure | str:
@@ -336,7 +335,7 @@ def shape_figure(flight: FlightReport) -> ReportFigure | str:
 
 
 def _no_joints(flight: FlightReport) -> str:
-    """Return why there is no picture of the joints."""
+    """Return the reason why there is no figure of the joints."""
     jointless = flight.robot is not None and not flight.robot.joint_names
     return "The robot has no joints." if jointless else NO_JOINTS
 
@@ -402,28 +401,30 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str:
 def twist_figure(flight: FlightReport) -> ReportFigure | None:
     """Velocity and angular velocity of the base link.
 
-    None where it rests, and of a gait of many equal cycles: there it shakes.
+    None if it rests, and for a gait of many equal cycles, in which it oscillates.
     """
     if flight.cycles is not None or not flight.twist.values.any():
         return None
     groups = axis_groups(flight.twist, (("velocity", "m/s"), ("rate", "rad/s")))
-    what = "Velocity of the base link's origin and its angular velocity, in the base link's frame"
-    return time_figure(flight, "twist", "Base velocity", what, groups)
+    caption = (
+        "Velocity of the base link's origin and its angular velocity, in the base link's frame"
+    )
+    return time_figure(flight, "twist", "Base velocity", caption, groups)
 
 
 _DECADES = 4
 
 _PEAKS = 0.02
-"""Part of the samples that may be beyond the axis: the peaks."""
+"""Largest share of the samples that may be beyond the axis, as peaks."""
 
 _FAR = (3.0, 1e4)
-"""Least and largest ratio of the span of all samples to that of all but the peaks, between which
-the axis leaves the peaks out. Below it they can be read together; above it all but the peaks is a
-robot at rest, and the peaks are what happens.
+"""Least and largest ratio of the span of all samples to that without peaks for which the axis
+leaves the peaks out. Below the first, both can be read together; above the second, the robot rests
+but for the peaks.
 """
 
 _SMALLEST = 1e-9
-"""Forces and torques that are rounding errors, N or N m."""
+"""Forces and torques up to this one are rounding errors, N or N m."""
 
 
 def efforts_figure(flight: FlightReport) -> ReportFigure | None:
@@ -445,19 +446,19 @@ def efforts_figure(flight: FlightReport) -> ReportFigure | None:
     groups = readable(wrench + joints)
     if not groups:
         return None
-    what = (
-        "What was commanded: thruster force and torque at the base link's origin, in its frame, "
-        "and the efforts of the joints"
+    caption = (
+        "Commanded thruster force and torque at the base link's origin, in its frame, and joint "
+        "efforts"
     )
     if not wrench:
-        what = "Commanded efforts of the joints; the thrusters gave nothing"
+        caption = "Commanded joint efforts; no thrust was commanded"
     if any(group.window is not None for group in groups):
-        what += ". Axes leave out short peaks, so that the rest can be read"
-    return time_figure(flight, "efforts", "Wrench and efforts", what, groups)
+        caption += ". Axes leave out short peaks, so that the rest can be read"
+    return time_figure(flight, "efforts", "Wrench and efforts", caption, groups)
 
 
 def window_of(signal: Signal) -> tuple[float, float] | None:
-    """Return lower and upper end of what can be read, where a few peaks are far beyond it."""
+    """Return the range of a signal without its few highest peaks; None if it has no such peaks."""
     if not len(signal):
         return None
     low, high = (float(np.min(signal.values)), float(np.max(signal.values)))
@@ -470,25 +471,25 @@ def window_of(signal: Signal) -> tuple[float, float] | None:
 
 
 def thrusters_figure(flight: FlightReport) -> ReportFigure | None:
-    """When each thruster was on, and what that took."""
+    """Duty cycles of the thrusters, their impulse, and the propellant."""
     names = flight.thruster_names
     if not len(flight.duty) or not flight.duty.values.any():
         return None
     used = [k for k in range(len(names)) if flight.duty.values[:, k].any()]
     duty = Signal(flight.duty.time, flight.duty.values[:, used])
     tints = [colour(k) for k in range(len(used))]
-    label, unit = "thrusters", "part of each tick that they are on"
+    label, unit = "thrusters", "share of each tick that they are on"
     groups = [TraceGroup(duty, [short(names[k]) for k in used], label, unit, tints, rows=True)]
     impulse, propellant = flight.impulse, flight.propellant
     groups.append(TraceGroup(impulse, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
-    what = "How much of each tick each thruster was on; below, the impulse that all gave"
+    caption = "Share of each tick that each thruster was on; below, the impulse of all of them"
     if propellant is not None:
         grams = Signal(propellant.time, 1e3 * propellant.values)
         groups.append(TraceGroup(grams, ["propellant"], "propellant", "g", [PALETTE[1]]))
-        what += " and the propellant that they took, by their specific impulse"
+        caption += " and the propellant consumed, by their specific impulse"
     if len(used) < len(names):
-        what += f". {len(names) - len(used)} of {len(names)} thrusters were never on"
-    return time_figure(flight, "thrusters", "Thruster firings", what, groups)
+        caption += f". {len(names) - len(used)} of {len(names)} thrusters were never on"
+    return time_figure(flight, "thrusters", "Thruster firings", caption, groups)
 
 
 def momentum_figure(flight: FlightReport) -> ReportFigure | str:
@@ -505,7 +506,7 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     top = np.ceil(np.log10(largest)) if largest > 0 else -15.0
     above.set_yscale("log")
     above.set_ylim(10.0 ** (top - _DECADES), 10.0**top)
-    # What is below the axis, zero above all, stands on its lower edge.
+    # Values below the axis, such as zero, are drawn on its lower edge.
     shown = np.maximum(changes, 10.0 ** (top - _DECADES))
     for i in range(2):
         above.plot(
@@ -533,10 +534,10 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
         draw_events(below, flight.events)
     largest_of = ", the largest in each slice of time" if len(time) > 2 * SLICES else ""
     caption = (
-        "The momentum balance of the whole system. Top: how far the linear momentum p "
-        "and the angular momentum L about the centre of mass are from their values at the start, "
-        f"what thrusters have put in taken off{largest_of}, on a logarithmic axis; less than it "
-        "shows, and zero, lies on its lower edge. Bottom: kinetic energy."
+        "The momentum balance of the whole system. Top: change of the linear momentum p and of the "
+        "angular momentum L about the centre of mass since the start, less the impulse of the "
+        f"thrusters{largest_of}, on a logarithmic axis; smaller changes and zero lie on its lower "
+        "edge. Bottom: kinetic energy."
     )
     aside = f" {BAND}" if dense else ""
     caption += aside + (f" {EVENTS}" if flight.events else "")
@@ -555,13 +556,13 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
 
 
 def power_of_ten(value: float) -> str:
-    """Return a power of ten as it is written, for a logarithmic axis."""
+    """Return a power of ten as text with an exponent, for a logarithmic axis."""
     exponent = str(round(np.log10(value))).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"10{exponent}"
 
 
 _SMALLEST_ERROR = 1e-12
-"""Errors of sensors that are rounding errors, m or rad."""
+"""Sensor errors up to this one are rounding errors, m or rad."""
 
 
 def errors_figure(flight: FlightReport) -> ReportFigure | None:
@@ -577,20 +578,23 @@ def errors_figure(flight: FlightReport) -> ReportFigure | None:
         errors = pose_errors(pose, targets)
         chosen = flight.controls(part)
         name = part.replace("_", "-")
-        for unit, what, members in (("m", "position", (0, 1, 2)), ("rad", "attitude", (3, 4, 5))):
+        for unit, quantity, members in (
+            ("m", "position", (0, 1, 2)),
+            ("rad", "attitude", (3, 4, 5)),
+        ):
             axes = [i for i in members if i in chosen]
             if len(errors) and axes:
                 signal = Signal(errors.time, errors.values[:, axes])
                 names = ["xyz"[i % 3] for i in axes]
                 colours = [PALETTE[i % 3] for i in axes]
-                groups.append(TraceGroup(signal, names, f"{name} {what}", unit, colours))
+                groups.append(TraceGroup(signal, names, f"{name} {quantity}", unit, colours))
     if not groups:
         return None
-    what = (
+    caption = (
         "Goal minus pose, in the world frame, for the components under control; attitude as the "
         "remaining rotation vector"
     )
-    return time_figure(flight, "errors", "Output errors", what, groups)
+    return time_figure(flight, "errors", "Output errors", caption, groups)
 
 
 def pose_errors(pose: Signal, targets: Sequence[Target]) -> Signal:
@@ -608,7 +612,7 @@ def pose_errors(pose: Signal, targets: Sequence[Target]) -> Signal:
 
 
 def sensors_figure(flight: FlightReport) -> ReportFigure | None:
-    """How far measured poses and joints are from what they were; None where sensors do not err."""
+    """Measured minus true poses and joint positions; None if sensors have no errors."""
     true = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
     pose, at = _at_the_same_times(flight.sensed_pose, true)
     turn = quaternion_multiply(pose.values[:, 3:], quaternion_inverse(true.values[at, 3:]))
@@ -617,18 +621,18 @@ def sensors_figure(flight: FlightReport) -> ReportFigure | None:
     groups = axis_groups(errors, (("base position", "m"), ("base attitude", "rad")))
     shape, at = _at_the_same_times(flight.sensed_shape, flight.shape)
     if len(shape):
-        bent = Signal(shape.time, shape.values - flight.shape.values[at])
+        off = Signal(shape.time, shape.values - flight.shape.values[at])
         units = {"m": "m", "rad": "rad"}
-        groups += joint_groups(flight, bent, "joints", units, lambda joint: [], JOINTS_A_PANEL)
+        groups += joint_groups(flight, off, "joints", units, lambda joint: [], JOINTS_A_PANEL)
     groups = [g for g in groups if np.abs(g.signal.values).max(initial=0.0) > _SMALLEST_ERROR]
     if not groups:
         return None
-    what = "Measured minus true, at the stamps of what was measured"
-    return time_figure(flight, "sensors", "Errors of the sensors", what, groups)
+    caption = "Measured minus true values, at the times of the measurements"
+    return time_figure(flight, "sensors", "Errors of the sensors", caption, groups)
 
 
 def _at_the_same_times(measured: Signal, true: Signal) -> tuple[Signal, Indices]:
-    """Return the samples that have a true one of their time, and which that is."""
+    """Return the measured samples that have a true one of equal time, and its index."""
     if not len(true):
         return Signal.none(measured.width), np.zeros(0, int)
     at = np.clip(np.searchsorted(true.time, measured.time - 1e-9), 0, len(true) - 1)

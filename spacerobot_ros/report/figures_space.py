@@ -41,7 +41,7 @@ from spacerobot_ros.report.signals import Indices
 from spacerobot_ros.report.solids import Canvas, Solids, View
 
 PIXELS = 420
-"""Across the picture of a robot."""
+"""Width of the picture of a robot, pixels."""
 _INSTANTS = 6
 
 
@@ -79,15 +79,15 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
 
 
 def view_of(flight: FlightReport) -> View:
-    """Return the direction to look from: above where all moves in a plane."""
+    """Return the direction of view: from above if the flight is planar."""
     return View(-90.0, 90.0) if flight.flat else View()
 
 
 def _instants(flight: FlightReport) -> list[int]:
-    """Up to six recorded states, about as much motion from one to the next.
+    """Return up to six recorded states with about equal motion in between.
 
-    Where a gait ends with equal cycles, three are spread over what comes before, and three over the
-    cycles, at one phase.
+    Of a gait that ends with equal cycles, three are before the cycles and three at one phase of the
+    cycles.
     """
     time, cycles = flight.position.time, flight.cycles
     if cycles is not None and cycles.start > 0.0:
@@ -104,12 +104,12 @@ def _instants(flight: FlightReport) -> list[int]:
 
 
 def _ending_at(last: int, found: Indices) -> list[int]:
-    """Return indices, each once, with the last recorded state instead of the last of them."""
+    """Return indices, each once, the last one replaced by that of the last recorded state."""
     return np.unique([*np.minimum(found[:-1], last), last]).tolist()
 
 
 def draw_robot(axes: Axes, solids: Solids, points: Array, view: View) -> None:
-    """Draw a robot to scale in axes that hold ``points`` (k, 3), with directions and a scale."""
+    """Draw a robot to scale in axes around ``points`` (k, 3), with a triad and a scale bar."""
     box = axes.get_window_extent()
     size = np.array([box.width, box.height])
     flat = view(points)
@@ -147,7 +147,7 @@ def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Lin
         axes.plot(flat[:, 0], flat[:, 1], color=INK, lw=0.8, zorder=5, rasterized=dense)
         keys.append(key(INK, "path of the base"))
     if flight.goal is not None and flight.drawn is not None:
-        # Where the position is not asked for, the ghost shows the attitude alone.
+        # Without a goal of the position, the ghost shows the attitude alone.
         r = flight.goal.position if flight.position_counts else path[-1]
         pose = Pose(matrix_from_quaternion(flight.goal.quaternion), r)
         for line in flight.drawn.base_outlines(pose):
@@ -159,7 +159,7 @@ def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Lin
 
 
 def _round_length(longest: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not longer."""
+    """Return the largest of 1, 2, 5 times a power of ten that is at most ``longest``."""
     power = 10.0 ** math.floor(math.log10(longest))
     return max(step * power for step in (1, 2, 5) if step * power <= longest * (1 + 1e-9))
 
@@ -175,7 +175,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
         return NO_STATES
     goals = [flight.goal] if flight.goal is not None and flight.position_counts else []
     goals += [sent.goal for sent in flight.tool_goals[-1:]]
-    # Beside the reach of an arm, the path of a base that nobody pushes would be a dot.
+    # Beside the reach of an arm, the path of a base without thrust would be a dot.
     shows_tool = len(flight.tool) > 0 and len(flight.tool_goals) > 0
     flown = [flight, *(other for other in beside if len(other.position))]
     tints = [_OTHERS[k % len(_OTHERS)] for k in range(len(flown))]
@@ -298,12 +298,12 @@ def _set_across(axes: Axes, values: Array) -> None:
 
 
 def _signed_area(x: Array, y: Array) -> float:
-    """Area inside a closed curve, positive where it runs counter-clockwise."""
+    """Return the area inside a closed curve, positive if it runs counter-clockwise."""
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
 
 
 def _arrow(axes: Axes, x: Array, y: Array) -> None:
-    """Show the sense of a loop where it is fastest."""
+    """Draw the direction of a loop as an arrow at its fastest point."""
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
     steps = np.hypot(np.diff(x) / (high - low)[0], np.diff(y) / (high - low)[1])
     k = int(np.argmax(steps))
@@ -316,7 +316,7 @@ def _arrow(axes: Axes, x: Array, y: Array) -> None:
 
 
 _BACK = 0.02
-"""A shape this near to where the loops begin, in their extent, has come round."""
+"""Distance from its first shape below which a loop is closed, as a share of its size."""
 
 _FEWEST = 4
 _DECADE = 10.0
@@ -325,7 +325,7 @@ _DECADE = 10.0
 def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     """Attitude, and the remaining angle to the goal, at the end of each loop in shape space.
 
-    None where the shape does not come round again and again.
+    None if the joints do not return to one shape several times.
     """
     if not len(flight.shape) or len(flight.attitude) != len(flight.shape):
         return None
@@ -373,9 +373,9 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
 
 
 def returns(shape: Signal) -> Indices:
-    """Return the samples at which the shape is back where its loops begin and end, the last shape.
+    """Return the samples at which the shape returns to the last one, where its loops are closed.
 
-    A stay there counts once, with its last sample; a stay at the very end with its first.
+    A rest there counts once, with its last sample; a rest at the end of the flight with its first.
     """
     values = shape.values
     moving = np.flatnonzero((np.abs(np.diff(values, axis=0)) > 0).any(axis=1))

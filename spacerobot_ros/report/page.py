@@ -110,7 +110,7 @@ def _outcome(flight: FlightReport) -> str:
     last = flight.statuses[-1]
     sentence = last.sentence
     if last.executing:
-        sentence += " The recording ends before that is decided."
+        sentence += " The recording ends before the outcome is known."
     state = f"<b>{escape(last.state.capitalize())}</b>" if last.state else ""
     return f'<p class="outcome {escape(last.state)}">{state}{escape(sentence)}</p>'
 
@@ -138,10 +138,10 @@ def _published(flight: FlightReport) -> list[str]:
     if found is None:
         return []
     return [
-        "<h2>Published figures beside measured ones</h2>",
+        "<h2>Published and measured values</h2>",
         _table("published", found),
-        '<p class="facts">Source: “planner”, what the planner gave with its first schedule; '
-        "“flight”, what was measured.</p>",
+        '<p class="facts">Source: “planner”, values of the first schedule; “flight”, '
+        "measured values.</p>",
     ]
 
 
@@ -178,12 +178,12 @@ def _events(events: Sequence[FlightEvent]) -> list[str]:
         for each in sorted(events, key=lambda each: each.time)
     ]
     more = len(rows) - _MAX_EVENT_ROWS
-    head = ("Time (s)", "What", "In words", "Node")
+    head = ("Time (s)", "Event", "Message", "Node")
     note = f'<p class="facts">{more} more are in the bag.</p>' if more > 0 else ""
     shown = table("events", head, rows[:_MAX_EVENT_ROWS], (0,)) + note
     if len(rows) > _MAX_UNFOLDED_ROWS:
         shown = f"<details><summary>{len(rows)} events</summary>{shown}</details>"
-    return ["<h2>What happened</h2>", shown]
+    return ["<h2>Events</h2>", shown]
 
 
 def _parameters(flight: FlightReport) -> list[str]:

@@ -188,7 +188,7 @@ def _over_plane(found: Analysis, pair: tuple[int, int]) -> tuple[Array, Array, A
 
 
 def _mark(axes: Axes, found: Analysis, pair: tuple[int, int]) -> None:
-    """Mark the shape that is looked at, and name the joints of the plane."""
+    """Mark the shape of the analysis, and name the joints of the plane."""
     assert found.nominal is not None
     i, j = (found.nominal.joints[k] for k in pair)
     axes.plot(found.shape[i], found.shape[j], marker="+", color=INK, ms=8, mew=1.3)

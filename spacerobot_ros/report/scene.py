@@ -33,7 +33,7 @@ Command = dict[str, Any]
 
 @dataclass(frozen=True)
 class Scene:
-    """What the viewer is told, the spans of time to look at (name, start, end), and a caption."""
+    """Commands of the viewer, spans of time to choose from (name, start, end), and a caption."""
 
     commands: list[Command]
     parts: list[tuple[str, float, float]]
@@ -51,7 +51,7 @@ def viewer_script() -> str | None:
 
 
 def set_property(path: str, name: str, value: Any) -> Command:
-    """Set a property of what is at a path, such as ``visible``."""
+    """Set a property of the object at a path, such as ``visible``."""
     return {"type": "set_property", "path": path, "property": name, "value": value}
 
 
@@ -110,7 +110,7 @@ def clip(path: str, time: Array, tracks: dict[str, Array]) -> Command:
     made = []
     for name, values in tracks.items():
         if name == "quaternion":
-            # The viewer goes the short way round between quaternions of the same sign.
+            # The viewer interpolates the short way between quaternions of equal sign.
             flips = np.cumsum((values[1:] * values[:-1]).sum(axis=1) < 0) % 2
             values = values * np.append(1, 1 - 2 * flips)[:, np.newaxis]
         numbers = {"times": np.round(time, 4).tolist(), "values": _rounded(values)}
@@ -124,20 +124,20 @@ def set_animation(clips: list[Command]) -> Command:
 
 
 def solid(path: str, visual: Visual, color: str, opacity: float = 1.0) -> list[Command]:
-    """A visual and, where it is a solid with sharp ones, its edges."""
+    """Return a visual and its sharp edges, if it has any."""
     shape = visual.shape
     matrix = matrix_of(shape.pose)
     if shape.kind == "cylinder":
         # Along y in three.js, along z in URDF.
         matrix = matrix @ np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
     look = {"type": "MeshPhongMaterial", "color": _number(color), "shininess": 15}
-    # Edges and ghosts in the surface of a solid are to be seen.
+    # Keep edges and ghosts visible in the surface of a solid.
     look |= {"polygonOffset": True, "polygonOffsetFactor": 1, "polygonOffsetUnits": 1}
     if opacity < 1.0:
         look |= {"transparent": True, "opacity": opacity, "depthWrite": False}
         look |= {"polygonOffsetFactor": -1, "polygonOffsetUnits": -1}
     if shape.kind == "mesh":
-        # Of both sides, because files differ in which of them is outside.
+        # Both sides are drawn, because files differ in which one is outside.
         look |= {"flatShading": True, "side": 2}
         return [_object(f"{path}/solid", _triangles(visual.mesh), look, "Mesh")]
     geometry = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}[shape.kind](shape.size)
@@ -180,13 +180,11 @@ def _rounded(values: Array) -> list[float]:
 
 
 def _number(color: str) -> int:
-    """A color ``#rrggbb`` as a number."""
+    """Return a color ``#rrggbb`` as a number."""
     return int(color[1:], 16)
 
 
-NO_VIEWER = (
-    "There is no 3D view: it takes the viewer of the Python package meshcat (pip install meshcat)."
-)
+NO_VIEWER = "The 3D view needs the Python package meshcat: pip install meshcat."
 
 _MARKUP = """<section id="animation" class="loading">
 <div id="stage"><div id="pane" role="img" aria-label="The robot in motion"></div></div>
@@ -195,9 +193,9 @@ _MARKUP = """<section id="animation" class="loading">
 <output id="now"></output>
 <select id="part" aria-label="Span of time"></select>
 <select id="speed" aria-label="Speed"></select></div>
-<p class="missing">This browser shows no WebGL, which the 3D view takes; the figures below do \
-without.</p>
-<noscript><p class="missing">The 3D view takes JavaScript; the figures below do without.</p>\
+<p class="missing">The 3D view needs WebGL, which this browser does not offer; the figures below \
+do not.</p>
+<noscript><p class="missing">The 3D view needs JavaScript; the figures below do not.</p>\
 </noscript>
 <p class="caption"><b>The flight.</b> {caption} Drag to turn the view, with the right button to \
 move it; click it first to zoom with the wheel.</p>
@@ -206,7 +204,7 @@ move it; click it first to zoom with the wheel.</p>
 
 
 def player_of(scene: Scene | str) -> PagePart:
-    """Return the player of a scene, or the sentence that stands for it."""
+    """Return the player of a scene, or the reason why there is none."""
     viewer = viewer_script()
     if isinstance(scene, str) or viewer is None:
         sentence = scene if isinstance(scene, str) else NO_VIEWER
@@ -221,14 +219,14 @@ def player_of(scene: Scene | str) -> PagePart:
 
 
 def _notices() -> tuple[tuple[str, str], ...]:
-    """Return the licences of MeshCat and of what is in its viewer, three.js above all."""
+    """Return the licences of MeshCat and of the libraries in its viewer, such as three.js."""
     own, others = "", []
     for file in distribution("meshcat").files or ():
         if file.name in ("LICENSE.txt", "LICENSE", "LICENCE"):
             own = file.read_text()
         elif file.name.endswith("THIRD_PARTY_LICENSES.json"):
             others += json.loads(file.read_text())
-    # One of them comes without the text of its licence; MeshCat's own has the words of MIT.
+    # A library without the text of its licence has the MIT licence, as in MeshCat's own.
     mit = own[own.find("Permission is hereby granted") :]
     found = [("MeshCat", own)]
     for each in others:
@@ -240,7 +238,7 @@ def _notices() -> tuple[tuple[str, str], ...]:
 
 
 FULL_CYCLES = 3
-"""Cycles at the beginning and at the end of a gait that are shown as they were."""
+"""Cycles at the beginning and at the end of a gait that are shown in full."""
 
 _MOST = 1000
 _MOST_INSTANTS = 300
@@ -249,11 +247,17 @@ _MOST_INSTANTS = 300
 
 @dataclass(frozen=True)
 class KeyFrames:
-    """States to show: their ``indices``, ascending, with the first and the last of the recording.
+    """Recorded states to show, between which motion is interpolated.
 
-    ``error``: how far, in tolerances, a state that is meant to be seen is from the line between
-    the key frames around it. ``every``: between the cycles shown in full, one state is shown every
-    so many cycles, always at the same phase; 0 where there are no such.
+    Attributes
+    ----------
+    indices
+        Their indices, ascending, with the first and the last state of the recording.
+    error
+        Largest distance of an omitted state from the interpolation, in tolerances.
+    every
+        Between the cycles shown in full, one state is shown per so many cycles, always at the same
+        phase; 0: all cycles are shown in full.
     """
 
     indices: Indices
@@ -267,10 +271,10 @@ def key_frames(motion: Signal, cycles: Cycles | None) -> KeyFrames:
     Parameters
     ----------
     motion
-        What is to be seen, (N, k), each column divided by its tolerance.
+        The visible motion, (N, k), each column divided by its tolerance.
     cycles
-        The equal cycles in it. Between the first and the last few of them, states of equal phase
-        stand for the rest: sampled anyhow, fast loops would look like slow ones.
+        Its equal cycles. All but the first and the last few are sampled at equal phase: otherwise
+        fast loops would look like slow ones (aliasing).
     """
     shown, every = np.arange(len(motion)), 0
     if cycles is not None and cycles.count > 2 * FULL_CYCLES:
@@ -287,25 +291,25 @@ def key_frames(motion: Signal, cycles: Cycles | None) -> KeyFrames:
 
 
 _POSITION_TOLERANCE = 0.001
-"""Of what is drawn between key frames, as a part of the size of the picture."""
+"""Tolerance of positions between key frames, as a share of the size of the scene."""
 
 _ANGLE_TOLERANCE = 0.005
-"""Likewise, rad."""
+"""Tolerance of angles between key frames, rad."""
 
 _LINE_POINTS = 4000
 _MOST_FACES = 20_000
-"""Of all meshes together: some 0.6 MB."""
+"""Largest number of faces of all meshes together: some 0.6 MB."""
 
 _BACKGROUND = [246 / 255, 247 / 255, 249 / 255]
 _FIELD_OF_VIEW = 30.0
-"""Degrees."""
+"""Field of view of the camera, deg."""
 
 _AXES = ("#d55e00", "#009e73", "#0072b2")
 WORLD, ROBOT = "/flight", "/flight/robot"
 
 
 def scene_of(flight: FlightReport) -> Scene | str:
-    """Return the scene of a flight, or one sentence on why there is none."""
+    """Return the scene of a flight, or the reason why there is none."""
     drawn = flight.drawn
     if drawn is None:
         return flight.not_drawn
@@ -321,7 +325,7 @@ def scene_of(flight: FlightReport) -> Scene | str:
 
 
 def _extent(flight: FlightReport, drawn: SolidRobot) -> tuple[Array, float]:
-    """Center and radius of what is to be seen."""
+    """Return center (3,) and radius of the visible scene, m."""
     clouds = [flight.position.values, flight.tool.values[:, :3]]
     for index in flight.samples(12):
         clouds.append(drawn.at(flight.joints[index], flight.base_at(index)).points())
@@ -333,7 +337,7 @@ def _extent(flight: FlightReport, drawn: SolidRobot) -> tuple[Array, float]:
 
 
 def _visible(flight: FlightReport, radius: float) -> Signal:
-    """All that moves in the picture (N, k), in tolerances."""
+    """Return the visible motion (N, k), in tolerances."""
     assert flight.robot is not None
     columns = [flight.position.values / (_POSITION_TOLERANCE * radius)]
     columns.append(flight.attitude.values / _ANGLE_TOLERANCE)
@@ -344,7 +348,7 @@ def _visible(flight: FlightReport, radius: float) -> Signal:
 
 
 def _stage(center: Array, radius: float, flat: bool) -> list[Command]:
-    """Background, camera, world axes and grid; everything is moved and scaled to radius 1."""
+    """Background, camera, world axes and grid; the scene is moved and scaled to radius 1."""
     world = np.eye(4)
     world[:3, :3] /= radius
     world[:3, 3] = -center / radius
@@ -389,7 +393,7 @@ def _grid(center: Array, radius: float, spacing: float, flat: bool) -> Array:
 
 
 def _link_paths(robot: RobotDescription) -> dict[str, str]:
-    """Place of every link in the viewer's tree, which is the tree of the URDF."""
+    """Return the path of every link in the viewer's tree, which is the tree of the URDF."""
     paths = {robot.base_link: ROBOT}
     for joint in joints_outward(robot):
         name = joint.child.replace("/", "\N{DIVISION SLASH}")
@@ -410,7 +414,7 @@ def _robot(robot: RobotDescription, meshes: Mapping[str, TriangleMesh]) -> list[
 
 
 def _faces(meshes: Mapping[str, TriangleMesh]) -> int:
-    """Return how many faces each mesh may have, so that the page stays small."""
+    """Return the largest number of faces of a mesh, so that the page stays small."""
     return _MOST_FACES // max(len(meshes), 1)
 
 
@@ -470,9 +474,7 @@ def _ghosts(flight: FlightReport, robot: RobotDescription, radius: float) -> lis
 
 
 def _aim(flight: FlightReport) -> Array:
-    """Where the ghost of the base stands: at its goal; where the base ends if only its attitude
-    was asked for.
-    """
+    """Return the position of the ghost: the goal, or the last one if only attitude is a goal."""
     assert flight.goal is not None
     return flight.goal.position if flight.position_counts else flight.position.values[-1]
 
@@ -504,12 +506,12 @@ def _caption(flight: FlightReport, frames: KeyFrames, radius: float, ghosts: boo
     within = max(frames.error, 1.0)
     text += (
         f" and within {within * _POSITION_TOLERANCE * radius:.2g} m and "
-        f"{within * _ANGLE_TOLERANCE:.2g} rad of the states that it stands for."
+        f"{within * _ANGLE_TOLERANCE:.2g} rad of the recorded states."
     )
     if frames.every:
         which = "every cycle" if frames.every == 1 else f"every {frames.every}th cycle"
         text += (
-            f" The first and the last {FULL_CYCLES} cycles are shown as they were; of those "
+            f" The first and the last {FULL_CYCLES} cycles are shown in full; of those "
             f"between, one instant of {which}, always at the same phase, so that fast loops do not "
             "look like slow ones."
         )

@@ -21,7 +21,7 @@ Image = npt.NDArray[np.float32]
 
 _OVERSAMPLING = 2
 _EDGE_WIDTH = 3
-"""Of a drawn edge, in pixels before they are averaged."""
+"""Width of an edge, in pixels before averaging."""
 
 _FLAT = 1e-6
 
@@ -37,9 +37,9 @@ class Face:
 
 @dataclass(frozen=True)
 class Edge:
-    """A line (k, 3) in the world, seen where one of the two surfaces beside it is.
+    """A line (k, 3) in the world, visible if one of the two faces beside it is.
 
-    ``normals`` (k - 1, 2, 3) are those of the surfaces; with none it is seen from everywhere.
+    ``normals`` (k - 1, 2, 3) are those of the faces; a line without normals is always visible.
     """
 
     line: Array
@@ -90,7 +90,7 @@ class Canvas:
         self._pixels = np.zeros((*size, 4), np.float32)
 
     def draw(self, faces: list[Face], edges: list[Edge]) -> None:
-        """Draw faces, and edges over them where nothing hides them."""
+        """Draw faces, and over them the edges that no face hides."""
         for face in faces:
             if face.normal @ self._view.toward > _FLAT:
                 self._fill(face)
@@ -98,7 +98,7 @@ class Canvas:
             self._line(edge)
 
     def image(self) -> Image:
-        """Return what was drawn as (rows, columns, 4), the top row first, transparent elsewhere."""
+        """Return the picture (rows, columns, 4), the top row first, transparent where empty."""
         n = _OVERSAMPLING
         total = sum(self._pixels[i::n, j::n] for i in range(n) for j in range(n))
         image = np.asarray(total, np.float32)
@@ -118,7 +118,7 @@ class Canvas:
         top = min(math.floor(float(corners[:, 1].max()) - 0.5) + 1, rows)
         if bottom >= top:
             return
-        # The face covers one run of pixels in each row.
+        # A convex face covers one run of pixels in each row.
         y = np.arange(bottom, top) + 0.5
         left, right = np.full(len(y), np.inf), np.full(len(y), -np.inf)
         for (ax, ay, _), (bx, by, _) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -147,7 +147,7 @@ class Canvas:
 
     def _line(self, edge: Edge) -> None:
         at = self._place(edge.line)
-        # An edge lies in the surfaces beside it: it is drawn a little nearer.
+        # An edge lies in the faces beside it and is drawn a little nearer.
         at[:, 2] += 2.0 * _EDGE_WIDTH / self._scale
         rows, columns = self._depth.shape
         brush = np.arange(_EDGE_WIDTH) - (_EDGE_WIDTH - 1) / 2
@@ -168,7 +168,7 @@ class Canvas:
 _BASE = "#c4c9d2"
 EDGE = "#3d4450"
 _FACES = 1500
-"""Of a mesh in a picture: each is filled by itself."""
+"""Largest number of faces of a mesh: each is filled by itself."""
 
 Colour = tuple[float, float, float]
 
@@ -202,7 +202,7 @@ class Solids:
 
 
 class SolidRobot:
-    """A robot that can be asked where its links are and what it looks like.
+    """A robot with its visuals, for pictures of any pose.
 
     ``meshes`` are the triangles of its meshes by their URIs.
     """
@@ -226,7 +226,7 @@ class SolidRobot:
         return solids
 
     def base_outlines(self, base: Pose) -> list[Array]:
-        """Return the edges of what is rigidly on the base link, as lines (k, 3) in the world."""
+        """Return the outlines of the base body as lines (k, 3) in the world."""
         lines = []
         for visual in self._visuals:
             if visual.body == 0:
@@ -246,5 +246,5 @@ def body_color(body: int) -> str:
 
 
 def _cross(pose: Pose) -> list[Array]:
-    """A small cross (three lines) in the place of what cannot be drawn."""
+    """Return a small cross (three lines), in place of a base without visuals."""
     return [pose.r + 0.1 * np.array([-axis, axis]) @ pose.R.T for axis in np.eye(3)]

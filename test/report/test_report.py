@@ -323,7 +323,7 @@ def test_cut_short_right_after_the_start(tmp_path: Path) -> None:
     statuses = [(0.0, "Flying a gait.", EXECUTING | goal_value())]
     page = report_of(tmp_path, Story(still(count=1), statuses, goals=[(0.0, *GOAL)]))
     assert list(page.figures) == FIGURES
-    assert "Flying a gait. The recording ends before that is decided." in page.text
+    assert "Flying a gait. The recording ends before the outcome is known." in page.text
 
 
 @pytest.mark.usefixtures("blank")

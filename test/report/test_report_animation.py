@@ -265,5 +265,5 @@ def test_without_webgl_a_sentence_says_so(page: Path, tmp_path: Path) -> None:
         window.open(page)
         window.wait_for("document.getElementById('animation').className === 'without'")
         text = window.evaluate("document.getElementById('animation').innerText")
-        assert text.startswith("This browser shows no WebGL")
+        assert text.startswith("The 3D view needs WebGL")
         assert window.evaluate("document.getElementById('pane').clientHeight") == 0

@@ -520,7 +520,7 @@ def test_what_the_page_says_of_a_flight(tmp_path: Path) -> None:
     assert "nobody" not in content.text
     assert "<title>a_scenario, lie_bracket, tester</title>" in text
     cut = flight(tmp_path, FLOWN[:2], name="cut.mcap")
-    assert "The recording ends before that is decided." in page(cut, PagePart(""), [])
+    assert "The recording ends before the outcome is known." in page(cut, PagePart(""), [])
 
 
 def test_whatever_a_bag_holds_is_text_on_the_page(tmp_path: Path) -> None:
