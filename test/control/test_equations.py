@@ -130,3 +130,22 @@ def test_status_has_the_smallest_singular_value() -> None:
         law = LAWS[name](load("servicer"), POSES, GAINS)
         law.command(state, reference)
         assert law.status.smallest_singular_value == pytest.approx(expected, rel=1e-9)
+
+
+def test_eq_12_has_the_third_angle_in_its_second_column() -> None:
+    """``omega = S d(Theta)/dt`` of the 321 sequence; the paper prints the first angle there."""
+    first, second, third = angles = np.array([0.4, -0.3, 1.1])
+
+    def rotation(angles: Array) -> Array:
+        return np.asarray(Rotation.from_euler("ZYX", angles[::-1]).as_matrix())
+
+    step, columns = 1e-6, []
+    for axis in np.eye(3):
+        rate = (rotation(angles + step * axis) - rotation(angles - step * axis)) / (2 * step)
+        spin = rate @ rotation(angles).T
+        columns.append([spin[2, 1], spin[0, 2], spin[1, 0]])
+    S = np.array(columns).T
+    np.testing.assert_allclose(S[:, 1], [-np.sin(third), np.cos(third), 0.0], atol=1e-9)
+    roll = [np.cos(second) * np.cos(third), np.cos(second) * np.sin(third), -np.sin(second)]
+    np.testing.assert_allclose(S[:, 0], roll, atol=1e-9)
+    assert np.abs(S[:, 1] - [-np.sin(first), np.cos(first), 0.0]).max() > 0.4

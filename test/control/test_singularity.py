@@ -47,6 +47,19 @@ def test_singular_arm(elbow: float) -> None:
         assert law.status.smallest_singular_value < 0.02
 
 
+def test_eq_27_as_printed_fails_at_a_singularity() -> None:
+    """Its ``Htilde = J_z^-T H+ J_z^-1`` has no bound there, so neither has the command."""
+    robot = load("planar_manipulator")
+    law = law_of("transposed_jacobian", robot, PLANAR_GAINS)
+    H = robot.inertia_matrix(np.array([0.3, 1.0]))[np.ix_([0, 1, 5, 6, 7], [0, 1, 5, 6, 7])]
+    sizes = []
+    for elbow in (1.0, 1e-3, 1e-6):
+        law.command(stretched(elbow), GOAL)
+        inverse = np.linalg.inv(law._out["J_z"][:, [0, 1, 5, 6, 7]])
+        sizes.append(float(np.linalg.norm(H @ inverse @ law.error)))
+    assert sizes[2] > 900.0 * sizes[1] > 900.0 * 50.0 * sizes[0]
+
+
 def test_damping_sets_in_smoothly() -> None:
     """The command has no jump at the threshold, and without damping it explodes."""
     robot = load("planar_manipulator")
