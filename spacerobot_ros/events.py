@@ -10,7 +10,7 @@ from spacerobot_ros.errors import SpaceRobotError
 
 
 class EventKind(str, Enum):
-    """What has happened; the value is the word ``event`` of the message."""
+    """Kinds of events; the value is the word ``event`` of the message."""
 
     CONFIGURED = "configured"
     ACTIVATED = "activated"
@@ -62,9 +62,9 @@ class Event:
     Attributes
     ----------
     kind
-        What has happened.
+        Kind of change.
     message
-        The same for people.
+        One sentence for people.
     level
         Of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR.
     time_s
@@ -72,7 +72,7 @@ class Event:
     goal_id
         The goal that the event is about; empty: none.
     about
-        What else the event is about, by name.
+        Further facts by name.
     """
 
     kind: EventKind

@@ -1,4 +1,4 @@
-"""The topics of the stack in one table, from which publishers, reports and documents are made.
+"""Table of all topics, from which publishers, reports and documents are made.
 
 Of the topics on which the plant publishes its state the table also says which numbers they carry:
 the plant's publisher and the re-simulation of a bag read it. A new one is an entry here and a
@@ -23,15 +23,15 @@ class StateField:
     Attributes
     ----------
     path
-        Where they are in the message: a part with numbers in it, or an array.
+        Path in the message: a part with numbers in it, or an array.
     quantity
-        What they are: a name in :attr:`~spacerobot_ros.simulation.sensors.ReportedState.
+        Name of the numbers in :attr:`~spacerobot_ros.simulation.sensors.ReportedState.
         quantities`.
     members
         The numbers of the part at ``path``, in their order; empty for an array.
     entries
-        What the entries of an array are called; empty: it has one for each joint, or whatever the
-        topic is about.
+        Names of the entries of an array; empty: it has one for each joint, or whatever the topic
+        is about.
     """
 
     path: str
@@ -45,7 +45,7 @@ class StateField:
         return [f"{self.path}.{member}" for member in self.members] or [self.path]
 
     def labels(self, names: Sequence[str]) -> list[str]:
-        """Return what each number is called; ``names`` are of the joints, or whatever it is of."""
+        """Return a label for each number; ``names`` are of the joints or thrusters."""
         if self.members:
             return self.columns
         return [entry.replace("_", " ") for entry in self.entries] or [
@@ -54,7 +54,7 @@ class StateField:
 
     @property
     def quaternion(self) -> int | None:
-        """Which of the numbers is the first of a quaternion, if there is one."""
+        """Index of the first number of a quaternion, if there is one."""
         first = "orientation.x"
         return self.members.index(first) if first in self.members else None
 
@@ -72,7 +72,7 @@ class Topic:
     publishers
         The nodes that publish it; ``user`` for what comes from outside the stack.
     meaning
-        What it says, for people.
+        Description of the content.
     when
         Under which condition it is there; empty: always.
     latched
@@ -82,7 +82,7 @@ class Topic:
     frame
         The frame of the header of a state topic: ``world`` or ``base``.
     of
-        What the arrays of a state topic have entries for: ``joints`` or ``thrusters``.
+        Objects that the entries of its arrays belong to: ``joints`` or ``thrusters``.
     every_tick
         Whether a state topic is published in every tick, or every ``base_pose_period``.
     """
@@ -162,7 +162,7 @@ _TABLE = (
         "momentum_expected",
         _ARRAY,
         _PLANT,
-        "what the momenta should be: those of the beginning, and what the thrusters put in",
+        "expected momenta: those of the beginning plus the impulses of the thrusters",
         when="actuation is effort",
         state=(StateField("data", "expected_momenta", entries=_MOMENTA),),
     ),
@@ -202,7 +202,7 @@ _TABLE = (
         "base_wrench_realised",
         _WRENCH_STAMPED,
         _PLANT,
-        "what the thrusters gave of base_wrench in the last tick, on average",
+        "mean wrench of the thrusters in the last tick, in answer to base_wrench",
         when="`thrusters` is set",
         state=(StateField("wrench", "thruster_wrench", _WRENCH),),
         frame="base",
@@ -372,7 +372,7 @@ GLOBAL_TOPICS = ("/clock", "/tf", "/tf_static")
 """Absolute names; where a stack is in a namespace they are put into it, so that it has its own."""
 
 NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event", "/heartbeat")
-"""Ends of topics that tell nothing of a flight: recorded only where they are asked for."""
+"""Endings of topics that are recorded only on request."""
 
 
 def state_topics() -> list[Topic]:

@@ -10,7 +10,7 @@ from spacerobot_ros.parameters import parameter
 
 @dataclass(frozen=True)
 class RecorderConfig(WatchdogConfig):
-    """What is recorded, and how the file is written."""
+    """Parameters of the recorder: topics, time and file."""
 
     bag: str = parameter("", "file to write; '': spacerobot-<date>-<time>.mcap here")
     when_exists: str = parameter(
@@ -48,7 +48,7 @@ class RecorderConfig(WatchdogConfig):
 
 @dataclass(frozen=True)
 class ReplayConfig:
-    """What is replayed, and how fast."""
+    """Parameters of a replay: bag, part of it, rate and topics."""
 
     bag: str = parameter("", "MCAP file to replay, or a folder with one")
     rate: float = parameter(1.0, "bag time over wall time", minimum=0.001, maximum=1000000.0)
@@ -59,7 +59,7 @@ class ReplayConfig:
     remap: str = parameter("", "other names for topics: 'old:=new', separated by spaces")
     clock: float = parameter(
         0.0,
-        "publish bag time on /clock so often; 0: what the bag has",
+        "publish bag time on /clock at this rate; 0: as recorded",
         unit="Hz",
         minimum=0.0,
         maximum=10000.0,

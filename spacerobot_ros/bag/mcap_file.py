@@ -132,8 +132,8 @@ class QosProfile:
     def from_yaml(cls, text: str) -> list[QosProfile]:
         """Read a channel's ``offered_qos_profiles``, whose policies are words or numbers.
 
-        ``text`` is the YAML of a list with one profile for each publisher; empty for none. What a
-        profile does not say is as in ``QosProfile()``.
+        ``text`` is the YAML of a list with one profile for each publisher; empty for none. Entries
+        that a profile lacks are as in ``QosProfile()``.
 
         Raises
         ------
@@ -316,7 +316,7 @@ def _compressor(compression: str) -> Callable[[bytes | bytearray], bytes]:
 
 
 class BagExistsError(RecordingError):
-    """A bag that is there, and is not to be written over."""
+    """A bag that exists and is not to be overwritten."""
 
 
 def _created(path: Path, overwrite: bool) -> io.FileIO:
@@ -325,7 +325,7 @@ def _created(path: Path, overwrite: bool) -> io.FileIO:
     Raises
     ------
     RecordingError
-        There is something that is not to be written over.
+        A file exists and is not to be overwritten.
     OSError
         It cannot be opened.
     """
@@ -338,7 +338,7 @@ def _created(path: Path, overwrite: bool) -> io.FileIO:
         raise BagExistsError(
             f"Cannot make the bag {path}: File exists; name another one, or remove it."
         ) from error
-    # Unbuffered: what was appended survives a kill.
+    # Unbuffered: appended records survive a kill.
     raw = open(descriptor, "wb", buffering=0)  # noqa: SIM115
     try:
         require_regular(os.fstat(descriptor).st_mode, path, "make")
@@ -371,7 +371,7 @@ class McapFile:
     Every append goes to the operating system at once, and one that fails is undone, so that the
     file of a process that dies is whole but for the record that it was appending. While it is open
     it is locked: no second one can be opened on the same path. ``compression`` and ``overwrite``
-    are as of :class:`~spacerobot_ros.bag.BagWriter`; ``profile`` says what the messages are.
+    are as of :class:`~spacerobot_ros.bag.BagWriter`; ``profile`` is that of the MCAP header.
 
     Raises
     ------
@@ -418,12 +418,12 @@ class McapFile:
         return self._size
 
     def check(self) -> None:
-        """Find out whether the path still names this file, and it has all that was written.
+        """Check that the path still leads to this file, with its full size.
 
         Raises
         ------
         RecordingError
-            It was removed, replaced, moved or cut, so the path no longer leads to what was written.
+            It was removed, replaced, moved or cut, so the path no longer leads to the data.
         """
         what = ""
         try:

@@ -48,9 +48,9 @@ LIMIT_VARIABLE = "SPACEROBOT_BAG_LIMIT"
 _LIMIT = 32.0
 """Its default, MB."""
 
-_SWELLING = 200
-"""What a bag may inflate to is this many times its file, where that is more. Telemetry compresses
-by 3 to 40, what was made to fill memories by 1000 and more."""
+_LARGEST_RATIO = 200
+"""Largest ratio of the inflated size of a bag to its file, beyond the limit above. Telemetry has
+3 to 40, bags made to fill the memory 1000 and more."""
 
 RECORD_HEADER = struct.Struct("<BQ")
 """Opcode, and the length of the body."""
@@ -69,7 +69,7 @@ DAMAGE = (
     struct.error,
     zstandard.ZstdError,
 )
-"""What reading a damaged record raises: the libraries have no error in common."""
+"""Exceptions of reading a damaged record: the libraries have no common base class."""
 
 
 # -- files ------------------------------------------------------------------------------------
@@ -153,7 +153,7 @@ def _require_both_ends(path: Path, file: BinaryIO) -> None:
     if length < 2 * size or file.read(size) != MCAP0_MAGIC:
         raise RecordingError(
             f"The bag {path} was cut short, its writer having been killed or its disk full: "
-            f"'spacerobot salvage {shlex.quote(str(path))}' makes a complete bag of what is in it."
+            f"'spacerobot salvage {shlex.quote(str(path))}' makes a complete bag of its content."
         )
     file.seek(0)
 
@@ -170,12 +170,12 @@ def file_size(file: BinaryIO) -> int:
 
 
 def records(file: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
-    """Go through the records between two places of a file: where each begins, opcode and body.
+    """Iterate over the records between two places of a file: where each begins, opcode and body.
 
     Raises
     ------
     ValueError
-        A record is larger than what is left.
+        A record is larger than the rest of the file.
     """
     while start < end:
         file.seek(start)
@@ -185,7 +185,7 @@ def records(file: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, by
 
 
 def records_in(data: bytes, place: int) -> Iterator[tuple[int, int, int]]:
-    """Go through the records of the unpacked chunk at ``place``: opcode, and where each lies in it.
+    """Iterate over the records of the unpacked chunk at ``place``: opcode, first and last place.
 
     Raises
     ------
@@ -240,7 +240,7 @@ def _header(file: BinaryIO, place: int, end: int) -> tuple[int, int]:
 
 
 def parsed(read: Callable[[ReadDataStream], T], body: bytes, place: int) -> T:
-    """Return what a class of ``mcap.records`` reads from the body of the record at ``place``.
+    """Return the object that a class of ``mcap.records`` reads from the record at ``place``.
 
     Raises
     ------
@@ -258,7 +258,7 @@ def parsed(read: Callable[[ReadDataStream], T], body: bytes, place: int) -> T:
 
 
 class Allowance:
-    """How much the chunks of a file may inflate to, together.
+    """Limit of the inflated size of all chunks of a file.
 
     Parameters
     ----------
@@ -267,17 +267,17 @@ class Allowance:
     """
 
     def __init__(self, compressed: int) -> None:
-        self.most = max(round(1e6 * _limit()), _SWELLING * compressed)
+        self.most = max(round(1e6 * _limit()), _LARGEST_RATIO * compressed)
         """In bytes."""
         self._taken = 0
 
     def take(self, size: int, place: int) -> None:
-        """Count what the chunk at ``place`` inflates to.
+        """Count the inflated size of the chunk at ``place``.
 
         Raises
         ------
         ValueError
-            That is too much.
+            The sum exceeds the allowance.
         """
         if self._taken + size > self.most:
             raise ValueError(
@@ -344,7 +344,7 @@ def unpacked(body: bytes, place: int) -> bytes:
 def _unpack_zstd(data: bytes, size: int) -> bytes:
     if not data and not size:
         return b""
-    # What a frame says of itself is what the library allocates.
+    # The library allocates as much as the frame claims.
     claimed = zstandard.frame_content_size(data)
     if claimed > size:
         raise ValueError(f"its frame claims {claimed} bytes")
@@ -382,7 +382,7 @@ _SUMMARY: dict[int, Callable[[ReadDataStream], Any]] = {
     Opcode.CHUNK_INDEX: ChunkIndex.read,
     Opcode.METADATA_INDEX: MetadataIndex.read,
 }
-"""What a summary is read for; it also has its offsets, which save no time."""
+"""Records of a summary that are read; its offsets would save no time."""
 
 RawMessage = tuple[int, int, int, bytes]
 """Channel, log time and publish time in nanoseconds, serialised message."""
@@ -433,7 +433,7 @@ def read_summary(path: Path, file: BinaryIO) -> Summary:
 
 
 def _check_chunks(summary: Summary, end: int) -> None:
-    """Refuse indexes by which more would be read than there is.
+    """Check that the indexed chunks do not overlap, and fit the allowance.
 
     Raises
     ------
@@ -453,7 +453,7 @@ def _check_chunks(summary: Summary, end: int) -> None:
 def indexed_records(
     file: BinaryIO, indexes: Sequence[AttachmentIndex | MetadataIndex], wanted: Opcode
 ) -> Iterator[tuple[int, bytes]]:
-    """Go through the records that an index of a summary names, each once: its place and body.
+    """Iterate over the records that an index of a summary names, each once: its place and body.
 
     Raises
     ------
@@ -468,7 +468,7 @@ def indexed_records(
 
 
 def messages_in_file_order(file: BinaryIO) -> Iterator[RawMessage]:
-    """Go through all messages of a bag in the order they were written.
+    """Iterate over all messages of a bag in the order they were written.
 
     Raises
     ------
@@ -502,7 +502,7 @@ def messages_in_time_order(
     end_ns: int = _END_OF_TIME,
     summary: Summary | None = None,
 ) -> Iterator[RawMessage]:
-    """Go through messages of a bag by log time, those of one time in the order they were written.
+    """Iterate over messages of a bag by log time, those of one time in the order they were written.
 
     Only chunks whose times overlap are in memory together.
 
@@ -599,7 +599,7 @@ def _chunk_and_entries(
     Raises
     ------
     ValueError
-        The chunk is damaged, or its indexes name what are no messages, or some twice.
+        The chunk is damaged, or its indexes name other records, or a message twice.
     """
     place = index.chunk_start_offset
     body = record_at(file, place, Opcode.CHUNK)

@@ -1,4 +1,4 @@
-"""Which message of a bag is due when: the time of a replay, without a clock or a publisher."""
+"""Times at which messages of a replay are due, without a clock or a publisher."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _RECENT_NS = SECOND
 """How old a message may be that is shown again after a jump."""
 
 _MOST_TOPICS = 1000
-"""Each takes a publisher, which takes memory and discovery."""
+"""Against bags made to harm: each topic takes a publisher, memory and discovery."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class ReplayTopic:
 
 @dataclass(frozen=True)
 class ReplayStatus:
-    """Where a replay is, as replay/status carries it.
+    """State of a replay, as replay/status carries it.
 
     Attributes
     ----------
@@ -108,21 +108,21 @@ class Timeline:
 
     @property
     def running(self) -> bool:
-        """Whether time goes on."""
+        """Whether the time of the bag advances."""
         return self._running
 
     def run(self, clock_ns: int) -> None:
-        """Go on, ``clock_ns`` being the clock's time now."""
+        """Let time advance; ``clock_ns`` is the present time of the clock."""
         if not self._running:
             self._clock_ns, self._running = clock_ns, True
 
     def stop(self, clock_ns: int) -> None:
-        """Stand still from now on."""
+        """Stop time."""
         self._bag_ns = self.bag_time(clock_ns)
         self._running = False
 
     def seek(self, bag_ns: int, clock_ns: int) -> None:
-        """Be at ``bag_ns`` in the bag when the clock is at ``clock_ns``."""
+        """Jump to ``bag_ns`` in the bag when the clock is at ``clock_ns``."""
         self._bag_ns, self._clock_ns = bag_ns, clock_ns
 
     def bag_time(self, clock_ns: int) -> int:
@@ -170,7 +170,7 @@ def renamed(remap: str, topics: Collection[str]) -> dict[str, str]:
     Raises
     ------
     ParameterError
-        A rule is written otherwise, or renames what is not among ``topics``.
+        A rule has another form, or names a topic that is not among ``topics``.
     """
     names = {}
     for rule in remap.split():
@@ -192,8 +192,8 @@ def renamed(remap: str, topics: Collection[str]) -> dict[str, str]:
 class Playback:
     """The messages of a bag in the rhythm of their log times.
 
-    What was latched before the start is due at once, because a subscriber of such a topic expects
-    its last message whenever it subscribes.
+    The last messages of latched topics before the start are due at once:
+    a subscriber of such a topic expects its last message whenever it subscribes.
 
     Parameters
     ----------
@@ -255,26 +255,26 @@ class Playback:
 
     @property
     def ended(self) -> bool:
-        """Whether nothing is left."""
+        """Whether no message is left."""
         return self._next is None
 
     @property
     def running(self) -> bool:
-        """Whether time goes on."""
+        """Whether the time of the bag advances."""
         return self._timeline.running
 
     def bag_time(self, clock_ns: int) -> int:
         """Return the time in the bag, in nanoseconds, when the clock is at ``clock_ns``."""
         now = self._timeline.bag_time(clock_ns)
-        # Not past what is still to come: that is late.
+        # Messages still to come are late, not skipped.
         return now if self._next is None else min(now, max(self._next.log_time_ns, self._start_ns))
 
     def run(self, clock_ns: int) -> None:
-        """Go on, ``clock_ns`` being the clock's time now."""
+        """Let time advance; ``clock_ns`` is the present time of the clock."""
         self._timeline.run(clock_ns)
 
     def pause(self, clock_ns: int) -> None:
-        """Stand still from now on."""
+        """Stop time."""
         self._timeline.stop(clock_ns)
 
     def due(self, clock_ns: int, most: int) -> list[ReplayMessage]:
@@ -306,10 +306,10 @@ class Playback:
         return self._take()
 
     def seek(self, bag_ns: int, clock_ns: int) -> list[ReplayMessage]:
-        """Be at ``bag_ns`` in the bag, or at its nearer end, running or not as before.
+        """Jump to ``bag_ns`` in the bag, or to its nearer end; a pause lasts.
 
-        Returns what a subscriber would have by then: of each topic the last message, if that is
-        latched or no older than a second. Where time stands still at the beginning it is what is
+        Returns the messages that a subscriber would have by then: of each topic the last one, if
+        it is latched or no older than a second. In a pause at the beginning these are the messages
         there, as nothing is before it; that comes again when time goes on.
 
         Raises
@@ -333,7 +333,7 @@ class Playback:
 
     @property
     def start_ns(self) -> int:
-        """Where the replay begins, ns."""
+        """Log time at which the replay begins, ns."""
         return self._start_ns
 
     @property
@@ -371,7 +371,7 @@ class Playback:
         yield from in_time
 
     def _latched_before(self, time_ns: int) -> Iterator[ReplayMessage]:
-        """Yield the messages of latched topics before a time; the last of each is what counts."""
+        """Yield the messages of latched topics before a time; the last of each counts."""
         latched = {n for t in self.topics if t.latched for n in self._bag.channel_ids(t.name)}
         if latched and time_ns > self._bag.start_time_ns:
             yield from self._between(latched, 0, time_ns - 1)

@@ -62,7 +62,7 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
 
 
 def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, int, bytes]]:
-    """Go through all messages of a bag, still serialised, in the order they were written.
+    """Iterate over all messages of a bag, still serialised, in the order they were written.
 
     Yields
     ------
@@ -134,7 +134,7 @@ class Bag:
         return isinstance(topic, str) and self._recorded_name(topic) in self.topics
 
     def items(self) -> Iterator[tuple[str, TopicSeries]]:
-        """Go through names and messages of all topics.
+        """Iterate over names and messages of all topics.
 
         Raises
         ------
@@ -144,7 +144,7 @@ class Bag:
         return ((topic, self[topic]) for topic in self)
 
     def values(self) -> Iterator[TopicSeries]:
-        """Go through the messages of all topics; raises as :meth:`items` does."""
+        """Iterate over the messages of all topics; raises as :meth:`items` does."""
         return (self[topic] for topic in self)
 
     @overload
@@ -227,7 +227,7 @@ class Bag:
         return int(self._statistics.message_end_time)
 
     def message_count(self, topic: str | None = None) -> int:
-        """Say how many messages a topic has, or the whole bag.
+        """Return the number of messages of a topic, or of the whole bag.
 
         Raises
         ------
@@ -252,7 +252,7 @@ class Bag:
     def raw_messages(
         self, channel_ids: set[int], start_ns: int = 0, end_ns: int = 2**63 - 1
     ) -> Iterator[RawMessage]:
-        """Go through the messages of some channels, still serialised, by log time.
+        """Iterate over the messages of some channels, still serialised, by log time.
 
         Yields
         ------
@@ -266,12 +266,12 @@ class Bag:
         return messages_in_time_order(self.path, channel_ids, start_ns, end_ns, self._summary)
 
     def qos(self, topic: str) -> list[QosProfile]:
-        """Return what the publishers of a topic offered, as far as the bag says it.
+        """Return the recorded quality of service of the publishers of a topic.
 
         Raises
         ------
         RecordingError
-            There is no such topic, or what the bag says cannot be read.
+            There is no such topic, or its record cannot be read.
         """
         texts = [c.metadata.get("offered_qos_profiles", "") for c in self._channels(topic)]
         return [profile for text in texts for profile in QosProfile.from_yaml(text)]
@@ -287,7 +287,7 @@ class Bag:
         return self[topic].time
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Go through the decoded messages of a topic by log time.
+        """Iterate over the decoded messages of a topic by log time.
 
         Yields
         ------
@@ -308,7 +308,7 @@ class Bag:
         """Return a topic as a table of pandas, or every topic by its name.
 
         The index is the log time in seconds, ``attrs["units"]`` has the units of the columns; see
-        :func:`~spacerobot_ros.bag.tables.table_of` for what the columns are.
+        :func:`~spacerobot_ros.bag.tables.table_of` for the columns.
 
         Raises
         ------
@@ -368,7 +368,7 @@ class Bag:
         return [*found, *attached.values()]
 
     def _sliding(self, namespace: str) -> dict[str, bool]:
-        """Of each joint of the robot in a namespace whether it slides."""
+        """Whether each joint of the robot in a namespace is prismatic."""
         if namespace not in self._kinds:
             # The model takes as long to import as everything else here.
             from spacerobot_ros.model.description import JointKind
@@ -467,7 +467,7 @@ class RecordedRobot:
     Parameters
     ----------
     bag
-        What was recorded.
+        The recording.
     namespace
         Of the robot's topics, such as ``/robot_1``; empty for none.
     """
@@ -481,7 +481,7 @@ class RecordedRobot:
         topic = f"{self.namespace}/{name}"
         if self.bag.topics.get(topic) != TOPICS[name].type or not self.bag.message_count(topic):
             return None
-        # What the summary counts need not be there.
+        # A damaged bag may lack messages that its summary counts.
         return self.bag[topic] if len(self.bag[topic]) else None
 
     def __getitem__(self, name: str) -> TopicSeries:

@@ -1,4 +1,4 @@
-"""Serialised messages on their way into a bag: which time they carry, and what went wrong."""
+"""Recording of serialised messages: the time base of a bag, latched topics, failures."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from spacerobot_ros.times import SECOND
 
 
 class RecordingState(Enum):
-    """What is done with a message that arrives."""
+    """Treatment of messages that arrive."""
 
     PAUSED = "paused"
-    """It is dropped, except that the last one of a latched topic is kept until recording starts."""
+    """Dropped, except that the last one of a latched topic is kept until recording starts."""
 
     WAITING = "waiting"
-    """It is kept in memory: whether a clock is published is not known yet."""
+    """Kept in memory: whether a clock is published is not known yet."""
 
     ON_CLOCK = "on clock"
-    """It is written with the time of the clock."""
+    """Written with the time of the clock."""
 
     ON_WALL_TIME = "on wall time"
-    """It is written with the wall time of its arrival."""
+    """Written with the wall time of arrival."""
 
     FAILED = "failed"
-    """It is dropped: the disk is full or gone. What was written before stays."""
+    """Dropped: the disk is full or gone. Messages written before stay."""
 
     CLOSED = "closed"
-    """It is dropped: the bag is complete."""
+    """Dropped: the bag is complete."""
 
 
 # Names of the module are found faster than members of an enum: they are needed for every message.
@@ -46,7 +46,7 @@ _DROPPING = (RecordingState.PAUSED, RecordingState.FAILED, RecordingState.CLOSED
 
 
 class _Early(NamedTuple):
-    """A message from before the time was known."""
+    """A message from before the time base was chosen."""
 
     channel: int
     message: bytes
@@ -55,11 +55,11 @@ class _Early(NamedTuple):
 
 
 class Recording:
-    """Writes messages with the one time of their bag; begins paused.
+    """Writes messages with one time base for the whole bag; begins paused.
 
     Messages carry the time of the clock, those before its first message that one's time. Where no
-    clock is published for ``clock_wait`` all carry the wall time of their arrival. What was decided
-    stays, because a bag has one time.
+    clock is published for ``clock_wait`` all carry the wall time of their arrival. The choice
+    stays, because a bag has one time base.
 
     Parameters
     ----------
@@ -107,11 +107,11 @@ class Recording:
 
     @property
     def messages_waiting(self) -> int:
-        """How many messages wait for the start, or for the time of the bag to be known."""
+        """How many messages wait for the start, or for the time base of the bag."""
         return len(self._early) + sum(last is not None for last in self.latched.values())
 
     def start(self) -> None:
-        """Record from now on, and what latched topics have sent last before that."""
+        """Record from now on, and the last messages of latched topics before that."""
         if self.state is not RecordingState.PAUSED:
             return
         self.state = self._decided or _WAITING
@@ -134,7 +134,7 @@ class Recording:
             self._decide(_ON_CLOCK)
 
     def record(self, channel: int, message: bytes, published_ns: int = 0) -> None:
-        """Write a message, or keep it until the time of the bag is decided.
+        """Write a message, or keep it until the time base of the bag is chosen.
 
         ``published_ns`` is its stamp; 0: the time at which it is recorded.
         """
@@ -164,7 +164,7 @@ class Recording:
         self._guarded(self.writer.flush)
 
     def check(self) -> None:
-        """Find out whether the file is still there, with all that was written."""
+        """Check that the file is still in its place, with its full size."""
         self._guarded(self.writer.check)
 
     def describe(self, name: str, values: dict[str, str]) -> None:
@@ -210,7 +210,7 @@ class Recording:
             raise
 
     def _decide(self, state: RecordingState) -> None:
-        """Settle which time the bag has, unless it is settled, and write the early messages."""
+        """Choose the time base of the bag, unless it is chosen, and write the early messages."""
         if self._decided is not None or self.failure is not None:
             return
         self._decided = state

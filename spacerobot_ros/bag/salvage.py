@@ -46,12 +46,12 @@ from spacerobot_ros.times import SECOND
 _STATE = ("odom", "joint_states", "momentum")
 _CHUNK_SIZE = 65536
 _CHANNEL_AND_TIME = struct.Struct("<H4xQ")
-"""What a message begins with; between them is its sequence number."""
+"""Channel and log time at the head of a message; between them is its sequence number."""
 
 
 @dataclass(frozen=True)
 class Salvaged:
-    """What was saved of a bag, and what was not.
+    """Result of salvaging a bag.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Salvaged:
 def salvage_bag(
     path: str | os.PathLike[str], out: str | os.PathLike[str] | None = None
 ) -> Salvaged:
-    """Write what can be read of a bag into a new, complete one; the old one stays as it is.
+    """Write the readable records of a bag into a new, complete one; the old one stays as it is.
 
     ``out`` is the new file, which must not exist; by default ``NAME-salvaged.mcap`` beside the old
     one.
@@ -132,8 +132,8 @@ def is_complete(path: Path) -> bool:
 
 
 def _whole_records(file: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
-    """Go through the records between two places, up to the first that is not whole."""
-    # What a consumer raises does not pass through here.
+    """Iterate over the records between two places, up to the first that is not whole."""
+    # Exceptions of consumers do not pass through here.
     with suppress(ValueError):
         yield from records(file, start, end)
 
@@ -227,7 +227,7 @@ class _Copy:
         if channel_id not in self._channels:
             return
         if channel_id not in self._entries:
-            # Readers that stream find what a message needs before it.
+            # Streaming readers need schema and channel before the message.
             self._entries[channel_id] = []
             channel = self._channels[channel_id]
             if channel.schema_id in self._schemas:
@@ -294,9 +294,9 @@ class LastState:
 
 
 def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
-    """Read the last state of which everything was recorded.
+    """Read the last state whose parts were all recorded.
 
-    Of a bag that was cut off, what can be read counts; ``namespace`` is that of the plant's topics.
+    Of a bag that was cut off, the readable part counts; ``namespace`` is that of the plant.
 
     Raises
     ------

@@ -23,7 +23,7 @@ from spacerobot_ros.times import SECOND
 _HEADER = (Nodetype.NAME, "std_msgs/msg/Header")
 
 _DAMAGE = (SerdeError, ValueError, IndexError, OverflowError, TypeError, struct.error)
-"""What decoding a damaged message raises."""
+"""Exceptions of decoding a damaged message."""
 
 
 class TopicSeries:
@@ -68,7 +68,7 @@ class TopicSeries:
 
     @property
     def paths(self) -> list[str]:
-        """Paths of the fields, for :meth:`field`; of what lists hold, the list."""
+        """Paths of the fields, for :meth:`field`; of lists of messages, that of the list."""
         return list(self._leaves(self.type_name, ""))
 
     def _leaves(self, type_name: str, prefix: str) -> Iterator[str]:
@@ -125,8 +125,8 @@ class TopicSeries:
         Returns
         -------
         An array of shape (N,) for a number, of shape (N, k) for k numbers in each message, with
-        whole numbers as 64-bit integers and others as float64. A list of N of what the messages
-        hold for everything else: strings, lists, messages, arrays that differ in length.
+        whole numbers as 64-bit integers and others as float64. A list of N values
+        for everything else: strings, lists, messages, arrays that differ in length.
 
         Raises
         ------
@@ -139,7 +139,7 @@ class TopicSeries:
                 return self._columns[path]
             except UnicodeDecodeError as error:
                 raise self._damaged(error) from error
-        # What is kept is not handed out, where it could be changed.
+        # Callers get copies, which they may change.
         fresh = in_list or type_name is not None
         messages = [m for _, m in self.messages()] if fresh else self._messages
         if in_list:
@@ -152,7 +152,7 @@ class TopicSeries:
         return np.array(values, dtype)
 
     def constant(self, path: str) -> bool:
-        """Whether a list of texts is the same in all messages, as far as that is seen at once.
+        """Whether a list of texts is the same in all messages, as far as the layout shows.
 
         True is certain; false may mean that messages differ elsewhere.
         """
@@ -183,7 +183,7 @@ class TopicSeries:
         return np.column_stack([_matrix(self.field(path), each) for path in fields])
 
     def messages(self) -> Iterator[tuple[int, Any]]:
-        """Go through the messages, without keeping them.
+        """Iterate over the messages, without keeping them.
 
         Yields
         ------

@@ -65,20 +65,20 @@ _UNITS = tuple(
 
 @dataclass(frozen=True)
 class Field:
-    """What all messages of a topic have at one place.
+    """One field of all messages of a topic.
 
     Attributes
     ----------
     path
-        The place, such as ``pose.pose.position.x``, or ``position`` for an array.
+        Path in a message, such as ``pose.pose.position.x``, or ``position`` for an array.
     values
         Numbers (N,), numbers (N, k), or texts (N,) as objects.
     units
         One for each column; empty where it is not known or there is none.
     labels
-        What the k entries of an array are called; empty for one value a message.
+        Names of the k entries of an array; empty for one value a message.
     of
-        What the entries are: ``joint``, ``thruster``, or ``entry``.
+        Kind of the entries: ``joint``, ``thruster``, or ``entry``.
     """
 
     path: str
@@ -259,11 +259,11 @@ _KEYWORD = re.compile(
 """Keywords of MATLAB, which no variable may be named by."""
 
 _QUOTED = re.compile(r'[,"\r\n]')
-"""What a text in CSV is in quotes for."""
+"""Characters for which a text in CSV is quoted."""
 
 
 class ExportFormat(str, Enum):
-    """What :func:`export` writes."""
+    """File formats of :func:`export`."""
 
     CSV = "csv"
     PARQUET = "parquet"
@@ -272,7 +272,7 @@ class ExportFormat(str, Enum):
 
 @dataclass(frozen=True)
 class Export:
-    """What was written.
+    """Result of an export.
 
     Attributes
     ----------

@@ -278,7 +278,7 @@ class BagWriter:
         self._finish_chunk()
 
     def close(self) -> None:
-        """Write what is left and the summary, and close the file; a second call does nothing.
+        """Write the rest and the summary, and close the file; a second call does nothing.
 
         Raises
         ------
@@ -374,7 +374,7 @@ class BagWriter:
                     )
 
     def check(self) -> None:
-        """Find out whether the file is still there, under its name, with all that was written.
+        """Check that the file is still in its place, with its full size.
 
         Raises
         ------

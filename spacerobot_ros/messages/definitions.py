@@ -152,7 +152,10 @@ def _share_folder(package: str) -> Path:
 
 @cache
 def fields_of(type_name: str) -> Fields:
-    """Return the fields of an installed type and of all types in it; raises as the above."""
+    """Return the fields of an installed type and of all types in it.
+
+    Raises as :func:`message_definition` does.
+    """
     return dict(get_types_from_msg(message_definition(type_name), type_name))
 
 
@@ -183,7 +186,7 @@ class MessageTypes:
         return self._store.serialize_cdr(message, message.__msgtype__)
 
     def decoder(self, type_name: str, text: bytes) -> Callable[[bytes], Any]:
-        """Return what decodes the messages of a type, given the text of its schema.
+        """Return the function that decodes messages of a type, given the text of its schema.
 
         Raises
         ------
@@ -224,7 +227,7 @@ def _layout(fields: Any) -> list[Any]:
 
 @lru_cache(maxsize=64)
 def _known(type_name: str, text: bytes) -> tuple[Typestore, Any]:
-    """Return a store of what a text defines, and the code for the type: made once for all bags.
+    """Return a store of the types in a text, and the code for the type: made once for all bags.
 
     Raises
     ------

@@ -68,7 +68,7 @@ class CoordinatedControlNode(CommanderNode):
                 kind, topic, partial(self._on_reference, topic), STREAM, raw=True
             )
 
-    def start_sentence(self) -> str:
+    def start_message(self) -> str:
         """Return what it controls by which law, and where goals are taken."""
         config, topic = self.config, self.resolve_topic_name("goal_pose")
         return (

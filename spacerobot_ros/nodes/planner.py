@@ -79,7 +79,7 @@ class PlannerNode(CommanderNode):
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
         self.create_service(Trigger, "~/statistics", self._on_statistics)
 
-    def start_sentence(self) -> str:
+    def start_message(self) -> str:
         """Return how it plans, and where goals are taken."""
         config, topic = self.config, self.resolve_topic_name("goal_pose")
         return (

@@ -42,7 +42,7 @@ from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_sta
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
-from spacerobot_ros.nodes.common.streams import RawInput, RawStream, Take
+from spacerobot_ros.nodes.common.streams import StreamTaps, Take
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns, set_stamp
 from spacerobot_ros.topics import NOT_RECORDED
@@ -64,7 +64,7 @@ _COMMON_NODES = {
     "planner/status": "planner",
     "controller/status": "coordinated_control",
 }
-"""Topics whose publishers have parameters that belong into the bag, and what the record is called.
+"""Topics whose publishers have parameters that belong into the bag, and the name of the record.
 
 A node that publishes them is configured: its parameters keep their values."""
 
@@ -95,10 +95,10 @@ class RecorderNode(FlightNode):
     depends_on = (Role.PLANT,)
     config: RecorderConfig
     recording: Recording | None = None
-    """What is being recorded, or was last."""
+    """The present recording, or the last one."""
 
     def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
-        self._taps = _StreamTaps()
+        self._taps = StreamTaps()
         self._stamps = _Stamps()
         self._asked: dict[str, RemoteParameters | None] = {}
         """The records of parameters that are in the bag, or that a node is asked for."""
@@ -119,9 +119,9 @@ class RecorderNode(FlightNode):
             max_duration_ns=round(config.max_duration * SECOND),
         )
         self.recording = Recording(writer, config.clock_wait, self._on_failure)
-        self._clock = self.resolve_topic_name(_CLOCK)
+        self._clock_topic = self.resolve_topic_name(_CLOCK)
         self._wanted = {self.resolve_topic_name(topic) for topic in config.topics.split()}
-        self._shared = {self._clock, *map(self.resolve_topic_name, _SHARED)}
+        self._shared = {self._clock_topic, *map(self.resolve_topic_name, _SHARED)}
         self._asked = {}
         frames = tuple(map(self.resolve_topic_name, (TRANSFORMS, STATIC_TRANSFORMS)))
         self._listeners: dict[str, Take] = {}
@@ -150,7 +150,7 @@ class RecorderNode(FlightNode):
         self.describe("spacerobot", {"version": __version__})
         for title, values in _descriptions(config.describe):
             self.describe(title, values)
-        if self._wanted and self._clock not in self._wanted:
+        if self._wanted and self._clock_topic not in self._wanted:
             self._follow_clock(self.recording)
         self.scan()
 
@@ -161,8 +161,8 @@ class RecorderNode(FlightNode):
             # Without the name: what two equal flights record is equal.
             self.report_event(Event(EventKind.RECORDING, "Recording has begun."))
 
-    def start_sentence(self) -> str:
-        """Return where it records to."""
+    def start_message(self) -> str:
+        """Return the path of the bag in one message."""
         return f"Records into {self.recording.writer.path}." if self.recording else ""
 
     def deactivate(self) -> None:
@@ -191,7 +191,7 @@ class RecorderNode(FlightNode):
         Raises
         ------
         RecordingError
-            The disk refused what was left.
+            The disk refused the rest of the data.
         """
         self._taps.release()
         for question in filter(None, self._asked.values()):
@@ -206,7 +206,7 @@ class RecorderNode(FlightNode):
 
         To be called before the recorder is configured. Messages are then recorded in the order of
         their publication, and a plant's commands as the plant received them. Other topics are
-        subscribed, and so is what a node outside publishes too.
+        subscribed, and so are topics that a node outside publishes too.
         """
         self._taps.nodes = [*nodes, self]
 
@@ -227,7 +227,7 @@ class RecorderNode(FlightNode):
 
     @property
     def failure(self) -> RecordingError | None:
-        """Why the recording has ended early."""
+        """The error that has ended the recording; None without."""
         return self.recording.failure if self.recording is not None else None
 
     def describe(self, name: str, values: dict[str, str]) -> None:
@@ -264,13 +264,13 @@ class RecorderNode(FlightNode):
     def flush(self) -> None:
         """Hand the recorded data to the operating system, and report lost messages."""
         if self.recording is not None:
-            clocks = self.count_publishers(self._clock)
+            clocks = self.count_publishers(self._clock_topic)
             self.recording.flush(clock_is_published=clocks > 0)
             self._publish_losses(self.recording)
             if clocks > 1:
                 self.get_logger().warning(
-                    f"{clocks} clocks are published on '{self._clock}': the times of the bag jump "
-                    "from one to the other. Give each stack a namespace and a clock of its own "
+                    f"{clocks} clocks are published on '{self._clock_topic}': the times of the bag "
+                    "jump from one to the other. Give each stack its own namespace and clock "
                     "(--ros-args -r __ns:=/NAME -r /clock:=clock).",
                     throttle_duration_sec=_LOSS_LOG_PERIOD,
                 )
@@ -280,7 +280,7 @@ class RecorderNode(FlightNode):
     def _is_chosen(self, topic: str, type_name: str) -> bool:
         """Whether a topic is recorded: one that is asked for, or else all of the stack.
 
-        A stack in a namespace is what is in it, and what stacks have in common. Only one clock
+        A stack in a namespace has the topics in it and the shared ones. Only one clock
         gives the times of a bag; those of other stacks would say nothing in it.
         """
         if self._wanted:
@@ -312,9 +312,9 @@ class RecorderNode(FlightNode):
         def on_clock(raw: bytes) -> None:
             recording.set_clock(first_time_ns(raw))
 
-        if not self._taps.tap(self._clock, on_clock, self.count_publishers(self._clock)):
-            depth = QoSProfile(depth=_QUEUE)
-            self.create_subscription(Clock, self._clock, on_clock, depth, raw=True)
+        topic = self._clock_topic
+        if not self._taps.tap(topic, on_clock, self.count_publishers(topic)):
+            self.create_subscription(Clock, topic, on_clock, QoSProfile(depth=_QUEUE), raw=True)
 
     def _record(self, recording: Recording, topic: str, type_name: str) -> None:
         publishers = self.get_publishers_info_by_topic(topic)
@@ -330,7 +330,7 @@ class RecorderNode(FlightNode):
             return
         self._recorded.add(topic)
         self._ask_for_parameters(topic, publishers)
-        record = _take(recording, self._stamps, topic, kind, channel, self._clock)
+        record = _take(recording, self._stamps, topic, kind, channel, self._clock_topic)
         take = _both(record, self._listeners.get(topic))
         qos = _subscribed_qos(offered)
         if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
@@ -340,13 +340,13 @@ class RecorderNode(FlightNode):
         events = loss_events(recording, topic)
         self.create_subscription(kind, topic, take, qos, event_callbacks=events, raw=True)
 
-    # -- what the recorder reports ------------------------------------------------------------
+    # -- reports ------------------------------------------------------------------------------
 
     def _on_failure(self, error: RecordingError) -> None:
         """Report why nothing is recorded any more; the other nodes go on."""
-        sentence = f"Recording has ended: {error}"
-        self.get_logger().error(sentence)
-        self._report(EventKind.RECORDING_FAILED, sentence, level=2)
+        message = f"Recording has ended: {error}"
+        self.get_logger().error(message)
+        self._report(EventKind.RECORDING_FAILED, message, level=2)
         self._publish_state()
 
     def _check(self) -> None:
@@ -361,17 +361,17 @@ class RecorderNode(FlightNode):
             self._splits = recording.writer.splits
             self._report(EventKind.FILE_SPLIT, f"Recording goes on in {recording.writer.path}.")
 
-    def _report(self, kind: EventKind, sentence: str, level: int = 0) -> None:
+    def _report(self, kind: EventKind, message: str, level: int = 0) -> None:
         bag = str(self.recording.writer.path) if self.recording is not None else ""
-        self.report_event(Event(kind, sentence, level, about={"bag": bag}))
+        self.report_event(Event(kind, message, level, about={"bag": bag}))
 
     def _publish_losses(self, recording: Recording) -> None:
         if not recording.lost:
             return
-        sentence = f"{recording.lost.total()} messages were lost on their way to the recorder."
-        self.get_logger().warning(sentence, throttle_duration_sec=_LOSS_LOG_PERIOD)
+        message = f"{recording.lost.total()} messages were lost on their way to the recorder."
+        self.get_logger().warning(message, throttle_duration_sec=_LOSS_LOG_PERIOD)
         counts = dict(sorted(recording.lost.items()))
-        self._publish("lost messages", DiagnosticStatus.WARN, sentence, counts)
+        self._publish("lost messages", DiagnosticStatus.WARN, message, counts)
 
     def _publish_state(self) -> None:
         recording = self.recording
@@ -391,15 +391,13 @@ class RecorderNode(FlightNode):
             },
         )
 
-    def _publish(
-        self, what: str, level: bytes, sentence: str, values: Mapping[str, object]
-    ) -> None:
+    def _publish(self, what: str, level: bytes, message: str, values: Mapping[str, object]) -> None:
         # A publisher without need would be one more thing to wait for and to record.
         if self._diagnostics is None:
             self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
         name = diagnostic_name(self.get_fully_qualified_name(), what)
         bag = "" if self.recording is None else self.recording.writer.path.name
-        array = DiagnosticArray(status=[diagnostic_status(name, level, sentence, values, bag)])
+        array = DiagnosticArray(status=[diagnostic_status(name, level, message, values, bag)])
         now_ns = self.recording.now_ns if self.recording is not None else 0
         set_stamp(array.header.stamp, now_ns)
         self._diagnostics.publish(array)
@@ -495,51 +493,6 @@ class _RecordedTransforms:
         recording.record(self._channel, message, time_ns)
 
 
-class _StreamTaps:
-    """Listens to the streams of nodes of this process, where these carry all of a topic."""
-
-    def __init__(self) -> None:
-        self.nodes: Sequence[FlightNode] = ()
-        self._tapped: dict[str, list[RawStream]] = {}
-
-    def tap(self, topic: str, listener: Take, publishers: int) -> bool:
-        """Listen to the streams of a topic; return whether they carry those of all publishers."""
-        streams = self._streams(topic, publishers)
-        if streams:
-            self._tapped[topic] = streams
-        for stream in streams:
-            stream.listen(listener)
-        return bool(streams)
-
-    def release_incomplete(self, count_publishers: Callable[[str], int]) -> list[str]:
-        """Release topics that have changed their publishers or nodes, and return which."""
-        changed = [
-            topic
-            for topic, streams in self._tapped.items()
-            if self._streams(topic, count_publishers(topic)) != streams
-        ]
-        for topic in changed:
-            self._release(topic)
-        return changed
-
-    def release(self) -> None:
-        """Release everything."""
-        for topic in list(self._tapped):
-            self._release(topic)
-
-    def _release(self, topic: str) -> None:
-        for stream in self._tapped.pop(topic):
-            stream.unlisten()
-
-    def _streams(self, topic: str, publishers: int) -> list[RawStream]:
-        """Return the streams that carry every message of a topic, empty if some may escape."""
-        found = [s for node in self.nodes for s in node.raw_streams if s.topic == topic]
-        for stream in found:
-            if isinstance(stream, RawInput):
-                return [stream]
-        return found if len(found) == publishers else []
-
-
 class _Stamps:
     """Reads the times that messages begin with; those of one state begin with the same bytes."""
 
@@ -584,7 +537,7 @@ def _take(
 
 
 def _both(record: Take, listener: Take | None) -> Take:
-    """Return what records a message, and shows it to a listener then."""
+    """Return a callback that records a message, then calls a listener."""
     if listener is None:
         return record
 
@@ -596,7 +549,7 @@ def _both(record: Take, listener: Take | None) -> Take:
 
 
 def loss_events(recording: Recording, topic: str) -> SubscriptionEventCallbacks:
-    """Return what a subscription is created with, so that lost messages are counted.
+    """Return event callbacks of a subscription that count lost messages.
 
     The middleware reports messages that their publisher no longer kept when they should have been
     sent again; it does not report the overflow of the subscription's own queue (Fast DDS).

@@ -42,10 +42,10 @@ _ACKNOWLEDGED = Duration(seconds=2)
 """How long a reader may take for the last messages."""
 
 _LONGEST_WAIT_NS = 3600 * SECOND
-"""What a timer holds is less than the times that a bag may have."""
+"""Longest period of a timer, which is shorter than times in a bag may be."""
 
 _DEEPEST_QUEUE = 10_000
-"""The middleware takes memory for queues: what a bag says may be anything."""
+"""Limit of depths in bags, which may be anything: the middleware allocates queues."""
 
 _CLOCK = "/clock"
 _STATUS, _SEEK = "replay/status", "replay/seek"
@@ -59,11 +59,11 @@ _BAD_BAG = 2
 
 
 class ReplayNode(FlightNode):
-    """Publishes what a bag holds, as bytes, with the quality of service that was recorded.
+    """Publishes the messages of a bag as bytes, with the recorded quality of service.
 
     It waits for readers to be matched, keeps the spacing of the log times divided by ``rate``, and
     has its process end with the bag. Meshes of ``robot_description`` that are not on this machine
-    are files with what the bag carries, as long as it lasts.
+    are written from the bag into files that are deleted at the end.
 
     Services: ``~/pause`` (SetBool), ``~/resume`` and, while paused, ``~/step`` (Trigger): the next
     message. A time on ``replay/seek`` is where it goes on, and ``replay/status`` says where it is.
@@ -75,7 +75,7 @@ class ReplayNode(FlightNode):
 
     def __init__(self, name: str = "replay", **kwargs: Any) -> None:
         self._sends: dict[str, Callable[[bytes], None]] = {}
-        self._timers: list[Timer] = []
+        self._playing_timers: list[Timer] = []
         self._close_bag: Callable[[], None] = lambda: None
         self._meshes: MeshFolder | None = None
         super().__init__(name, **kwargs)
@@ -124,25 +124,27 @@ class ReplayNode(FlightNode):
         self._timer.cancel()
         self._waiting = self.create_timer(_READER_CHECK, self._on_reader_check, clock=self._steady)
         reports = self.create_timer(_STATUS_PERIOD, self._publish_status, clock=self._steady)
-        self._timers = [self._timer, self._waiting, reports]
+        self._playing_timers = [self._timer, self._waiting, reports]
         rate = self.config.clock
         if rate:
-            self._timers.append(self.create_timer(1.0 / rate, self._on_clock, clock=self._steady))
+            self._playing_timers.append(
+                self.create_timer(1.0 / rate, self._on_clock, clock=self._steady)
+            )
         if not self.config.wait:
             self._begin()
 
-    def start_sentence(self) -> str:
-        """Return what is replayed."""
+    def start_message(self) -> str:
+        """Return bag, number of topics and rate in one message."""
         config = self.config
         return f"Replays {len(self._outputs)} topic(s) of {config.bag} at {config.rate:g} times."
 
     def deactivate(self) -> None:
         """Pause; the replay continues from the same message when it is activated again."""
-        if self._timers:
+        if self._playing_timers:
             self._playback.pause(self._now())
-        for timer in self._timers:
+        for timer in self._playing_timers:
             self.destroy_timer(timer)
-        self._timers = []
+        self._playing_timers = []
 
     def cleanup(self) -> None:
         """Close the bag, and remove the files of its meshes."""
@@ -179,12 +181,12 @@ class ReplayNode(FlightNode):
                     f"Topic '{topic.name}' cannot be replayed as '{name}': that is no topic name."
                 ) from None
             except SpaceRobotError as error:
-                sentence = f"Topic '{topic.name}' is not replayed: {error}"
+                message = f"Topic '{topic.name}' is not replayed: {error}"
                 # Every bag has transforms, and few machines without ROS have their type.
                 if topic.type_name == TRANSFORM_TYPE:
-                    self.get_logger().info(sentence)
+                    self.get_logger().info(message)
                 else:
-                    self.get_logger().warning(sentence)
+                    self.get_logger().warning(message)
                 continue
             self._outputs.append(publisher)
             send = raw_publish(publisher)
@@ -327,7 +329,7 @@ class ReplayNode(FlightNode):
             self._end_with(error)
 
     def _publish_status(self) -> None:
-        """Say where the replay is."""
+        """Publish position, rate and state of the replay."""
         playback = self._playback
         position = playback.bag_time(self._now()) - playback.start_ns
         status = ReplayStatus(
@@ -337,9 +339,9 @@ class ReplayNode(FlightNode):
             ended=playback.ended,
             rate=self.config.rate,
         )
-        sentence = f"The replay is at {status.position_s:.3f} s of {status.duration_s:.3f} s."
+        message = f"The replay is at {status.position_s:.3f} s of {status.duration_s:.3f} s."
         name = self.get_fully_qualified_name()
-        self._status_topic.publish(diagnostic_status(name, b"\0", sentence, status.to_values()))
+        self._status_topic.publish(diagnostic_status(name, b"\0", message, status.to_values()))
 
     def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if not (self._paused and self._begun):
@@ -362,7 +364,7 @@ class ReplayNode(FlightNode):
 
 
 def _described(send: Callable[[bytes], None], meshes: MeshFolder) -> Callable[[bytes], None]:
-    """Return what sends robot descriptions with the files of the meshes that only the bag has."""
+    """Return a function that sends robot descriptions with files of the bag's meshes."""
 
     def send_with_files(data: bytes) -> None:
         try:
@@ -377,7 +379,7 @@ def _described(send: Callable[[bytes], None], meshes: MeshFolder) -> Callable[[b
 
 
 def _profile(qos: QosProfile) -> QoSProfile:
-    """Return what a publisher offers; depths are not always in a bag, and then like the stack's."""
+    """Return the QoS of a publisher; a depth that a bag lacks is that of the stack."""
     latched = qos.durability == "transient_local"
     best_effort = qos.reliability == "best_effort"
     return QoSProfile(

@@ -1,1 +1,1 @@
-"""What all nodes share: life cycle, parameters, serialised messages."""
+"""Parts shared by all nodes: life cycle, parameters, serialised messages."""

@@ -33,8 +33,8 @@ from spacerobot_ros.nodes.common.messages import (
     KnownFrames,
     diagnostic_name,
     diagnostic_status,
+    goal_description,
     goal_of,
-    goal_sentence,
 )
 from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
@@ -197,7 +197,7 @@ class CommanderNode(FlightNode):
         stamp = message.header.stamp
         accepted = commander.receive_goal(key, stamp.sec, stamp.nanosec, read)
         if accepted is not None:
-            self.log("info", goal_sentence(part, accepted.goal_id, message, accepted.goal))
+            self.log("info", goal_description(part, accepted.goal_id, message, accepted.goal))
 
     def _goal_shape(self) -> Array | None:
         """Return the shape (n,) that goals are to end in; None: any."""

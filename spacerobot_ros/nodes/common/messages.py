@@ -43,7 +43,7 @@ def message_class(type_name: str) -> Any:
     Raises
     ------
     SpaceRobotError
-        Its package is not installed; the sentence goes after the name of a topic.
+        Its package is not installed; the message goes after the name of a topic.
     """
     try:
         message_definition(type_name)
@@ -62,13 +62,13 @@ def diagnostic_name(node: str, part: str) -> str:
 
 
 def diagnostic_status(
-    name: str, level: bytes, sentence: str, values: Mapping[str, object], hardware_id: str = ""
+    name: str, level: bytes, message: str, values: Mapping[str, object], hardware_id: str = ""
 ) -> DiagnosticStatus:
     """Return the status of the component ``name``, with values as texts."""
     return DiagnosticStatus(
         level=level,
         name=name,
-        message=sentence,
+        message=message,
         hardware_id=hardware_id,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
     )
@@ -145,7 +145,7 @@ def goal_of(
     return Goal.checked(moved[:3], moved[3:], shape)
 
 
-def goal_sentence(part: str, goal_id: str, message: PoseStamped, goal: Goal) -> str:
+def goal_description(part: str, goal_id: str, message: PoseStamped, goal: Goal) -> str:
     """Return one line about a goal that has come."""
     position = ", ".join(f"{x:.4g}" for x in goal.position)
     quaternion = ", ".join(f"{x:.4g}" for x in goal.quaternion)

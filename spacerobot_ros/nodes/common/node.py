@@ -1,4 +1,4 @@
-"""What all nodes of the stack share: managed life, parameters, raw streams."""
+"""Base class of all nodes: life cycle, parameters, raw streams, events, failures."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from rclpy.lifecycle.node import LifecycleState
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import serialize_message
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
@@ -30,8 +29,8 @@ from std_srvs.srv import Trigger
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
 from spacerobot_ros.nodes.common.streams import Connections, RawInput, RawOutput, RawStream, Take
 from spacerobot_ros.nodes.common.watchdog import Liveness, Pulse, Role, Silence
@@ -49,7 +48,7 @@ EVENTS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-"""What a late subscriber must still get: reliable, transient local, depth 1."""
+"""A late subscriber gets the last message: reliable, transient local, depth 1."""
 
 AUTOSTART = Parameter(
     "autostart",
@@ -77,7 +76,7 @@ class FlightNode(LifecycleNode):
 
     Subclasses give ``Config``, the declaration of their parameters, and the four hooks
     :meth:`configure`, :meth:`activate`, :meth:`deactivate` and :meth:`cleanup`, which raise
-    :class:`SpaceRobotError` with a sentence when they cannot.
+    :class:`SpaceRobotError` when they cannot.
 
     An exception of a callback (subscription, timer, service) ends neither the process nor the
     executor: the node is deactivated, calls :meth:`on_failure`, and sends an event; a supervisor
@@ -101,7 +100,7 @@ class FlightNode(LifecycleNode):
     """The frozen dataclass that declares the node's parameters."""
 
     role: ClassVar[Role | None] = None
-    """What other nodes depend on this one for."""
+    """Role of the node that others depend on."""
 
     depends_on: ClassVar[tuple[Role, ...]] = ()
     """The roles of the nodes that are noticed when they are silent."""
@@ -146,7 +145,7 @@ class FlightNode(LifecycleNode):
         Raises
         ------
         SpaceRobotError
-            A transition failed; the sentence says why.
+            A transition failed; the message says why.
         """
         self.require(self.trigger_configure)
         self.require(self.trigger_activate)
@@ -157,7 +156,7 @@ class FlightNode(LifecycleNode):
         Raises
         ------
         SpaceRobotError
-            It failed; the sentence, which is not logged as well, says why.
+            It failed; the message, which is not logged as well, says why.
         """
         self._raising = True
         try:
@@ -187,9 +186,9 @@ class FlightNode(LifecycleNode):
         Parameters
         ----------
         kind, topic
-            Of the messages.
+            Type of the messages and name of the topic.
         callback
-            What is done with each.
+            Called with each message.
         number
             Called before with the number that its publisher has given to the message, if wanted.
         """
@@ -210,9 +209,8 @@ class FlightNode(LifecycleNode):
         if event.time_s is None:
             event = replace(event, time_s=self.simulated_time_s)
         values = event.to_values(time.time() if self.events_have_wall_time else None)
-        name, level = self.get_fully_qualified_name(), bytes([event.level])
-        message = diagnostic_status(name, level, event.message, values)
-        self._event_stream.take(serialize_message(message))
+        name = self.get_fully_qualified_name()
+        self._event_stream.take(StatusRecord(name, event.level, event.message, values).encoded())
 
     @property
     def simulated_time_s(self) -> float | None:
@@ -279,27 +277,27 @@ class FlightNode(LifecycleNode):
             return  # The executor had the callback in its queue when its entity was destroyed.
         self.get_logger().debug("".join(traceback.format_exception(error)))
         if isinstance(error, SpaceRobotError):
-            sentence = str(error)
+            message = str(error)
         else:
-            sentence = f"Node '{self.get_name()}' has failed at {what}: {_described(error)}."
-        if sentence == self._failure:
+            message = f"Node '{self.get_name()}' has failed at {what}: {_described(error)}."
+        if message == self._failure:
             return  # It is known, and may come with every message.
-        self._report_failure(sentence, error)
+        self._report_failure(message, error)
         try:
             if self.is_active:
                 self.trigger_deactivate()
         except Exception as second:  # There must be an end to it.
             self.get_logger().error(f"Node '{self.get_name()}' cannot stop: {_described(second)}.")
-        self.fault = SpaceRobotError(sentence)
+        self.fault = SpaceRobotError(message)
 
-    def _report_failure(self, sentence: str, error: Exception) -> None:
-        self._failure = sentence
-        self.get_logger().error(sentence)
+    def _report_failure(self, message: str, error: Exception) -> None:
+        self._failure = message
+        self.get_logger().error(message)
         try:
-            self.on_failure(sentence, error)
+            self.on_failure(message, error)
         except Exception as second:
             self.get_logger().error(f"Node '{self.get_name()}': {_described(second)}.")
-        self.report_event(Event(EventKind.FAILED, sentence, level=2))
+        self.report_event(Event(EventKind.FAILED, message, level=2))
 
     @property
     def parameter_values(self) -> dict[str, Value]:
@@ -356,23 +354,23 @@ class FlightNode(LifecycleNode):
         """Create the entities that exist as long as the node, such as its status."""
 
     def configure(self) -> None:
-        """Create what the node needs: model, publishers, subscriptions."""
+        """Create model, publishers, subscriptions and services."""
 
     def activate(self) -> None:
         """Begin to work."""
 
-    def start_sentence(self) -> str:
-        """Return the sentence that the node logs when it becomes active."""
+    def start_message(self) -> str:
+        """Return the message that the node logs when it becomes active."""
         return f"Node '{self.get_name()}' is active."
 
     def deactivate(self) -> None:
         """Stop working, keeping everything."""
 
     def cleanup(self) -> None:
-        """Give up what configure created."""
+        """Release the resources of configure."""
 
-    def on_failure(self, sentence: str, error: Exception) -> None:
-        """Say in the status of the node that an error stops it; it is deactivated then."""
+    def on_failure(self, message: str, error: Exception) -> None:
+        """Report in the status of the node that an error stops it; it is deactivated then."""
 
     def interrupt(self) -> None:
         """Give up a computation that takes long; called from another thread when all is to end."""
@@ -420,11 +418,11 @@ class FlightNode(LifecycleNode):
         return self._report_transition(result, EventKind.CONFIGURED)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run the hook; the heart of the node beats from then on."""
+        """Run the hook and begin the heartbeats."""
         result = self._run(self.activate)
         if result is TransitionCallbackReturn.SUCCESS and self._liveness is not None:
             self._liveness.begin()
-            self.get_logger().info(self.start_sentence())
+            self.get_logger().info(self.start_message())
         return self._report_transition(result, EventKind.ACTIVATED)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -439,13 +437,13 @@ class FlightNode(LifecycleNode):
         return self._report_transition(result, EventKind.CLEANED_UP)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop working and give everything up."""
+        """Stop working and release all resources."""
         self._end_heartbeats()
         self._run(self.deactivate)
         return self._report_transition(self._run(self.cleanup), EventKind.SHUT_DOWN)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Give everything up after a transition that failed; the node may be configured again."""
+        """Release all resources after a failed transition; the node may be configured again."""
         self._end_heartbeats()
         with suppress(Exception):  # What failed may have left anything.
             self.cleanup()
@@ -469,11 +467,11 @@ class FlightNode(LifecycleNode):
                 self._report_failure(str(error), error)
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
-            # rclpy drops what a transition raises; a defect must at least be seen.
-            sentence = f"Node '{self.get_name()}' has failed: {_described(error)}."
-            self.fault = SpaceRobotError(sentence)
+            # rclpy drops exceptions of transitions; a defect must at least be logged.
+            message = f"Node '{self.get_name()}' has failed: {_described(error)}."
+            self.fault = SpaceRobotError(message)
             self.get_logger().debug(traceback.format_exc())
-            self._report_failure(sentence, error)
+            self._report_failure(message, error)
             return TransitionCallbackReturn.ERROR
         self.fault = None
         return TransitionCallbackReturn.SUCCESS
@@ -517,7 +515,7 @@ class FlightNode(LifecycleNode):
         return [*self.timers, *self.subscriptions, *self.services, *self.publishers]
 
     def _destroy_configured(self) -> None:
-        """Destroy what configure made; the services of every ROS node stay for the next start."""
+        """Destroy the entities of configure; the services of every ROS node stay."""
         self._fix_parameters(fixed=False)
         self.raw_streams[:] = self._permanent_streams
         if self._liveness is not None:
@@ -543,7 +541,7 @@ class FlightNode(LifecycleNode):
         Raises
         ------
         ParameterError
-            There is one; the sentence says what to do.
+            There is one; the message says what to do.
         """
         for change in changes:
             if change.name == AUTOSTART.name:

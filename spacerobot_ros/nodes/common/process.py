@@ -1,4 +1,4 @@
-"""A node in a process of its own, and what every process of the stack does about discovery."""
+"""A node in a process of its own; discovery and transport of every process of the stack."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _use_sockets_without_shared_memory() -> None:
         os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
         _LOG.warning(
             "%s has %d kB that can be used: messages go through sockets "
-            "(FASTDDS_BUILTIN_TRANSPORTS=UDPv4). What killed processes have left there, "
+            "(FASTDDS_BUILTIN_TRANSPORTS=UDPv4). Files of killed processes there, "
             "fastrtps_*, may be deleted while nothing runs.",
             _SHARED_MEMORY,
             free // 1024,
@@ -83,9 +83,9 @@ def use_private_discovery() -> None:
 def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = None) -> int:
     """Run one node in its own process until SIGINT, SIGTERM, SIGHUP, or the end of its parent.
 
-    A parent counts only if it has started this process to end with it; what a shell or ``ros2 run``
-    has started does not. Returns the exit code: 0 after a signal, 2 when the node cannot start (the
-    sentence is on standard error), the node's own when it ends by itself.
+    A parent counts only if it has started this process to end with it: not a shell or ``ros2 run``.
+    Returns the exit code: 0 after a signal, 2 when the node cannot start (the message is on
+    standard error), the node's own when it ends by itself.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
             print(f"{error}", file=sys.stderr, flush=True)
             return 2
         node.on_end = stop.set_result
-        # What is there now stays; going through it again in flight would take tens of ms.
+        # Present objects stay; collecting among them in flight would take tens of ms.
         gc.collect()
         gc.freeze()
         executor = EventsExecutor()

@@ -125,7 +125,7 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
     Raises
     ------
     ParameterError
-        A given value is refused; the sentence names the parameter.
+        A given value is refused; the message names the parameter.
     """
     values = {}
     for parameter in parameters:
@@ -166,7 +166,7 @@ def fix(node: Node, parameters: Iterable[Parameter], *, fixed: bool) -> None:
 def typed(
     parameters: Mapping[str, Parameter], changes: Iterable[RosParameter]
 ) -> list[RosParameter]:
-    """Return what a user wants to set, in the types of the declarations; others as they are.
+    """Return changed parameters in the types of their declarations; others as they are.
 
     So a whole number does for a real one (``ros2 param set /plant tick_rate 50``), and an empty
     list for any.
@@ -174,7 +174,7 @@ def typed(
     Raises
     ------
     ParameterError
-        A value is refused; the sentence names the parameter.
+        A value is refused; the message names the parameter.
     """
     known = [(parameters.get(change.name), change) for change in changes]
     return [

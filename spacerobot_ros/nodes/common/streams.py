@@ -5,9 +5,9 @@ from __future__ import annotations
 import inspect
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -87,24 +87,24 @@ def raw_publish(publisher: Publisher) -> Take:
 class RawStream:
     """The messages of one topic that pass through a node.
 
-    A subscription of its own is dear for a component of the same process that wants every
-    message: the middleware copies each one, queues it, and wakes the executor for it.
+    For a component of the same process that needs every message, a subscription is expensive: the
+    middleware copies each message, queues it, and wakes the executor.
 
     Parameters
     ----------
     topic
         Its full name.
     take
-        What is done with each message.
+        Called with each message.
     """
 
     def __init__(self, topic: str, take: Take) -> None:
         self.topic = topic
         self.take = self._take = take
-        """``take`` is what the owner calls with each message; look it up every time."""
+        """``take``: called by the owner with each message; looked up every time."""
 
-    def listen(self, listener: Take) -> None:
-        """Have every message shown to a listener, before it is taken; one listener at a time."""
+    def add_listener(self, listener: Take) -> None:
+        """Call a listener with every message before ``take``; one listener at a time."""
         act = self._take
 
         def take(raw: bytes) -> None:
@@ -113,13 +113,13 @@ class RawStream:
 
         self.take = take
 
-    def unlisten(self) -> None:
-        """Call the listener no more."""
+    def remove_listener(self) -> None:
+        """Stop calling the listener."""
         self.take = self._take
 
 
 class RawOutput(RawStream):
-    """What one publisher publishes: ``take`` sends a message on its way.
+    """Messages of one publisher: ``take`` publishes a message.
 
     A new listener is shown the last message of a latched topic first, as a subscription is.
 
@@ -145,20 +145,20 @@ class RawOutput(RawStream):
         self.await_readers: Callable[[Duration], bool] = publisher.wait_for_all_acked
         """Waits until they have received everything; returns whether they have, in time."""
 
-    def listen(self, listener: Take) -> None:
-        """Have every message shown to a listener, the last one of a latched topic at once."""
-        super().listen(listener)
+    def add_listener(self, listener: Take) -> None:
+        """Call a listener with every message, with the last one of a latched topic at once."""
+        super().add_listener(listener)
         if self._last is not None:
             listener(self._last)
 
 
 class RawInput(RawStream):
-    """What a node receives on a topic, from any publisher: ``take`` is the node's callback."""
+    """Messages received on a topic, from any publisher: ``take`` is the node's callback."""
 
     def callback(
         self, number: Callable[[int], None] | None, on_error: Callable[[Exception], None]
     ) -> Callable[..., None]:
-        """Return what a subscription calls with each message.
+        """Return the callback of a subscription.
 
         Parameters
         ----------
@@ -186,3 +186,57 @@ class RawInput(RawStream):
         # By the number of parameters rclpy finds out that the information is wanted.
         take_numbered.__signature__ = _TWO_PARAMETERS  # type: ignore[attr-defined]
         return take_numbered
+
+
+class StreamingNode(Protocol):
+    """A node whose streams others may listen to."""
+
+    raw_streams: list[RawStream]
+
+    def get_fully_qualified_name(self) -> str:
+        """Return the name of the node with its namespace."""
+
+
+class StreamTaps:
+    """Listens to the streams of nodes of this process, where these carry all of a topic."""
+
+    def __init__(self) -> None:
+        self.nodes: Sequence[StreamingNode] = ()
+        self._tapped: dict[str, list[RawStream]] = {}
+
+    def tap(self, topic: str, listener: Take, publishers: int) -> bool:
+        """Listen to the streams of a topic; return whether they carry those of all publishers."""
+        streams = self._streams(topic, publishers)
+        if streams:
+            self._tapped[topic] = streams
+        for stream in streams:
+            stream.add_listener(listener)
+        return bool(streams)
+
+    def release_incomplete(self, count_publishers: Callable[[str], int]) -> list[str]:
+        """Release topics that have changed their publishers or nodes, and return which."""
+        changed = [
+            topic
+            for topic, streams in self._tapped.items()
+            if self._streams(topic, count_publishers(topic)) != streams
+        ]
+        for topic in changed:
+            self._release(topic)
+        return changed
+
+    def release(self) -> None:
+        """Release everything."""
+        for topic in list(self._tapped):
+            self._release(topic)
+
+    def _release(self, topic: str) -> None:
+        for stream in self._tapped.pop(topic):
+            stream.remove_listener()
+
+    def _streams(self, topic: str, publishers: int) -> list[RawStream]:
+        """Return the streams that carry every message of a topic, empty if some may escape."""
+        found = [s for node in self.nodes for s in node.raw_streams if s.topic == topic]
+        for stream in found:
+            if isinstance(stream, RawInput):
+                return [stream]
+        return found if len(found) == publishers else []

@@ -12,7 +12,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.experimental import EventsExecutor
-from rclpy.serialization import serialize_message
 from rclpy.timer import Timer
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -20,9 +19,10 @@ from std_srvs.srv import SetBool, Trigger
 from spacerobot_ros.bag.salvage import last_state
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.messages.readers import CommandReader
+from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.shared_parameters import robot_of
-from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
+from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.streams import RawInput
@@ -67,7 +67,7 @@ _RUNNING, _PAUSED, _RESTING = PlantState.RUNNING, PlantState.PAUSED, PlantState.
 
 
 class PlantNode(FlightNode):
-    """Integrates the momentum-conserving model and publishes what a real robot would.
+    """Integrates the momentum-conserving model and publishes the topics of a real robot.
 
     In ``lockstep`` it publishes the state of tick k and steps when the command stamped with that
     tick is there. In ``realtime`` it runs on the wall clock times ``real_time_factor``, holds the
@@ -86,7 +86,7 @@ class PlantNode(FlightNode):
         self._wall_timers: list[Timer] = []
         self._monitor: PlantMonitor | None = None
         self.status = PlantStatus(PlantState.INACTIVE)
-        """What was published last on plant/status."""
+        """Last status on plant/status."""
         super().__init__(name, **kwargs)
 
     @property
@@ -106,7 +106,7 @@ class PlantNode(FlightNode):
 
     @property
     def state(self) -> PlantState:
-        """What the plant does with time and with commands."""
+        """Treatment of time and commands."""
         return self.status.state
 
     @property
@@ -202,7 +202,7 @@ class PlantNode(FlightNode):
         self._commands.rest()
         self._look_at_status()
 
-    def start_sentence(self) -> str:
+    def start_message(self) -> str:
         """Return which robot it is, and how its time runs."""
         config = self.config
         pace = "in lockstep"
@@ -213,15 +213,15 @@ class PlantNode(FlightNode):
             f"{config.tick_rate:g} Hz {pace}."
         )
 
-    def on_failure(self, sentence: str, error: Exception) -> None:
+    def on_failure(self, message: str, error: Exception) -> None:
         """Report the failure, and command nothing when the plant is started again."""
         self._stop_timers()
         self._active = PlantState.FAILED
         reason = "model" if isinstance(error, SpaceRobotError) else "exception"
         if self._monitor is None:
-            self._publish_status(PlantStatus(PlantState.FAILED, sentence, reason))
+            self._publish_status(PlantStatus(PlantState.FAILED, message, reason))
             return
-        self._monitor.failure = reason, sentence
+        self._monitor.failure = reason, message
         self._commands.rest()
         self._look_at_status()
 
@@ -250,12 +250,12 @@ class PlantNode(FlightNode):
         self._wall_timers = []
 
     def cleanup(self) -> None:
-        """Say that there is no plant any more."""
+        """Report that there is no plant any more."""
         self._active, self._monitor = PlantState.INACTIVE, None
         self._publish_status(PlantStatus(PlantState.INACTIVE, "The plant is not configured."))
 
     def _look_at_status(self) -> None:
-        """Publish the status and what has happened, if anything has."""
+        """Publish a changed status and the events since the last call."""
         assert self._monitor is not None
         self._faults_seen = self.plant.active
         events = self._monitor.update(self._active, self.time_ns / SECOND)
@@ -266,9 +266,9 @@ class PlantNode(FlightNode):
 
     def _publish_status(self, status: PlantStatus) -> None:
         self.status = status
-        name, level = self.get_fully_qualified_name(), bytes([status.level])
-        message = diagnostic_status(name, level, status.message, status.to_values())
-        self._status.take(serialize_message(message))
+        name = self.get_fully_qualified_name()
+        record = StatusRecord(name, status.level, status.message, status.to_values())
+        self._status.take(record.encoded())
 
     def _resumed(self, robot: SpaceRobot) -> tuple[InitialState | None, int]:
         """Return the state to start from (None: the configuration's) and its tick.

@@ -65,7 +65,7 @@ class PlantReport:
     node
         Whose they are.
     plant, commands
-        What is reported.
+        Sources of the report.
     real_time
         How well it keeps to the clock; None in lockstep.
     """
@@ -161,16 +161,16 @@ class PlantReport:
 
     def _command_status(self, *, refused: bool) -> DiagnosticStatus:
         commands = self._commands
-        level, sentence = _WARN if refused else _OK, "commands arrive"
+        level, message = _WARN if refused else _OK, "commands arrive"
         if commands.fault:
             level = _ERROR
-            sentence = f"Nothing moves until '~/rearm' is called: {commands.fault}."
+            message = f"Nothing moves until '~/rearm' is called: {commands.fault}."
         elif refused and self._last_refusal:
-            sentence = self._last_refusal
+            message = self._last_refusal
         return diagnostic_status(
             self._name("commands"),
             level,
-            sentence,
+            message,
             {
                 "refused": commands.counts.total(),
                 **{f"refused.{reason.value}": n for reason, n in commands.counts.items()},
@@ -281,7 +281,7 @@ def timing_status(name: str, real_time: RealTime) -> DiagnosticStatus:
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 
-_PATIENCE = 0.5
+_LONGEST_WAIT = 0.5
 """Longest wait for readers, wall s."""
 
 
@@ -295,7 +295,7 @@ class StatePublisher:
     robot
         Whose state it is.
     state
-        What it reports.
+        The reported quantities.
     config
         Names of the frames.
     """
@@ -359,7 +359,7 @@ class StatePublisher:
 
     def await_readers(self) -> None:
         """Wait until all readers have received the states, but not for one that has stopped."""
-        end = time.monotonic() + _PATIENCE
+        end = time.monotonic() + _LONGEST_WAIT
         for output in self._outputs.values():
             left = max(0.0, end - time.monotonic())
             if not output.await_readers(Duration(seconds=left)):
@@ -408,7 +408,7 @@ class TransformPublisher:
             self._static = node.send_raw(self._kind, STATIC_TRANSFORMS, LATCHED)
 
     def publish_static(self, time_ns: int) -> None:
-        """Publish what does not move."""
+        """Publish the transforms of fixed links."""
         if self._static is not None:
             self._static.take(self._frames.static_message(time_ns) or b"")
 
@@ -442,7 +442,7 @@ class LinkMarkers:
         ]
 
     def publish(self, time_ns: int) -> None:
-        """Publish every shape where it is."""
+        """Publish all shapes at their present poses."""
         if not self._targets:
             return
         plant = self._plant

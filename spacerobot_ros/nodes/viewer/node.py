@@ -168,7 +168,7 @@ class ViewerNode(FlightNode):
             1.0 / self.config.update_rate, self._draw, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
 
-    def start_sentence(self) -> str:
+    def start_message(self) -> str:
         """Return the address of the page."""
         return f"Serves the page at {self.url}, drawn {self.config.update_rate:g} times a second."
 
