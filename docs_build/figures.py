@@ -12,7 +12,6 @@ import numpy as np
 
 from spacerobot_ros.control import ControlState, PoseReference
 from spacerobot_ros.control.controller import build_controller
-from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import (
     attitude_error,
@@ -21,6 +20,7 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.planning import GaitSchedule, PlanRequest
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.trials import Problem, state_of, try_method
 

@@ -11,7 +11,7 @@ from spacerobot_ros.version import __version__
 if TYPE_CHECKING:
     from spacerobot_ros.bag import read_bag
     from spacerobot_ros.flight.api import fly, plan
-    from spacerobot_ros.flight.scenario import load_scenario
+    from spacerobot_ros.scenario import load_scenario
 
 __all__ = ["__version__", "fly", "load_scenario", "plan", "read_bag"]
 
@@ -43,7 +43,7 @@ def __getattr__(name: str) -> Any:
 
         return getattr(api, name)
     if name == "load_scenario":
-        from spacerobot_ros.flight.scenario import load_scenario
+        from spacerobot_ros.scenario import load_scenario
 
         return load_scenario
     if name == "read_bag":

@@ -24,12 +24,12 @@ from geometry_msgs.msg import PoseStamped
 
 from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.scenario import Scenario, load_scenario
 from spacerobot_ros.messages.statuses import key_values
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.run import ros
 from spacerobot_ros.session.viewing import viewing

@@ -15,10 +15,10 @@ import numpy.typing as npt
 
 from spacerobot_ros.benchmarks.real_time import finish, stack_in_processes
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState
+from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.processes import MultiProcessStack
 
 GOAL_PERIOD = 12.0

@@ -31,7 +31,6 @@ from std_msgs.msg import Float64MultiArray
 
 from spacerobot_ros.bag import BagWriter
 from spacerobot_ros.benchmarks.engines import dynamics_benchmark, median_cpu_times
-from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import c_compiler
 from spacerobot_ros.nodes import ReplayNode
@@ -39,6 +38,7 @@ from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import PlanRequest
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.run import ros
 from spacerobot_ros.session.stack import InProcessStack
 from spacerobot_ros.simulation import VelocityPlant

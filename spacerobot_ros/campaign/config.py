@@ -13,11 +13,10 @@ import yaml
 
 from spacerobot_ros.campaign.targets import DrawnFlight, Target, description_of, targets_of
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.parameter_files import CONFIGS, number_in
-from spacerobot_ros.flight.scenario import Scenario, scenario_or_robot
 from spacerobot_ros.measures import METRICS, metric_names
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import suggestion
+from spacerobot_ros.scenario import CONFIGS, Scenario, number_in, scenario_or_robot
 
 SAMPLERS = ("random", "latin_hypercube", "sobol", "halton", "saltelli")
 """Samplers; the last one, for sensitivity indices of all orders, is SALib's, the others scipy's."""

@@ -21,10 +21,10 @@ from spacerobot_ros.campaign.draws import needed
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import ParameterError, RecordingError
-from spacerobot_ros.flight.scenario import load_scenario, scenario_text
 from spacerobot_ros.measures import metric_names
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.resources import is_path
+from spacerobot_ros.scenario import load_scenario, scenario_text
 from spacerobot_ros.version import __version__
 
 DRAWN = "draw."

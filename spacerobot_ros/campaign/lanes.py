@@ -41,7 +41,6 @@ from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.lockstep import fly_scenario
-from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.measures import Measures, Outcome, momentum_drift
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
@@ -51,6 +50,7 @@ from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import PlannerStatus, remaining_error
+from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
 

@@ -20,18 +20,18 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import Robots, fly_scenario, require_flyable
 from spacerobot_ros.flight.reading import read_run
-from spacerobot_ros.flight.scenario import Scenario, scenario_text
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.shared_parameters import BelievedRobotConfig, RobotConfig, robot_of
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.registry import build_method
+from spacerobot_ros.scenario import Scenario, scenario_text
 from spacerobot_ros.termination import child_options
 
 
 class _OneByOneEngine(ABC):
-    """Flies one draw after the other; one that cannot be flown does not end the others."""
+    """Flies one draw after the other; a draw that cannot be flown does not end the others."""
 
     name: str
     least = 1
@@ -59,7 +59,7 @@ class _OneByOneEngine(ABC):
         Raises
         ------
         SpaceRobotError
-            Something of it is refused.
+            A parameter, the robot or the goal is refused.
         """
 
 
@@ -87,7 +87,7 @@ class FlightsEngine(_OneByOneEngine):
         Raises
         ------
         SpaceRobotError
-            Something of it is refused.
+            A parameter, the robot or the goal is refused.
         """
         return fly_scenario(
             flight.scenario,
@@ -98,7 +98,7 @@ class FlightsEngine(_OneByOneEngine):
 
 
 def robots_of(flight: DrawnFlight) -> Robots:
-    """Return the models of a flight: built once for all draws that differ in masses alone."""
+    """Return the models of a flight, which all draws that differ in masses alone share."""
     scenario = flight.scenario
     robots = nominal_robots(scenario)
     if "planner" in scenario.commanders:
@@ -110,13 +110,13 @@ def robots_of(flight: DrawnFlight) -> Robots:
 
 
 def nominal_robots(scenario: Scenario) -> Robots:
-    """Return the models of a scenario without dispersions of masses, the same ones each time."""
+    """Return the models of a scenario without dispersions of masses, the same objects each time."""
     plant = description_of(scenario).urdf
 
     def built(node: str, config: RobotConfig) -> SpaceRobot | None:
         text = config.robot_description
         if not (config.robot or text):
-            text = plant  # What commanders believe in that name no robot.
+            text = plant  # The robot of commanders that name none.
         return _built(node, text, config)
 
     return Robots.of(scenario, built)
@@ -136,11 +136,11 @@ class _BuiltMethod:
 
 
 _last_method: _BuiltMethod | None = None
-"""What planned the last flight: its solvers serve all flights, and no plan depends on another."""
+"""The method of the last flight: its solvers serve all flights, and no plan depends on another."""
 
 
 def _method(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
-    """Return the method of a planner, that of the last flight where it planned alike."""
+    """Return the method of a planner: that of the last flight if its planner was equal."""
     global _last_method
     if _last_method is None or not _last_method.serves(robot, config):
         method = build_method(
@@ -159,7 +159,7 @@ def node_robot(node: str, flight: DrawnFlight) -> SpaceRobot:
 
 
 def _built(node: str, text: str, config: RobotConfig) -> SpaceRobot | None:
-    """Return the robot of a node, the same one as long as the node believes in it."""
+    """Return the robot that a node assumes, the same object as long as it assumes it."""
     error, seed = 0.0, 0
     if isinstance(config, BelievedRobotConfig):
         error, seed = config.model_error, config.model_error_seed

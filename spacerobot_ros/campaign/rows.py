@@ -1,4 +1,4 @@
-"""What comes of a draw, and what flies draws."""
+"""The rows of a campaign, one for each draw, and the engines that fly draws."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ LANES = "lanes"
 """The engine that flies many at once."""
 
 FLIGHTS = "flights"
-"""The engine that flies one by one, and what others leave to it."""
+"""The engine that flies draws one by one, the fallback of the others."""
 
 ERROR = "error"
-"""The outcome of a flight that could not be flown; the reason says why."""
+"""The outcome of a draw that could not be flown."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """What came of one draw.
+    """The result of one draw.
 
     Attributes
     ----------
     draw
-        What was drawn.
+        The numbers that were drawn.
     outcome, reason
-        What became of the goal, or ``error``; and the sentence.
+        The end of the goal, or ``error``; and the message about it.
     metrics
-        By name; empty where nothing was flown.
+        Metrics by name; empty where nothing was flown.
     passed
         Whether the goal was reached and every criterion met.
     engine
-        What flew it.
+        Name of the engine that flew it.
     fallback
         Why the engine ``flights`` flew it instead of the campaign's; empty if it did not.
     wall_time, plan_time
-        What the flight, and planning in it, took, s.
+        Wall time of the flight, and of planning in it, s.
     """
 
     draw: Draw

@@ -1,4 +1,4 @@
-"""What a campaign can disperse, by name, and how a value that is drawn changes a flight."""
+"""The quantities that a campaign can disperse, by name, and how a drawn value changes a flight."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.parameter_files import CONFIGS
-from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
@@ -21,6 +19,7 @@ from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.parameters import Parameter, declared, values_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import robot_file, suggestion
+from spacerobot_ros.scenario import CONFIGS, Scenario
 from spacerobot_ros.simulation.faults import KINDS
 
 AXES = ("x", "y", "z")
@@ -31,7 +30,7 @@ _OF_ALL_FLIGHTS = (
     *("plant.robot", "plant.robot_description", "plant.time_mode", "plant.resume_bag"),
     *("planner.resume_file", "coordinated_control.resume_file"),
 )
-"""Parameters that say what is flown, and how."""
+"""Parameters that are the same in all flights of a campaign."""
 _POSES = ("goal", "end_effector_goal", "initial")
 
 KINDS_OF_TARGETS = (
@@ -45,7 +44,7 @@ KINDS_OF_TARGETS = (
     ("initial.joints.JOINT", "offset of a joint at the start, m or rad"),
     ("faults[i].at, .until, .value", "of the i-th fault of plant.faults"),
 )  # fmt: skip
-"""What there is, for people."""
+"""The kinds of names, with their meanings for people."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +54,15 @@ class Target:
     Attributes
     ----------
     name
-        Of its column.
+        Name of its column.
     apply
-        Changes a flight by a value that is drawn.
+        Function that returns a flight with a drawn value.
     unit
-        For people.
+        Unit, for people.
     text
-        Whether it is a text.
+        Whether its values are texts.
     sets
-        What it sets, by names under which two targets that set the same number meet.
+        Names of the numbers that it sets; two targets that set the same number share one.
     """
 
     name: str
@@ -80,7 +79,7 @@ class DrawnFlight:
     Attributes
     ----------
     scenario
-        What is flown; the plant's masses are not in it before :meth:`finished`.
+        The scenario; the plant's masses are not in it before :meth:`finished`.
     nominal
         The robot without dispersions.
     mass, inertia
@@ -106,7 +105,7 @@ class DrawnFlight:
 
     @property
     def inertial(self) -> InertialParameters | None:
-        """What the bodies weigh; None: what the robot's description says."""
+        """Masses, centres and inertias of the bodies; None: those of the robot's description."""
         if np.all(self.mass == 1.0) and np.all(self.inertia == 1.0) and not self.com.any():
             return None
         parameters = InertialParameters.of(self.nominal)
@@ -157,12 +156,12 @@ def _description(robot: str, text: str) -> RobotDescription:
 
 
 def targets_of(name: str, scenario: Scenario) -> list[Target]:
-    """Return what a name means: one target, or one of each body.
+    """Return the targets of a name: one, or one for each body.
 
     Raises
     ------
     ParameterError
-        There is no such thing; the sentence asks for what may be meant.
+        There is no such target; the message suggests a similar name.
     """
     kind, dot, rest = name.partition(".")
     if kind in CONFIGS:
@@ -224,7 +223,7 @@ def _plain(name: str, node: str, declaration: Parameter, value: Any) -> Target:
 
 
 def _entry(name: str, node: str, declaration: Parameter, index: str, scenario: Scenario) -> Target:
-    """Return a number of a list, by its place or by the joint that it is of."""
+    """Return the target of a number in a list, by its index or by its joint."""
     values = _list(name, node, declaration, scenario)
     of_joints = declaration.of_joints or (node == "plant" and declaration.length is None)
     joints = list(description_of(scenario).joint_names) if of_joints else []
@@ -250,7 +249,7 @@ def _entry(name: str, node: str, declaration: Parameter, index: str, scenario: S
 
 
 def _list(name: str, node: str, declaration: Parameter, scenario: Scenario) -> list[float]:
-    """Return a list of numbers as the scenario has it; one of joints that is empty is zero."""
+    """Return the numbers of a list parameter; an empty list for joints is zeros."""
     values = values_of(scenario.config(node))[declaration.name]
     assert isinstance(values, tuple)
     if values:
@@ -263,7 +262,7 @@ def _list(name: str, node: str, declaration: Parameter, scenario: Scenario) -> l
 
 
 def _start(scenario: Scenario) -> list[float]:
-    """Return the joint positions at the start: where none are given, as near to zero as may be."""
+    """Return the joint positions at the start; by default, as near to zero as limits allow."""
     given, robot = scenario.plant.initial_joint_positions, description_of(scenario)
     if given:
         return list(given)
@@ -272,7 +271,7 @@ def _start(scenario: Scenario) -> list[float]:
 
 
 def _bodies(name: str, scenario: Scenario) -> list[tuple[int, str]]:
-    """Return the bodies that a name means: one, or all by ``*``."""
+    """Return the bodies of a name, all for ``*``, each with its index."""
     names = [body.name for body in description_of(scenario).bodies]
     if name == "*":
         return list(enumerate(names))
@@ -429,8 +428,8 @@ def _line(words: list[str], part: str, text: str) -> str:
 def urdf_with(robot: RobotDescription, parameters: InertialParameters) -> str:
     """Return the URDF of a robot with other masses, centres of mass and inertias.
 
-    The first link of each body has what the body weighs; those that fixed joints weld to it weigh
-    nothing.
+    The first link of each body has the inertia of the body; links that fixed joints weld to it have
+    none.
     """
     root = ET.fromstring(robot.urdf)
     weights: Iterable[Any] = zip(

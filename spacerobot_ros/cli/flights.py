@@ -32,7 +32,7 @@ from spacerobot_ros.cli.progress import display
 from spacerobot_ros.termination import termination
 
 if TYPE_CHECKING:
-    from spacerobot_ros.flight.scenario import Scenario
+    from spacerobot_ros.scenario import Scenario
 
 
 @click.command("run")
@@ -118,7 +118,7 @@ def _chosen(
     realtime: float | None,
 ) -> Scenario:
     """Return the scenario with the changes of the command line."""
-    from spacerobot_ros.flight.scenario import scenario_or_robot
+    from spacerobot_ros.scenario import scenario_or_robot
 
     scenario = goal.of(scenario_or_robot(name))
     scenario.require_goal()
@@ -206,7 +206,7 @@ def up_command(
     A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. Send goals by topic or
     with the command spacerobot goal. Ctrl-C, SIGTERM or SIGHUP ends the nodes.
     """
-    from spacerobot_ros.flight.scenario import scenario_or_robot
+    from spacerobot_ros.scenario import scenario_or_robot
 
     chosen = scenario_or_robot(scenario).in_real_time(rate).with_settings(settings)
     from spacerobot_ros.session.run import keep_up
@@ -260,7 +260,7 @@ def goal_command(
 @click.command("scenarios")
 def scenarios_command() -> None:
     """List the scenarios that come with the package."""
-    from spacerobot_ros.flight.scenario import load_scenario, scenario_names
+    from spacerobot_ros.scenario import load_scenario, scenario_names
 
     for name in scenario_names():
         click.echo(f"{name:<26}{load_scenario(name).description}")

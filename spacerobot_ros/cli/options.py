@@ -17,7 +17,7 @@ import click
 from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
-    from spacerobot_ros.flight.scenario import Scenario
+    from spacerobot_ros.scenario import Scenario
 
     _Choice = click.Choice[str]
 else:  # Generic in new versions only.

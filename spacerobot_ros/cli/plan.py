@@ -135,8 +135,7 @@ def problem_of(
     GoalError
         The goal is not finite.
     """
-    from spacerobot_ros.flight.parameter_files import parse_setting
-    from spacerobot_ros.flight.scenario import scenario_or_robot
+    from spacerobot_ros.scenario import parse_setting, scenario_or_robot
 
     for text in settings:
         node, _, _ = parse_setting(text)

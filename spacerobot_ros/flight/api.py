@@ -14,18 +14,18 @@ from spacerobot_ros import planning
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
-from spacerobot_ros.flight.parameter_files import CONFIGS
-from spacerobot_ros.flight.scenario import (
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import GaitSchedule, Goal
+from spacerobot_ros.planning.methods.registry import method_options
+from spacerobot_ros.resources import resource_names
+from spacerobot_ros.scenario import (
+    CONFIGS,
     Scenario,
     load_scenario,
     scenario_names,
     scenario_of,
     scenario_or_robot,
 )
-from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import GaitSchedule, Goal
-from spacerobot_ros.planning.methods.registry import method_options
-from spacerobot_ros.resources import resource_names
 from spacerobot_ros.simulation.trials import state_of
 
 
@@ -46,7 +46,7 @@ def fly(
     Parameters
     ----------
     what
-        A scenario: its name, its file, or :func:`~spacerobot_ros.flight.scenario.load_scenario`'s;
+        A scenario: its name, its file, or :func:`~spacerobot_ros.scenario.load_scenario`'s;
         or a robot: its name, its URDF file, or its model. A name that is both is the scenario.
     goal
         Where the base is to be; or its position (3,), m, or position and quaternion (7,). None: the

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from spacerobot_ros.flight.scenario import Scenario
+    from spacerobot_ros.scenario import Scenario
 
 _FIRST_CAPACITY = 1024
 

@@ -34,7 +34,6 @@ from spacerobot_ros.control.executive import END_EFFECTOR
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event
 from spacerobot_ros.flight.flight import Flight, FlightLog
-from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
@@ -43,6 +42,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.goal_file import BASE, GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus, ScheduleStart
+from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator
 from spacerobot_ros.simulation.sensors import ReportedState

@@ -1,4 +1,4 @@
-"""Reads a flight from its bag: all that the bag holds, and nothing that it does not.
+"""Reads a flight from its bag: all that the bag holds; other parts stay empty.
 
 :func:`read_flight` reads any bag, of whatever stack; :func:`read_run` one of ``spacerobot run``,
 which must be complete.
@@ -29,14 +29,13 @@ from spacerobot_ros.errors import (
 )
 from spacerobot_ros.events import Event
 from spacerobot_ros.flight.flight import Commands, Flight, SentGoal, Signal, goal_at_end
-from spacerobot_ros.flight.parameter_files import CONFIGS
-from spacerobot_ros.flight.scenario import COMMANDERS, Published, Scenario
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
+from spacerobot_ros.scenario import COMMANDERS, CONFIGS, Published, Scenario
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS, StateField
 
@@ -326,7 +325,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def read_flight(bag: FlightBag) -> Flight:
-    """Return all of a flight that its bag holds, whatever that is.
+    """Return a flight with all parts that its bag holds.
 
     Arrays are read when they are first asked for.
 
@@ -426,7 +425,7 @@ def _read_statuses(bag: FlightBag, commander: str) -> list[tuple[int, Status]]:
 
 
 def _scenario(bag: FlightBag) -> Scenario:
-    """Return as much of the scenario of a flight as its bag says."""
+    """Return the scenario of a flight, as far as its bag holds it."""
     metadata = bag.metadata
     about = metadata.get("scenario", {})
     nodes = {
@@ -474,7 +473,7 @@ def recorded_scenario(bag: Bag) -> Scenario:
     Raises
     ------
     RecordingError
-        The bag does not say what was flown.
+        The bag lacks the goal or the parameters.
     """
     robot = RecordedRobot(bag)
     about = bag.metadata.get("scenario", {})
@@ -485,8 +484,8 @@ def recorded_scenario(bag: Bag) -> Scenario:
     }
     if "plant" not in nodes or "goal_position" not in about:
         raise RecordingError(
-            f"The bag {bag.path} does not say what was flown: bags of 'spacerobot run' hold the "
-            "goal and all parameters."
+            f"The bag {bag.path} lacks the goal or the parameters of its flight, which bags of "
+            "'spacerobot run' hold."
         )
     try:
         values = {

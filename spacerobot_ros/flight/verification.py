@@ -48,18 +48,18 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Difference:
-    """A number in the bag that is not what the commands make of it, or the largest deviation.
+    """A number in the bag that does not follow from the commands, or deviates most.
 
     Attributes
     ----------
     time
         Simulated time, s.
     topic, field
-        Which number it is.
+        Name of the number.
     recorded, expected
         Its value in the bag, and in the re-simulation.
     remark
-        What is known of the commands that led to it; a clause in brackets, or empty.
+        Known facts about the commands that led to it: a clause in brackets, or empty.
     """
 
     time: float
@@ -141,14 +141,14 @@ def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Ve
     published = [p for p in published if p.follows_from(resimulation.states)]
     missing = _missing(flight, published, resimulation)
     if first > 0:
-        # What the flight begins from is given, and what moved it there is not in the bag.
+        # The first state is an input: the commands before it are not in the bag.
         published = [p.after(first) for p in published]
     _require_no_reset(flight, published, resimulation)
     found = _Comparison(flight, published, resimulation, tolerance).result()
     return replace(found, missing=missing)
 
 
-# -- what the bag holds -----------------------------------------------------------------------
+# -- the contents of the bag ------------------------------------------------------------------
 
 
 RecordedCommand = NDArray[np.float64] | CommandError
@@ -234,7 +234,7 @@ class _RecordedPlant:
 def read_command(
     message: Any, source: CommandSource, robot: SpaceRobot, frame_prefix: str = ""
 ) -> RecordedCommand:
-    """Return what a decoded message commands, in the order of the robot's joints.
+    """Return the command in a decoded message, in the order of the robot's joints.
 
     Joints that it does not name are commanded nothing; ``frame_prefix`` is of the robot's frames.
     """
@@ -321,9 +321,9 @@ class _Published:
         return sum(states[name].shape[1] for name in names) == self.values.shape[1]
 
     def expected(self, states: dict[str, Floats], rows: NDArray[np.int64]) -> Floats:
-        """Return what the re-simulation has for each message, shaped as the values.
+        """Return the values of the re-simulation for each message, shaped as those of the bag.
 
-        A quaternion has the sign of the recorded one, which means nothing.
+        A quaternion gets the sign of the recorded one: both signs are the same attitude.
         """
         expected = np.hstack([states[each.quantity][rows] for each in self.topic.state])
         start = 0
@@ -432,7 +432,7 @@ def _initial(
 
 @dataclass
 class _Resimulation:
-    """What came of the commands.
+    """A re-simulation of the commands.
 
     ``states`` are the quantities of the topics, (ticks + 1, size) each, from tick ``first`` to tick
     ``end``; ``stopped`` says why the plant went no further, ``latched`` in which tick a fault
@@ -573,7 +573,7 @@ class _Comparison:
     def _first_difference(self) -> Difference | None:
         found: tuple[int, Difference] | None = None
         for p, expected, deviation in self._pairs:
-            # Not "greater": what is no number is a difference.
+            # Not "greater": NaN is a difference.
             wrong = ~(deviation <= self._tolerance)
             rows = np.flatnonzero(wrong.any(axis=1))
             if not rows.size:

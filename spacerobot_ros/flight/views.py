@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _DASHES = ("-", "--", "-.", ":")
-"""Of the joints beyond those that have a colour of their own."""
+"""Line styles of the joints beyond the number of colours."""
 
 _INK, _GOAL = "#1f2328", "#CC79A7"
 _MOST_FRAMES = 1000
@@ -54,7 +54,7 @@ class Animation:
     Attributes
     ----------
     html
-        What a notebook shows.
+        The content that a notebook shows.
     """
 
     def __init__(self, html: str) -> None:
@@ -109,7 +109,7 @@ def table(flight: Flight) -> pd.DataFrame:
 
 
 def _labels(flight: Flight) -> dict[str, tuple[str, ...]]:
-    """Return what the numbers of the other quantities are called."""
+    """Return the names of the numbers in the other quantities."""
     names: dict[str, tuple[str, ...]] = {"propellant": ("",), "pose_lost": ("",)}
     for part in ("measured_pose", "end_effector_pose"):
         names[part] = _NAMES["pose"]
@@ -125,7 +125,7 @@ def _labels(flight: Flight) -> dict[str, tuple[str, ...]]:
 
 
 def figure(flight: Flight) -> Picture:
-    """Draw the pose of the base beside its goal, the joints, and what drove them."""
+    """Draw the pose of the base beside its goal, the joints, and their efforts or rates."""
     efforts = flight.scenario.plant.actuation == "effort"
     wrench = flight.commands.get("base_wrench")
     thrust = wrench is not None and bool(np.any(wrench.values))

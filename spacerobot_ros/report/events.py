@@ -15,13 +15,13 @@ from spacerobot_ros.report.figures import INK, MUTED, PALETTE, inches, panel
 from spacerobot_ros.times import SECOND
 
 LANE = 0.62
-"""Room that a lane with its key takes below a time axis, inches."""
+"""Height of a strip of events with its key below a time axis, inches."""
 
 _MOST = 2000
-"""Marks in a lane: more are a band anyway."""
+"""Most marks in a strip: more would merge."""
 
 _BELOW = 0.44
-"""Of the lane's upper edge below the axis, inches: labels are between."""
+"""Distance of the strip's upper edge from the axis, inches: labels are between."""
 
 _HEIGHT = 0.24
 _GOOD, _BAD, _WARN, _PLAIN = PALETTE[2], "#c62f2f", PALETTE[1], PALETTE[0]
@@ -37,14 +37,14 @@ class FlightEvent:
 
     @property
     def text(self) -> str:
-        """What has happened in a few words, such as ``fault on: joint_stuck elbow at 5``."""
+        """The event in a few words, such as ``fault on: joint_stuck elbow at 5``."""
         label, about = _MARKS[self.event.kind].label, self.event.about
         details = [about[key] for key in _DETAILS if about.get(key)]
         return f"{label}: {', '.join(details)}" if details else label
 
 
 _DETAILS = ("fault", "joints", "reason", "method", "node")
-"""What tells an event from others of its kind."""
+"""Keys that distinguish an event from others of its kind."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ _MARKS = {
     EventKind.NODE_SILENT: _Mark("node silent", "h", _BAD, 1),
     EventKind.NODE_BACK: _Mark("node back", "h", _GOOD, 1, hollow=True),
 }
-"""Kinds that are drawn; the others are about the life of nodes."""
+"""Kinds that are drawn; the others are about nodes that start and stop."""
 
 
 _GLYPHS = {
@@ -103,11 +103,11 @@ _GLYPHS = {
     "|": "❙❙",
     "P": "✚✚",
 }
-"""The markers of matplotlib as letters, full and hollow."""
+"""Markers of matplotlib as characters, full and hollow."""
 
 _FAULTS = frozenset((EventKind.FAULT_INJECTED, EventKind.FAULT_ENDED, EventKind.FAULTS_CLEARED))
 _STRONG = _FAULTS | {EventKind.STUCK_JOINT, EventKind.LATCHED, EventKind.GOAL_ABORTED}
-"""Kinds that are marked through the whole height of a chart."""
+"""Kinds that are marked over the whole height of a chart."""
 
 
 def mark_of(kind: EventKind) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def mark_of(kind: EventKind) -> dict[str, Any]:
         "kind": kind.value,
         "glyph": _GLYPHS[mark.marker][mark.hollow],
         "colour": mark.colour,
-        # Faults have a row between, so that what found them does not stand in their words.
+        # Faults have a row of their own between, so that texts do not overlap.
         "row": 1 if kind in _FAULTS else 2 * mark.row,
         "strong": kind in _STRONG,
     }
@@ -147,7 +147,7 @@ def drawn_events(
 
 
 def draw_events(axes: Axes, events: Sequence[FlightEvent]) -> None:
-    """Draw a lane below a time axis with the events in its span, and a key of their marks."""
+    """Draw a strip below a time axis with the events in its span, and a key of their marks."""
     start, end = axes.get_xlim()
     shown = [each for each in events if start <= each.time <= end][:_MOST]
     figure = axes.figure

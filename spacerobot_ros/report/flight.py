@@ -20,7 +20,6 @@ from spacerobot_ros.flight.reading import (
     open_flight_bag,
     read_flight,
 )
-from spacerobot_ros.flight.scenario import COMMANDERS, Published
 from spacerobot_ros.measures import flown_time
 from spacerobot_ros.model import RobotDescription
 from spacerobot_ros.model.description import Array, Joint, JointKind, Pose
@@ -32,6 +31,7 @@ from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.events import FlightEvent, drawn_events
 from spacerobot_ros.report.signals import Cycles, find_cycles, nearest_rotvec, rotvecs
 from spacerobot_ros.report.solids import SolidRobot
+from spacerobot_ros.scenario import COMMANDERS, Published
 from spacerobot_ros.times import SECOND
 
 
@@ -389,7 +389,7 @@ class FlightReport:
 
     @property
     def position_counts(self) -> bool:
-        """Whether the position of the base is part of what the method flies to."""
+        """Whether the method controls the position of the base."""
         method = METHODS.get(self.method)
         return method is None or "position" in method.controls
 
@@ -444,7 +444,7 @@ class FlightReport:
 
     @property
     def not_drawn(self) -> str:
-        """A sentence on what the bag lacks for a picture of the robot; empty for nothing."""
+        """A message about data missing for a picture of the robot; empty: none is missing."""
         lacking = []
         if self.robot is None:
             lacking.append("no robot description (robot_description)")
@@ -461,7 +461,7 @@ class FlightReport:
 
     @property
     def missing_meshes(self) -> str:
-        """A sentence for captions about meshes that the bag does not carry; empty for none."""
+        """A sentence for captions about meshes that are not in the bag; empty: all are."""
         links = self.robot.links if self.robot is not None else ()
         named = {each.resource for link in links for each in link.shapes if each.kind == "mesh"}
         missing = named - self.meshes.keys()

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spacerobot_ros.flight.scenario import Published
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.report.flight import FlightReport, joint_unit
+from spacerobot_ros.scenario import Published
 
 _ABSENT = "–"
 _TICKS = 1.5
-"""Control periods by which times may differ that are one to people."""
+"""Control periods by which times may differ that count as equal."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Table:
 
 
 def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
-    """Label, value and a note for each of the numbers that stand on top."""
+    """Return label, value and note of each headline number."""
     rows: list[tuple[str, str, str]] = []
     error, tool, sensed = flight.final_error, flight.tool_error, flight.sensed_error
     if error is not None:
@@ -56,7 +56,7 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
 
 
 def runs_table(flights: Sequence[FlightReport]) -> Table:
-    """What several flights came to, a row each: the numbers on top that any of them has."""
+    """Return the headline numbers of several flights, a row each."""
     found = [{label: value for label, value, _ in headline(flight)} for flight in flights]
     labels = list(dict.fromkeys(label for values in found for label in values))
     rows = [
@@ -67,7 +67,7 @@ def runs_table(flights: Sequence[FlightReport]) -> Table:
 
 
 def result_table(flight: FlightReport) -> Table:
-    """Goal, end, errors, times and momentum drift: the rows that the bag has numbers for."""
+    """Return goal, final state, errors, times and momentum drift, as far as the bag has them."""
     rows: list[tuple[str, ...]] = []
     goal, error = flight.goal, flight.final_error
     if goal is not None and (flight.controls("base") or not flight.outputs):
@@ -117,7 +117,7 @@ def _tool_rows(flight: FlightReport, error: PoseError) -> list[tuple[str, ...]]:
 
 
 def joint_table(flight: FlightReport) -> Table | None:
-    """First and last shape and the peak velocities, beside the limits of the URDF."""
+    """Return first and last positions and peak velocities of the joints, with their limits."""
     if not flight.joint_names or not len(flight.shape):
         return None
     rows = []
@@ -145,7 +145,7 @@ def joint_table(flight: FlightReport) -> Table | None:
 
 
 def published_table(flight: FlightReport) -> Table | None:
-    """Published figures beside those of this flight; None if the scenario has none."""
+    """Return published figures beside those of this flight; None if the scenario has none."""
     if not flight.published:
         return None
     rows = []
@@ -162,7 +162,7 @@ def published_table(flight: FlightReport) -> Table | None:
 
 
 def _measured(flight: FlightReport, row: Published) -> tuple[list[float], str]:
-    """The figure of this flight that a published one stands for, and where it comes from."""
+    """Return the figure of this flight for a published one, and its source."""
     figures: dict[str, Iterable[float]] = {}
     if len(flight.position):
         figures["final_position_m"] = flight.position.values[-1]
@@ -183,7 +183,7 @@ def _measured(flight: FlightReport, row: Published) -> tuple[list[float], str]:
 
 
 def _decimals(x: float) -> int:
-    """Number of decimals that a figure was printed with."""
+    """Return the number of decimals of a printed figure."""
     text = repr(x)
     return 0 if "e" in text or text.endswith(".0") else len(text.partition(".")[2])
 
@@ -193,7 +193,7 @@ def _vector(values: Iterable[float]) -> str:
 
 
 def _number(x: float) -> str:
-    """Return a number of m or rad; what rounds to zero has no sign."""
+    """Return a number of m or rad with 5 decimals; -0 becomes 0."""
     return f"{round(x, 5) + 0.0:.5f}"
 
 
@@ -213,7 +213,7 @@ def _schedules(flight: FlightReport) -> str:
 
 
 def _to_end(flight: FlightReport) -> str:
-    """Return the time to the end where it is not that of the schedules."""
+    """Return the time to the end if it differs from that of the schedules; else nothing."""
     whole, flown = flight.time_to_end, flight.manoeuvre_time
     if whole is None or flown is None or abs(whole - flown) < _TICKS * flight.tick:
         return ""

@@ -79,7 +79,7 @@ FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
     "momentum": momentum_figure,
     "path": path_figure,
 }
-"""What :func:`write_figures` draws, by name."""
+"""The figures of :func:`write_figures`, by name."""
 
 _REPORTED = (
     configurations_figure,
@@ -103,7 +103,7 @@ def write_report(
 ) -> None:
     """Write the report of a bag as one HTML file, which needs nothing besides itself.
 
-    Any bag makes a page: what it does not hold is left out, with a sentence that says so. Bags
+    Any bag makes a page: parts that it lacks are left out, and the page says so. Bags
     ``beside`` it, of other methods to the same goal for one, get a row in a table and their paths
     in the figure of paths. Of several robots in the bag ``namespace`` chooses one.
 

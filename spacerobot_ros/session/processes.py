@@ -24,13 +24,13 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.scenario import COMMANDERS, Kill, Scenario
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.common.streams import Connections, unconnected
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
+from spacerobot_ros.scenario import COMMANDERS, Kill, Scenario
 from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.stack import Stack, namespace_words
 from spacerobot_ros.termination import child_options

@@ -23,10 +23,10 @@ from spacerobot_ros.flight.reading import (
     require_states,
     with_propellant,
 )
-from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.nodes.common.process import use_loopback_discovery, use_private_discovery
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.stack import InProcessStack, Stack
@@ -39,7 +39,7 @@ Progress = Callable[[float, float], None]
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run came to. ``summary`` is the object that ``--json`` writes."""
+    """The result of a run; ``summary`` is the object that ``--json`` writes."""
 
     summary: dict[str, Any]
 
@@ -94,7 +94,7 @@ def run_scenario(
     simulated time and more is interrupted at one of the looks at it, five a second of wall time.
 
     SIGINT, SIGTERM and SIGHUP end the flight early; the flight until then is recorded and summed
-    up. Before it has begun they raise what they would without it.
+    up. Before the flight they act as in any other program.
 
     Raises
     ------

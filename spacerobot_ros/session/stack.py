@@ -19,7 +19,6 @@ from rclpy.validate_namespace import validate_namespace
 
 from spacerobot_ros.bag import free_name
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.flight.scenario import Scenario
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.nodes import (
     NODE_TYPES,
@@ -30,6 +29,7 @@ from spacerobot_ros.nodes import (
 )
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
+from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.topics import GLOBAL_TOPICS, NOT_RECORDED
 

@@ -13,8 +13,8 @@ from support.campaigns import campaign, flown
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.flight import Flight
-from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.scenario import load_scenario
 
 ROBOT = description_of(load_scenario("faults/stuck_slider"))
 BODIES = [body.name for body in ROBOT.bodies]

@@ -10,8 +10,7 @@ from support.command_line import CliRunner, Result
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.parameter_files import parse_setting
-from spacerobot_ros.flight.scenario import load_scenario, scenario_names
+from spacerobot_ros.scenario import load_scenario, parse_setting, scenario_names
 
 QUICK = [
     "--method",

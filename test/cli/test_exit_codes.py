@@ -9,7 +9,7 @@ import yaml
 from support.command_line import CliRunner
 
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.flight.scenario import load_scenario
+from spacerobot_ros.scenario import load_scenario
 
 SLIDING = ("sliding_masses", "--method", "lie_bracket")
 

@@ -12,11 +12,11 @@ from support.command_line import CliRunner
 from support.oracles import PinocchioOracle
 
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import JointLimits
 from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
 from spacerobot_ros.resources import resource_names, robot_file
+from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.own_robot import first_shape, first_turn, remarks
 from spacerobot_ros.simulation.trials import try_method
 

@@ -13,9 +13,9 @@ from spacerobot_ros.errors import ParameterError, RecordingError
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.flight.reading import read_run, recorded_scenario
-from spacerobot_ros.flight.scenario import Scenario, load_scenario
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session.run import run_scenario
 
 ROOT = Path(__file__).resolve().parents[2]

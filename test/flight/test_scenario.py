@@ -13,16 +13,17 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import GoalError, ParameterError
-from spacerobot_ros.flight.parameter_files import CONFIGS, NODES
-from spacerobot_ros.flight.scenario import (
+from spacerobot_ros.nodes import NODE_TYPES
+from spacerobot_ros.resources import robot_file, share_directory
+from spacerobot_ros.scenario import (
+    CONFIGS,
+    NODES,
     Kill,
     load_scenario,
     parse_kills,
     scenario_names,
     scenario_or_robot,
 )
-from spacerobot_ros.nodes import NODE_TYPES
-from spacerobot_ros.resources import robot_file, share_directory
 
 
 def test_the_configurations_are_those_of_the_nodes() -> None:
@@ -201,7 +202,7 @@ def test_a_robot_beside_its_scenario_is_found_and_integers_go_with_floats(tmp_pa
 
 def test_a_robot_alone_is_a_scenario_without_a_goal() -> None:
     alone = scenario_or_robot("three_joint_arm")
-    with pytest.raises(ParameterError, match="'three_joint_arm' is a robot, and no scenario"):
+    with pytest.raises(ParameterError, match="'three_joint_arm' is a robot and has no goal"):
         alone.require_goal()
     there = alone.with_goal(rpy_deg=(0.0, 0.0, 90.0))
     there.require_goal()

@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 from support.fuzzing import NUMBERS, TEXTS, VALUES, attempt, damaged, fuzz
 
 from spacerobot_ros.control.thrusters import load_thrusters
-from spacerobot_ros.flight.parameter_files import NODES, parse_setting
-from spacerobot_ros.flight.scenario import Scenario, load_scenario
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.resources import resource_names, robot_file, share_directory
+from spacerobot_ros.scenario import NODES, Scenario, load_scenario, parse_setting
 
 FILES = [
     (share_directory() / "config" / f"{name}.yaml").read_text(encoding="utf-8")

@@ -21,12 +21,12 @@ from spacerobot_ros.errors import (
     RobotDescriptionError,
     SpaceRobotError,
 )
-from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.messages.readers import TemplateReader, UnreadableError
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import Parameter
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.scenario import load_scenario
 
 CHUNK = 6
 ORIGIN, NO_TURN = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]

@@ -14,9 +14,9 @@ import yaml
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.scenario import load_scenario, scenario_names
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.parameters import declared
+from spacerobot_ros.scenario import load_scenario, scenario_names
 
 FILE = Path(__file__).parents[2] / "launch" / "flight_stack.launch.py"
 

@@ -11,9 +11,9 @@ import pytest
 from support.chromium import Browser, browser, chromium
 
 from spacerobot_ros.events import EventKind
-from spacerobot_ros.flight.scenario import load_scenario, scenario_names
 from spacerobot_ros.report import write_report
 from spacerobot_ros.report.flight import read_report
+from spacerobot_ros.scenario import load_scenario, scenario_names
 from spacerobot_ros.session.run import run_scenario
 
 pytestmark = [

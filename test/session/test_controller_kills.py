@@ -22,10 +22,10 @@ from support.killed_flight import (
 from support.ros_harness import nanoseconds
 
 from spacerobot_ros.bag import Bag, read_bag
-from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.run import ros
 
 pytestmark = pytest.mark.slow

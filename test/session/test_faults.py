@@ -11,9 +11,9 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.scenario import load_scenario, parse_kills
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.resources import share_directory
+from spacerobot_ros.scenario import load_scenario, parse_kills
 from spacerobot_ros.session.processes import KillTimeline
 from spacerobot_ros.session.run import run_scenario
 

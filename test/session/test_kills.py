@@ -19,9 +19,9 @@ from support.killed_flight import (
 )
 
 from spacerobot_ros.bag import Bag
-from spacerobot_ros.flight.scenario import Scenario, load_scenario
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.run import ros
 

@@ -10,8 +10,8 @@ import pytest
 from rclpy.serialization import deserialize_message
 
 from spacerobot_ros.bag import iterate_raw
-from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.nodes.common.messages import message_class
+from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.run import run_scenario
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_domain")]

@@ -14,9 +14,9 @@ import rclpy
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.stack import InProcessStack, checked_namespace
 
 ROOT = Path(__file__).parents[2]

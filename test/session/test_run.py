@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.bag import iterate_raw, read_bag
 from spacerobot_ros.cli.options import write_json
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.scenario import Scenario, load_scenario
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session.run import RunResult, run_scenario
 
 SHORT = {

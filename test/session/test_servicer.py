@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from support.oracles import PinocchioOracle
 
 from spacerobot_ros.bag import Bag, read_bag
-from spacerobot_ros.flight.scenario import load_scenario
+from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.run import RunResult, run_scenario
 
 Array = npt.NDArray[np.float64]

@@ -15,7 +15,6 @@ from support.made_bags import array, joint_states, made_bag, odometry, pose
 from spacerobot_ros.bag import BagWriter, iterate_raw
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.control.thrusters import find_thrusters
-from spacerobot_ros.flight.scenario import Scenario, load_scenario
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
@@ -25,6 +24,7 @@ from spacerobot_ros.planning.execution.status import (
     PlannerStatus,
 )
 from spacerobot_ros.resources import share_directory
+from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session import run
 
 HALF = math.sin(0.05), math.cos(0.05)

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.flight.scenario import load_scenario
 from spacerobot_ros.flight.verification import verify_bag
+from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.run import run_scenario
 
 MILLIMETRE = 1e-3

@@ -217,9 +217,12 @@ def outcomes(folder: Path, operations: list[str], words: str = "") -> Iterator[O
 def main() -> None:
     folder, operations, *words = sys.argv[1:]
     # What every case would import is there before the processes part.
+    import spacerobot_ros.bag.salvage
 
     if operations != "everything":
-        pass
+        import spacerobot_ros.cli.main
+        import spacerobot_ros.flight.verification
+        import spacerobot_ros.report  # noqa: F401
 
     for outcome in outcomes(Path(folder), operations.split(","), *words):
         print(json.dumps({**vars(outcome), "fault": outcome.fault}), flush=True)

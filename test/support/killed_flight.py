@@ -11,7 +11,7 @@ import numpy as np
 
 from spacerobot_ros.bag import Bag, RecordingError, read_bag
 from spacerobot_ros.bag.salvage import salvage_bag
-from spacerobot_ros.flight.scenario import Scenario
+from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.session.processes import MultiProcessStack
 
 KILLS = 20

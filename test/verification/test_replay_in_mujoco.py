@@ -14,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.bag import Bag, read_bag
-from spacerobot_ros.flight.scenario import load_scenario
+from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.run import run_scenario
 
 Array = npt.NDArray[np.float64]

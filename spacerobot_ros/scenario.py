@@ -1,0 +1,674 @@
+"""Scenarios: ROS parameter files of a flight's nodes, with a section for its goals.
+
+This module also reads parameter files and settings of the command line.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from spacerobot_ros.bag.config import RecorderConfig
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.laws.registry import LAWS
+from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
+from spacerobot_ros.parameters import Value, configured, declared, reconfigured, values_of
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.resources import (
+    is_path,
+    resource_names,
+    robot_file,
+    share_directory,
+    suggestion,
+)
+from spacerobot_ros.simulation import InitialState
+from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.simulation.trials import Problem
+from spacerobot_ros.viewer.server import ViewerConfig
+
+CONFIGS: Mapping[str, type[Any]] = {
+    "plant": PlantConfig,
+    "planner": PlannerConfig,
+    "coordinated_control": ControllerConfig,
+    "recorder": RecorderConfig,
+    "viewer": ViewerConfig,
+}
+"""The nodes that a scenario may set parameters of, and what declares these parameters."""
+
+NODES = tuple(CONFIGS)
+
+COMMANDERS = ("planner", "coordinated_control")
+"""The nodes that take goals; a scenario runs those that its file has a section for."""
+
+_OF_EVERY_NODE = ("autostart", "use_sim_time")
+"""Parameters of every node, beside those of its configuration."""
+
+_GOALS = ("goal", "end_effector_goal")
+_KEYS = (
+    "description",
+    "published",
+    "published_method",
+    "kills",
+    "goal_joint_positions",
+    *(f"{goal}_{part}" for goal in _GOALS for part in ("position", "orientation", "rotvec")),
+)
+
+_LOCKSTEP: Mapping[str, Mapping[str, Any]] = {"plant": {"time_mode": "lockstep"}}
+"""The overrides of every scenario that is loaded."""
+
+_VIEWED = 0.1
+"""Longest wall time between transforms of a flight in real time, s."""
+
+_KILL = re.compile(r"(\S+) at (\S+)(?: until (\S+))?")
+
+
+@dataclass(frozen=True)
+class Published:
+    """A figure of a publication on this scenario, to compare with the measured one.
+
+    ``quantity`` is a key of the run's summary, or a note of the gait in the planner's status;
+    ``note`` comments on the printed figure (a misprint, an integration error).
+    """
+
+    quantity: str
+    printed: list[float]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Kill:
+    """A node that is killed ``at`` a simulated time and started again ``until`` another, s."""
+
+    node: str
+    at: float
+    until: float
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """The nodes of a flight with their parameters, and the goals of the flight.
+
+    Attributes
+    ----------
+    name, path, description
+        Name, path and description of the parameter file.
+    goal, end_effector_goal
+        Goal poses of the base and of the end-effector.
+    commanders
+        The nodes that fly to them.
+    published, published_method
+        Figures of a publication, and the gait method that they hold for; empty: any.
+    kills
+        The nodes that are killed during the flight, by time.
+    in_file, overrides
+        Parameters by node and full name; overrides take precedence over the file.
+    has_goal
+        Whether a goal was given; without one ``goal`` is the start.
+    """
+
+    name: str
+    path: Path
+    description: str
+    goal: Goal
+    end_effector_goal: Goal | None
+    commanders: tuple[str, ...]
+    published: tuple[Published, ...]
+    published_method: str
+    kills: tuple[Kill, ...]
+    in_file: Mapping[str, Mapping[str, Any]]
+    overrides: Mapping[str, Mapping[str, Any]]
+    has_goal: bool = True
+    _configs: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """Results of :meth:`config`, by node."""
+    _changes: dict[str, tuple[Any, dict[str, Any]]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+    """By node, a configuration of another scenario and the parameters that differ in this one."""
+
+    def config(self, node: str) -> Any:
+        """Return the configuration of a node: defaults, the file's parameters, the overrides.
+
+        Raises
+        ------
+        ParameterError
+            The node has no such parameter, or a value is refused; the message names both.
+        """
+        if node not in self._configs:
+            self._configs[node] = self._configured(node)
+        return self._configs[node]
+
+    def _configured(self, node: str) -> Any:
+        known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
+        before, values = self._changes.get(node, (None, self._given(node)))
+        for name, value in values.items():
+            if name not in (*known, *_OF_EVERY_NODE):
+                raise ParameterError(f"Node '{node}' has no parameter '{name}'.")
+            if isinstance(value, str) and name in known:
+                is_number = isinstance(known[name].default, (int, float))
+                values[name] = number_in(value) if is_number else value
+        try:
+            if before is not None:
+                return reconfigured(before, values)
+            return configured(CONFIGS[node], values)
+        except ParameterError as error:
+            raise ParameterError(f"Node '{node}': {error}") from error
+
+    def _given(self, node: str) -> dict[str, Any]:
+        """Return the parameters of a node in the file and the overrides, as written there."""
+        return {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
+
+    @property
+    def plant(self) -> PlantConfig:
+        """The plant's configuration; see :meth:`config`."""
+        return self.config("plant")
+
+    @property
+    def planner(self) -> PlannerConfig:
+        """The planner's configuration; see :meth:`config`."""
+        return self.config("planner")
+
+    @property
+    def controller(self) -> ControllerConfig:
+        """The controller's configuration; see :meth:`config`."""
+        return self.config("coordinated_control")
+
+    @property
+    def lockstep(self) -> bool:
+        """Whether the plant waits for commands instead of the wall clock."""
+        return self.plant.time_mode == "lockstep"
+
+    @property
+    def comparable(self) -> tuple[Published, ...]:
+        """The published figures, if they hold for the method that is flown."""
+        return self.published if self.published_method in ("", self.planner.method) else ()
+
+    def parameters(self, node: str) -> dict[str, Value]:
+        """Return the parameters of a node in the file and the overrides, in their declared types.
+
+        Raises
+        ------
+        ParameterError
+            A parameter of the node is refused.
+        """
+        values = values_of(self.config(node))
+        given = self._given(node)
+        # An empty list is every list's default, and has no type that ROS could know it by.
+        found = {name: values[name] for name in given if name in values and values[name] != ()}
+        if "use_sim_time" in given:
+            found["use_sim_time"] = bool(given["use_sim_time"])
+        return found
+
+    def records(self, nodes: Sequence[str]) -> dict[str, dict[str, str]]:
+        """Return the metadata records of a bag of the flight, by name.
+
+        ``scenario`` has name, description, goals and published figures, ``parameters/<node>`` every
+        parameter of a node as a JSON text.
+        """
+        goals = {"goal": self.goal, "end_effector_goal": self.end_effector_goal}
+        scenario = {"name": self.name, "description": self.description}
+        for name, goal in goals.items():
+            if goal is not None:
+                scenario[f"{name}_position"] = " ".join(map(repr, goal.position.tolist()))
+                scenario[f"{name}_orientation"] = " ".join(map(repr, goal.quaternion.tolist()))
+        scenario["published"] = json.dumps([asdict(row) for row in self.comparable])
+        parameters = {
+            f"parameters/{node}": {
+                name: json.dumps(value) for name, value in values_of(self.config(node)).items()
+            }
+            for node in nodes
+        }
+        return {"scenario": scenario, **parameters}
+
+    def problem(self) -> Problem:
+        """Return the planning problem of the goal of the base.
+
+        Raises
+        ------
+        ParameterError
+            The scenario names no robot, or a parameter is refused.
+        GoalError
+            The shape of the goal is of another robot.
+        """
+        plant, planner = self.plant, self.planner
+        name = planner.robot or plant.robot
+        if not name:
+            raise ParameterError(f"The scenario '{self.name}' names no robot; see plant.robot.")
+        robot = SpaceRobot.from_file(robot_file(name))
+        self.require_shape_of(robot)
+        return Problem(self.name, robot, InitialState.of(plant), self.goal, planner)
+
+    def require_shape_of(self, robot: SpaceRobot) -> None:
+        """Refuse a goal whose joint positions are of another robot.
+
+        Raises
+        ------
+        GoalError
+            It has more or fewer joint positions than the robot has joints.
+        """
+        shape = self.goal.joint_positions
+        if shape is not None and len(shape) != robot.n:
+            raise GoalError(
+                f"The goal shape has {len(shape)} joint position(s); robot "
+                f"'{robot.description.name}' has {robot.n} joints."
+            )
+
+    def with_overrides(self, node: str, values: Mapping[str, Any]) -> Scenario:
+        """Return the scenario with more parameters of one node set."""
+        merged = {**self.overrides, node: {**self.overrides.get(node, {}), **values}}
+        made = self._replaced(overrides=merged)
+        known = made._configs.pop(node, None)
+        if known is not None:
+            made._changes[node] = known, dict(values)
+        elif node in made._changes:
+            before, earlier = made._changes[node]
+            made._changes[node] = before, {**earlier, **values}
+        return made
+
+    def with_poses(self, goal: Goal, end_effector_goal: Goal | None) -> Scenario:
+        """Return the scenario with other goals."""
+        return self._replaced(goal=goal, end_effector_goal=end_effector_goal)
+
+    def _replaced(self, **changes: Any) -> Scenario:
+        """Return another scenario with the configurations that are known of this one."""
+        made = replace(self, **changes)
+        made._configs.update(self._configs)
+        made._changes.update(self._changes)
+        return made
+
+    def in_real_time(self, factor: float) -> Scenario:
+        """Return the scenario in real time, a factor faster, with planning in the background."""
+        pace = {"time_mode": "realtime", "real_time_factor": factor}
+        scenario = self.with_overrides("plant", pace)
+        if "planner" in self.commanders:
+            scenario = scenario.with_overrides("planner", {"plan_in_background": True})
+        # Viewers follow wall time; the plant adapts its own topics to that.
+        shown = {"diagnostics_period": 1.0}
+        period = self.config("recorder").tf_period
+        if period:
+            shown["tf_period"] = min(period, _VIEWED * factor)
+        return scenario.with_overrides("recorder", shown)
+
+    def with_method(self, method: str) -> Scenario:
+        """Return the scenario with another gait method, or another control law.
+
+        Raises
+        ------
+        ParameterError
+            It has no planner or no controller that could use it.
+        """
+        kind, node, parameter = "gait method", "planner", "method"
+        if method in LAWS:
+            kind, node, parameter = "control law", "coordinated_control", "law"
+        if node not in self.commanders:
+            raise ParameterError(
+                f"'{method}' is a {kind}, and the scenario '{self.name}' has no section "
+                f"'{node}' that could use it: it flies with {' and '.join(self.commanders)}."
+            )
+        return self.with_overrides(node, {parameter: method})
+
+    def with_settings(self, texts: Sequence[str]) -> Scenario:
+        """Return the scenario with ``node.parameter=value`` set, each as :func:`parse_setting`.
+
+        Raises
+        ------
+        ParameterError
+            A text has another form, or names no node.
+        """
+        scenario = self
+        for text in texts:
+            node, name, value = parse_setting(text)
+            scenario = scenario.with_overrides(node, {name: value})
+        return scenario
+
+    def with_goal(
+        self,
+        pose: Sequence[float] | None = None,
+        rotvec: Sequence[float] | None = None,
+        rpy_deg: Sequence[float] | None = None,
+    ) -> Scenario:
+        """Return the scenario with another pose (7,), and then another attitude (3,), if given.
+
+        The attitude is a rotation vector (rad), or roll, pitch and yaw about fixed axes (deg). The
+        published figures, which hold for the published goal, are dropped.
+
+        Raises
+        ------
+        GoalError
+            The pose or the attitude is not finite, or the attitude is given twice.
+        """
+        goal = self.goal
+        if pose is not None:
+            given = Goal.checked(pose[:3], pose[3:])
+            goal = replace(goal, position=given.position, quaternion=given.quaternion)
+        if rotvec is not None and rpy_deg is not None:
+            raise GoalError("The attitude of the goal is given twice, in radians and in degrees.")
+        if rotvec is not None:
+            given = Goal.from_rotvec(goal.position.tolist(), rotvec)
+            goal = replace(goal, quaternion=given.quaternion)
+        if rpy_deg is not None:
+            given = Goal.from_rpy(goal.position.tolist(), rpy_deg)
+            goal = replace(goal, quaternion=given.quaternion)
+        if goal is self.goal:
+            return self
+        return replace(self, goal=goal, published=(), has_goal=True)
+
+    def require_goal(self) -> None:
+        """Refuse a robot alone, which has no goal.
+
+        Raises
+        ------
+        ParameterError
+            There is no goal.
+        """
+        if not self.has_goal:
+            raise ParameterError(
+                f"'{self.name}' is a robot and has no goal: give one, for instance "
+                "--goal-rpy-deg 0 0 10, or make a scenario of it with `spacerobot new`."
+            )
+
+
+def scenario_text(scenario: Scenario) -> str:
+    """Return the text of a parameter file of the scenario, with its overrides.
+
+    Published figures and kills of nodes are not in it.
+    """
+    about: dict[str, Any] = {"description": scenario.description}
+    goals = {"goal": scenario.goal, "end_effector_goal": scenario.end_effector_goal}
+    for name, goal in goals.items():
+        if goal is not None:
+            about[f"{name}_position"] = goal.position.tolist()
+            about[f"{name}_orientation"] = goal.quaternion.tolist()
+    if scenario.goal.joint_positions is not None:
+        about["goal_joint_positions"] = scenario.goal.joint_positions.tolist()
+    content = {"scenario": {"ros__parameters": about}}
+    for node in ("plant", *scenario.commanders, "recorder"):
+        values = {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in scenario.parameters(node).items()
+        }
+        if values or node != "recorder":
+            content[f"/**/{node}"] = {"ros__parameters": values}
+    return str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+
+
+def load_scenario(name: str) -> Scenario:
+    """Return a scenario of this package by name, or of any parameter file by path.
+
+    Raises
+    ------
+    ParameterError
+        There is no such scenario, or its file cannot be used; the message names it.
+    """
+    path = Path(name)
+    if path.suffix not in (".yaml", ".yml"):
+        path = share_directory() / "config" / f"{name}.yaml"
+    if not path.is_file():
+        known, robots = scenario_names(), resource_names("urdf", ".urdf")
+        raise ParameterError(
+            f"There is no scenario '{name}'; there are: {', '.join(known)}, or any YAML file."
+            f"{suggestion(name, [*known, *robots])}"
+        )
+    content = read_content(path)
+    section = content.get("scenario")
+    values = section.get("ros__parameters") if isinstance(section, dict) else None
+    if not isinstance(values, dict):
+        raise ParameterError(
+            f"The scenario file {path} has no 'scenario: ros__parameters:' section with a goal."
+        )
+    in_file = sections_of(content, path)
+    unknown = sorted(set(map(str, values)) - set(_KEYS))
+    if unknown:
+        raise ParameterError(
+            f"The scenario file {path} has an unknown key '{unknown[0]}' in its scenario section; "
+            f"it takes {', '.join(_KEYS)}."
+        )
+    return Scenario(
+        name=path.stem,
+        path=path.resolve(),
+        description=str(values.get("description", "")),
+        goal=_goal("goal", values, path),
+        end_effector_goal=(
+            _goal("end_effector_goal", values, path)
+            if any(key.startswith("end_effector_goal") for key in values)
+            else None
+        ),
+        commanders=tuple(name for name in COMMANDERS if name in in_file) or ("planner",),
+        published=_published(values.get("published", {}), path),
+        published_method=str(values.get("published_method", "")),
+        kills=parse_kills(values.get("kills", []), f"the file {path}"),
+        in_file={node: _with_robot_beside(path, values) for node, values in in_file.items()},
+        overrides=_LOCKSTEP,
+    )
+
+
+def _with_robot_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
+    """Return parameters of a scenario file, with a robot that is a file beside it by its path."""
+    robot = values.get("robot")
+    if isinstance(robot, str) and is_path(robot) and (path.parent / robot).is_file():
+        return {**values, "robot": str((path.parent / robot).resolve())}
+    return values
+
+
+def scenario_or_robot(name: str) -> Scenario:
+    """Return a scenario, or one without a goal of a robot alone (a name or a URDF file).
+
+    The planner of a robot alone chooses its method.
+
+    Raises
+    ------
+    ParameterError
+        There is no such scenario or robot, or its file is broken.
+    RobotDescriptionError
+        The robot is refused.
+    """
+    path = Path(name)
+    is_robot = path.suffix not in (".yaml", ".yml") and (
+        path.is_file() or is_path(path.name) or name in resource_names("urdf", ".urdf")
+    )
+    if name in scenario_names() or not is_robot:
+        return load_scenario(name)
+    path = path if path.is_file() else robot_file(name)
+    load_robot(path)  # Another file is refused before a goal is asked for.
+    robot = {"robot": str(path.resolve()) if path == Path(name) else name}
+    return _of_robot(path.name.split(".")[0], path, robot)
+
+
+def scenario_of(robot: RobotDescription) -> Scenario:
+    """Return a scenario without a goal of a robot alone, as :func:`scenario_or_robot` does."""
+    return _of_robot(robot.name, Path(), {"robot_description": robot.urdf})
+
+
+def _of_robot(name: str, path: Path, robot: dict[str, str]) -> Scenario:
+    return Scenario(
+        name=name,
+        path=path,
+        description="",
+        goal=Goal.checked([0, 0, 0], [0, 0, 0, 1]),
+        end_effector_goal=None,
+        commanders=("planner",),
+        published=(),
+        published_method="",
+        kills=(),
+        in_file={"plant": robot, "planner": robot},
+        overrides=_LOCKSTEP,
+        has_goal=False,
+    )
+
+
+def scenario_names() -> list[str]:
+    """Return the names of the scenarios that come with the package, those with faults last."""
+    faults = resource_names("config/faults", ".yaml")
+    return [*resource_names("config", ".yaml"), *(f"faults/{name}" for name in faults)]
+
+
+def parse_kills(lines: object, where: str) -> tuple[Kill, ...]:
+    """Read ``NODE at SECONDS [until SECONDS]``, a list of such lines, by time.
+
+    Raises
+    ------
+    ParameterError
+        A line is none, its node is none that may be killed, or its times are not in order.
+    """
+    if not isinstance(lines, list):
+        raise ParameterError(
+            f"'kills' in {where} is {lines!r}, not a list of lines NODE at SECONDS."
+        )
+    return tuple(sorted((_kill(line, where) for line in lines), key=lambda k: k.at))
+
+
+def _kill(line: object, where: str) -> Kill:
+    match = _KILL.fullmatch(" ".join(str(line).split()))
+    if match is None:
+        raise ParameterError(
+            f"The kill {str(line)!r} in {where} is not NODE at SECONDS [until SECONDS]."
+        )
+    node, at, until = match[1], match[2], match[3] or "inf"
+    if node not in ("plant", *COMMANDERS):
+        raise ParameterError(
+            f"The kill {str(line)!r} in {where} names '{node}'; it may name "
+            f"{', '.join(('plant', *COMMANDERS))}."
+        )
+    try:
+        kill = Kill(node, float(at), float(until))
+    except ValueError:
+        kill = Kill(node, 0.0, 0.0)
+    if not 0 <= kill.at < kill.until:
+        raise ParameterError(
+            f"The kill {str(line)!r} in {where} needs times in s, the second after the first."
+        )
+    return kill
+
+
+def _published(rows: Any, path: Path) -> tuple[Published, ...]:
+    try:
+        return tuple(
+            Published(quantity, [float(x) for x in row["printed"]], str(row.get("note", "")))
+            for quantity, row in rows.items()
+        )
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ParameterError(
+            f"The section 'published' of the scenario file {path} is not "
+            f"quantity: {{printed: [numbers], note: text}}: {error!r}."
+        ) from error
+
+
+def _goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
+    try:
+        position = values.get(f"{name}_position", [0.0, 0.0, 0.0])
+        orientation = values.get(f"{name}_orientation", [0.0, 0.0, 0.0, 1.0])
+        if f"{name}_rotvec" in values:
+            orientation = Goal.from_rotvec(position, values[f"{name}_rotvec"]).quaternion
+        return Goal.checked(position, orientation, values.get(f"{name}_joint_positions"))
+    except (GoalError, ValueError, TypeError) as error:
+        raise ParameterError(f"The goal of the scenario file {path} is refused: {error}") from error
+
+
+# -- parameter files and settings --------------------------------------------------------------
+
+
+def read_sections(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the parameters by node and full name that a parameter file has.
+
+    A section is for a node in any namespace (``/**/plant``), in one (``/robot_1/plant``), in none
+    (``plant``), or for all nodes (``/**``); of two that set a parameter the later one counts, and
+    the one for all nodes counts least.
+
+    Raises
+    ------
+    ParameterError
+        The file cannot be read, or a section has no ``ros__parameters`` with parameters under it.
+    """
+    return sections_of(read_content(path), path)
+
+
+def read_content(path: Path) -> dict[Any, Any]:
+    """Return the content of a parameter file; empty where the file is no mapping.
+
+    Raises
+    ------
+    ParameterError
+        The file cannot be read.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise ParameterError(f"The scenario file {path} cannot be read: {reason}.") from error
+    return content if isinstance(content, dict) else {}
+
+
+def sections_of(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
+    """Return what :func:`read_sections` does, of a content that was read.
+
+    Raises
+    ------
+    ParameterError
+        A section has no ``ros__parameters`` with parameters under it.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    of_all: dict[str, Any] = {}
+    for key, given in content.items():
+        node = str(key).rpartition("/")[2]
+        if node not in (*NODES, "**"):
+            continue
+        given = {} if given is None else given
+        values = given.get("ros__parameters", {}) if isinstance(given, dict) else None
+        if not isinstance(values, dict):
+            raise ParameterError(
+                f"The section '{key}' of the scenario file {path} is not 'ros__parameters:' with "
+                "the parameters under it."
+            )
+        (of_all if node == "**" else found.setdefault(node, {})).update(_flat(values))
+    for node, values in found.items():
+        known = {parameter.name for parameter in declared(CONFIGS[node])}
+        shared = {name: value for name, value in of_all.items() if name in known}
+        found[node] = {**shared, **values}
+    return found
+
+
+def parse_setting(text: str) -> tuple[str, str, Any]:
+    """Split ``node.parameter=value``; the value is read as YAML.
+
+    Raises
+    ------
+    ParameterError
+        The text has another form, or names no node.
+    """
+    key, equals, value = text.partition("=")
+    node, dot, name = key.strip().partition(".")
+    if not equals or not dot or node not in NODES or not name:
+        raise ParameterError(
+            f"'{text}' is not node.parameter=value with one of the nodes {', '.join(NODES)}."
+        )
+    try:
+        parsed = yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise ParameterError(f"The value in '{text}' cannot be read.") from None
+    return node, name, number_in(parsed) if isinstance(parsed, str) else parsed
+
+
+def number_in(text: str) -> float | str:
+    """Return the number in a text, if it is one: YAML wants a dot in 1e-3, people do not."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _flat(section: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return parameters by full name: a map within a section is a group of them."""
+    flat: dict[str, Any] = {}
+    for key, value in section.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
