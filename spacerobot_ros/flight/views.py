@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.files import write_output
-from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
 from spacerobot_ros.topics import TOPICS
 
@@ -242,21 +242,21 @@ class _Skeleton:
     """The links of a robot as points: the origins of their frames, and their centres of mass."""
 
     def __init__(self, description: RobotDescription) -> None:
-        self._robot = SpaceRobot(description)
-        names = [link.name for link in description.links]
-        index = {name: i for i, name in enumerate(names)}
-        count = len(names)
-        self._com = np.array([link.inertia.com for link in description.links])
+        self._kinematics = ForwardKinematics(description)
+        names, count = self._kinematics.links, len(self._kinematics.links)
+        inertias = {link.name: link.inertia for link in description.links}
+        self._com = np.array([inertias[name].com for name in names])
         # From a link's frame to its centre of mass, and from its parent's centre of mass to it.
         self.links = [(i, count + i) for i in range(count)]
-        self.links += [(count + index[j.parent], index[j.child]) for j in description.joints]
+        self.links += [
+            (count + names.index(joint.parent), names.index(joint.child))
+            for joint in description.joints
+        ]
 
     def points(self, pose: Array, q: Array) -> Array:
         """Return (2 L, 3) in the world, m: the frames, and the centres of mass."""
-        R_WB, r_WB = matrix_from_quaternion(pose[3:]), pose[:3]
-        frames, centres = [], []
-        for k, name in enumerate(self._robot.link_names):
-            R_BL, r_BL = self._robot.link_pose(name, q)
-            frames.append(r_WB + R_WB @ r_BL)
-            centres.append(r_WB + R_WB @ (r_BL + R_BL @ self._com[k]))
-        return np.array([*frames, *centres])
+        R_BL, r_BL = self._kinematics.link_poses(q)
+        centres = r_BL + (R_BL @ self._com[:, :, None])[:, :, 0]
+        return np.asarray(
+            pose[:3] + np.concatenate([r_BL, centres]) @ matrix_from_quaternion(pose[3:]).T
+        )

@@ -1,10 +1,11 @@
 """Whether a goal is reachable: plans, and joint positions of an arm, in a child process.
 
 The process has a lower priority, so that neither the page nor the plant waits for it. It works on
-one goal at a time: a newer one cancels the plan in progress. Requests and answers are lines of JSON
-on its standard input and output. For a controller, which flies to any pose and reports only in
-flight that the arm is too short, joint positions are searched that bring the end-effector to its
-goal while the base is at its own.
+one goal at a time: a newer one cancels the plan in progress. Numbered questions and answers are
+pickled on its standard input and output, which no other program can write to.
+
+A controller flies to any pose and reports only in flight that the arm is too short: for it, joint
+positions are searched that bring the end-effector to its goal while the base is at its own.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import pickle
 import subprocess
 import sys
 import threading
@@ -20,7 +22,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
@@ -113,7 +115,7 @@ _MOST_POINTS = 200
 """Largest number of points of the path in an answer."""
 
 
-class Verdict(str, Enum):
+class Verdict(Enum):
     """Verdict on a goal."""
 
     UNCHECKED = "unchecked"
@@ -172,27 +174,6 @@ class Question:
     tool: Goal | None = None
     link: str = ""
 
-    def to_json(self, number: int) -> str:
-        """Return the request as a line."""
-        state, goal, tool = self.state, self.goal, self.tool
-        return json.dumps(
-            {
-                "number": number,
-                "urdf": self.urdf,
-                "parameters": dict(self.parameters),
-                "state": [
-                    each.tolist()
-                    for each in (
-                        *(state.position, state.quaternion, state.q),
-                        *(state.linear_momentum, state.angular_momentum),
-                    )
-                ],
-                "goal": [goal.position.tolist(), goal.quaternion.tolist(), _listed(goal)],
-                "tool": tool and [tool.position.tolist(), tool.quaternion.tolist()],
-                "link": self.link,
-            }
-        )
-
 
 def question_of(
     state: StackState,
@@ -234,11 +215,6 @@ def question_of(
     return Question(robot.urdf, parameters["planner"], start, goal)
 
 
-def _listed(goal: Goal) -> list[float] | None:
-    """Return the joint positions of a goal as a list."""
-    return None if goal.joint_positions is None else goal.joint_positions.tolist()
-
-
 class GoalChecker:
     """Checks goals in the background; a new question replaces the one before."""
 
@@ -246,7 +222,8 @@ class GoalChecker:
         self._process: subprocess.Popen[bytes] | None = None
         self._reader: threading.Thread | None = None
         self._number = self._begun = 0
-        self._last = self._progress = ""
+        self._last: Question | None = None
+        self._progress = ""
         self._asked_at = 0.0
         self._cancelled_at: float | None = None
         self._answered = True
@@ -260,8 +237,8 @@ class GoalChecker:
         if not self._answered and self._cancelled_at is None:
             self._cancelled_at = time.monotonic()
         self._answered, self._asked_at = False, time.monotonic()
-        self._last = question.to_json(self._number)
-        self._send(process, self._last)
+        self._last = question
+        self._send(process, question)
 
     def cancel(self) -> bool:
         """Cancel the check in progress; return whether there was one."""
@@ -270,7 +247,7 @@ class GoalChecker:
         self._number += 1
         self._cancelled_at = self._cancelled_at or time.monotonic()
         self._answered = True
-        self._send(self._process, json.dumps({"number": self._number}))
+        self._send(self._process, None)
         return True
 
     def look(self) -> Check | None:
@@ -320,7 +297,7 @@ class GoalChecker:
             self.close()
             self._begun = 0
             self._process = subprocess.Popen(
-                [sys.executable, "-m", __name__],
+                [sys.executable, "-c", f"from {__name__} import main; main()"],
                 **child_options(),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
@@ -333,34 +310,24 @@ class GoalChecker:
             self._reader.start()
         return self._process
 
-    def _send(self, process: subprocess.Popen[bytes], line: str) -> None:
+    def _send(self, process: subprocess.Popen[bytes], question: Question | None) -> None:
+        """Send a numbered question; None cancels the one before."""
         assert process.stdin is not None
-        with suppress(OSError):  # It has ended, which the next look notices.
-            process.stdin.write(line.encode() + b"\n")
+        with suppress(OSError):  # The process has ended, which the next call of look notices.
+            pickle.dump((self._number, question), process.stdin)
             process.stdin.flush()
 
-    def _read(self, lines: IO[bytes]) -> None:
-        with suppress(ValueError, OSError):  # Closed.
-            for line in lines:
-                answer = json.loads(line)
+    def _read(self, answers: IO[bytes]) -> None:
+        with suppress(ValueError, OSError, EOFError):  # Closed.
+            while True:
+                number, answer = pickle.load(answers)
                 with self._lock:
-                    if "progress" in answer:
-                        self._progress = f": {answer['progress']}"
-                    elif "verdict" in answer:
-                        self._answers[answer["number"]] = _check_of(answer)
+                    if answer is None:
+                        self._begun, self._progress = number, ""
+                    elif isinstance(answer, str):
+                        self._progress = f": {answer}"
                     else:
-                        self._begun, self._progress = answer["number"], ""
-
-
-def _check_of(answer: Mapping[str, Any]) -> Check:
-    shape, path = answer.get("shape"), answer.get("path")
-    return Check(
-        Verdict(answer["verdict"]),
-        answer["message"],
-        answer.get("duration_s", 0.0),
-        None if shape is None else np.array(shape, float),
-        None if path is None else np.array(path, float).reshape(-1, 3),
-    )
+                        self._answers[number] = answer
 
 
 # -- in the process -----------------------------------------------------------------------------
@@ -372,8 +339,8 @@ class Planner:
     def __init__(self) -> None:
         self._built: tuple[str, Mapping[str, str]] | None = None
 
-    def answer(self, question: Mapping[str, Any], cancellation: Cancellation) -> dict[str, Any]:
-        """Return the fields of an answer.
+    def answer(self, question: Question, cancellation: Cancellation) -> Check:
+        """Return the result of a check.
 
         Raises
         ------
@@ -381,32 +348,25 @@ class Planner:
             A newer question has arrived.
         """
         try:
-            if question["tool"] is not None:
-                return _of_arm(question)
-            built = question["urdf"], question["parameters"]
+            if question.tool is not None:
+                return _check_of_arm(question, question.tool)
+            built = question.urdf, question.parameters
             if built != self._built:
                 self._build(*built)
                 self._built = built
-            r, o, q, p, L = (np.array(each, float) for each in question["state"])
-            state = RobotState(r, o, q, p, L)
-            goal = Goal.checked(*question["goal"])
-            request = PlanRequest(state, goal, self._config.tolerance)
+            request = PlanRequest(question.state, question.goal, self._config.tolerance)
             schedule = self._worker.plan(PlanningTask(request), cancellation)
         except PlanningCancelled:
             raise
         except SpaceRobotError as error:
-            return {"verdict": Verdict.REFUSED.value, "message": str(error)}
+            return Check(Verdict.REFUSED, str(error))
         path = schedule.path.position
         step = max(1, len(path) // _MOST_POINTS)
         duration = schedule.expected_duration
         message = f"Reachable in {duration:.4g} s by '{schedule.method}'."
-        return {
-            "verdict": Verdict.REACHABLE.value,
-            "message": f"{message}{_uncontrolled(schedule, goal, request.tolerance)}",
-            "duration_s": duration,
-            "shape": schedule.positions[-1].tolist(),
-            "path": np.vstack([path[:-1:step], path[-1:]]).tolist(),
-        }
+        message += _uncontrolled(schedule, question.goal, request.tolerance)
+        shown = np.vstack([path[:-1:step], path[-1:]])
+        return Check(Verdict.REACHABLE, message, duration, schedule.positions[-1], shown)
 
     def _build(self, urdf: str, parameters: Mapping[str, str]) -> None:
         self._built = None
@@ -437,21 +397,19 @@ def _uncontrolled(schedule: GaitSchedule, goal: Goal, tolerance: Tolerance) -> s
     )
 
 
-def _of_arm(question: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the answer on whether the arm reaches its goal."""
-    robot = parse_robot(question["urdf"])
-    base, tool = (Goal.checked(*question[name]) for name in ("goal", "tool"))
-    q = np.array(question["state"][2], float)
-    shape, distance, angle = arm_shape(robot, question["link"], base, tool, q)
-    found = {"shape": shape.tolist()}
+def _check_of_arm(question: Question, tool: Goal) -> Check:
+    """Return whether the arm reaches its goal."""
+    robot = parse_robot(question.urdf)
+    q = question.state.q
+    shape, distance, angle = arm_shape(robot, question.link, question.goal, tool, q)
     if is_near(distance, angle):
         message = "The end-effector can reach its goal there."
-        return {"verdict": Verdict.REACHABLE.value, "message": message, **found}
+        return Check(Verdict.REACHABLE, message, shape=shape)
     message = (
         f"The end-effector cannot reach its goal: the nearest joint positions found leave "
         f"{distance:.3g} m and {angle:.3g} rad."
     )
-    return {"verdict": Verdict.REFUSED.value, "message": message, **found}
+    return Check(Verdict.REFUSED, message, shape=shape)
 
 
 class _LastQuestion:
@@ -459,16 +417,16 @@ class _LastQuestion:
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
-        self._question: dict[str, Any] | None = None
+        self._question: tuple[int, Question | None] | None = None
         self._cancellation = Cancellation()
 
-    def put(self, question: dict[str, Any]) -> None:
+    def put(self, question: tuple[int, Question | None]) -> None:
         with self._condition:
             self._question = question
             self._cancellation.cancel()
             self._condition.notify()
 
-    def take(self) -> tuple[dict[str, Any], Cancellation]:
+    def take(self) -> tuple[tuple[int, Question | None], Cancellation]:
         with self._condition:
             while self._question is None:
                 # A bounded wait lets signals through.
@@ -483,30 +441,26 @@ def main() -> None:
     with guarded(), suppress(Terminated):
         os.nice(_NICE)
         # Keep output of libraries out of the answers.
-        answers = os.fdopen(os.dup(1), "w")
+        answers = os.fdopen(os.dup(1), "wb")
         os.dup2(2, 1)
         last = _LastQuestion()
 
         def read() -> None:
-            for line in sys.stdin:
-                last.put(json.loads(line))
+            with suppress(EOFError):
+                while True:
+                    last.put(pickle.load(sys.stdin.buffer))
             os._exit(0)
 
-        def say(**words: Any) -> None:
-            answers.write(json.dumps(words) + "\n")
+        def send(number: int, answer: Check | str | None) -> None:
+            pickle.dump((number, answer), answers)
             answers.flush()
 
         threading.Thread(target=read, daemon=True).start()
         planner, number = Planner(), 0
-        with report_progress(lambda progress: say(number=number, progress=progress.message)):
+        with report_progress(lambda progress: send(number, progress.message)):
             while True:
-                question, cancellation = last.take()
-                number = question["number"]
-                say(number=number)
-                if "urdf" in question:
+                (number, question), cancellation = last.take()
+                send(number, None)
+                if question is not None:
                     with suppress(PlanningCancelled):
-                        say(number=number, **planner.answer(question, cancellation))
-
-
-if __name__ == "__main__":
-    main()
+                        send(number, planner.answer(question, cancellation))

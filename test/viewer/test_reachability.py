@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from threading import Event
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -36,29 +35,26 @@ def question(*position: float, **parameters: object) -> Question:
     return Question(URDF, texts, ORIGIN, goal)
 
 
-def as_asked(asked: Question) -> dict[str, Any]:
-    return dict(json.loads(asked.to_json(1)))
-
-
 def test_an_answer_is_what_the_planner_would_plan() -> None:
-    answer = Planner().answer(as_asked(question(0.1, 0.0, 0.05, tick_rate=10.0)), Cancellation())
+    answer = Planner().answer(question(0.1, 0.0, 0.05, tick_rate=10.0), Cancellation())
     own = plan(
         "sliding_masses", position=(0.1, 0.0, 0.05), method="lie_bracket", t1=4.0, cycles=0,
         control_period=0.1,
     )  # fmt: skip
-    assert answer["verdict"] == "reachable"
-    assert answer["duration_s"] == pytest.approx(own.duration)
-    np.testing.assert_allclose(answer["shape"], own.positions[-1], atol=1e-9)
-    np.testing.assert_allclose(answer["path"][-1], own.path.position[-1], atol=1e-12)
+    assert answer.verdict == Verdict.REACHABLE
+    assert answer.duration_s == pytest.approx(own.duration)
+    assert answer.shape is not None
+    assert answer.path is not None
+    np.testing.assert_allclose(answer.shape, own.positions[-1], atol=1e-9)
+    np.testing.assert_allclose(answer.path[-1], own.path.position[-1], atol=1e-12)
 
 
 def test_joint_positions_of_a_goal_are_asked_for_and_a_method_without_them_says_so() -> None:
     asked = question(0.1, 0.0, 0.05)
     wanted = replace(asked, goal=replace(asked.goal, joint_positions=np.array([0.1, -0.05, 0.2])))
-    assert as_asked(wanted)["goal"][2] == [0.1, -0.05, 0.2]
-    answer = Planner().answer(as_asked(wanted), Cancellation())
-    assert answer["verdict"] == "reachable"
-    assert "'lie_bracket' does not control the final joint positions" in answer["message"]
+    answer = Planner().answer(wanted, Cancellation())
+    assert answer.verdict == Verdict.REACHABLE
+    assert "'lie_bracket' does not control the final joint positions" in answer.message
 
 
 def test_goal_components_that_a_method_does_not_control_are_named_with_their_errors() -> None:
@@ -66,30 +62,28 @@ def test_goal_components_that_a_method_does_not_control_are_named_with_their_err
         question(0.3, -0.4, 0.0, method="area_loop"),
         urdf=load_robot(robot_file("three_joint_arm")).urdf,
     )
-    answer = Planner().answer(as_asked(chain), Cancellation())
-    assert answer["verdict"] == "reachable", answer
-    assert "'area_loop' does not control the position: it ends 0.5 m off." in answer["message"]
+    answer = Planner().answer(chain, Cancellation())
+    assert answer.verdict == Verdict.REACHABLE, answer
+    assert "'area_loop' does not control the position: it ends 0.5 m off." in answer.message
     here = replace(chain, goal=Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]))
-    assert "control" not in Planner().answer(as_asked(here), Cancellation())["message"]
+    assert "control" not in Planner().answer(here, Cancellation()).message
 
 
 def test_a_refusal_has_the_sentence_of_the_planner_and_the_next_goal_is_planned() -> None:
     planner = Planner()
-    refused = planner.answer(as_asked(question(9.0, 0.0, 0.0)), Cancellation())
-    assert refused["verdict"] == "refused"
-    assert "slider" in refused["message"] or "limits" in refused["message"]
-    wrong = planner.answer(as_asked(question(0.1, 0.0, 0.0, method="none")), Cancellation())
-    assert (wrong["verdict"], "method" in wrong["message"]) == ("refused", True)
-    assert planner.answer(as_asked(question(0.1, 0.0, 0.0)), Cancellation())["verdict"] == (
-        "reachable"
-    )
+    refused = planner.answer(question(9.0, 0.0, 0.0), Cancellation())
+    assert refused.verdict == Verdict.REFUSED
+    assert "slider" in refused.message or "limits" in refused.message
+    wrong = planner.answer(question(0.1, 0.0, 0.0, method="none"), Cancellation())
+    assert (wrong.verdict, "method" in wrong.message) == (Verdict.REFUSED, True)
+    assert planner.answer(question(0.1, 0.0, 0.0), Cancellation()).verdict == (Verdict.REACHABLE)
 
 
 def test_a_cancelled_check_has_no_answer() -> None:
     cancellation = Cancellation()
     cancellation.cancel()
     with pytest.raises(PlanningCancelled):
-        Planner().answer(as_asked(question(0.1, 0.0, 0.0, method="optimal")), cancellation)
+        Planner().answer(question(0.1, 0.0, 0.0, method="optimal"), cancellation)
 
 
 @pytest.fixture
@@ -155,18 +149,18 @@ def test_the_arm_of_a_controlled_robot_reaches_its_goal_or_not() -> None:
         base, tool = (Goal(each[:3], each[3:7]) for each in (full, pose))
         start = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6))
         near = Question(urdf, {}, start, base, tool, link)
-        answer = Planner().answer(as_asked(near), Cancellation())
-        assert answer["verdict"] == "reachable", answer
-        shape = np.array(answer["shape"])
+        answer = Planner().answer(near, Cancellation())
+        assert answer.verdict == Verdict.REACHABLE, answer
+        shape = np.array(answer.shape)
         assert np.all((lower - 1e-6 <= shape) & (shape <= upper + 1e-6))
         for name, position in zip(robot.joint_names, shape, strict=True):
             full[model.joints[model.getJointId(name)].idx_q] = position
         pin.framesForwardKinematics(model, data, full)
         np.testing.assert_allclose(data.oMf[frame].translation, tool.position, atol=1e-3)
     far = Goal(tool.position + np.array([9.0, 0.0, 0.0]), tool.quaternion)
-    answer = Planner().answer(as_asked(replace(near, tool=far)), Cancellation())
-    assert answer["verdict"] == "refused"
-    assert "m and" in answer["message"]
+    answer = Planner().answer(replace(near, tool=far), Cancellation())
+    assert answer.verdict == Verdict.REFUSED
+    assert "m and" in answer.message
 
 
 def _unit(quaternion: Array) -> Array:
