@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import astuple
 
 import casadi as ca
 import numpy as np
 
 from spacerobot_ros.batch.flights import Controlled, Flights
-from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController, build_controller
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.laws.law import Gains
@@ -27,7 +25,6 @@ from spacerobot_ros.control.state import ControlState, PoseReference, Reference
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.symbolic_rotations import quaternion_from_rotvec, quaternion_multiply
 from spacerobot_ros.times import SECOND
 
@@ -42,47 +39,39 @@ CONTROL_OUTPUTS = ("command", "exact", "measured", "next_monitor", "verdict")
 
 
 class BatchController:
-    """One controller for all flights of a batch.
+    """One controller for all flights of a batch, with their goals and gains.
 
-    :meth:`serving` returns it with the goals of a batch, which it needs for everything but
-    :meth:`function`.
-
-    Raises
-    ------
-    ParameterError
-        The law cannot drive the selected outputs.
+    Parameters
+    ----------
+    program
+        Goals and gains of the flights.
+    controller
+        See :func:`.build_controller`; the gains and goals that it has are replaced.
     """
 
-    def __init__(self, robot: SpaceRobot, config: ControllerConfig) -> None:
-        self._config = config
-        self._program = Controlled(config)
-        self._controller: CoordinatedController = build_controller(robot, config)
-        self.law = self._controller.law
-        self._n, self.period_ns = robot.n, round(config.control_period * SECOND)
+    def __init__(self, program: Controlled, controller: CoordinatedController) -> None:
+        self.program, self.controller, self.law = program, controller, controller.law
+        self._config, self._n = program.config, controller.law.robot.n
+        self._period_ns = round(program.config.control_period * SECOND)
         selection = self.law.outputs.selection
         self._groups = (
             bool(selection.base),
             bool(selection.end_effector),
-            robot.n if selection.joints else 0,
+            self._n if selection.joints else 0,
         )
 
     @classmethod
     def of(cls, flights: Flights) -> BatchController:
-        """Return the controller of the flights of a batch."""
+        """Return the controller of the flights of a batch.
+
+        Raises
+        ------
+        ParameterError
+            The law cannot control the selected outputs.
+        """
         program = flights.program
         assert isinstance(program, Controlled)
-        return cls(program.robot or flights.robot, program.config).serving(program)
-
-    def serving(self, program: Controlled) -> BatchController:
-        """Return this controller with other goals and gains; everything else is shared."""
-        served = copy(self)
-        served._program, served._config = program, program.config
-        return served
-
-    @property
-    def until_decided(self) -> bool:
-        """Whether flights end with the decision about their goals."""
-        return self._program.until_decided
+        return cls(program, build_controller(program.robot or flights.robot, program.config))
 
     # -- one flight ---------------------------------------------------------------------------
 
@@ -96,7 +85,7 @@ class BatchController:
         bounds
             (m,) errors of the outputs beyond which control is lost.
         """
-        program, controller = self._program, self._controller
+        program, controller = self.program, self.controller
         controller.reset()
         controller.set_gains(self._gains(row))
         joints = None if program.joints is None else _of(program.joints, row)
@@ -114,12 +103,12 @@ class BatchController:
 
     def time(self, tick: int) -> float:
         """Return the time of a tick as controllers know it, s."""
-        return tick * self.period_ns / SECOND
+        return tick * self._period_ns / SECOND
 
     def command(self, tick: int, state: ControlState) -> list[Array]:
         """Return efforts and wrench for a state of the flight that was begun last."""
         time = self.time(tick)
-        realised = self._controller.command(time, state, state.q, state.qdot).realised
+        realised = self.controller.command(time, state, state.q, state.qdot).realised
         return [realised.tau, realised.wrench_B]
 
     def decision(self, monitor: GoalMonitor, tick: int, qdot: Array, bounds: Array) -> Decision:
@@ -127,7 +116,7 @@ class BatchController:
 
         ``qdot`` (n,) are measured joint rates, ``bounds`` (m,) those of :meth:`begin`.
         """
-        controller, time = self._controller, self.time(tick)
+        controller, time = self.controller, self.time(tick)
         found = monitor.decision(
             time,
             controller.reference_at_rest(time),
@@ -140,7 +129,7 @@ class BatchController:
 
     def distance(self, state: ControlState, goal: Reference) -> OutputDistance:
         """Return the distance of the outputs in a state from a goal for all of them."""
-        return self._controller.distance_between(state, goal)
+        return self.controller.distance_between(state, goal)
 
     # -- lanes --------------------------------------------------------------------------------
 
@@ -154,7 +143,7 @@ class BatchController:
         return np.array([np.concatenate(self._gains(row).diagonals(selection)) for row in rows])
 
     def _gains(self, row: int) -> Gains:
-        each = self._program.gains
+        each = self.program.gains
         return each[row] if each else self._config.gains
 
     def exact(
@@ -163,7 +152,7 @@ class BatchController:
         """Return a command that :meth:`function` cannot give."""
         self.law.set_gains(self._gains(row))
         commanded = self.law.command(state, profile.at(self.time(tick)))
-        return self._controller.limited(state, commanded)
+        return self.controller.limited(state, commanded)
 
     def function(self) -> ca.Function:
         """Return the function from :data:`CONTROL_INPUTS` to :data:`CONTROL_OUTPUTS`.
@@ -213,7 +202,7 @@ class BatchController:
         )
         results = dict(zip(names, values, strict=True))
         omega, q, qdot = measured[10:13], measured[13 : 13 + n], measured[13 + n :]
-        actuation, lowered = self._controller.limited_expression(
+        actuation, lowered = self.controller.limited_expression(
             omega, q, qdot, results["actuation"]
         )
         exact = ca.logic_or(lowered, ca.logic_not(law.defined(results)))
@@ -227,7 +216,7 @@ class BatchController:
         ):
             largest[kind] = ca.fmax(largest[kind], ca.fabs(error))
             error_share = ca.fmax(error_share, ca.fabs(error) / bound)
-        for rate, limit in zip(ca.vertsplit(qdot), self._controller.joint_rates, strict=True):
+        for rate, limit in zip(ca.vertsplit(qdot), self.controller.joint_rates, strict=True):
             rate_share = ca.fmax(rate_share, ca.fabs(rate) * (1.0 / limit))
         monitor = GoalMonitor(0.0, *ca.vertsplit(memory))
         verdict = monitor.decision(

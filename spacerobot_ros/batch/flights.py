@@ -7,7 +7,7 @@ Rows are flights. A row has the numbers of :class:`.PlantConfig`, :class:`.Initi
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,6 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.integration import steps_in
-from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.simulation.actuators import PLANTS
 from spacerobot_ros.simulation.config import SensorConfig
 from spacerobot_ros.simulation.plant import InitialState
@@ -100,14 +99,7 @@ class Starts:
             The plant would refuse the initial state.
         """
         one = cls.of(robot, [initial])
-        return cls(
-            position=np.repeat(one.position, count, axis=0),
-            quaternion=np.repeat(one.quaternion, count, axis=0),
-            q=np.repeat(one.q, count, axis=0),
-            qdot=np.repeat(one.qdot, count, axis=0),
-            momenta=np.repeat(one.momenta, count, axis=0),
-            of_center=np.repeat(one.of_center, count),
-        )
+        return cls(*(np.repeat(getattr(one, each.name), count, axis=0) for each in fields(cls)))
 
     def __len__(self) -> int:
         return len(self.position)
@@ -207,13 +199,6 @@ class FollowedSchedule:
     positions: Array
     shape_gain: float = 0.0
     deadband: float = 0.0
-
-    @classmethod
-    def of(
-        cls, schedule: GaitSchedule, shape_gain: float = 0.0, deadband: float = 0.0
-    ) -> FollowedSchedule:
-        """Return the program of a planned schedule."""
-        return cls(schedule.positions, shape_gain, deadband)
 
 
 @dataclass(frozen=True)

@@ -269,7 +269,7 @@ class CompiledTick:
             model.derived[key] = cls._new(flights, model)
         found: CompiledTick = model.derived[key]
         if found.controller is not None and isinstance(program, Controlled):
-            return replace(found, controller=found.controller.serving(program))
+            return replace(found, controller=BatchController(program, found.controller.controller))
         return found
 
     @classmethod

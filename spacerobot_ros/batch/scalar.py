@@ -172,7 +172,7 @@ class _Control:
         if decision is not Decision.NONE and result.decision[row] == Decision.NONE:
             result.decision[row], result.decided_tick[row] = decision, tick
             result.decided_distance[row] = astuple(controller.distance(state, self._goal))
-            self.decided = controller.until_decided
+            self.decided = controller.program.until_decided
         return commands
 
 
