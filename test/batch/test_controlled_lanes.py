@@ -186,6 +186,32 @@ def test_thrusters_in_lanes_are_fired_as_by_the_modulator(force: float) -> None:
     assert bool(here.fallback_ticks.any()) == (force < 10.0)
 
 
+@needs_compiler
+def test_the_noise_of_a_flight_is_that_of_its_seed() -> None:
+    """Of flights that are equal but for their seeds, those of one seed alone are equal."""
+    flights = controlled(
+        *("planar_manipulator", SHAPE),
+        ticks=8,
+        count=4,
+        noise=1e-3,
+        gains=Gains.uniform(30.0, 60.0),
+    )
+    assert flights.sensors is not None
+    flights.starts.position[:], flights.sensors.pose_bias[:] = 0.0, 0.0
+    flights.sensors.noise[:], flights.sensors.seeds[:] = 1e-3, [7, 8, 7, 9]
+    program = flights.program
+    assert isinstance(program, Controlled)
+    alike = dataclasses.replace(
+        flights, program=dataclasses.replace(program, gains=()), inertial=None
+    )
+    for result in (fly_lanes(alike), fly_one_by_one(alike)):
+        for values in (result.measured_pose[:, -1], result.qdot[:, -1]):
+            np.testing.assert_array_equal(values[0], values[2])
+            others = (values[0], values[1], values[3])
+            for one, other in itertools.combinations(others, 2):
+                assert np.abs(one - other).max() > 1e-7
+
+
 def test_a_controller_at_another_rate_is_refused() -> None:
     flights = controlled("planar_manipulator", SHAPE, ticks=5)
     with pytest.raises(ParameterError, match="another rate"):

@@ -119,6 +119,22 @@ def test_coordinated_control_in_lanes_is_that_of_the_plant_and_the_controller() 
     assert len({row.metrics["duration_s"] for row in lanes.values()}) > 3
 
 
+@pytest.mark.parametrize("engine", [LanesEngine, FlightsEngine])
+def test_every_flight_has_noise_of_its_own(engine: type[LanesEngine | FlightsEngine]) -> None:
+    """Nothing but the noise differs: the campaign's seed and the number of the flight decide it."""
+    same = {"goal.position.x": {"choice": [0.5]}}
+    noisy = {"plant.sensors.position_noise": 0.002, "plant.sensors.joint_rate_noise": 1e-4}
+
+    def ends(seed: int) -> list[float]:
+        made = controlled(flights=3, seed=seed, disperse=same, set=noisy, longest=0.3)
+        rows = flown(engine(), made)
+        return [rows[number].metrics["position_error_m"] for number in range(3)]
+
+    first, again, other = ends(3), ends(3), ends(4)
+    assert first == again
+    assert len({*first, *other}) == 6
+
+
 def test_flights_in_lanes_are_interrupted_or_left_to_the_controller() -> None:
     """The longest time ends them all; joints that seem to race have control given up."""
     lanes, _ = assert_same_flights(controlled(flights=3, longest=0.305))
