@@ -5,9 +5,11 @@ nearest to it, step 3 goes round the square, step 4 comes back by the path of st
 such that its geometric phase is the turn of the base that is missing after step 1; steps 2 and 4
 cancel.
 
-Every leg is a straight line of the shape from rest to rest. The plant holds each velocity for a
-tick: the shape then moves along the same straight lines with other speeds within a tick, and the
-geometric phase, which depends on the path alone, is that of the smooth motion exactly.
+Every leg is a straight line of the shape from rest to rest; the paper's laws also start from joint
+rates that are not zero (its property 3), for which this method does not plan. The plant holds each
+velocity for a tick: the shape then moves along the same straight lines with other speeds within a
+tick, and the geometric phase, which depends on the path alone, is that of the smooth motion
+exactly.
 
 The side ``z*`` of the square solves ``phase(z*) = wanted phase``; its centre ``psi*`` is where the
 curvature is largest, remark 2, among the centres round which it fits into the joint limits.
