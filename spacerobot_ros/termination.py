@@ -309,6 +309,59 @@ def child_options(environment: Mapping[str, str] | None = None) -> dict[str, Any
     }
 
 
+def start_child(
+    words: Sequence[str], environment: Mapping[str, str] | None = None, **options: Any
+) -> subprocess.Popen[bytes]:
+    """Start Python with these words, in a session of its own; it ends with this process.
+
+    ``options`` are those of ``subprocess.Popen``; see :func:`child_options` for ``environment``.
+    """
+    import subprocess
+
+    own = child_options(environment)
+    return subprocess.Popen([sys.executable, *words], start_new_session=True, **own, **options)
+
+
+def run_child(
+    words: Sequence[str], environment: Mapping[str, str] | None = None, **options: Any
+) -> subprocess.CompletedProcess[str]:
+    """Run Python with these words to its end, or to that of this process; return its output."""
+    import subprocess
+
+    own = child_options(environment)
+    return subprocess.run(
+        [sys.executable, *words], capture_output=True, text=True, check=False, **own, **options
+    )
+
+
+def end_child(process: subprocess.Popen[bytes], signals: Mapping[int, float]) -> int:
+    """End a child of :func:`start_child` and return its exit code.
+
+    Parameters
+    ----------
+    process
+        The child.
+    signals
+        Signals to send one after the other, each with the longest wait for the end, wall s; signal
+        0 only waits. Then the child is killed with all of its session.
+    """
+    import subprocess
+
+    for number, patience in signals.items():
+        process.send_signal(number)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(patience)
+            break
+    if process.poll() is None:
+        with suppress(OSError):
+            os.killpg(process.pid, signal.SIGKILL)
+    for stream in (process.stdin, process.stdout):
+        if stream is not None:
+            with suppress(OSError):
+                stream.close()
+    return process.wait()
+
+
 @contextmanager
 def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     """Start a program that does not end by itself with this process, and kill it at the end.

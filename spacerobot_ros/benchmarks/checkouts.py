@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import statistics
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +13,7 @@ from typing import Any
 
 from spacerobot_ros.benchmarks import measurements
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.termination import child_options
+from spacerobot_ros.termination import run_child
 
 Figures = Mapping[str, float]
 
@@ -70,14 +68,7 @@ class Checkout:
             result = Path(folder, "figures.json")
             environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", **(variables or {})}
             environment["PYTHONPATH"] = str(self.folder)
-            run = subprocess.run(
-                [sys.executable, *arguments, str(result)],
-                cwd=folder,
-                **child_options(environment),
-                capture_output=True,
-                text=True,
-                check=False,
-            )
+            run = run_child([*arguments, str(result)], environment, cwd=folder)
             if run.returncode != 0:
                 last = (run.stderr.strip().splitlines() or ["it gave no reason."])[-1]
                 raise SpaceRobotError(f"The benchmark of {self.folder} failed: {last}")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 import time
 from abc import ABC, abstractmethod
@@ -27,7 +25,7 @@ from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.registry import build_method
 from spacerobot_ros.scenario import Scenario, scenario_text
-from spacerobot_ros.termination import child_options
+from spacerobot_ros.termination import run_child
 
 
 class _OneByOneEngine(ABC):
@@ -199,11 +197,9 @@ class RosEngine(_OneByOneEngine):
     def _run(self, scenario: Scenario, file: Path, bag: Path, longest: float) -> None:
         """Fly a scenario in another process: signals and the contexts of ROS are a process's."""
         file.write_text(scenario_text(scenario), encoding="utf-8")
-        command = [sys.executable, "-m", "spacerobot_ros", "run", str(file), "--bag", str(bag)]
+        command = ["-m", "spacerobot_ros", "run", str(file), "--bag", str(bag)]
         command += ["--longest", repr(longest)]
-        done = subprocess.run(
-            command, capture_output=True, text=True, check=False, **child_options()
-        )
+        done = run_child(command)
         if not bag.exists():
             lines = (done.stderr or done.stdout).strip().splitlines() or ["it left no bag"]
             raise SpaceRobotError(f"spacerobot run ended with {done.returncode}: {lines[-1]}")

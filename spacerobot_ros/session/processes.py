@@ -7,11 +7,9 @@ import math
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -33,7 +31,7 @@ from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.scenario import COMMANDERS, Kill, Scenario
 from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.stack import Stack, namespace_words
-from spacerobot_ros.termination import child_options
+from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.times import SECOND, stamp_to_ns
 from spacerobot_ros.topics import NOT_RECORDED
 
@@ -156,21 +154,10 @@ class MultiProcessStack(Stack):
             overrides["stop_when_decided"] = True
         overrides |= parameters
         overrides = {k: list(v) if isinstance(v, tuple) else v for k, v in overrides.items()}
-        file = Path(self._folder.name, f"{name}.yaml")
-        own = f"{self.namespace}/{name}" if self.namespace else name
-        file.write_text(yaml.safe_dump({own: {"ros__parameters": overrides}}), "utf-8")
+        module, folder = NODE_TYPES[name].__module__, Path(self._folder.name)
+        words = node_words(name, module, overrides, folder, self.namespace)
         with self._log_of(name).open("wb") as log:
-            self.processes[name] = subprocess.Popen(
-                [
-                    *(sys.executable, "-m", _CHILD, NODE_TYPES[name].__module__),
-                    *("--ros-args", "-r", f"__node:={name}", *namespace_words(self.namespace)),
-                    *("--params-file", str(file)),
-                ],
-                **child_options(self._environment()),
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-            )
+            self.processes[name] = start_child(words, self._environment(), stdout=log, stderr=log)
 
     def _environment(self) -> dict[str, str]:
         """Return the environment of a node; variables that the user has set stay."""
@@ -243,11 +230,7 @@ class MultiProcessStack(Stack):
             process.send_signal(signal.SIGTERM)
         end = time.monotonic() + _SHORT_PATIENCE
         for process in left:
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(max(0.0, end - time.monotonic()))
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
+            end_child(process, {0: max(0.0, end - time.monotonic())})
         self.executor.shutdown()
         self.client.node.destroy_node()
         self._folder.cleanup()
@@ -268,8 +251,7 @@ class MultiProcessStack(Stack):
 
     def kill(self, name: str) -> None:
         """Kill a node, as a crash would."""
-        os.killpg(self.processes[name].pid, signal.SIGKILL)
-        self.processes[name].wait()
+        end_child(self.processes[name], {})
 
     def _supervise(self) -> None:
         """Kill and start the nodes that the scenario names for this time; the others must run."""
@@ -288,19 +270,9 @@ class MultiProcessStack(Stack):
         """End nodes together, and return their exit codes."""
         for name in names:
             self.processes[name].send_signal(signal.SIGINT)
-        return {name: self._await_end(self.processes[name]) for name in names}
-
-    def _await_end(self, process: subprocess.Popen[bytes]) -> int:
-        try:
-            return process.wait(_END)
-        except subprocess.TimeoutExpired:
-            # The traceback that it then writes shows where it hangs.
-            process.send_signal(signal.SIGABRT)
-        try:
-            return process.wait(1.0)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            return process.wait()
+        # The traceback that SIGABRT causes shows where a node hangs.
+        waits = {0: _END, signal.SIGABRT: 1.0}
+        return {name: end_child(self.processes[name], waits) for name in names}
 
     def _on_clock(self, message: Clock) -> None:
         self._time_ns = stamp_to_ns(message.clock)
@@ -374,6 +346,17 @@ class MultiProcessStack(Stack):
             if time.monotonic() > deadline:
                 raise _LateError(f"Waited {patience:g} s for {what} in vain.")
             self.executor.spin_once(timeout_sec=0.02)
+
+
+def node_words(
+    name: str, module: str, parameters: Mapping[str, Any], folder: Path, namespace: str
+) -> list[str]:
+    """Return the arguments of Python that run a node; its parameter file is written to a folder."""
+    file = folder / f"{name}.yaml"
+    own = f"{namespace}/{name}" if namespace else name
+    file.write_text(yaml.safe_dump({own: {"ros__parameters": dict(parameters)}}), "utf-8")
+    ros = ["--ros-args", "-r", f"__node:={name}", *namespace_words(namespace)]
+    return ["-m", _CHILD, module, *ros, "--params-file", str(file)]
 
 
 class _LateError(SpaceRobotError):

@@ -6,21 +6,19 @@ import os
 import select
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import yaml
-
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes.common.process import use_loopback_discovery
 from spacerobot_ros.nodes.viewer import node
 from spacerobot_ros.parameters import Value
-from spacerobot_ros.session.stack import checked_namespace, namespace_words
-from spacerobot_ros.termination import child_options
+from spacerobot_ros.session.processes import node_words
+from spacerobot_ros.session.stack import checked_namespace
+from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.viewer.server import require_viser
 
 _START = 30.0
@@ -30,8 +28,6 @@ _END = 1.5
 """Wall time after SIGINT at which the process is killed, s."""
 
 _NICENESS = 5
-
-_CHILD = "spacerobot_ros.session.child"
 
 
 @contextmanager
@@ -60,21 +56,11 @@ def viewing(
     use_loopback_discovery()
     namespace = checked_namespace(namespace)
     with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
-        file, log = Path(folder, "viewer.yaml"), Path(folder, "viewer.txt")
-        own = f"{namespace}/viewer" if namespace else "viewer"
-        file.write_text(yaml.safe_dump({own: {"ros__parameters": dict(parameters)}}), "utf-8")
+        log = Path(folder, "viewer.txt")
         with log.open("wb") as errors:
-            process = subprocess.Popen(
-                [
-                    *(sys.executable, "-m", _CHILD, node.__name__),
-                    *("--ros-args", "-r", "__node:=viewer", "--log-level", "WARN"),
-                    *namespace_words(namespace),
-                    *("--params-file", str(file)),
-                ],
-                **child_options(),
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                start_new_session=True,
+            words = node_words("viewer", node.__name__, parameters, Path(folder), namespace)
+            process = start_child(
+                [*words, "--log-level", "WARN"], stdout=subprocess.PIPE, stderr=errors
             )
         yield_to_flight(process.pid)
         try:
@@ -85,7 +71,7 @@ def viewing(
             if process.poll() is not None:
                 show(f"The viewer ended early: {(_lines(log) or ['it was killed.'])[-1]}")
         finally:
-            _end(process)
+            end_child(process, {signal.SIGINT: _END})
 
 
 def yield_to_flight(pid: int) -> None:
@@ -117,15 +103,3 @@ def _announcement(process: subprocess.Popen[bytes], log: Path) -> str:
         elif time.monotonic() > deadline:
             raise SpaceRobotError(f"The viewer has not served its page within {_START:g} s.")
     return text.decode(errors="replace").strip()
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    process.send_signal(signal.SIGINT)
-    try:
-        process.wait(_END)
-    except subprocess.TimeoutExpired:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-    if process.stdout is not None:
-        process.stdout.close()

@@ -46,7 +46,7 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
-from spacerobot_ros.termination import Terminated, child_options, guarded
+from spacerobot_ros.termination import Terminated, end_child, guarded, start_child
 from spacerobot_ros.viewer.state import Part, StackState
 
 _STARTS = 8
@@ -275,13 +275,7 @@ class GoalChecker:
         process, self._process = self._process, None
         self._cancelled_at = None
         if process is not None:
-            with suppress(OSError):
-                os.killpg(process.pid, 9)
-            process.wait()
-            for stream in (process.stdin, process.stdout):
-                if stream is not None:
-                    with suppress(OSError):
-                        stream.close()
+            end_child(process, {})
 
     def _stuck(self) -> bool:
         since = self._cancelled_at
@@ -296,13 +290,8 @@ class GoalChecker:
         if self._process is None or self._process.poll() is not None:
             self.close()
             self._begun = 0
-            self._process = subprocess.Popen(
-                [sys.executable, "-c", f"from {__name__} import main; main()"],
-                **child_options(),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                start_new_session=True,
-            )
+            words = ["-c", f"from {__name__} import main; main()"]
+            self._process = start_child(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
             assert self._process.stdout is not None
             self._reader = threading.Thread(
                 target=self._read, args=(self._process.stdout,), daemon=True
