@@ -39,13 +39,7 @@ _NO_GOAL = GoalOptions(None, None, None)
 @click.command("plan")
 @click.argument("scenario", metavar="SCENARIO|ROBOT")
 @goal_options
-@click.option(
-    "--method",
-    type=Registered(METHODS),
-    default="optimal",
-    show_default=True,
-    help="Gait method.",
-)
+@click.option("--method", type=Registered(METHODS), help="Gait method [the scenario's].")
 @settings_option
 @json_option("Write schedule and predicted path as JSON.")
 @picture_option("Draw schedule and predicted path (.png, .svg, .pdf).")
@@ -66,7 +60,7 @@ _NO_GOAL = GoalOptions(None, None, None)
 def plan_command(
     scenario: str,
     goal: GoalOptions,
-    method: str,
+    method: str | None,
     settings: tuple[str, ...],
     json_file: Path | None,
     picture: Path | None,
@@ -83,6 +77,7 @@ def plan_command(
     from spacerobot_ros.simulation.trials import PlanEvaluation, compare, try_method
 
     problem = problem_of(scenario, goal, settings)
+    method = method or problem.config.method
     if count is not None:
         _try_random(problem, [method] if beside is None else [method, beside], count, within)
         return
@@ -92,6 +87,8 @@ def plan_command(
     if comparing:
         for line in table(found):
             click.echo(line)
+    if comparing and method == "auto":
+        method = _shortest(found)
     trial = found.get(method)
     if not isinstance(trial, PlanEvaluation):
         fail()
@@ -116,6 +113,18 @@ def plan_command(
         click.echo(f"picture     {picture}")
     if not trial.reached:
         fail(f"The goal is not reached within the planner's tolerance: {left}.")
+
+
+def _shortest(found: Mapping[str, PlanEvaluation | SpaceRobotError]) -> str:
+    """Return the method of the shortest plan that ends within tolerance; empty without one."""
+    from spacerobot_ros.simulation.trials import PlanEvaluation
+
+    reached = [
+        (each.duration, name)
+        for name, each in found.items()
+        if isinstance(each, PlanEvaluation) and each.reached
+    ]
+    return min(reached, default=(0.0, ""))[1]
 
 
 def problem_of(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.registry import method_options
 from spacerobot_ros.resources import resource_names
 from spacerobot_ros.scenario import (
@@ -38,7 +40,7 @@ def fly(
     seed: int | None = None,
     parameters: Mapping[str, Any] | None = None,
 ) -> Flight:
-    """Fly a scenario or a robot to a goal, without ROS: the same flight as ``spacerobot run``.
+    """Fly a scenario or a robot to a goal without ROS: the same flight as ``spacerobot run``.
 
     ``fly("sliding_masses")``, ``fly("planar_chain", rotvec=(0, 0, 1))``,
     ``fly("my.urdf", (0.1, 0, 0), parameters={"planner.position_tolerance": 1e-3})``.
@@ -49,28 +51,28 @@ def fly(
         A scenario: its name, its file, or :func:`~spacerobot_ros.scenario.load_scenario`'s;
         or a robot: its name, its URDF file, or its model. A name that is both is the scenario.
     goal
-        Where the base is to be; or its position (3,), m, or position and quaternion (7,). None: the
+        Goal pose of the base; or its position (3,), m, or position and quaternion (7,). None: the
         goal of the scenario.
     rotvec
-        Its attitude (3,), rad, as exponential coordinates, in the place of the goal's.
+        Attitude of the goal (3,), rad, as exponential coordinates; replaces that of ``goal``.
     method
         A gait method or a control law; None: that of the scenario.
     seed
-        Of the noise of sensors and actuators.
+        Seed of the noise of sensors and actuators.
     parameters
         Parameters of the nodes by name: ``{"plant.sensors.position_noise": 0.001}``.
 
     Raises
     ------
     ParameterError
-        There is no such scenario, robot, method or parameter, or only the nodes can fly this.
+        There is no such scenario, robot, method or parameter, or only the nodes can fly it.
     GoalError
-        The goal is none.
+        The goal is no pose.
     """
     scenario = _aimed(_scenario(what), goal, None, rotvec)
     if not scenario.has_goal:
         raise ParameterError(
-            f"'{scenario.name}' is a robot, and no scenario with a goal: give one, for instance "
+            f"'{scenario.name}' is a robot and has no goal: give one, for instance "
             "rotvec=(0, 0, 0.1)."
         )
     scenario = _with_parameters(scenario, {} if parameters is None else parameters)
@@ -95,7 +97,7 @@ def plan(
     A scenario gives the start, the limits, the tolerances, the control period, the method and,
     where none is given, the goal: ``plan("arm_attitude")``, or for another goal
     ``plan(load_scenario("sliding_masses"), rotvec=(0, 0, 0.1))``.
-    With a robot all that is as :func:`spacerobot_ros.planning.plan` has it, which takes more
+    For a robot these are the defaults of :func:`spacerobot_ros.planning.plan`, which takes more
     arguments: ``plan("sliding_masses", rotvec=(0.5, 0, 0), start=(0, 1, 0))``.
 
     Parameters
@@ -104,14 +106,15 @@ def plan(
         The model, a URDF file or the name of a robot; or a scenario, its file, or its name. A name
         that is both is the scenario where no goal is given, and else the robot.
     goal
-        Where the base is to be; or its position (3,), m, or position and quaternion (7,).
+        Goal pose of the base; or its position (3,), m, or position and quaternion (7,).
     position, rotvec
-        Its position (3,), m, and attitude (3,), rad, as exponential coordinates, in the place of
-        the goal's.
+        Position (3,), m, and attitude (3,), rad, as exponential coordinates; they replace those of
+        ``goal``.
     method
-        Name of a gait method; None: that of the scenario, or ``optimal``.
+        Name of a gait method; None: that of the scenario; of a robot alone ``auto``, or ``optimal``
+        if there are options of a method.
     options
-        Those of the method by name, and for a robot the other arguments of
+        Options of the method by name, and for a robot the other arguments of
         :func:`spacerobot_ros.planning.plan`.
 
     Raises
@@ -131,9 +134,13 @@ def plan(
                 goal = Goal.checked(goal.position, goal.quaternion, shape)
         position = None if position is None else _numbers(position, "position")
         rotvec = None if rotvec is None else _numbers(rotvec, "rotvec")
-        given = {"position": position, "rotvec": rotvec, "method": method}
+        given = {"position": position, "rotvec": rotvec}
         chosen = {name: value for name, value in given.items() if value is not None}
-        return planning.plan(what, goal, **{**chosen, **options})
+        if method is None:
+            # The options of a method that is not named are those of `optimal`.
+            of_method = options.keys() - signature(planning.plan).parameters.keys()
+            method = "optimal" if of_method else PlannerConfig().method
+        return planning.plan(what, goal, method=method, **{**chosen, **options})
     scenario = what if isinstance(what, Scenario) else load_scenario(str(what))
     scenario = _aimed(scenario, goal, position, rotvec)
     settings: dict[str, Any] = {} if method is None else {"method": method}
@@ -147,7 +154,7 @@ def plan(
 
 
 def _is_scenario(what: SpaceRobot | Scenario | str | Path, *, aimed: bool) -> bool:
-    """Whether a scenario is planned for: a name that is also a robot's is one without a goal."""
+    """Whether a name is a scenario's; one that is also a robot's is so without a goal."""
     if isinstance(what, SpaceRobot | Scenario):
         return isinstance(what, Scenario)
     name = str(what)
@@ -168,7 +175,7 @@ def _scenario(what: SpaceRobot | Scenario | str | Path) -> Scenario:
 
 
 def _aimed(scenario: Scenario, *given: Any) -> Scenario:
-    """Return a scenario with another goal, whose figures are not the published ones."""
+    """Return a scenario with another goal, without published figures."""
     if all(each is None for each in given):
         return scenario
     return replace(scenario, goal=_goal(scenario.goal, *given), published=(), has_goal=True)
@@ -203,7 +210,7 @@ def _numbers(values: npt.ArrayLike, what: str) -> list[float]:
     try:
         return [float(x) for x in np.asarray(values, dtype=float).reshape(-1)]
     except (TypeError, ValueError, OverflowError):
-        raise GoalError(f"The {what} {values!r} is no list of numbers.") from None
+        raise GoalError(f"The {what} {values!r} is not a list of numbers.") from None
 
 
 def _with_parameters(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
@@ -217,7 +224,7 @@ def _with_parameters(scenario: Scenario, settings: Mapping[str, Any]) -> Scenari
         node, dot, name = str(key).partition(".")
         if not dot or node not in CONFIGS:
             raise ParameterError(
-                f"'{key}' is no parameter: it is called node.parameter with one of the nodes "
+                f"'{key}' is not a parameter: give node.parameter with one of the nodes "
                 f"{', '.join(CONFIGS)}."
             )
         scenario = scenario.with_overrides(node, {name: value})

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.command_line import CliRunner, Result
 
+from spacerobot_ros import fly, load_scenario
+from spacerobot_ros import plan as python_plan
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.cli.plan import problem_of
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.simulation.trials import random_goals, try_goals
 
 URDF = Path(__file__).parents[2] / "urdf"
@@ -31,7 +36,7 @@ def plan(*arguments: str) -> Result:
 def test_schedule_and_path_are_written_and_drawn(tmp_path: Path) -> None:
     target, picture = tmp_path / "a" / "plan.json", tmp_path / "b" / "plan.png"
     result = plan(
-        *("planar_chain", "--goal-rotvec", "0", "0", "0.7", *QUICK),
+        *("planar_chain", "--goal-rotvec", "0", "0", "0.7", "--method", "optimal", *QUICK),
         *("--json", str(target), "--picture", str(picture)),
     )
     assert result.exit_code == 0, result.output
@@ -71,11 +76,46 @@ def test_a_robot_by_its_file_needs_no_scenario() -> None:
         *("--set", "plant.initial_joint_positions=[0.3, 0.2]"),
     )
     assert result.exit_code == 0, result.output
-    assert "optimal" in result.output
+    assert "optimal" in result.output or "auto" in result.output
+
+
+@pytest.mark.parametrize("name", ["planar_chain", "faults/stuck_slider"])
+def test_the_method_is_the_scenarios_in_plan_and_run_and_python(name: str, tmp_path: Path) -> None:
+    """Their methods are square_path and lie_bracket, that of a robot alone is auto."""
+    target = tmp_path / "plan.json"
+    plan(name, "--json", str(target))
+    written = json.loads(target.read_text())
+    scenario = load_scenario(name)
+    assert written["method"] == scenario.planner.method != PlannerConfig().method
+    assert python_plan(scenario).method == written["method"]
+    assert (
+        fly(scenario.with_overrides("planner", {"max_corrections": 0})).method == written["method"]
+    )
+
+
+def test_the_method_of_a_robot_alone_is_chosen_in_plan_and_run_and_python(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    chosen: list[str] = []
+
+    def suitable(method: str, *_: Any, **__: Any) -> None:
+        chosen.append(method)
+        raise PlanningError("That is enough.")
+
+    for module in ("simulation.trials", "planning.api", "planning.execution.worker"):
+        monkeypatch.setattr(f"spacerobot_ros.{module}.build_method", suitable)
+    robot = URDF / "planar_chain.urdf"
+    assert plan(str(robot), "--goal-rotvec", "0", "0", "-0.2").exit_code == 1
+    with pytest.raises(PlanningError, match="enough"):
+        python_plan(robot, rotvec=(0, 0, -0.2))
+    with pytest.raises(PlanningError, match="enough"):
+        fly(robot, rotvec=(0, 0, -0.2))
+    assert chosen == ["auto"] * 3
 
 
 def test_many_goals_are_counted() -> None:
-    result = plan("planar_chain", "--random", "2", "--beside", "square_path", *QUICK)
+    words = ("--method", "optimal", "--beside", "square_path")
+    result = plan("planar_chain", "--random", "2", *words, *QUICK)
     assert result.exit_code == 0, result.output
     rows = {line.split()[0]: line.split() for line in result.output.splitlines()}
     assert rows["optimal"][1:5] == ["2", "2", "0", "0"]

@@ -77,7 +77,7 @@ def test_goals_are_given_in_many_ways() -> None:
         fly("sliding_masses", (1.0, 2.0))
     with pytest.raises(ParameterError, match=r"no parameter 'sensors\.position'"):
         fly("sliding_masses", parameters={"plant.sensors.position": 1.0})
-    with pytest.raises(ParameterError, match="'position_noise' is no parameter"):
+    with pytest.raises(ParameterError, match="'position_noise' is not a parameter"):
         fly("sliding_masses", parameters={"position_noise": 1.0})
 
 
