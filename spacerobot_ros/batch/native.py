@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import lru_cache
@@ -396,34 +397,26 @@ def _library(
     functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit, thrusters: int
 ) -> ctypes.CDLL:
     """Return the library, with the vector functions of the C library if it has them."""
-    try:
-        return _compiled(functions, declarations, unit, unit.libmvec, thrusters)
-    except NoLibraryError:
-        if not unit.libmvec:
-            raise
-        return _compiled(functions, declarations, unit, "", thrusters)
-
-
-def _compiled(
-    functions: Mapping[str, ca.Function],
-    declarations: str,
-    unit: VectorUnit,
-    libmvec: str,
-    thrusters: int,
-) -> ctypes.CDLL:
     given = list(functions.values())
     renamed = [_renamed(function, f"vector_{function.name()}") for function in given]
-    body = _SELECTION.sub(r"where(\1,\2)", vector_source(renamed, "V"))
-    parts = [_definitions(given, unit, libmvec, thrusters), _file("lanes.hpp"), body]
-    parts += [
-        f"#define {name} {function.name()}"
-        for name, function in zip(functions, renamed, strict=True)
+    parts = [
+        _file("lanes.hpp"),
+        _SELECTION.sub(r"where(\1,\2)", vector_source(renamed, "V")),
+        *(f"#define {name} {each.name()}" for name, each in zip(functions, renamed, strict=True)),
+        declarations,
+        _file("thrusters.hpp"),
+        _file("driver.hpp"),
+        *map(_trial, given),
     ]
-    parts += [declarations, _file("thrusters.hpp"), _file("driver.hpp"), *map(_trial, given)]
     # Vectors as arguments between functions of this file: no other is called with them.
     flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *unit.flags)
-    libraries = ("-lmvec",) if libmvec else ()
-    return native_library(f"lanes_{given[0].name()}", "\n".join(parts), flags, libraries, given)
+    name = f"lanes_{given[0].name()}"
+    if unit.libmvec:
+        source = "\n".join([_definitions(given, unit, unit.libmvec, thrusters), *parts])
+        with suppress(NoLibraryError):
+            return native_library(name, source, flags, ("-lmvec",), given)
+    source = "\n".join([_definitions(given, unit, "", thrusters), *parts])
+    return native_library(name, source, flags, (), given)
 
 
 def _declarations(

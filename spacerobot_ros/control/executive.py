@@ -69,7 +69,7 @@ class ControlExecutive:
         config: ControllerConfig,
         report: Callable[[ControllerStatus], None],
         goal_file: GoalFile | None = None,
-        warn: Callable[[str], None] = lambda sentence: None,
+        warn: Callable[[str], None] = lambda message: None,
         report_event: Callable[[Event], None] = lambda event: None,
     ) -> None:
         self.controller = controller
@@ -91,7 +91,7 @@ class ControlExecutive:
         self.plant_blocked = False
         """Whether the plant ignores commands, set by the owner. Each command then holds the pose of
         its state, so that none of them moves the robot when the plant obeys again."""
-        self._abort_sentence = ""
+        self._abort_message = ""
         """The message of the status while the state is aborted."""
         self._pending: dict[str, IdentifiedGoal] = {}
         """Goals that are accepted and wait for the next measured state."""
@@ -150,10 +150,10 @@ class ControlExecutive:
         self._pending.pop(key, None)
         self._pending[key] = goal
 
-    def refuse(self, sentence: str, goal_id: str = "") -> None:
+    def refuse(self, message: str, goal_id: str = "") -> None:
         """Report the refusal of a goal; an earlier goal is still pursued."""
-        self._publish(ControllerState.REFUSED, sentence, goal_id)
-        self._decided(EventKind.GOAL_REFUSED, sentence, ControllerState.REFUSED, goal_id)
+        self._publish(ControllerState.REFUSED, message, goal_id)
+        self._decided(EventKind.GOAL_REFUSED, message, ControllerState.REFUSED, goal_id)
 
     def resume(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         """Accept the goals that an earlier controller saved.
@@ -206,10 +206,7 @@ class ControlExecutive:
             return False
         self._give_up(f"Aborted by the plant: {why}")
         self._hold_here = True
-        # At once: the next measured state may be long in coming.
-        self._goal_state = self._reported_state = ControllerState.ABORTED
-        self._publish(ControllerState.ABORTED, self._abort_sentence)
-        self._decided(EventKind.GOAL_ABORTED, self._abort_sentence, ControllerState.ABORTED)
+        self._report_abort()  # At once: the next measured state may be long in coming.
         return True
 
     def plant_obeys_again(self) -> None:
@@ -223,14 +220,20 @@ class ControlExecutive:
         else:
             self._hold_here = True
 
-    def _give_up(self, sentence: str) -> None:
+    def _give_up(self, message: str) -> None:
         """Drop every goal and its file; the message is that of the status from now on."""
         pursued = self._pending or self._goal_state is ControllerState.TRACKING
         # A decided goal stays decided: without another one the abort is about no goal.
         self._goal_id = self._latest_id() if pursued else ""
         self._pending.clear()
-        self._abort_sentence = sentence
+        self._abort_message = message
         self._file.delete()
+
+    def _report_abort(self) -> None:
+        """Report that every goal has been given up."""
+        self._goal_state = self._reported_state = ControllerState.ABORTED
+        self._publish(ControllerState.ABORTED, self._abort_message)
+        self._decided(EventKind.GOAL_ABORTED, self._abort_message, ControllerState.ABORTED)
 
     # -- states -------------------------------------------------------------------------------
 
@@ -282,7 +285,7 @@ class ControlExecutive:
             if decision != Decision.NONE:
                 self._goal_state, kind = _DECIDED[Decision(int(decision))]
                 self._file.delete()
-                self._decided(kind, self._sentence(self._goal_state), self._goal_state)
+                self._decided(kind, self._message(self._goal_state), self._goal_state)
         state = self.state
         if (
             state is self._reported_state
@@ -293,7 +296,7 @@ class ControlExecutive:
         self._next_report = time + self._config.status_period
         self._reported_state, self._limited = state, result.limited
         self._command_report = _command_report(self.controller, result)
-        self._publish(state, self._sentence(state), self._goal_id)
+        self._publish(state, self._message(state), self._goal_id)
 
     # -- control that is lost -----------------------------------------------------------------
 
@@ -328,9 +331,7 @@ class ControlExecutive:
         """Give up every goal, and bring the robot to rest."""
         self._give_up(f"Aborted: control is lost, {why}; the robot is brought to rest.")
         self.controller.come_to_rest()
-        self._goal_state = self._reported_state = ControllerState.ABORTED
-        self._publish(ControllerState.ABORTED, self._abort_sentence)
-        self._decided(EventKind.GOAL_ABORTED, self._abort_sentence, ControllerState.ABORTED)
+        self._report_abort()
 
     def _shift_time(self, seconds: float) -> None:
         """Continue the goal as if time had not jumped."""
@@ -342,9 +343,7 @@ class ControlExecutive:
         """Hold the measured pose, after an abort or when the plant obeys again."""
         self.controller.hold_here(time, state)
         if self._abort_requested:
-            self._goal_state = self._reported_state = ControllerState.ABORTED
-            self._publish(ControllerState.ABORTED, self._sentence(ControllerState.ABORTED))
-            self._decided(EventKind.GOAL_ABORTED, self._abort_sentence, ControllerState.ABORTED)
+            self._report_abort()
         elif self._goal_state is not ControllerState.ABORTED:
             self._goal_state, self._goal_id = ControllerState.HOLDING, ""
         self._abort_requested = self._hold_here = False
@@ -363,8 +362,8 @@ class ControlExecutive:
             end_effector=poses.get(END_EFFECTOR),
             joints=shapes[0] if shapes else None,
         )
-        sentence, goal_id = "The goal is accepted.", self._goal_id
-        self._report_event(Event(EventKind.GOAL_ACCEPTED, sentence, goal_id=goal_id))
+        message, goal_id = "The goal is accepted.", self._goal_id
+        self._report_event(Event(EventKind.GOAL_ACCEPTED, message, goal_id=goal_id))
         self._goal_state = ControllerState.TRACKING
         self._monitor.begin(time)
         self._next_report, self._error_bounds = time, None
@@ -390,18 +389,18 @@ class ControlExecutive:
 
     # -- status -------------------------------------------------------------------------------
 
-    def _publish(self, state: ControllerState, sentence: str, goal_id: str | None = None) -> None:
+    def _publish(self, state: ControllerState, message: str, goal_id: str | None = None) -> None:
         about = self._goal_id if goal_id is None else goal_id
-        self._report(ControllerStatus(state, sentence, about, self._command_report))
+        self._report(ControllerStatus(state, message, about, self._command_report))
 
     def _decided(
-        self, kind: EventKind, sentence: str, state: ControllerState, goal_id: str | None = None
+        self, kind: EventKind, message: str, state: ControllerState, goal_id: str | None = None
     ) -> None:
         """Report the event of a goal that is decided; by default of the present one."""
         about = self._goal_id if goal_id is None else goal_id
-        self._report_event(Event(kind, sentence, state.level, goal_id=about))
+        self._report_event(Event(kind, message, state.level, goal_id=about))
 
-    def _sentence(self, state: ControllerState) -> str:
+    def _message(self, state: ControllerState) -> str:
         match state:
             case ControllerState.HOLDING:
                 away = self.controller.distance_from_reference()
@@ -412,7 +411,7 @@ class ControlExecutive:
             case ControllerState.REACHED | ControllerState.FAILED:
                 return decided_message(state, self.controller.distance_to_goal())
             case ControllerState.ABORTED:
-                return self._abort_sentence
+                return self._abort_message
             case ControllerState.ESTIMATING:
                 elapsed = self.controller.estimated_for
                 return f"The base is not measured; it is estimated since {elapsed:.3g} s."
