@@ -77,6 +77,10 @@ fuzz: $(STAMP)/test ## try more than ten thousand inputs that nobody would send,
 known-errors: $(STAMP)/test ## put each known error into the package; the tests must notice it; ONLY=WORD: some
 	PYTHONPATH=test $(BIN)/python3 -m support.known_errors $(ONLY)
 
+.PHONY: passage
+passage: $(STAMP)/test ## change every parameter in a flight: it reaches the quantities that it is to change, and no others
+	$(BIN)/python3 -m pytest -q -m "slow or not slow" test/passage
+
 .PHONY: expected
 expected: $(STAMP)/test ## write what the tests expect of parameters and plans anew, where a change is wanted
 	PYTHONPATH=.:test $(BIN)/python3 -m support.expected
