@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from support.passage import FLIGHTS, Case, cases, table
 
-from spacerobot_ros.flight.parameter_files import CONFIGS
 from spacerobot_ros.parameters import declared
+from spacerobot_ros.scenario import CONFIGS
 
 TESTS = Path(__file__).resolve().parents[1]
 
