@@ -236,7 +236,7 @@ def read_command(
 ) -> RecordedCommand:
     """Return the command in a decoded message, in the order of the robot's joints.
 
-    Joints that it does not name are commanded nothing; ``frame_prefix`` is of the robot's frames.
+    ``frame_prefix`` is the prefix of the frames of the robot.
     """
     try:
         if source.quantity == "wrench":

@@ -268,7 +268,7 @@ def _little_endian(raw: bytes, type_name: str) -> bytes:
 class JointReader:
     """Takes one quantity of JointState messages into the order of the model's joints.
 
-    Joints that a message does not name are left out (zero).
+    A message must name all joints, in any order.
 
     Parameters
     ----------
@@ -277,7 +277,7 @@ class JointReader:
     quantities
         What to read; the first is required in every message.
     complete
-        Whether every joint must be named, as in a measured state.
+        Whether it is a measured state, whose stamp and size are bounded.
     """
 
     def __init__(
@@ -351,7 +351,7 @@ class JointReader:
         names = self._reader.texts("name")
         self._problem, self._order, self._copies = "", None, []
         try:
-            order = joint_order(self._joints, names, complete=self._complete)
+            order = joint_order(self._joints, names)
             for i, quantity in enumerate(self._quantities):
                 count = self._reader.count(quantity)
                 if count or i == 0:

@@ -57,6 +57,9 @@ class ThrusterPlant(WrappedPlant):
     ``thruster_health``, ``stuck_on``
         (m,) real over nominal thrust (1 unless set), and whether a thruster is stuck open. The
         allocation knows neither; see :meth:`exclude`.
+    ``wrench_fault``
+        Factor (6,) on the wrench of the thrusters, and wrench (6,) added to it; None: no fault. The
+        modulation does not know it.
 
     Parameters
     ----------
@@ -94,6 +97,7 @@ class ThrusterPlant(WrappedPlant):
         self.propellant = 0.0
         self.thruster_health = np.ones(count)
         self.stuck_on: npt.NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
+        self.wrench_fault: tuple[Array, Array] | None = None
 
     @property
     def missing(self) -> str:
@@ -144,6 +148,9 @@ class ThrusterPlant(WrappedPlant):
         works = self.thruster_health * self.duty
         self.thrust[:] = self.table.force * works
         self.wrench[:] = self._wrenches @ works
+        if self.wrench_fault is not None:
+            factor, added = self.wrench_fault
+            self.wrench[:] = factor * self.wrench + added
         self.on_time += on_time
         self.propellant += tick * float(self._mass_flow @ works)
         limited: bool = self.plant.step(effort, self.wrench)
@@ -191,7 +198,8 @@ class FaultyPlant(WrappedPlant):
     faults. A tick without faults costs one comparison.
 
     The command of a joint gets bias and noise added, then is scaled if the joint is slow; a stuck
-    joint is held in place (:meth:`Plant.hold`).
+    joint is held in place (:meth:`Plant.hold`). Faults of the wrench act on the commanded wrench,
+    or on that of the thrusters if these are modelled.
 
     Parameters
     ----------
@@ -231,7 +239,8 @@ class FaultyPlant(WrappedPlant):
         """Ticks since the beginning."""
         self.step: Callable[..., bool] = self._step
         self._control_period = control_period
-        self._rng = np.random.default_rng(seed)
+        # Another stream than that of the sensors, which have the seed itself.
+        self._rng = np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
         self._index = {name: i for i, name in enumerate(self.robot.joint_names)}
         n = self.robot.n
         self._bias, self._noise, self._factor = np.zeros(n), np.zeros(n), np.ones(n)
@@ -273,6 +282,7 @@ class FaultyPlant(WrappedPlant):
         self._seen = active
         self._bias[:], self._noise[:], self._factor[:] = 0.0, 0.0, 1.0
         self._wrench_factor[:], self._wrench_held[:] = 1.0, 0.0
+        wrench_faulty = False
         held = np.zeros(self.robot.n, dtype=np.bool_)
         variances = np.zeros_like(self._noise)
         for fault in active:
@@ -289,17 +299,21 @@ class FaultyPlant(WrappedPlant):
             elif fault.kind in ("thruster_off", "thruster_stuck"):
                 self._wrench_factor[axes] = 0.0
                 self._wrench_held[axes] = fault.value
+                wrench_faulty = True
             elif fault.kind == "thruster_weak":
                 self._wrench_factor[axes] *= fault.value
+                wrench_faulty = True
         self._noise[:] = np.sqrt(variances)
         self.plant.hold(held)
-        self._disturb_nozzles(active)
+        if self._thrusters is not None:
+            self._thrusters.wrench_fault = (
+                (self._wrench_factor, self._wrench_held) if wrench_faulty else None
+            )
+            self._disturb_nozzles(self._thrusters, active)
         self._actuators_sound = all(KINDS[f.kind].sensor for f in active)
 
-    def _disturb_nozzles(self, active: tuple[Fault, ...]) -> None:
-        thrusters = self._thrusters
-        if thrusters is None:
-            return
+    @staticmethod
+    def _disturb_nozzles(thrusters: ThrusterPlant, active: tuple[Fault, ...]) -> None:
         thrusters.thruster_health[:], thrusters.stuck_on[:] = 1.0, False
         for fault in active:
             if fault.kind.startswith("nozzle_"):
@@ -326,8 +340,10 @@ class FaultyPlant(WrappedPlant):
         if self._noise.any():
             disturbed += self._noise * self._rng.standard_normal(self.robot.n)
         realised = [self._factor * disturbed]
-        if wrench:
+        if wrench and self._thrusters is None:
             realised.append(self._wrench_factor * wrench[0] + self._wrench_held)
+        elif wrench:  # The thrusters have the faults of the wrench themselves.
+            realised.append(wrench[0])
         return realised
 
 

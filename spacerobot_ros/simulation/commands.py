@@ -1,9 +1,9 @@
-"""Which commands reach the actuators of a plant: the one rule set, for its node and for bags.
+"""Validation of commands: the rules by which a plant accepts them, for its node and for bags.
 
 A command comes from a *source* (one topic) with a stamp and values, and answers the state of that
 stamp. In lockstep the command of a tick is the first one that is stamped with it; a refused one
 makes it a tick at rest. In real time a command answers any state that was published lately, and
-holds until it is older than the timeout; one publisher commands, not two by turns.
+holds until it is older than the timeout; only one publisher may command.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ NEVER = -math.inf
 
 
 _START = 1.0
-"""Time for which a stamp of zero is that of the first state where commands never grow old, s."""
+"""Time after the start during which a stamp of zero means the first state, without a timeout, s."""
 
 _STAMP_ROUNDING = 1_000
-"""By how much a stamp may be off its state where a commander keeps time in floating point, ns."""
+"""Rounding error allowed in a stamp, of commanders that keep time in floating point, ns."""
 
-_SUPERSEDED = "it answers a state from before the plant was started, reset or stopped"
+_SUPERSEDED = "it answers a state that is older than the last start, reset or stop of the plant"
 
 _BRAKING_RATE = 20.0
 """Joint rates decay as exp(-20 t/s) while the motors are strong enough."""
@@ -51,7 +51,7 @@ Quantity = Literal["velocity", "effort", "wrench"]
 
 
 class Reason(str, Enum):
-    """Why a command is refused; the value is the word for it in parameters and diagnostics."""
+    """Reason to refuse a command; the value is its word in parameters and diagnostics."""
 
     MALFORMED = "malformed"
     """Unknown or missing joints, wrong lengths, another frame."""
@@ -60,28 +60,28 @@ class Reason(str, Enum):
     EARLY = "early"
     """Stamped ahead of the plant's time."""
     UNKNOWN_STATE = "unknown_state"
-    """Stamped between two ticks: there is no such state."""
+    """Stamped between two ticks."""
     OUT_OF_ORDER = "out_of_order"
     """Stamped before the command that is in force."""
     BEYOND_LIMITS = "beyond_limits"
     SECOND_COMMANDER = "second_commander"
-    """Another commander has already answered the same state, or two send by turns."""
+    """Another commander has answered the same state, or two publishers alternate."""
     LATCHED = "latched"
     """A fault is latched: nothing moves until it is rearmed."""
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why a command was refused.
+    """Refusal of a command.
 
     Attributes
     ----------
     reason
-        The kind of it.
+        Its reason.
     clause
-        What goes after "was refused:", with numbers and names.
+        The reason in words, with numbers and names; it completes "the command was refused:".
     latches
-        Whether this refusal has latched a fault, after which nothing moves until it is rearmed.
+        Whether it has latched a fault: nothing moves until the plant is rearmed.
     """
 
     reason: Reason
@@ -89,19 +89,15 @@ class Refusal:
     latches: bool = False
 
 
-def joint_order(
-    joints: Sequence[str], named: Sequence[str], *, complete: bool = False
-) -> npt.NDArray[np.intp]:
-    """Return which of the robot's joints each name of a message is.
+def joint_order(joints: Sequence[str], named: Sequence[str]) -> npt.NDArray[np.intp]:
+    """Return the indices of the named joints of a message among the robot's joints.
 
     Parameters
     ----------
     joints
         Names of the robot's joints.
     named
-        Those of the message.
-    complete
-        Whether every joint must be named, as in a measured state.
+        Names in the message: all joints, in any order.
 
     Raises
     ------
@@ -112,35 +108,35 @@ def joint_order(
     unknown = [name for name in named if name not in index]
     if unknown:
         raise CommandError(f"joint '{unknown[0]}' is unknown; the robot has {', '.join(joints)}")
-    if complete and len(set(named)) < len(index):
-        missing = next(name for name in index if name not in named)
-        raise CommandError(f"joint '{missing}' is missing")
     if len(set(named)) != len(named):
         raise CommandError(f"a joint is named twice in {list(named)}")
+    if len(named) < len(index):
+        missing = next(name for name in index if name not in named)
+        raise CommandError(f"joint '{missing}' is missing: a message must name all joints")
     return np.array([index[name] for name in named], dtype=np.intp)
 
 
 def require_values(named: Sequence[str], quantity: str, count: int) -> None:
-    """Refuse a message with another number of values than joints.
+    """Check that a message has as many values as joints.
 
     Raises
     ------
     CommandError
-        It is one.
+        It has another number of values.
     """
     if count != len(named):
         raise CommandError(f"{len(named)} joint(s) are named but {count} {quantity} value(s) given")
 
 
 def require_frame(frame: str, base_link: str, prefix: str = "") -> None:
-    """Refuse a wrench that is not in the frame of the base link; an empty name is that frame.
+    """Check that a wrench is in the frame of the base link; an empty name is that frame.
 
-    The name may have the prefix of the robot's frames, if they have one.
+    The name may have the prefix of the robot's frames.
 
     Raises
     ------
     CommandError
-        It is one.
+        It is in another frame.
     """
     if frame not in ("", base_link, prefix + base_link):
         raise CommandError(f"the wrench is in frame '{frame}'; it is taken in '{base_link}'")
@@ -152,28 +148,28 @@ class CommandSource:
     Attributes
     ----------
     topic
-        Its name below the robot's namespace.
+        Name below the robot's namespace.
     quantity
-        What its commands are.
+        Quantity of its commands.
     limits
         (size,) largest magnitude of each value.
     command
-        (size,) what the actuators are to do now: joint by joint (m/s, rad/s, N or N m), or force
-        (N) over torque (N m) at the origin of the base link, base components.
+        (size,) command in force: of the joints (m/s, rad/s, N or N m), or force (N) over torque
+        (N m) at the origin of the base link, base components.
     stamp_ns
-        When the command in force was stamped; :data:`NEVER` while there is none.
+        Stamp of the command in force; :data:`NEVER`: there is none.
     arrived
-        Whether the command of this tick has come, accepted or not (lockstep).
+        Whether the command of this tick has arrived, accepted or not (lockstep).
     resting
-        Whether the last command was taken back, so that joints are to come to rest.
+        Whether the last command was revoked, so that the joints are brought to rest.
     required
         Whether a lockstep plant waits for its commands.
     commanders
-        How many publish on the topic, as far as is known.
+        Known number of publishers of the topic.
     senders
-        Which of them has sent the last message.
+        Identifies the publisher of the last message.
     sender
-        Which of them has sent the command in force.
+        Publisher of the command in force.
     """
 
     def __init__(
@@ -189,7 +185,7 @@ class CommandSource:
         self.commanders = 1
 
     def rest(self) -> None:
-        """Command nothing from now on."""
+        """Revoke the command in force."""
         self.command[:] = 0.0
         self.stamp_ns = NEVER
         self.resting = True
@@ -204,19 +200,19 @@ class CommandSource:
 
 
 class CommandValidator:
-    """Decides which commands drive a plant, counts those that it refuses, and latches faults.
+    """Accepts or refuses commands to a plant, counts refusals, and latches faults.
 
     Parameters
     ----------
     plant
-        What is commanded.
+        The commanded plant.
     config
-        Its configuration: time mode, timeout, limits, and which reasons latch.
+        Its configuration: time mode, timeout, limits, and reasons that latch a fault.
 
     Raises
     ------
     ParameterError
-        ``latched_faults`` has a word that is no reason.
+        ``latched_faults`` has an unknown word.
     """
 
     def __init__(self, plant: Plant, config: PlantConfig) -> None:
@@ -224,7 +220,7 @@ class CommandValidator:
         silence_ns = round((config.command_timeout or _START) * SECOND)
         joints = partial(CommandSource, "joint_commands", senders=Senders(silence_ns))
         self.sources = [joints("velocity", robot.velocity_limit)]
-        """Those whose commands are the arguments of a step, in that order: the joints' first."""
+        """Sources in the order of the arguments of a step: the joints' first."""
         self._brakes: _JointBrakes | None = None
         if config.actuation == "effort":
             self.sources = [
@@ -241,21 +237,21 @@ class CommandValidator:
         self._one_commander = config.second_commander == "refuse"
         self._latching = _latching(config.latched_faults)
         self.counts: Counter[Reason] = Counter()
-        """How many commands were refused, by reason."""
+        """Number of refused commands by reason."""
         self.fault = ""
-        """Why nothing moves; empty while commands pass."""
+        """The latched fault, as a clause; empty: none."""
         self.fault_reason = ""
-        """The same as a word: that of the reason to refuse a command, ``abort``, ``watchdog``."""
+        """Its word: the value of a :class:`Reason`, ``abort``, or ``watchdog``."""
         self.timed_out = False
-        """Whether the last command was brought to rest because it was too old."""
+        """Whether the last command was revoked because it was too old."""
         self.timeouts = 0
-        """How often that has happened."""
+        """Number of such revocations."""
         self.last_stamp_ns: float = NEVER
-        """The stamp of the command that was the last one then."""
+        """Stamp of the last command before the latest of them."""
 
     @property
     def complete(self) -> bool:
-        """Whether every command that a lockstep plant waits for is there."""
+        """Whether all commands that a lockstep plant waits for have arrived."""
         # Twice as fast as all() over a generator, and asked every tick.
         for source in self.sources:  # noqa: SIM110
             if source.required and not source.arrived:
@@ -275,18 +271,18 @@ class CommandValidator:
         Parameters
         ----------
         source
-            Where it came from.
+            Its source.
         stamp_ns
             Its stamp.
         values
-            What it commands; an error, if its message is malformed.
+            Its values, or the error of a malformed message.
         now_ns
             Simulated time of the plant's state.
 
         Returns
         -------
         Refusal or None
-            Why it is refused; None if it is in force now.
+            The refusal; None: the command is in force.
         """
         unset = False
         if self._lockstep:
@@ -310,13 +306,13 @@ class CommandValidator:
             return None
         refusal = self._refuse(source, refusal, now_ns)
         if self._lockstep:
-            # Time must go on for the others: a bad command is a tick at rest.
+            # Time must go on: a refused command is a tick at rest.
             source.rest()
             source.arrived = True
         return refusal
 
     def unreadable(self, source: CommandSource, error: CommandError, now_ns: int) -> Refusal:
-        """Refuse bytes that are no message: they have no stamp, and so answer no tick."""
+        """Refuse bytes that are not a message; without a stamp they answer no tick."""
         return self._refuse(source, Refusal(Reason.MALFORMED, str(error)), now_ns)
 
     def begin_step(self) -> list[Array]:
@@ -328,54 +324,54 @@ class CommandValidator:
         return self._commands
 
     def begin(self, now_ns: int) -> None:
-        """Command nothing, and accept from now on what answers the state of this time or later."""
+        """Revoke all commands, and accept only answers to states of this time or later."""
         self.rest()
         self._earliest = now_ns
 
     def rest(self) -> None:
-        """Command nothing any more."""
+        """Revoke all commands."""
         self.timed_out = False
         for source in self.sources:
             source.rest()
             source.arrived = False
 
-    def latch(self, reason: str, sentence: str, now_ns: int) -> None:
-        """Bring everything to rest until :meth:`rearm`; the first fault stays the one shown.
+    def latch(self, reason: str, clause: str, now_ns: int) -> None:
+        """Bring everything to rest until :meth:`rearm`; of several faults the first is shown.
 
-        What answers a state from before the fault is refused even after it is rearmed.
+        Commands that answer a state from before the fault are refused even after that.
 
         Parameters
         ----------
         reason
             A word: the value of a :class:`Reason`, ``abort`` or ``watchdog``.
-        sentence
-            What goes after "a fault is latched:".
+        clause
+            The fault in words; it completes "a fault is latched:".
         now_ns
             Simulated time of the plant's state.
         """
         if not self.fault:
-            self.fault, self.fault_reason = sentence, reason
+            self.fault, self.fault_reason = clause, reason
             self._earliest = now_ns + self._period
         self.timed_out = False
         for source in self.sources:
             source.rest()
 
     def rearm(self) -> str:
-        """Let commands pass again; return the fault that was latched, empty if there was none."""
+        """Accept commands again; return the fault that was latched, empty: there was none."""
         fault, self.fault, self.fault_reason = self.fault, "", ""
         return fault
 
     def require_commanded(self) -> None:
-        """Wait for wrenches only while a node publishes them; joints are always waited for."""
+        """Wait for wrenches only while a node publishes them; joint commands are always awaited."""
         for source in self.sources[1:]:
             source.required = source.commanders > 0
             if not source.required:
-                # No commander is left that could turn the thrusters off.
+                # No commander is left to turn the thrusters off.
                 source.rest()
                 source.arrived = False
 
     def drop_old(self, now_ns: int) -> list[CommandSource]:
-        """Bring to rest the sources without a command for the timeout, and return them."""
+        """Revoke commands older than the timeout; return their sources."""
         silent, last = [], NEVER
         for source in self.sources:
             age = now_ns - source.stamp_ns
@@ -390,7 +386,7 @@ class CommandValidator:
         return silent
 
     def _unsound(self, source: CommandSource, values: Array | CommandError) -> Refusal | None:
-        """Return why values are refused whenever they come, if they are."""
+        """Return the refusal of values that are never accepted, if they are such."""
         if isinstance(values, CommandError):
             return Refusal(Reason.MALFORMED, str(values))
         # A sum is finite only if every term is; for a few numbers a list is summed fastest.
@@ -402,14 +398,14 @@ class CommandValidator:
         return None
 
     def _rounded(self, stamp_ns: int) -> int:
-        """Return the tick that a stamp means, if it is off by rounding only."""
+        """Return the stamp of the nearest tick, if the difference is rounding only."""
         tick = (stamp_ns + self._period // 2) // self._period * self._period
         return tick if abs(stamp_ns - tick) <= _STAMP_ROUNDING else stamp_ns
 
     def _untimely(self, source: CommandSource, stamp_ns: int, now_ns: int) -> Refusal | None:
-        """Return why a command does not belong to this moment of real time, if it does not."""
+        """Return the refusal of a command with an unsuitable stamp in real time, if it has one."""
         if source.senders.multiple_publishers and self._one_commander:
-            return Refusal(Reason.SECOND_COMMANDER, "two publishers command by turns")
+            return Refusal(Reason.SECOND_COMMANDER, "two publishers alternate on the topic")
         age = (now_ns - stamp_ns) / SECOND
         if self._timeout and age > self._timeout:
             return Refusal(Reason.STALE, f"it is {age:.3g} s old")
@@ -435,12 +431,12 @@ class CommandValidator:
         return None
 
     def _refuse(self, source: CommandSource, refusal: Refusal, now_ns: int) -> Refusal:
-        """Count a refused command; where its reason latches, everything comes to rest."""
+        """Count a refused command, and latch a fault if its reason does."""
         self.counts[refusal.reason] += 1
         if refusal.reason not in self._latching or self.fault:
             return refusal
-        sentence = f"a command on '{source.topic}' was refused: {refusal.clause}"
-        self.latch(refusal.reason.value, sentence, now_ns)
+        clause = f"a command on '{source.topic}' was refused: {refusal.clause}"
+        self.latch(refusal.reason.value, clause, now_ns)
         return Refusal(refusal.reason, refusal.clause, latches=True)
 
 
@@ -465,18 +461,18 @@ def _latching(words: str) -> frozenset[Reason]:
 
 
 class _JointBrakes:
-    """Motor efforts against the joint rates of a plant: inner forces, which leave its momenta."""
+    """Efforts that brake the joints of a plant: internal forces, which keep its momenta."""
 
     def __init__(self, plant: Plant, control_period: float) -> None:
         robot: SpaceRobot = plant.robot
         rate = min(_BRAKING_RATE, _LARGEST_RATE_PER_TICK / control_period)
         outputs = ComputedTorqueLaw.default_outputs(robot, "")
-        # Only the damping acts: the reference is always where the joints are.
+        # Only the damping acts: the reference is always the present shape.
         self._law = ComputedTorqueLaw(robot, outputs, Gains.uniform(1.0, rate))
         self._plant = plant
 
     def efforts(self) -> Array:
-        """Return the efforts (n,) to hold for the next tick, N or N m, before limits."""
+        """Return the efforts (n,) of the next tick, N or N m, before limits."""
         plant = self._plant
         state = ControlState(
             plant.pose[:3], plant.pose[3:], plant.twist[:3], plant.twist[3:], plant.q, plant.qdot
@@ -485,31 +481,31 @@ class _JointBrakes:
 
 
 _UNNUMBERED = 2**63
-"""Middleware that does not number messages reports a larger number."""
+"""Middleware without sequence numbers reports a larger number."""
 
 _MOST_PUBLISHERS = 100
-"""Largest number of publishers that are remembered."""
+"""Largest number of remembered publishers."""
 
 
 class Senders:
-    """Tells the publishers of one topic apart, by the numbers that each gives its messages.
+    """Identifies the publishers of one topic by their sequence numbers.
 
-    A publisher numbers its messages one by one, so a message belongs to the publisher whose last
-    one has the number before. Other numbers are those of a publisher that has not sent before, or
-    was started again. A publisher that comes back after another has sent, and was not silent
-    meanwhile, shares the topic with it; one that takes over for good does not.
+    A publisher numbers its messages consecutively, so a message belongs to the publisher whose last
+    message has the number before. Any other number is that of a new or restarted publisher. A
+    publisher that sends again after another one, within the silence, shares the topic with it; one
+    that has taken over for good does not.
 
     Parameters
     ----------
     silence_ns
-        Simulated time without a message after which a publisher has handed over, ns.
+        Simulated time without a message after which a publisher counts as replaced, ns.
 
     Attributes
     ----------
     current
-        A number for the publisher of the last message; None where the middleware numbers nothing.
+        Index of the publisher of the last message; None: the middleware has no sequence numbers.
     multiple_publishers
-        Whether that publisher and another one send by turns.
+        Whether that publisher and another one alternate.
     """
 
     def __init__(self, silence_ns: int) -> None:
@@ -520,10 +516,10 @@ class Senders:
         self._heard = 0
         self._publishers = 0
         self._others: dict[int, tuple[int, int]] = {}
-        """Of publishers that another one has followed, by their next number: which, and when."""
+        """Index and last time (ns) of replaced publishers, by their next sequence number."""
 
     def note(self, number: int, now_ns: int) -> None:
-        """Note the number of a message that comes at a simulated time (ns)."""
+        """Take the sequence number of a message that arrives at a simulated time (ns)."""
         if number == self._next:
             self._next, self._heard, self.multiple_publishers = number + 1, now_ns, False
             return

@@ -10,19 +10,19 @@ from spacerobot_ros.parameters import group, parameter
 from spacerobot_ros.times import SECOND
 
 _LARGEST = 1e6
-"""Largest error of a sensor, m or rad (a second): more is no measurement, and its square counts."""
+"""Largest error of a sensor, m or rad (/s): squares of much larger ones overflow."""
 
 _FAR = 1e9
 """Largest quantity of an initial state, and longest time, SI."""
 
 
 def period_ns(tick_rate: float) -> int:
-    """Return the duration of a tick in ns: stamps are whole multiples of it."""
+    """Return the duration of a tick, ns; stamps are whole multiples of it."""
     return round(SECOND / tick_rate)
 
 
 def _bias(default: tuple[float, ...], description: str, unit: str) -> Any:
-    """Return the parameter of a bias, with as many components as its default has, if any."""
+    """Return the parameter of a bias with the length of its default, of any length if that is 0."""
     return parameter(
         default,
         description,
@@ -35,7 +35,7 @@ def _bias(default: tuple[float, ...], description: str, unit: str) -> Any:
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """How the sensors err: 1 sigma of their noise, their biases, and the seed."""
+    """Errors of the sensors: 1 sigma of their noise, their biases, and the seed."""
 
     position_noise: float = parameter(
         0.0, "1 sigma an axis of odom, in world", unit="m", minimum=0.0, maximum=_LARGEST
@@ -63,7 +63,7 @@ class SensorConfig:
 
 @dataclass(frozen=True)
 class PlantConfig(WatchdogConfig, RobotConfig):
-    """What a plant is: actuation, time, limits, initial state, faults, sensors."""
+    """Parameters of a plant: actuation, time, limits, initial state, faults, sensors."""
 
     actuation: str = parameter(
         "velocity", "what joint_commands carry", choices=("velocity", "effort")
@@ -88,25 +88,25 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     second_commander: str = parameter(
         "refuse",
         "realtime: a second answer to the same state from another commander, and two commanders "
-        "that send by turns",
+        "that alternate",
         choices=("refuse", "accept"),
     )
     latched_faults: str = parameter(
         "second_commander",
-        "reasons to refuse a command after which nothing moves until ~/rearm, separated by "
+        "reasons to refuse a command that latch a fault until ~/rearm, separated by "
         "spaces: malformed not_finite stale early unknown_state out_of_order beyond_limits "
         "second_commander",
     )
     watchdog_action: str = parameter(
-        "report", "what a silent commander leads to beside a report", choices=("report", "latch")
+        "report",
+        "reaction to a silent commander: report alone, or latch a fault too",
+        choices=("report", "latch"),
     )
     integration_step: float = parameter(
         0.0, "longest step; 0: 0.01 (velocity), 0.001 (effort)", unit="s", minimum=0.0, maximum=_FAR
     )
     thrusters: str = parameter("", "'urdf': those of the robot's URDF; a YAML file; '': any wrench")
-    thrusters_excluded: str = parameter(
-        "", "names of thrusters that are not used, separated by spaces"
-    )
+    thrusters_excluded: str = parameter("", "names of thrusters out of use, separated by spaces")
     world_frame: str = parameter("world", "name of the inertial frame")
     end_effector_frame: str = parameter("", "link of end_effector_pose; '': 'end_effector', if any")
     base_pose_period: float = parameter(
@@ -180,7 +180,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     )
     faults: tuple[str, ...] = parameter(
         (),
-        "what goes wrong and when, e.g. 'joint_stuck joint_2 at 10 until 50'; see docs/faults.md",
+        "fault lines, e.g. 'joint_stuck joint_2 at 10 until 50'; see docs/faults.md",
         texts=True,
     )
     sensors: SensorConfig = group(SensorConfig())

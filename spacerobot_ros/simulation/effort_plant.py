@@ -1,19 +1,23 @@
-"""Joints that run into their limits: inelastic stops.
+"""The plant under efforts: free-flying dynamics driven by joint efforts and a wrench on the base.
+
+One tick is one compiled function: limits, integration, and every quantity that is published. The
+total momenta are states (:mod:`spacerobot_ros.model.composite_rigid_body`): without thrust they are
+constant to the last bit. A tick in which a joint touches a limit is repeated with inelastic stops.
 
 A stop acts between the two links of its joint, along the joint's coordinate: an internal force,
-which changes neither total momentum; the other joints and the base take their share. With ``K`` the
-inertia matrix of the shape (:mod:`spacerobot_ros.model.composite_rigid_body`), stops do two things:
+which changes neither total momentum; the other joints and the base react to it. With ``K`` the
+inertia matrix of the shape, stops do two things:
 
 * Arrival: of all rates that lead beyond no limit, ``qdot+`` is the nearest to ``qdot-`` in the
   metric of K. The joint does not rebound; ``(qdot+ - qdot-)' K (qdot+ - qdot-) / 2`` of energy is
   lost (Carnot). The time of arrival is found to rounding.
 * Holding: a joint on its stop stays there through an integration step if it is pushed outwards,
-  that is, if the nearest to ``qdot + h K^-1 Q`` that leads beyond no limit has it at rest (Gauss's
-  principle of least constraint over a step, Moreau's time stepping). So it leaves with a delay of
-  at most one step, and the endless shorter and shorter hops of joints that knock each
-  other off their stops end.
+  that is, if the rates nearest to ``qdot + h K^-1 Q`` that do not lead beyond a limit have it at
+  rest (Gauss's principle of least constraint over a step, Moreau's time stepping). It leaves with a
+  delay of at most one step, which ends the ever shorter hops of joints that knock each other off
+  their stops.
 
-A joint that is locked where it is (a brake, a jam) is brought to rest by the same impulse and held.
+A locked joint (a brake, a jam) is brought to rest by the same kind of impulse and held.
 """
 
 from __future__ import annotations
@@ -31,10 +35,10 @@ from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.simulation.plant import Flags, InitialState
 
 _BISECTIONS = 40
-"""They leave 1e-12 of an integration step of the time of arrival."""
+"""Bisections of the time of arrival: the error is 1e-12 of an integration step."""
 
 _BEYOND = 1e-12
-"""Distance beyond its end at which a joint counts as outside: relative, in m or rad below one."""
+"""Distance beyond a limit at which a joint counts as outside: relative, below one in m or rad."""
 
 
 class JointStops:
@@ -60,11 +64,10 @@ class JointStops:
     def advance(
         self, state: Array, command: Array, duration: float, locked: Flags | None = None
     ) -> tuple[Array, Flags]:
-        """Return the state after ``duration`` s under a held command, and the joints that stops
-        stopped or held.
+        """Return the state after ``duration`` s under a held command, and the joints (n,) that
+        their stops have brought to rest or held.
 
-        ``locked`` (n,) are joints that something holds wherever they are; moving ones are brought
-        to rest at once, as by a stop.
+        ``locked`` (n,) joints are brought to rest at once and held at any position.
 
         Raises
         ------
@@ -89,9 +92,10 @@ class JointStops:
         return x, stopped
 
     def _rest(self, x: Array, command: Array, held: Flags, locked: Flags) -> tuple[Flags, Flags]:
-        """Bring locked joints and joints on their stops to rest, in ``x``; return which stops hold
-        through the next step, and these with those that have arrived. ``held`` are the joints that
-        stops held until now.
+        """Bring locked joints and joints on their stops to rest, in ``x``.
+
+        Returns the joints that their stops hold through the next step, and these with the joints
+        that have arrived. ``held`` are the joints that stops held until now.
         """
         q, qdot = x[self._q], x[self._qdot]
         inward = np.where(q <= self._lower, 1.0, np.where(q >= self._upper, -1.0, 0.0))
@@ -105,7 +109,7 @@ class JointStops:
             if qdot[locked].any():
                 qdot[:], _ = at_rest(np.asarray(np.linalg.inv(K)), qdot, locked)
                 _, Q = self._equations(x, command)
-            # From here on they are as good as part of the bodies they join.
+            # From here on they are fixed joints.
             free = np.where(locked, 0.0, 1.0)
             K, Q = np.where(np.eye(q.size) > 0, K, K * np.outer(free, free)), Q * free
         compliance: Array = np.asarray(np.linalg.inv(K))
@@ -122,8 +126,8 @@ class JointStops:
         after = self._step(x, command, np.where(held, 0.0, 1.0), step)[0]
         if not np.all(np.isfinite(after)):
             raise SpaceRobotError(
-                "The motion is no longer finite: the commands drive the robot beyond what an "
-                "integration step can follow."
+                "The motion is no longer finite: the commands drive the robot too fast for the "
+                "integration step. Reduce the commands, or parameter 'integration_step'."
             )
         return after
 
@@ -132,7 +136,7 @@ class JointStops:
         return bool(np.any((q < self._below) | (q > self._above)))
 
     def _arrival(self, x: Array, command: Array, held: Flags, step: float) -> float:
-        """Return after which part of a step (s) the first joint is outside."""
+        """Return the time within a step (s) at which the first joint is outside."""
         early, late = 0.0, step
         for _ in range(_BISECTIONS):
             middle = (early + late) / 2
@@ -144,7 +148,7 @@ class JointStops:
 
 
 def at_rest(compliance: Array, rates: Array, joints: Flags) -> tuple[Array, Array]:
-    """Return the rates (n,) after the impulses (n,) that bring some joints to rest, and these.
+    """Return the rates (n,) after impulses that bring some joints to rest, and the impulses (n,).
 
     ``compliance`` (n, n) is the inverse of K.
     """
@@ -157,15 +161,15 @@ def at_rest(compliance: Array, rates: Array, joints: Flags) -> tuple[Array, Arra
 
 
 def pushed_out(compliance: Array, rates: Array, inward: Array, guess: Flags) -> Flags:
-    """Return which joints (n,) their stops bring to rest, so that ``inward * rates >= 0`` for all.
+    """Return the joints (n,) that their stops bring to rest, so that ``inward * rates >= 0``.
 
-    ``inward`` is 1 or -1 on a stop and 0 elsewhere. These joints make the rates after the impulses
-    the nearest to those before in the metric of K. The linear complementarity problem is solved
-    by Murty's least-index pivoting, which ends for every positive definite K from every ``guess``.
+    ``inward`` is 1 or -1 on a stop and 0 elsewhere. The rates after the impulses are the nearest to
+    those before in the metric of K. The linear complementarity problem is solved by Murty's
+    least-index pivoting, which ends for every positive definite K from every ``guess``.
     """
     joints = guess.copy()
     tried: set[bytes] = set()
-    # What comes up again is a tie to rounding: either answer is right.
+    # A set that comes up again is a tie to rounding: either answer is right.
     while joints.tobytes() not in tried:
         tried.add(joints.tobytes())
         after, impulses = at_rest(compliance, rates, joints)
@@ -184,19 +188,18 @@ With it the energy of a tumbling six-joint arm, its joints turning at several ra
 """
 
 _DIVERGED = 1e100
-"""No quantity of a state is as large (SI units)."""
+"""Magnitude (SI units) beyond which a state counts as diverged."""
 
 
 class EffortPlant:
     """A free-flying robot under held joint efforts and a held wrench on its base.
 
-    After :meth:`step`, the attributes are the state that a robot would report: those of
-    :class:`Plant`, where ``effort`` is what was realised up to now, without the efforts of stops,
-    and
+    After :meth:`step`, the attributes are those of :class:`Plant`, where ``effort`` is that of the
+    last tick after clipping, without the efforts of stops, and
 
     ``wrench``
-        (6,) force (N) over torque (N m) at the origin of the base link, base components, as
-        realised up to now.
+        (6,) force (N) over torque (N m) of the last tick at the origin of the base link, base
+        components.
 
     Parameters
     ----------
@@ -205,7 +208,7 @@ class EffortPlant:
     control_period
         Duration of a tick, s.
     initial
-        Where to start.
+        Initial state.
     integration_step
         Longest Runge-Kutta step within a tick, s.
 
@@ -255,7 +258,7 @@ class EffortPlant:
         return self._next_state[p_W.start : L_W.stop]
 
     def reset(self) -> None:
-        """Return to the initial state, nothing actuated; the limit counters go on."""
+        """Return to the initial state, without efforts; the limit counters go on."""
         start, robot = self.initial, self.robot
         self._state[:] = np.concatenate(
             [
@@ -275,13 +278,13 @@ class EffortPlant:
         return self._next_state
 
     def place(self, state: Array) -> None:
-        """Put the robot into another state (2 n + 13,); the next step goes on from there."""
+        """Set the state (2 n + 13,) from which the next step starts."""
         self._next_state[:] = state
 
     def hold(self, joints: Flags) -> None:
-        """Hold these joints (n,) where they are from now on, by inner forces.
+        """Lock these joints (n,) at their positions from now on, and no others.
 
-        A joint that moves is stopped by an inner impulse; neither total momentum changes.
+        A moving joint is stopped by an internal impulse; neither total momentum changes.
         """
         self._held[:] = joints
         self._holding = bool(joints.any())
@@ -312,7 +315,7 @@ class EffortPlant:
         return self._apply_limits()
 
     def _apply_limits(self) -> bool:
-        """Count what was clipped, and take the tick again if a joint touched a stop or is held."""
+        """Count clipped joints, and repeat the tick if a joint touched a stop or is locked."""
         n = self.robot.n
         clipped, touched = self._limited[1 : 1 + n] != 0.0, self._limited[1 + n] != 0.0
         stopped = np.zeros(n, dtype=np.bool_)
@@ -334,7 +337,7 @@ class EffortPlant:
         return bool(clipped.any() or stopped.any())
 
     def _report(self) -> None:
-        """Fill every output at ``_state``: a tick of zero duration."""
+        """Compute all outputs at ``_state``, by a tick of zero duration."""
         self._h[:] = 0.0
         self._advance.evaluate()
         self._h[:] = self.control_period
@@ -360,7 +363,7 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     momentum = model("momentum", quaternion, q, v, omega, qdot)
     link_R, link_r = model("link_poses", q)
     clipped = command[:n] != effort
-    # Comparisons with what is not a number are false.
+    # Comparisons with NaN are false.
     diverged = parts[-1].stop - ca.sum1(ca.fabs(next_state) < _DIVERGED)
     touched = marched[-1] + diverged
     return model.function(
@@ -380,9 +383,9 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
 
 
 def _watched_step(robot: SpaceRobot, model: Composition) -> ca.Function:
-    """Return the step that also counts, in one more entry of the state, joints on or beyond stops.
+    """Return the step with one more state: the number of joints on or beyond stops so far.
 
-    It looks at the end of each step: a joint cannot swing beyond its limit and back within one.
+    They are counted at the end of each step: a joint cannot swing beyond its limit and back in one.
     """
     watched = ca.MX.sym("x", state_slices(robot.n)[-1].stop + 1)
     command, h = ca.MX.sym("command", robot.n + 6), ca.MX.sym("h")
@@ -392,6 +395,6 @@ def _watched_step(robot: SpaceRobot, model: Composition) -> ca.Function:
 
 
 def _touching(robot: SpaceRobot, state: ca.MX) -> ca.MX:
-    """Return how many joints are not strictly inside their limits."""
+    """Return the number of joints that are not strictly inside their limits."""
     q = state[: robot.n]
     return robot.n - ca.sum1(ca.logic_and(q > ca.DM(robot.lower), q < ca.DM(robot.upper)))

@@ -1,8 +1,8 @@
-"""Faults: a timeline of them, each written as one line, and the plant whose actuators have them.
+"""Fault lines and their timeline.
 
 ``KIND TARGET [VALUE] [at SECONDS] [until SECONDS]``, for example
 ``joint_stuck joint_2 at 10 until 50``. Without ``at`` a fault begins at once, without ``until`` it
-never ends. Kinds, their targets and what their values mean are in :data:`KINDS`.
+never ends. :data:`KINDS` has the kinds with their targets and values.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from dataclasses import dataclass
 from spacerobot_ros.errors import ParameterError
 
 _LARGEST = 1e6
-"""Largest value of a fault, in its unit: more is beyond every robot, and squares would overflow."""
+"""Largest value of a fault, in its unit: squares of much larger ones overflow."""
 
 _LONGEST = 1e9
 """Largest time of a fault, s."""
 
 _MOST_FAULTS = 1000
-"""More at once take longer than a tick to look through."""
+"""Largest number of faults: more take longer than a tick to search."""
 
 WRENCH_AXES = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
-"""Components of the thrusters' wrench on the base, base components."""
+"""Components of the wrench on the base, in base components."""
 
 POSE_AXES = (
     "position_x",
@@ -36,16 +36,23 @@ POSE_AXES = (
 """Components of the measured pose: position in W, rotation vector in B."""
 
 GROUPS = ("position", "attitude", "velocity", "angular_velocity", "joints", "joint_rates")
-"""What sensors measure: the base's pose and twist, joint positions and rates."""
+"""Groups of measured quantities: the base's pose and twist, joint positions and rates."""
 
 
 @dataclass(frozen=True)
 class FaultKind:
-    """A kind of fault: its targets (``joint`` and ``nozzle`` stand for all names of such), and its
-    value if any.
+    """A kind of fault.
 
-    ``value`` says what the number is, empty where a fault has none, ``minimum`` and ``maximum``
-    bound it. ``sensor`` are the kinds that change what is measured and not what happens.
+    Attributes
+    ----------
+    targets
+        Names of targets; ``joint`` and ``nozzle`` stand for all names of joints and thrusters.
+    value
+        Meaning of its number; empty: it has none.
+    minimum, maximum
+        Range of that number.
+    sensor
+        Whether it changes measurements instead of the motion.
     """
 
     targets: tuple[str, ...]
@@ -73,7 +80,7 @@ KINDS: dict[str, FaultKind] = {
     "sensor_dropout": FaultKind(("odom",), sensor=True),
     "sensor_delay": FaultKind(("odom",), "s, to whole ticks", 0.0, 60.0, sensor=True),
 }
-"""The kinds of faults by name."""
+"""Kinds of faults by name."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +102,8 @@ class Fault:
 
 @dataclass(frozen=True)
 class Targets:
-    """What faults can hit: joints by name, the thrusters' wrench if there is one, and the nozzles
-    that give it by name, if they are modelled.
+    """Targets of faults: joint names, the wrench on the base if there is one, and thruster names if
+    thrusters are modelled.
     """
 
     joints: Sequence[str] = ()
@@ -124,14 +131,14 @@ def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
     line
         As the module describes.
     targets
-        What there is to hit.
+        Targets of this plant.
     now
-        When the fault begins if the line does not say, s.
+        Begin of the fault if the line has none, s.
 
     Raises
     ------
     ParameterError
-        The line is no fault of this robot; the sentence quotes it.
+        The line is not a fault of this plant; the message quotes it.
     """
 
     def refusal(reason: str) -> ParameterError:
@@ -146,7 +153,7 @@ def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
     kind = KINDS[name]
     known = targets.of(kind)
     if not known:
-        raise refusal(f"this plant has nothing that {name} could hit")
+        raise refusal(f"this plant has no target of {name}")
     if target not in known:
         raise refusal(f"the target of {name} is one of {', '.join(known)}")
     value = 0.0
@@ -186,27 +193,27 @@ class FaultTimeline:
     Parameters
     ----------
     lines
-        One fault each; see :func:`parse_fault`.
+        Fault lines; see :func:`parse_fault`.
     targets
-        What there is to hit.
+        Targets of this plant.
     """
 
     def __init__(self, lines: Iterable[str], targets: Targets) -> None:
         self._targets = targets
         self.faults: list[Fault] = []
         self.active: tuple[Fault, ...] = ()
-        """Another tuple whenever other faults are active than before."""
+        """Active faults; a new tuple object after every change."""
         self.next_change = -math.inf
-        """When ``active`` changes next, s."""
+        """Time of the next change of ``active``, s."""
         self.read(lines)
 
     def read(self, lines: Iterable[str], now: float = 0.0) -> None:
-        """Add a fault a line, which begins ``now`` (s) unless it says when.
+        """Add a fault per line, which begins ``now`` (s) if the line has no time.
 
         Raises
         ------
         ParameterError
-            A line is no fault, or there are too many; none is added.
+            A line is not a fault, or there are too many; none is added.
         """
         added = [parse_fault(line, self._targets, now) for line in lines if line.strip()]
         if len(self.faults) + len(added) > _MOST_FAULTS:
@@ -218,7 +225,7 @@ class FaultTimeline:
         self.next_change = -math.inf
 
     def clear(self) -> None:
-        """Forget every fault, those to come too."""
+        """Remove all faults, also those that have not begun."""
         self.faults.clear()
         self.next_change = -math.inf
 

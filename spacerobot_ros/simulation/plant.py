@@ -1,4 +1,4 @@
-"""The interface of every plant, and plants round other plants."""
+"""The interface of plants, a base class of plants that wrap others, and their initial state."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Flags = npt.NDArray[np.bool_]
 
 
 class Plant(Protocol):
-    """A robot that steps by ticks; the attributes are the state that it would report then.
+    """A simulated robot that advances by ticks; the attributes are its state after the last one.
 
     ``pose``
         (7,) position ``r_WB`` in m and quaternion ``R_WB`` (x, y, z, w) of the base link.
@@ -32,11 +32,11 @@ class Plant(Protocol):
         (n,) efforts of the joints' actuators, N or N m.
     ``momentum``
         (7,) linear momentum (kg m/s), angular momentum about the system's centre of mass
-        (kg m^2/s), both in W, and kinetic energy (J): summed body by body from the state above.
+        (kg m^2/s), both in W, and kinetic energy (J), summed over the bodies.
     ``link_R``, ``link_r``
         (3, 3 L) and (3, L): pose in B of every link, in the order of ``robot.link_names``.
 
-    The arrays are the plant's own: they change in place.
+    The arrays belong to the plant and change in place: copy values that are kept.
     """
 
     robot: SpaceRobot
@@ -54,7 +54,7 @@ class Plant(Protocol):
         """Return to the initial state."""
 
     def hold(self, joints: Flags) -> None:
-        """Hold these joints (n,) where they are from now on, and no others."""
+        """Lock these joints (n,) at their positions from now on, and no others."""
 
     @property
     def step(self) -> Callable[..., bool]:
@@ -70,7 +70,7 @@ class Plant(Protocol):
 
 
 class WrappedPlant:
-    """Reports the state of the plant within, in the same arrays; subclasses add its step."""
+    """Base class of plants around another: its state in the same arrays; subclasses add a step."""
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
@@ -90,7 +90,7 @@ class WrappedPlant:
         return self.plant.expected_momenta
 
     def hold(self, joints: Flags) -> None:
-        """Hold these joints (n,) where they are from now on, and no others."""
+        """Lock these joints (n,) at their positions from now on, and no others."""
         self.plant.hold(joints)
 
     def reset(self) -> None:
@@ -100,12 +100,12 @@ class WrappedPlant:
 
 @dataclass(frozen=True)
 class InitialState:
-    """Where a run starts: base pose in W (m; quaternion x, y, z, w), shape, and total momenta in W.
+    """Initial state of a plant: base pose in W (m; quaternion x, y, z, w), shape, momenta in W.
 
-    ``joint_positions`` None means zero, or the nearest limit of a joint that cannot be there.
+    ``joint_positions`` None means zero, or the nearest limit of a joint whose range excludes zero.
     ``angular_momentum`` (kg m^2/s) is about the system's centre of mass. ``joint_velocities`` None
     means zero; the base's twist follows from them and the momenta. ``center_of_mass`` (m, in W)
-    puts the system's centre of mass there instead of the base link at ``position``.
+    places the system's centre of mass instead of the base link.
 
     Raises
     ------
@@ -123,7 +123,7 @@ class InitialState:
 
     @classmethod
     def of(cls, config: PlantConfig) -> InitialState:
-        """Return where a configuration has a run start; an empty list leaves a choice open.
+        """Return the initial state of a configuration; empty lists mean defaults.
 
         Raises
         ------
@@ -207,7 +207,7 @@ class InitialState:
         return _of_joints(robot, self.joint_velocities, "velocities")
 
     def system_position(self, robot: SpaceRobot) -> Array:
-        """Return where the system's centre of mass is in W (3,), m.
+        """Return the position of the system's centre of mass in W (3,), m.
 
         Raises
         ------
@@ -228,13 +228,13 @@ def _optional(values: tuple[float, ...]) -> Array | None:
     return np.array(values) if values else None
 
 
-def _of_joints(robot: SpaceRobot, given: Array, what: str) -> Array:
+def _of_joints(robot: SpaceRobot, given: Array, quantity: str) -> Array:
     values = np.asarray(given, dtype=float)
     if values.shape != (robot.n,):
         raise ParameterError(
-            f"The initial joint {what} are {values.size} numbers; robot "
+            f"The initial joint {quantity} are {values.size} numbers; robot "
             f"'{robot.description.name}' has {robot.n} joints: {', '.join(robot.joint_names)}."
         )
     if not np.all(np.isfinite(values)):
-        raise ParameterError(f"The initial joint {what} must be finite, not {values.tolist()}.")
+        raise ParameterError(f"The initial joint {quantity} must be finite, not {values.tolist()}.")
     return values

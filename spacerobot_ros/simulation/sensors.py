@@ -1,4 +1,4 @@
-"""What a robot measures of itself: the truth with bias, noise, delay, and now and then nothing."""
+"""Sensors of a plant, and its state as the topics carry it: measured and true."""
 
 from __future__ import annotations
 
@@ -32,20 +32,22 @@ _NOISES = {
 
 
 class Sensors:
-    """The measured state of a plant beside the true one.
+    """Measurements of the state of a plant, with bias, noise, delay and dropouts.
 
-    ``pose`` (7,), ``twist`` (6,), ``q`` and ``qdot`` (n,) are what was measured last, arranged as
-    those of the plant. Each call of :meth:`measure` draws new noise from the seed, so a flight of
-    as many ticks is the same again.
+    ``pose`` (7,), ``twist`` (6,), ``q`` and ``qdot`` (n,) are the last measurements, arranged as
+    the state of the plant. Each call of :meth:`measure` draws new noise: flights with the same seed
+    are the same.
+
+    A delay begins with the state at its beginning: until it has passed, pose and twist stand still.
 
     Parameters
     ----------
     plant
-        Whose state is measured, and whose faults the sensors share.
+        The measured plant, with the faults of its sensors.
     config
-        How they err without faults.
+        Errors without faults.
     control_period
-        s.
+        Duration of a tick, s.
 
     Raises
     ------
@@ -66,21 +68,22 @@ class Sensors:
         self.pose, self.twist = plant.pose.copy(), plant.twist.copy()
         self.q, self.qdot = plant.q.copy(), plant.qdot.copy()
         self.dropout = False
-        """Whether the pose was not measured at all."""
+        """Whether there is no measurement of the pose."""
         self._pose_bias, self._joint_bias = np.zeros(6), np.zeros(n)
         self._noise = dict.fromkeys(_NOISES, 0.0)
         self.pose_covariance, self.twist_covariance = np.zeros(36), np.zeros(36)
-        """Of what odom measures: position and attitude, velocities, each 6 x 6 in a row. Noise
-        alone counts: a bias and a delay are unknown to who measures."""
+        """Covariances of pose and twist, each 6 x 6 in a row, of the noise alone: a sensor knows
+        neither its bias nor its delay."""
         self._delay = 0
-        self._past: deque[tuple[Array, Array]] = deque([(self.pose, self.twist)], maxlen=1)
+        self._past: deque[tuple[Array, Array]] = deque(maxlen=1)
+        """True poses and twists of the last ticks, copied."""
         self._adopt(plant.active)
         self.used = self.imperfect or any(KINDS[f.kind].sensor for f in plant.timeline.faults)
-        """Whether what is measured has ever been, or will be, another thing than the truth."""
+        """Whether measurements differ from the truth now, did before, or will by a known fault."""
 
     @property
     def imperfect(self) -> bool:
-        """Whether what is measured now differs from the truth."""
+        """Whether measurements differ from the truth now."""
         return bool(
             self.dropout
             or self._delay
@@ -90,7 +93,7 @@ class Sensors:
         )
 
     def measure(self) -> None:
-        """Measure the present state of the plant; perfect sensors that were never used do not."""
+        """Measure the present state of the plant; does nothing for sensors without errors."""
         if self._plant.active is not self._faults:
             self._adopt(self._plant.active)
             self.used = self.used or self.imperfect
@@ -98,7 +101,7 @@ class Sensors:
             return
         plant, normal, noise = self._plant, self._rng.standard_normal, self._noise
         self._past.append((plant.pose.copy(), plant.twist.copy()))
-        # After a change of the delay the past may still be shorter than it.
+        # After the beginning of a delay the past is shorter than it.
         pose, twist = self._past[max(0, len(self._past) - 1 - self._delay)]
         n = len(self.q)
         errors = normal(12)
@@ -113,7 +116,7 @@ class Sensors:
         self.qdot[:] = plant.qdot + noise["joint_rates"] * normal(n)
 
     def _adopt(self, faults: tuple[Fault, ...]) -> None:
-        """Take over the sensors' share of the faults that are active now."""
+        """Apply the active faults of sensors."""
         self._faults = faults
         config = self._config
         self._pose_bias[:3] = config.position_bias or 0.0
@@ -133,7 +136,7 @@ class Sensors:
             elif fault.kind == "sensor_delay":
                 delay = max(delay, fault.value)
         self._noise = {group: variance**0.5 for group, variance in variances.items()}
-        # The noise of a group is the same in all directions: so it is in any frame.
+        # The noise of a group is isotropic, so its covariance is the same in any frame.
         for covariance, linear, angular in (
             (self.pose_covariance, "position", "attitude"),
             (self.twist_covariance, "velocity", "angular_velocity"),
@@ -149,18 +152,18 @@ class ReportedState:
     Parameters
     ----------
     plant
-        Whose state it is.
+        The plant.
     config
         Its configuration: sensors and end-effector.
 
     Attributes
     ----------
     sensors
-        What they measure is what odom and joint_states carry.
+        Sources of odom and joint_states.
     quantities
-        By the names of :attr:`StateField.quantity`: arrays, those of the plant itself, which change
-        in place. Another dictionary as soon as the sensors begin to err. What a plant does not have
-        (thrusters, an end-effector, a truth beside its measurements) is not in it.
+        Arrays by the names of :attr:`StateField.quantity`, which change in place. It is replaced by
+        another dictionary when the sensors begin to err. Quantities that a plant does not have
+        (thrusters, an end-effector, a truth beside its measurements) are not in it.
 
     Raises
     ------
@@ -187,7 +190,7 @@ class ReportedState:
         ]
 
     def names(self, topic: Topic) -> tuple[str, ...]:
-        """Return what the arrays of a topic have entries for."""
+        """Return the names of the entries of a topic's arrays: joints or thrusters."""
         if topic.of == "thrusters" and self._thrusters is not None:
             return tuple(self._thrusters.table.names)
         return tuple(self._plant.robot.joint_names)
@@ -198,7 +201,7 @@ class ReportedState:
         Returns
         -------
         bool
-            Whether :attr:`quantities` are others than before.
+            Whether :attr:`quantities` has been replaced.
         """
         self.sensors.measure()
         if self._link is not None:
@@ -249,7 +252,7 @@ class ReportedState:
 
 
 def _end_effector(robot: SpaceRobot, name: str) -> int | None:
-    """Return the number of the link whose pose is published, if one is."""
+    """Return the index of the link whose pose is published; None: there is none."""
     links = list(robot.link_names)
     link = robot.description.end_effector(name)
     if link and link not in links:

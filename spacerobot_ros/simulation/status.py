@@ -1,4 +1,4 @@
-"""What a plant reports of itself: whether it moves, why not, and what is injected."""
+"""Status of a plant: its state, the reason, and the injected faults."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _SEPARATOR = "; "
 
 
 class PlantState(str, Enum):
-    """What a plant does with time and with commands; the value of ``state`` in plant/status."""
+    """State of a plant with regard to time and commands; the value of ``state`` in plant/status."""
 
     INACTIVE = "inactive"
     """It publishes no states and accepts no command."""
     RUNNING = "running"
-    """A command is in force; in lockstep also: it waits for one."""
+    """A command is in force, or (lockstep) it waits for one."""
     RESTING = "resting"
-    """Time goes on and no command is in force: none has come yet, or the last is too old."""
+    """Time goes on without a command in force: none has come yet, or the last is too old."""
     PAUSED = "paused"
-    """Time stands still; commands are accepted."""
+    """Time is stopped; commands are accepted."""
     LATCHED = "latched"
-    """Time goes on with everything at rest, until the fault is rearmed."""
+    """Time goes on with everything at rest, until the plant is rearmed."""
     FAILED = "failed"
     """An error has stopped it: it is inactive until it is configured or activated again."""
 
@@ -39,24 +39,23 @@ class PlantStatus:
     Attributes
     ----------
     state
-        What it does.
+        State of the plant.
     message
-        The same for people, with the reason.
+        State and reason in a sentence.
     reason
-        Why, as a word. Latched, or paused and latched: the word of the reason to refuse a command,
-        ``abort`` or ``watchdog``; resting: ``no_command`` or ``timeout``; failed: ``model`` or
-        ``exception``; empty otherwise.
+        Reason as a word. Latched, or paused and latched: the reason to refuse a command, ``abort``
+        or ``watchdog``; resting: ``no_command`` or ``timeout``; failed: ``model`` or ``exception``;
+        empty otherwise.
     latched_fault
-        Why nothing moves until ``~/rearm``, in whatever state the plant is; empty: nothing is
-        latched.
+        The fault that is latched until ``~/rearm``, in any state of the plant; empty: none.
     time_s
-        Simulated time since which it is so, s.
+        Simulated time of the last change, s.
     rearms, resets
-        How often the plant was rearmed and reset: a subscriber that missed a status still notices.
+        Number of rearms and resets, for subscribers that have missed a status.
     faults
-        The injected faults that are active, each as its line.
+        Lines of the active injected faults.
     timeouts
-        How often it has come to rest because no command came in time.
+        Number of times that the joints were brought to rest because no command came in time.
     last_command_s
         Stamp of the last command before the latest of these, s; None: there was none.
     """
@@ -80,7 +79,7 @@ class PlantStatus:
         return 1 if self.reason == "timeout" or self.faults else 0
 
     def to_values(self) -> dict[str, str]:
-        """Return the status as the key-value pairs of a DiagnosticStatus."""
+        """Return the key-value pairs of a DiagnosticStatus."""
         values = {
             "state": self.state.value,
             "reason": self.reason,
@@ -96,12 +95,12 @@ class PlantStatus:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "") -> PlantStatus:
-        """Return the status that :meth:`to_values` has turned into these pairs.
+        """Return the status of key-value pairs as of :meth:`to_values`.
 
         Raises
         ------
         SpaceRobotError
-            They are no status of a plant.
+            They are not those of a plant.
         """
         try:
             faults, last = values.get("faults", ""), values.get("last_command_s")
@@ -118,16 +117,16 @@ class PlantStatus:
                 faults=tuple(faults.split(_SEPARATOR)) if faults else (),
             )
         except (KeyError, ValueError) as error:
-            raise SpaceRobotError(f"This is no status of a plant: {error}.") from error
+            raise SpaceRobotError(f"The values are not a status of a plant: {error}.") from error
 
 
 class PlantMonitor:
-    """Follows the state of a plant, and reports its changes.
+    """Derives the status of a plant, and the events of its changes.
 
     Parameters
     ----------
     commands, plant
-        What is followed.
+        The plant and the validator of its commands.
     lockstep
         Whether the plant waits for commands, and so never rests without one.
     """
@@ -135,26 +134,26 @@ class PlantMonitor:
     def __init__(self, commands: CommandValidator, plant: FaultyPlant, *, lockstep: bool) -> None:
         self._commands, self._plant, self._lockstep = commands, plant, lockstep
         self.rearms = self.resets = 0
-        """How often the plant was rearmed and reset; for the owner to count."""
+        """Number of rearms and resets, counted by the owner."""
         self.status = PlantStatus(PlantState.INACTIVE, "The plant is inactive.")
-        """The status of the last update."""
+        """Status of the last update."""
         self.failure = "", ""
-        """Reason and message of the error that stopped the plant; for the owner to set."""
+        """Reason and message of the error that stopped the plant, set by the owner."""
 
     def update(self, activity: PlantState, time_s: float) -> list[Event]:
-        """Take up what has changed.
+        """Update the status.
 
         Parameters
         ----------
         activity
-            What the plant does with time: inactive, running, paused or failed.
+            Activity of the plant: inactive, running, paused or failed.
         time_s
             Simulated time, s.
 
         Returns
         -------
         list[Event]
-            What has happened; empty if the status is still true.
+            Events since the last update; empty: the status is the same.
         """
         before = self.status
         now = replace(
@@ -185,7 +184,7 @@ class PlantMonitor:
                 reason, message = self.failure
                 return PlantStatus(activity, message, reason, fault)
             case PlantState.PAUSED:
-                message = "Time stands still until '~/pause' ends it"
+                message = "Time is stopped until '~/pause' resumes it"
                 if fault:
                     message += f", and a fault is latched: {fault}"
             case _ if fault:
@@ -206,7 +205,7 @@ class PlantMonitor:
 
 
 def _events(before: PlantStatus, now: PlantStatus) -> list[Event]:
-    """Return what has happened between two statuses, in an order in which it can have happened."""
+    """Return the events between two statuses, in a possible order."""
     events: list[Event] = []
 
     def add(kind: EventKind, message: str, level: int = 0, **about: str) -> None:

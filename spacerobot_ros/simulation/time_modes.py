@@ -1,4 +1,4 @@
-"""Who drives the time of a plant: its commanders (lockstep), or the wall clock (real time)."""
+"""Time modes of a plant: stepped by its commanders (lockstep), or by the wall clock."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.times import SECOND
 
 _LONGEST_LAG = 10
-"""Ticks that a real-time plant may be late and still make up; what is beyond is lost for good."""
+"""Late ticks that a real-time plant makes up; further ones are lost."""
 
 _CATCH_UP = 2
-"""Ticks that a late plant takes at once: commands must get a word in between."""
+"""Ticks that a late plant takes at once, before commands are read again."""
 
 
 class Lockstep:
-    """Steps as soon as every command of a tick is there.
+    """Steps as soon as all commands of a tick have arrived.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class Lockstep:
         self._commands = commands
         self._looked_at = -1
         self.waits = False
-        """Whether the plant was waiting in the same tick at the last two looks."""
+        """Whether the plant was waiting in the same tick at the last two checks."""
 
     @property
     def may_step(self) -> bool:
@@ -35,7 +35,7 @@ class Lockstep:
         return self._commands.complete
 
     def looks(self, tick: int, *, pose_lost: bool) -> bool:
-        """Return whether a plant that checks now and then is to step.
+        """Return whether a plant that checks periodically must step.
 
         A state without a pose may get no answer: a commander cannot know that no pose will come
         before it receives another state. So the plant steps without a command if it was still
@@ -47,17 +47,16 @@ class Lockstep:
 
 @dataclass(frozen=True)
 class Timing:
-    """How well a plant in real time keeps to the clock, and its commander to the plant.
+    """Deadline statistics of a plant in real time, and of its commander.
 
     Attributes
     ----------
     tick_rate
         Ticks a second of wall time since the last report.
     ticks, ticks_late, worst_tick
-        Ticks taken; those taken after the next one was due; by how much at most, s.
+        Number of ticks; of those taken after the next one was due; largest delay, s.
     commands, commands_late, worst_command
-        States that were answered; those answered after the tick that follows them was due; by how
-        much at most, s.
+        Number of answered states; of those answered after the next tick was due; largest delay, s.
     command_age
         Simulated time since the state that the command in force answers, s.
     worse
@@ -76,10 +75,10 @@ class Timing:
 
 
 class RealTime:
-    """Says when ticks are due by the wall clock, and counts ticks and commands that are late.
+    """Schedules ticks by the wall clock, and counts late ticks and commands.
 
-    A tick has missed its deadline when it is taken after the next one is due; a command, when it
-    comes after the tick that follows the state it answers is due.
+    A tick is late when it is taken after the next one is due; a command is late when it arrives
+    after the tick that follows its state is due.
 
     Parameters
     ----------
@@ -106,11 +105,11 @@ class RealTime:
         return self._pace / SECOND
 
     def start(self, now_ns: int, tick: int) -> None:
-        """Let time go on from a tick, whose state is due now."""
+        """Start from a tick whose state is due now."""
         self._origin = now_ns - tick * self._pace
 
     def due(self, now_ns: int, tick: int) -> int:
-        """Return how many ticks are to be taken now, after ``tick``; forget those lost for good."""
+        """Return the number of ticks to take now, after ``tick``; lost ticks are dropped."""
         behind = int((now_ns - self._origin) / self._pace) - tick
         if behind > _LONGEST_LAG:
             self.ticks_lost += behind - _LONGEST_LAG
@@ -118,7 +117,7 @@ class RealTime:
         return min(behind, _CATCH_UP)
 
     def count_tick(self, now_ns: int, tick: int) -> None:
-        """Count that the tick after ``tick`` is taken now."""
+        """Count the tick after ``tick``, which is taken now."""
         self._ticks += 1
         self._now, self._state_ns = now_ns, tick * self._period
         late = now_ns - (self._origin + (tick + 2) * self._pace)
@@ -127,7 +126,7 @@ class RealTime:
             self._worst_tick = max(self._worst_tick, late)
 
     def count_command(self, now_ns: int, stamp_ns: float) -> None:
-        """Count that the command in force answers the state of that stamp (simulated time)."""
+        """Count a command in force that answers the state of a stamp (simulated time)."""
         if stamp_ns <= self._answered_ns:
             return  # A command that was refused has changed nothing.
         self._answered_ns = stamp_ns
@@ -138,7 +137,7 @@ class RealTime:
             self._worst_answer = max(self._worst_answer, late)
 
     def report(self) -> Timing:
-        """Return all that was counted, and the rate of ticks since the last call."""
+        """Return the statistics, and the rate of ticks since the last call."""
         late = self._ticks_late, self._answers_late
         worse, self._reported = late != self._reported, late
         elapsed = (self._now - self._reported_at) / SECOND

@@ -1,4 +1,4 @@
-"""Plans made without ROS and tried in the plant: one goal, every method, or many random goals."""
+"""Plans evaluated in the plant without ROS: of one goal, by all methods, or of random goals."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 from spacerobot_ros.times import SECOND
 
 _MOST_PIECES = 1000
-"""Schedules that end short of the goal on purpose may follow each other this often."""
+"""Largest number of successive schedules of a method that plans in stages."""
 
 _RANDOM_TOLERANCE = 1e-5
-"""A random goal is reached when the flight ends this near, rad and m."""
+"""Tolerance of random goals, rad and m."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What is to be planned, and for what robot.
+    """A planning problem.
 
     Attributes
     ----------
     name
-        For people: a scenario or a robot.
+        Name of the scenario or robot.
     robot, initial
-        The model, and where it starts.
+        The model and its initial state.
     goal
-        Where it is to go.
+        The goal.
     config
-        The planner's parameters: control period, tolerance, options of the methods.
+        Parameters of the planner: control period, tolerance, options of the methods.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Problem:
 
     @property
     def control_period(self) -> float:
-        """How long a command is held, s."""
+        """Duration for which a command is held, s."""
         return period_ns(self.config.tick_rate) / SECOND
 
     def method(self, name: str) -> GaitMethod:
@@ -72,27 +72,27 @@ class Problem:
         return build_method(name, self.robot, self.control_period, step, self.config.method_options)
 
     def plant(self) -> VelocityPlant:
-        """Return the robot at the start."""
+        """Return the plant in the initial state."""
         step = self.config.integration_step
         return VelocityPlant(self.robot, self.control_period, self.initial, step)
 
 
 @dataclass(frozen=True)
 class PlanEvaluation:
-    """The plan of a method for a problem, and how its flight in the plant ended.
+    """The plan of a method for a problem, and the result of its flight in the plant.
 
     Attributes
     ----------
     method
         Name of the gait method.
     pieces
-        The schedules flown one after the other: one, for a method that plans to the end.
+        Successive schedules; only one, unless the method plans in stages.
     error
-        What remained to the goal at ``pose``.
+        Error of ``pose`` and joints at the end.
     pose
         (7,) of the base in W at the end: position (m) and quaternion.
     limited
-        Ticks in which the plant limited a joint.
+        Number of ticks in which the plant limited a joint.
     plan_time
         Wall time of planning, s.
     reached
@@ -112,7 +112,7 @@ class PlanEvaluation:
 
     @property
     def duration(self) -> float:
-        """Time that the manoeuvre takes, s."""
+        """Duration of the manoeuvre, s."""
         return sum(piece.duration for piece in self.pieces)
 
     @property
@@ -134,7 +134,7 @@ class PlanEvaluation:
 
 
 def state_of(plant: VelocityPlant) -> RobotState:
-    """Return the state that a plant is in."""
+    """Return the state of a plant."""
     return RobotState(
         plant.pose[:3].copy(),
         plant.pose[3:].copy(),
@@ -145,14 +145,14 @@ def state_of(plant: VelocityPlant) -> RobotState:
 
 
 def try_method(problem: Problem, name: str, method: GaitMethod | None = None) -> PlanEvaluation:
-    """Plan by a method, ``method`` if it is built already, and fly the schedule in the plant.
+    """Plan by a method (``method``, if it is built already), and fly the schedule in the plant.
 
     Raises
     ------
     PlanningError
         The method refuses the goal.
     ParameterError
-        An option does not go with the robot.
+        An option does not suit the robot.
     """
     plant, tolerance = problem.plant(), problem.config.tolerance
     pieces: list[GaitSchedule] = []
@@ -188,9 +188,8 @@ def compare(problem: Problem) -> dict[str, PlanEvaluation | SpaceRobotError]:
     """Return the evaluation of every method by its name, or the reason of its refusal."""
     found: dict[str, PlanEvaluation | SpaceRobotError] = {}
     for name, method in METHODS.items():
-        # That one only chooses among the others.
         if name == "auto":
-            continue
+            continue  # It chooses among the others.
         try:
             method.require_suitable(problem.robot)
             found[name] = try_method(problem, name)
@@ -201,10 +200,10 @@ def compare(problem: Problem) -> dict[str, PlanEvaluation | SpaceRobotError]:
 
 @dataclass
 class Record:
-    """How many random goals a method has reached.
+    """Results of a method for random goals.
 
-    ``reached`` and ``missed`` count the flights, ``refused`` has the sentences of the goals that
-    were not planned, ``durations`` and ``plan_times`` (s) are of all that were flown.
+    ``reached`` and ``missed`` count the flights, ``refused`` has the messages of goals that could
+    not be planned, ``durations`` and ``plan_times`` (s) are those of all flights.
     """
 
     method: str
@@ -216,9 +215,9 @@ class Record:
 
 
 def random_goals(problem: Problem, count: int, distance: float, angle: float) -> list[Goal]:
-    """Return goals within ``distance`` (m) and ``angle`` (rad) of the start, always the same ones.
+    """Return goals within ``distance`` (m) and ``angle`` (rad) of the start, with a fixed seed.
 
-    Planar robots are asked to turn about their axis; others about any, evenly.
+    Axes of rotation are uniform; those of planar robots are their axis.
     """
     rng = np.random.default_rng(0)
     start = problem.plant().pose
@@ -242,7 +241,7 @@ def try_goals(
     methods: Sequence[str],
     show: Callable[[str], None] = lambda line: None,
 ) -> list[Record]:
-    """Plan every goal by every method, fly the plans in the plant, and count what comes of them."""
+    """Plan every goal by every method, fly the plans in the plant, and count the results."""
     tight = replace(
         problem.config,
         position_tolerance=_RANDOM_TOLERANCE,

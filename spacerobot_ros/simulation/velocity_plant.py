@@ -21,9 +21,8 @@ from spacerobot_ros.simulation.plant import Flags, InitialState
 class VelocityPlant:
     """A free-floating robot whose servos realise held joint velocities.
 
-    After :meth:`step`, the attributes are the state that a robot would report: those of
-    :class:`Plant`, where ``qdot`` are the velocities held up to now, and ``effort`` is zero: what
-    the servos need is not modelled.
+    After :meth:`step`, the attributes are those of :class:`Plant`, where ``qdot`` are the
+    velocities of the last tick. ``effort`` is zero: the efforts of servos are not modelled.
 
     Parameters
     ----------
@@ -32,7 +31,7 @@ class VelocityPlant:
     control_period
         Duration of a tick, s.
     initial
-        Where to start.
+        Initial state.
     integration_step
         Longest Runge-Kutta step of the attitude within a tick, s.
 
@@ -75,7 +74,7 @@ class VelocityPlant:
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: what the run began with."""
+        """Linear over angular momentum (6,) in W: those of the initial state."""
         return self._momenta
 
     def reset(self) -> None:
@@ -97,7 +96,7 @@ class VelocityPlant:
         self._h[:] = self.control_period
 
     def hold(self, joints: Flags) -> None:
-        """Hold these joints (n,) where they are from now on, whatever is commanded."""
+        """Lock these joints (n,) at their positions from now on, and no others."""
         self._held = joints.copy() if joints.any() else None
 
     def step(self, command: Array) -> bool:

@@ -15,15 +15,15 @@ from support.fuzzing import NUMBERS, TEXTS, damaged, fuzz
 from support.plant_rig import STATE, Rig
 from support.ros_harness import Harness
 
-GOOD = JointState(name=["slider_1"], velocity=[0.01], effort=[0.01])
+JOINTS = ["slider_1", "slider_2", "slider_3"]
+
+GOOD = JointState(name=JOINTS, velocity=[0.01, 0.0, 0.0], effort=[0.01, 0.0, 0.0])
 FRAMES = st.sampled_from(["", "base_link"]) | TEXTS
 
 
 @st.composite
 def joint_commands(draw: st.DrawFn) -> tuple[list[str], list[float], list[float], int]:
-    names = draw(
-        st.lists(st.sampled_from(["slider_1", "slider_2", "slider_3"]) | TEXTS, max_size=4)
-    )
+    names = draw(st.permutations(JOINTS) | st.lists(st.sampled_from(JOINTS) | TEXTS, max_size=4))
     size = len(names) if draw(st.booleans()) else draw(st.integers(0, 4))
     numbers = st.lists(NUMBERS, min_size=size, max_size=size)
     late = draw(st.sampled_from([0, 0, 0, 1, -1, 10**9, -(10**9), 10**18]))

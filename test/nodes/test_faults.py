@@ -168,7 +168,7 @@ def test_time_goes_on_over_a_reset(harness: Harness) -> None:
 
 BAD: dict[str, tuple[Any, tuple[str, ...]]] = {
     "no fault": (["joint_stuck elbow"], ("joint_stuck elbow", "slider_1")),
-    "no thrusters": (["thruster_off all"], ("thruster_off all", "nothing")),
+    "no thrusters": (["thruster_off all"], ("thruster_off all", "no target")),
     "a number": (3.0, ("'faults'", "list of texts")),
     "text of several": ("joint_stuck slider_1; joint_slow slider_2", ("joint_slow slider_2",)),
 }

@@ -24,6 +24,8 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import PlantNode
 
+JOINTS = ["slider_1", "slider_2", "slider_3"]
+
 URDF = Path(__file__).parents[2] / "urdf"
 
 
@@ -46,7 +48,7 @@ def test_a_supervisor_can_take_the_plant_through_its_life(harness: Harness) -> N
 
     def step(publisher: Publisher) -> None:
         before = probe.count("joint_states")
-        message = JointState(name=["slider_1"], velocity=[0.2])
+        message = JointState(name=JOINTS, velocity=[0.2, 0.0, 0.0])
         message.header.stamp = probe.last("joint_states").header.stamp
         publisher.publish(message)
         harness.spin_until(lambda: probe.count("joint_states") > before, "a step")

@@ -100,7 +100,7 @@ def test_two_that_send_by_turns_latch_whatever_their_stamps(
         answer(state)
         if rig.probe.count("joint_states") % 8 == 0:
             message = command_at(rig.now_ns + round(ahead_s * 1e9))
-            message.velocity = [0.3]
+            message.velocity = [0.3, 0.0, 0.0]
             other.publish(message)
 
     answer = rig.probe.react["joint_states"]
@@ -126,7 +126,7 @@ def test_a_stamp_ahead_of_time_never_moves_a_joint(harness: Harness, timeout: fl
 
 
 def command_at(stamp_ns: int) -> JointState:
-    message = JointState(name=["slider_1"], velocity=[0.1])
+    message = JointState(name=["slider_1", "slider_2", "slider_3"], velocity=[0.1, 0.0, 0.0])
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
     return message
 

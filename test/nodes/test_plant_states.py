@@ -21,6 +21,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from spacerobot_ros.nodes import PlantNode
 
+JOINTS = ["slider_1", "slider_2", "slider_3"]
+
 Array = npt.NDArray[np.float64]
 
 URDF = Path(__file__).parents[2] / "urdf"
@@ -167,7 +169,7 @@ def test_a_namespace_moves_all_but_the_clock_and_the_diagnostics(harness: Harnes
     # A newcomer is shown the state that waits.
     harness.spin_until(lambda: set(topics) <= set(probe.order), "the state in the namespace")
     publisher = harness.matched(probe.create_publisher(JointState, "/craft/joint_commands", 10))
-    publisher.publish(JointState(name=["slider_1"], velocity=[0.5]))
+    publisher.publish(JointState(name=JOINTS, velocity=[0.5, 0.0, 0.0]))
     harness.spin_until(
         lambda: probe.last("/craft/joint_states").velocity[0] == 0.5, "a step in the namespace"
     )
@@ -236,7 +238,7 @@ def test_a_late_reader_gets_the_state_that_waits(harness: Harness) -> None:
     # It is the same tick still, and goes on from it.
     publisher = late.create_publisher(JointState, "joint_commands", 10)
     harness.matched(publisher)
-    publisher.publish(JointState(name=["slider_1"], velocity=[0.2]))
+    publisher.publish(JointState(name=JOINTS, velocity=[0.2, 0.0, 0.0]))
     harness.spin_until(
         lambda: nanoseconds(late.last("joint_states").header.stamp) > 0, "the next tick"
     )

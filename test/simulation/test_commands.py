@@ -499,14 +499,15 @@ def test_a_limit_is_named_beside_what_is_beyond_it() -> None:
 
 def test_names_and_lengths() -> None:
     joints = ("a", "b", "c")
-    assert joint_order(joints, ["c", "a"]).tolist() == [2, 0]
-    for named, complete, words in (
-        (["c", "x"], False, "'x' is unknown"),
-        (["a", "b"], True, "'c' is missing"),
-        (["a", "a"], False, "named twice"),
+    assert joint_order(joints, ["c", "a", "b"]).tolist() == [2, 0, 1]
+    for named, words in (
+        (["c", "x"], "'x' is unknown"),
+        (["a", "b"], "'c' is missing: a message must name all joints"),
+        ([], "'a' is missing"),
+        (["a", "a", "b"], "named twice"),
     ):
         with pytest.raises(CommandError, match=words):
-            joint_order(joints, named, complete=complete)
+            joint_order(joints, named)
     require_values(["a", "b"], "effort", 2)
     with pytest.raises(CommandError, match=r"2 joint\(s\) are named but 3 effort"):
         require_values(["a", "b"], "effort", 3)

@@ -14,7 +14,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
-from spacerobot_ros.simulation.actuators import FaultyPlant
+from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
 from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
 from spacerobot_ros.simulation.sensors import Sensors
 
@@ -198,3 +198,47 @@ def test_sensors_that_will_fail_are_in_use_from_the_begin(fault: str) -> None:
     assert flight.sensors.used
     assert not flight.sensors.imperfect
     assert not Flight(SensorConfig(), "joint_stuck elbow_pitch at 5", ticks=1).sensors.used
+
+
+@pytest.mark.parametrize("config", [SensorConfig(), SensorConfig(position_bias=(0.3, -0.2, 0.1))])
+@pytest.mark.parametrize(("tick", "delay"), [(0.05, 0.15), (0.1, 0.3)])
+def test_a_delay_that_begins_in_flight_holds_the_present_pose_and_follows_it(
+    config: SensorConfig, tick: float, delay: float
+) -> None:
+    """Whatever quotients round to, a delay of three ticks lasts three; a bias does not add up."""
+    plant = FaultyPlant(VelocityPlant(robot_of(URDF), tick, START), (), tick, wrench=False)
+    sensors = Sensors(plant, config, tick)
+    bias = np.array(config.position_bias)
+    true, measured = [], []
+    for number in range(14):
+        if number == 6:
+            plant.inject(f"sensor_delay odom {delay}")
+        sensors.measure()
+        true.append(plant.pose.copy())
+        pose = sensors.pose if sensors.used else plant.pose
+        measured.append(np.concatenate([pose[:3] - bias * sensors.used, pose[3:]]))
+        plant.step(np.array([0.1, -0.05, 0.1]))
+    held = 5 if bias.any() else 6  # Sensors in use remember the state before.
+    expected = [*true[:6], *[true[max(held, number - 3)] for number in range(6, 14)]]
+    np.testing.assert_allclose(measured, expected, rtol=0, atol=1e-15)
+    assert np.ptp([pose[0] for pose in true]) > 1e-4
+
+
+def test_actuators_and_sensors_draw_from_different_streams() -> None:
+    """With one seed, no draw of one is among the first thousands of the other."""
+    config = PlantConfig(
+        faults=tuple(f"actuator_noise {name} 0.001" for name in robot_of(URDF).joint_names),
+        sensors=SensorConfig(position_noise=1.0, seed=11),
+    )
+    plant = build_plant(robot_of(URDF), config, START)
+    sensors = Sensors(plant, config.sensors, config.control_period)
+    noises, errors = [], []
+    for _ in range(300):
+        sensors.measure()
+        errors.append(sensors.pose[:3] - plant.pose[:3])
+        plant.step(np.zeros(3))
+        noises.append(plant.qdot / 0.001)
+    of_actuators, of_sensors = np.ravel(noises), np.ravel(errors)
+    assert of_actuators.std() == pytest.approx(1.0, abs=0.15)
+    assert np.abs(of_actuators[:, None] - of_sensors).min() > 1e-9
+    assert abs(np.corrcoef(of_actuators, of_sensors)[0, 1]) < 0.15

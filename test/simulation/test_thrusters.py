@@ -183,3 +183,22 @@ def test_where_thrusters_come_from(tmp_path: Path) -> None:
     bare = SERVICER.replace("<thruster", "<!--").replace("</thruster>", "-->")
     with pytest.raises(RobotDescriptionError, match="has no <thruster> elements"):
         with_thrusters(EffortPlant(robot_of(bare), TICK), TICK, "urdf")
+
+
+def test_faults_of_the_wrench_act_on_the_thrusters_and_not_on_what_is_asked_of_them() -> None:
+    """A component that is stuck, off or weak is so in every tick, whatever pulses begin."""
+    faults = ("thruster_stuck force_y 3.5", "thruster_off torque_x", "thruster_weak force_x 0.5")
+    sound, inner = flying(), flying()
+    broken = FaultyPlant(inner, faults, TICK, wrench=True)
+    rng = np.random.default_rng(4)
+    for _ in range(40):
+        command = wanted(rng)
+        sound.step(np.zeros(6), command)
+        broken.step(np.zeros(6), command)
+        np.testing.assert_array_equal(inner.duty, sound.duty)
+        expected = sound.wrench * [0.5, 0.0, 1.0, 0.0, 1.0, 1.0] + [0.0, 3.5, 0.0, 0.0, 0.0, 0.0]
+        np.testing.assert_array_equal(inner.wrench, expected)
+    np.testing.assert_allclose(broken.momentum[:6], broken.expected_momenta, atol=1e-12)
+    broken.inject("clear")
+    broken.step(np.zeros(6), command)
+    assert inner.wrench_fault is None
