@@ -107,7 +107,7 @@ def run_command(
         write_report(path, report)
         click.echo(f"report      {report}")
     if not result.succeeded:
-        fail(result.sentence)
+        fail(result.message)
 
 
 def _chosen(

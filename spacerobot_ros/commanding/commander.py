@@ -153,7 +153,7 @@ class Commander(ABC):
     host
         Its surroundings.
     goal_keys
-        What goals may be for.
+        Parts of the robot that goals may be for.
     pose_required
         Whether a state waits for its odom.
     clock
@@ -245,7 +245,7 @@ class Commander(ABC):
         Parameters
         ----------
         key
-            What the goal is for.
+            Part of the robot that the goal is for.
         sec, nanosec
             Stamp of its header, which names it.
         read
@@ -456,7 +456,7 @@ class Commander(ABC):
 
     @abstractmethod
     def _abort_goal(self) -> str | None:
-        """Have the executive give up its goals; return what the robot does then."""
+        """Have the executive give up its goals; return the reaction of the robot, for the user."""
 
     @abstractmethod
     def answer(self) -> None:

@@ -76,7 +76,7 @@ class ControllerCommander(Commander):
         if self.active and self.executive is not None and not self._waits_for_first_pose():
             overdue = self.states.overdue()
         if overdue is not None:
-            # An answer to a lost pose would come a tick late; what it estimates goes on from there.
+            # An answer to a lost pose would come a tick late; the estimate goes on from that state.
             self._answer_as(overdue, send=overdue is _WHOLE)
         super().take_joints(stamp_ns, joints)
 

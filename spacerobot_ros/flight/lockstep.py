@@ -1,18 +1,18 @@
 """A flight in lockstep without ROS: the plant and its commanders, in the order of their nodes.
 
-The nodes of a stack in one process hand messages to each other in the order of publication. What
-they do between two ticks follows from that, and is done here by calls:
+The nodes of a stack in one process pass messages to each other in the order of publication. The
+loop makes the same calls in the same order:
 
 1. The plant reports the state of tick k.
 2. The planner answers it as soon as its joints are there, the controller when its pose is, too, and
    the planner's reference, if there is one.
-3. The first command of the tick counts; when all that the plant waits for are there, it steps.
+3. The first command of the tick counts; the plant steps when it has every command it waits for.
 4. The flight ends with the decision about the goal. The planner reports it before its command, so
    that the state of tick k is the last one; the controller after its commands, so that the state of
    tick k + 1 is.
 
-Which messages make a state is decided by the same
-:class:`~spacerobot_ros.flight.state_synchroniser.StateSynchroniser` as in the nodes, on stamps.
+Planner and controller are the same :class:`~spacerobot_ros.commanding.commander.Commander` objects
+as in the nodes, given arrays in place of messages.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Robots:
     description: RobotDescription | None = None
     """Of the plant, with the URDF that is recorded; None: as its model has it."""
     method: GaitMethod | None = None
-    """What plans, for the planner's robot and configuration; None: it is built for this flight."""
+    """Gait method for the planner's robot and configuration; None: it is built for this flight."""
 
     @classmethod
     def of(
@@ -363,7 +363,7 @@ class _LockstepFlight:
             if refusal.latches:
                 self._look_at_plant(PlantState.RUNNING)
 
-    # -- what the plant reports to its commanders ---------------------------------------------
+    # -- the status of the plant --------------------------------------------------------------
 
     def _look_at_plant(self, activity: PlantState) -> None:
         """Pass a change of the plant's status to the commanders."""

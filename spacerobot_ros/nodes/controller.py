@@ -69,7 +69,7 @@ class CoordinatedControlNode(CommanderNode):
             )
 
     def start_message(self) -> str:
-        """Return what it controls by which law, and where goals are taken."""
+        """Return robot, law, rate and the topic of goals."""
         config, topic = self.config, self.resolve_topic_name("goal_pose")
         return (
             f"Controls {described_robot(self.commander.robot)} by '{config.law}' at "

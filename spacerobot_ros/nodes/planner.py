@@ -80,7 +80,7 @@ class PlannerNode(CommanderNode):
         self.create_service(Trigger, "~/statistics", self._on_statistics)
 
     def start_message(self) -> str:
-        """Return how it plans, and where goals are taken."""
+        """Return method, robot, rate and the topic of goals."""
         config, topic = self.config, self.resolve_topic_name("goal_pose")
         return (
             f"Plans by '{config.method}' for {described_robot(self.commander.robot)} at "
@@ -145,7 +145,7 @@ class PlannerNode(CommanderNode):
         self.log("warning" if status.state.level else "info", status.message)
 
     def announce(self, start: ScheduleStart) -> None:
-        """Publish a schedule, its path and its goal; beside the flight where plans are made so."""
+        """Publish a schedule, its path and its goal; in a thread where plans are made in one."""
         if not self.config.plan_in_background:
             self._publish_schedule(start)
             return

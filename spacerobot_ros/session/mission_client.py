@@ -101,12 +101,12 @@ class MissionClient:
 
     @property
     def outcome(self) -> Outcome | None:
-        """What became of the goal; None as long as it is followed."""
+        """Outcome of the goal; None as long as it is followed."""
         return self._done.result()
 
     @property
-    def sentence(self) -> str:
-        """The sentence of the last status; empty before the first."""
+    def message(self) -> str:
+        """The message of the last status; empty before the first."""
         return "" if self.status is None else self.status.message
 
     @property
@@ -156,7 +156,7 @@ class MissionClient:
             self._end_effector_topic.publish(self._pose(end_effector, stamp))
 
     def await_delivery(self) -> None:
-        """Wait until those that take goals have received what was sent."""
+        """Wait until all readers of goals have received the goal that was sent."""
         end = time.monotonic() + _LONGEST_DELIVERY
         for publisher in self._sends:
             publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
@@ -171,7 +171,7 @@ class MissionClient:
         Raises
         ------
         SpaceRobotError
-            What ``look`` raises.
+            Raised by ``look``.
         """
         failures: list[SpaceRobotError] = []
 

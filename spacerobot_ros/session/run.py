@@ -39,7 +39,7 @@ Progress = Callable[[float, float], None]
 
 @dataclass(frozen=True)
 class RunResult:
-    """The result of a run; ``summary`` is the object that ``--json`` writes."""
+    """Result of a run; ``summary`` is the object that ``--json`` writes."""
 
     summary: dict[str, Any]
 
@@ -49,8 +49,8 @@ class RunResult:
         return bool(self.summary["succeeded"])
 
     @property
-    def sentence(self) -> str:
-        """How it ended."""
+    def message(self) -> str:
+        """Its end, for the user."""
         return str(self.summary["message"])
 
 
@@ -136,7 +136,7 @@ def _summary(stack: Stack, wall_time: float) -> dict[str, Any]:
     bag = open_flight_bag(stack.bag)
     flight = read_flight(bag)
     require_states(bag, flight)
-    outcome, message = client.outcome or Outcome.INTERRUPTED, client.sentence
+    outcome, message = client.outcome or Outcome.INTERRUPTED, client.message
     if outcome is Outcome.INTERRUPTED:
         message = f"Interrupted after {flight.duration:.6g} s of simulated time."
     flight = replace(
@@ -167,16 +167,16 @@ _LATCHED = 1.0
 _LOOK_PERIOD = 0.1
 
 
-class _Sentences:
-    """Shows the sentences of the status that a client receives, each once."""
+class _StatusPrinter:
+    """Shows the messages of the statuses that a client receives, each once."""
 
     def __init__(self, client: MissionClient, show: Callable[[str], None]) -> None:
         self._client, self._show, self._shown = client, show, ""
 
     def show(self) -> None:
-        """Show the sentence of the last status if it is new."""
-        if self._client.sentence != self._shown:
-            self._shown = self._client.sentence
+        """Show the message of the last status if it is new."""
+        if self._client.message != self._shown:
+            self._shown = self._client.message
             with suppress(OSError):  # A closed terminal is no reason to drop the robot.
                 self._show(self._shown)
 
@@ -206,10 +206,10 @@ def keep_up(
                 with suppress(OSError):
                     topic = f"{stack.namespace}/goal_pose" if stack.namespace else "goal_pose"
                     show(f"{scenario.name} is up; goals on '{topic}', Ctrl-C ends it.")
-                sentences = _Sentences(stack.client, show)
+                statuses = _StatusPrinter(stack.client, show)
 
                 def look() -> bool:
-                    sentences.show()
+                    statuses.show()
                     return stopped()
 
                 stack.spin(look)
@@ -261,15 +261,15 @@ def send_goal(
             client = _with_decider(clients, executor, min(timeout or _DISCOVERY, _DISCOVERY))
             with ended_on_request() as stopped:
                 client.send(goal)
-                began, sentences = time.monotonic(), _Sentences(client, show)
+                began, statuses = time.monotonic(), _StatusPrinter(client, show)
 
                 def look() -> bool:
-                    sentences.show()
+                    statuses.show()
                     late = timeout > 0 and time.monotonic() - began > timeout
                     return stopped() or late
 
                 outcome = client.follow(executor, look, _LOOK_PERIOD)
-                sentences.show()
+                statuses.show()
                 return outcome
         finally:
             for each in clients:

@@ -1,4 +1,4 @@
-"""The nodes of a scenario, running: what every stack offers, and the stack in one process."""
+"""Stacks, the running nodes of a scenario: their common base, and the stack in one process."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Stack(ABC):
             )
         self.scenario = scenario
         self.when_exists = scenario.parameters("recorder").get("when_exists", "refuse")
-        """What is done where a bag that the user names exists; by default it is refused."""
+        """Reaction to a bag of this name that exists; by default it is refused."""
         self.bag = free_name(bag) if bag is not None and self.when_exists == "next" else bag
         recorder = () if bag is None else ("recorder",)
         self.names = ("plant", *scenario.commanders, *recorder)
@@ -109,7 +109,7 @@ class Stack(ABC):
     @property
     @abstractmethod
     def statistics(self) -> PlannerStatistics:
-        """What the planner has done, once the flight is finished."""
+        """Plans and commands of the planner, once the flight is finished."""
 
     @abstractmethod
     def start(self, goal: Goal | None) -> None:
@@ -138,7 +138,7 @@ class Stack(ABC):
 
     @abstractmethod
     def finish(self) -> None:
-        """Stop time, record what is still on its way, and complete the bag.
+        """Stop time, record messages still on their way, and complete the bag.
 
         Raises
         ------
@@ -227,14 +227,14 @@ class InProcessStack(Stack):
 
     @property
     def statistics(self) -> PlannerStatistics:
-        """What the planner has done so far."""
+        """Plans and commands of the planner so far."""
         return PlannerStatistics() if self._planner is None else self._planner.statistics
 
     def start(self, goal: Goal | None) -> None:
         """Activate everything and send the goal, if any; the plant's first state is planned from.
 
-        It happens at the next spin, inside a callback: what is published from a callback is
-        delivered in the order of publication, what is published between spins is not.
+        It happens at the next spin, inside a callback: only messages that are published from
+        callbacks are delivered in the order of publication.
 
         Raises
         ------
@@ -263,7 +263,7 @@ class InProcessStack(Stack):
             self._planner.interrupt()
 
     def finish(self) -> None:
-        """Stop the plant, record what is still on its way, and complete the bag."""
+        """Stop the plant, record messages still on their way, and complete the bag."""
         if self.plant.is_active:
             if self.client.outcome is Outcome.INTERRUPTED:
                 self.plant.drain(self.executor)
@@ -272,7 +272,7 @@ class InProcessStack(Stack):
             node.trigger_deactivate()
         if self._recorder is None:
             return
-        # In one process what is published is there.
+        # In one process published messages have arrived.
         self._recorder.drain(self.executor, quiet=0.1)
         self._recorder.trigger_deactivate()
         self._recorder.trigger_cleanup()

@@ -83,11 +83,11 @@ def test_a_controller_killed_at_random_moments_goes_on(flight: Flight, tmp_path:
     starts = [0.0]
     for _ in range(KILLS):
         flight.pass_time(rng.uniform(0.1, 2.0))
-        assert not flight.decided, f"in mid-manoeuvre: {stack.client.sentence}"
+        assert not flight.decided, f"in mid-manoeuvre: {stack.client.message}"
         starts.append(flight.leave("coordinated_control", timeouts=4)[1])
         flight.spin(lambda: commanded[0] / 1e9 > starts[-1], "it commands again")
     flight.spin(lambda: flight.decided, "the goal is decided")
-    assert stack.client.outcome is Outcome.REACHED, stack.client.sentence
+    assert stack.client.outcome is Outcome.REACHED, stack.client.message
     assert not (tmp_path / "goals.json").exists()
     stack.finish()
     bag = read_bag(flight.bags[0])

@@ -49,7 +49,7 @@ def test_a_scenario_ends_as_documented_and_can_be_flown_again(name: str, tmp_pat
     met, distance, angle = EXPECTED[name]
     scenario = load_scenario(f"faults/{name}")
     result = run_scenario(scenario, tmp_path / "run.mcap")
-    assert result.succeeded is met, result.sentence
+    assert result.succeeded is met, result.message
     bag = read_bag(tmp_path / "run.mcap")
     odom = bag["/odom_true" if "/odom_true" in bag.topics else "/odom"]
     position = [odom.field(f"pose.pose.position.{x}")[-1] for x in "xyz"]
@@ -63,7 +63,7 @@ def test_a_scenario_ends_as_documented_and_can_be_flown_again(name: str, tmp_pat
     if name == "biased_pose":
         assert left >= 0.09, "it is believed"
     if not met:
-        assert "stuck" in result.sentence
+        assert "stuck" in result.message
     # The summary is of the truth.
     assert result.summary["position_error_m"] == pytest.approx(left, abs=1e-12)
     verification = verify_bag(tmp_path / "run.mcap")
@@ -74,7 +74,7 @@ def test_a_scenario_ends_as_documented_and_can_be_flown_again(name: str, tmp_pat
 def test_killed_nodes_go_on_to_the_goal(tmp_path: Path) -> None:
     scenario = load_scenario(f"faults/{KILLED}").in_real_time(4.0)
     result = run_scenario(scenario, tmp_path / "run.mcap", processes=True)
-    assert result.succeeded, result.sentence
+    assert result.succeeded, result.message
     bag = read_bag(tmp_path / "run.mcap")
     end = [bag["/odom"].field(f"pose.pose.position.{x}")[-1] for x in "xyz"]
     assert np.linalg.norm(end - scenario.goal.position) <= 1e-3

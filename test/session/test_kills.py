@@ -91,7 +91,7 @@ def test_a_node_killed_at_random_moments_joins_in_again(flight: Flight, name: st
     away: Away = []
     for _ in range(KILLS):
         flight.pass_time(rng.uniform(0.1, 2.0))
-        assert not flight.decided, f"in mid-manoeuvre: {stack.client.sentence}"
+        assert not flight.decided, f"in mid-manoeuvre: {stack.client.message}"
         away.append(flight.leave(name))
         if name == "plant":
             flight.spin(after(stack, away[-1][1]), "time goes on")
@@ -103,7 +103,7 @@ def test_a_node_killed_at_random_moments_joins_in_again(flight: Flight, name: st
     if name == "recorder":
         grown = flight.bags[-1].stat().st_size + 5000
         flight.spin(lambda: flight.bags[-1].stat().st_size > grown, "the last one records")
-    assert stack.client.outcome is Outcome.REACHED, stack.client.sentence
+    assert stack.client.outcome is Outcome.REACHED, stack.client.message
     stack.finish()
     bags = [whole(bag) for bag in flight.bags]
     last = bags[-1]["/odom"]

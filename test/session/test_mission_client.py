@@ -99,7 +99,7 @@ def test_only_the_status_of_the_goal_that_was_sent_decides_it(
         assert mission.client.outcome is None
     mission.report(kind(reached, "Reached.", goal_id=first))  # type: ignore[arg-type]
     assert mission.client.outcome is Outcome.REACHED
-    assert mission.client.sentence == "Reached."
+    assert mission.client.message == "Reached."
     assert mission.ends == 1
 
 

@@ -202,8 +202,8 @@ def test_unreachable_goal_is_summed_up_too(tmp_path: Path) -> None:
     result = run_scenario(scenario, tmp_path / "run.mcap")
     assert not result.succeeded
     assert result.summary["state"] == "refused"
-    assert "beyond stroke" in result.sentence
-    assert "slider_1" in result.sentence
+    assert "beyond stroke" in result.message
+    assert "slider_1" in result.message
 
 
 def test_interrupted_run_leaves_a_complete_bag(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def fly(bag: Path, law: str, robot: Path | None = None, **settings: Any) -> RunR
 def assert_arrived(result: RunResult) -> Bag:
     """Both poses, as Pinocchio has them from the last joint positions, are the goals."""
     bag = read_bag(result.summary["bag"])
-    assert result.succeeded, result.sentence
+    assert result.succeeded, result.message
     odom, joints = bag["/odom"], bag["/joint_states"]
     names = list(next(joints.messages())[1].name)
     oracle = PinocchioOracle(bag.attachments["robot_description.urdf"].decode(), names)
@@ -154,7 +154,7 @@ def test_lost_thrust_is_reported(law: str, tmp_path: Path) -> None:
     assert status_values(bag, "lost_force_N")[0] > 10 * force
     assert status_values(bag, "lost_torque_Nm")[0] > 10 * torque
     assert result.summary["state"] == "failed"
-    assert "not reached in time" in result.sentence
+    assert "not reached in time" in result.message
 
 
 @pytest.mark.slow

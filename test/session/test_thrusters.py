@@ -42,7 +42,7 @@ def test_both_poses_are_reached_by_pulses(excluded: str, tmp_path: Path) -> None
     )
     result = run_scenario(scenario, path)
     summary, bag = result.summary, read_bag(path)
-    assert result.succeeded, result.sentence
+    assert result.succeeded, result.message
     assert summary["position_error_m"] <= MILLIMETRE
     assert summary["attitude_error_rad"] <= TENTH_OF_A_DEGREE
     assert summary["end_effector_position_error_m"] <= MILLIMETRE
