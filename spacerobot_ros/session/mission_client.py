@@ -19,9 +19,10 @@ from std_msgs.msg import Header
 
 from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower, Status
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.events import EventKind
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import read_status
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM
+from spacerobot_ros.nodes.common.node import EVENTS, LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
@@ -89,10 +90,18 @@ class MissionClient:
                 PoseStamped, "end_effector/goal_pose", STREAM
             )
             self._sends.append(self._end_effector_topic)
+        self.failures: dict[str, str] = {}
+        """Messages of the nodes that have failed, by the last part of their names."""
+        self.node.create_subscription(DiagnosticStatus, "events", self._on_event, EVENTS)
         topic, self._read = STATUS_TOPICS[decider]
         self._status_topic = self.node.create_subscription(
             DiagnosticStatus, topic, self._on_status, LATCHED
         )
+
+    @property
+    def goal_id(self) -> str | None:
+        """Id of the goal that was sent last; None before the first."""
+        return self._follower.goal_id
 
     @property
     def gait(self) -> PlannerStatus | None:
@@ -205,6 +214,11 @@ class MissionClient:
         p.x, p.y, p.z = goal.position.tolist()
         o.x, o.y, o.z, o.w = goal.quaternion.tolist()
         return message
+
+    def _on_event(self, received: DiagnosticStatus) -> None:
+        event = read_status(received)
+        if event.values.get("event") == EventKind.FAILED.value:
+            self.failures[event.name.rpartition("/")[2]] = event.message
 
     def _on_status(self, received: DiagnosticStatus) -> None:
         message = read_status(received)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
 
@@ -121,14 +122,23 @@ class Stack(ABC):
         Raises
         ------
         SpaceRobotError
-            A node has ended by itself.
+            A node has ended by itself, or a commander with a goal has failed; the bag is complete.
         """
 
         def on_look() -> bool:
             self._supervise()
+            failures = self.client.failures
+            for name in self.scenario.commanders if self.client.goal_id else ():
+                if name in failures:
+                    raise SpaceRobotError(failures[name])
             return look()
 
-        self.client.follow(self.executor, on_look)
+        try:
+            self.client.follow(self.executor, on_look)
+        except SpaceRobotError:
+            with suppress(SpaceRobotError):
+                self.finish()
+            raise
 
     def interrupt(self) -> None:  # noqa: B027
         """Give up computations that take long; called from another thread when all is to end."""
@@ -257,6 +267,12 @@ class InProcessStack(Stack):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         timer = self.client.node.create_timer(0.001, launch, clock=steady)
 
+    def _supervise(self) -> None:
+        """Notice a commander that has failed, even where it has no memory left for an event."""
+        for node in self._commanders:
+            if node.fault is not None:
+                raise node.fault
+
     def interrupt(self) -> None:
         """Cancel the plan that is being made."""
         if self._planner is not None:
@@ -269,7 +285,8 @@ class InProcessStack(Stack):
                 self.plant.drain(self.executor)
             self.plant.trigger_deactivate()
         for node in self._commanders:
-            node.trigger_deactivate()
+            if node.is_active:
+                node.trigger_deactivate()
         if self._recorder is None:
             return
         # In one process published messages have arrived.

@@ -236,3 +236,31 @@ def test_a_state_from_before_the_activation_is_answered(harness: Harness) -> Non
     assert fake.probe.count("joint_commands") == 0
     fake.planner.trigger_activate()
     fake.answers(1)
+
+
+def test_another_description_replaces_the_robot_and_ends_its_goal(harness: Harness) -> None:
+    """A goal of the robot before is not reached by the one that is there now."""
+    fake = FakePlant(harness, {"robot": ""})
+    fake.planner.trigger_activate()
+    fake.describe()
+    fake.describe()  # The same again changes nothing.
+    fake.goals.publish(goal_at(NEAR))
+    fake.show(1)
+    harness.spin_until(
+        lambda: (
+            fake.probe.count("planner/status")
+            and values_of(fake.probe.last("planner/status"))["state"] == "executing"
+        ),
+        "the goal is pursued",
+    )
+    text = (URDF / "sliding_masses.urdf").read_text("utf-8")
+    fake.describe(text.replace("slider_", "runner_"))
+    harness.spin_until(
+        lambda: values_of(fake.probe.last("planner/status"))["state"] == "aborted", "its end"
+    )
+    assert "another robot" in fake.probe.last("planner/status").message
+    before = fake.probe.count("joint_commands")
+    fake.show(2, runner_1=0.0, runner_2=0.0, runner_3=0.0)
+    last = fake.answers(before + 1)[-1]
+    assert list(last.name) == ["runner_1", "runner_2", "runner_3"]
+    assert list(last.velocity) == [0.0] * 3

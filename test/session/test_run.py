@@ -19,8 +19,9 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.bag import iterate_raw, read_bag
 from spacerobot_ros.cli.options import write_json
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session.run import RunResult, run_scenario
 
@@ -255,3 +256,26 @@ def test_the_published_manoeuvre(tmp_path: Path) -> None:
     assert summary["ticks"] == 98_000
     assert summary["momentum_drift"] <= 1e-12
     assert result.succeeded
+
+
+@pytest.mark.parametrize("error", [RuntimeError("the gait is no number"), MemoryError()])
+def test_a_run_whose_commander_fails_ends_with_the_reason_and_a_whole_bag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    """In lockstep the plant would wait for its command for ever."""
+    update, states = Executive.update, iter(range(1000))
+
+    def failing(self: Executive, measured: Any) -> Any:
+        if next(states) == 40:
+            raise error
+        return update(self, measured)
+
+    monkeypatch.setattr(Executive, "update", failing)
+    with pytest.raises(SpaceRobotError, match=rf"'planner' has failed.*{type(error).__name__}"):
+        run_scenario(short(), tmp_path / "run.mcap")
+    bag = read_bag(tmp_path / "run.mcap")
+    with AnyReader([bag.path]) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+    assert counts["/joint_states"] == 41
+    assert counts["/joint_commands"] == 40
+    assert (tmp_path / "run.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")

@@ -1,0 +1,401 @@
+"""Commanders without ROS: goals, states and plants that come in any order, and their answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.sentences import assert_one_sentence
+
+from spacerobot_ros.commanding.commander import Activity, ArrayDecoder, Commander, StateArrays
+from spacerobot_ros.commanding.controller import JOINT_REFERENCE, ControllerCommander
+from spacerobot_ros.commanding.goal_follower import Status
+from spacerobot_ros.commanding.planner import PlannerCommander
+from spacerobot_ros.commanding.plant_state import Stamped
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.errors import CommandError, PlanningError
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.urdf import load_robot
+from spacerobot_ros.parameters import configured, declared
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.status import PlantState, PlantStatus
+
+TICK = 50_000_000
+GOAL = Goal.checked([0.05, -0.03, 0.02], [0.0, 0.0, 0.0, 1.0])
+LATCHED = PlantStatus(PlantState.LATCHED, "Nothing moves.", "abort", "a fuse is blown")
+
+
+class Host:
+    """Records in order whatever a commander does."""
+
+    def __init__(self) -> None:
+        self.commands: list[int] = []
+        self.statuses: list[Status] = []
+        self.events: list[Event] = []
+        self.lines: list[tuple[str, str]] = []
+        self.publishers = {"odom"}
+        self.waiting: tuple[list[Stamped], list[Stamped]] = ([], [])
+
+    def send_command(self, stamp_ns: int) -> None:
+        self.commands.append(stamp_ns // TICK)
+
+    def publish_status(self, status: Status) -> None:
+        self.statuses.append(status)
+
+    def report_event(self, event: Event) -> None:
+        self.events.append(event)
+
+    def announce(self, start: Any) -> None:
+        pass
+
+    def log(self, level: str, message: str) -> None:
+        self.lines.append((level, message))
+
+    def has_publisher(self, topic: str) -> bool:
+        return topic in self.publishers
+
+    def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
+        waiting, self.waiting = self.waiting, ([], [])
+        return waiting
+
+    @property
+    def states(self) -> list[str]:
+        return [status.state.value for status in self.statuses]
+
+
+class OneRobotDecoder(ArrayDecoder):
+    """Refuses joints of another number, and odom that is no pose."""
+
+    def __init__(self, n: int) -> None:
+        self._n = n
+
+    def require(self, joints: StateArrays) -> None:
+        if len(joints.q) != self._n:
+            raise CommandError("joint 'wing' is unknown")
+
+    def base(self, odom: StateArrays) -> tuple[Any, Any]:
+        if odom.pose is None:
+            raise CommandError("its bytes are no Odometry")
+        return super().base(odom)
+
+
+@pytest.fixture(scope="module")
+def robot() -> SpaceRobot:
+    return SpaceRobot(load_robot(robot_file("sliding_masses")))
+
+
+@pytest.fixture(scope="module")
+def arm() -> SpaceRobot:
+    return SpaceRobot(load_robot(robot_file("planar_manipulator")))
+
+
+def config(kind: Any, **settings: Any) -> Any:
+    defaults = {each.name: each.default for each in declared(kind)}
+    return configured(kind, {**defaults, "tick_rate": 20.0, **settings})
+
+
+class Rig:
+    """A commander, its host, a wall clock that the test moves, and states of a robot at rest."""
+
+    def __init__(
+        self, make: Callable[..., Commander], settings: Any, n: int, **others: Any
+    ) -> None:
+        self.wall, self.n, self.host = 10.0, n, Host()
+        self.commander: Any = make(settings, self.host, clock=lambda: self.wall, **others)
+
+    def message(self, tick: int, *, n: int | None = None, posed: bool = True) -> StateArrays:
+        joints = np.zeros(self.n if n is None else n)
+        pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]) if posed else None
+        return StateArrays(tick * TICK, joints, joints, pose, np.zeros(6))
+
+    def stamped(self, tick: int, **about: Any) -> Stamped:
+        return Stamped(tick * TICK, self.message(tick, **about))
+
+    def odom(self, tick: int, **about: Any) -> None:
+        self.commander.receive_odom(*self.stamped(tick, **about))
+
+    def joints(self, tick: int, **about: Any) -> None:
+        self.commander.receive_joints(*self.stamped(tick, **about))
+
+    def state(self, tick: int) -> None:
+        self.odom(tick)
+        self.joints(tick)
+
+    def goal(self, sec: int = 7, goal: Goal = GOAL) -> Any:
+        return self.commander.receive_goal(BASE, sec, 0, lambda: goal)
+
+    def use(self, robot: SpaceRobot) -> None:
+        self.commander.use(robot, OneRobotDecoder(self.n))
+
+
+METHOD = {"method": "lie_bracket", "lie_bracket.t1": 2.0, "lie_bracket.n1": 1}
+
+
+@pytest.fixture
+def planner(robot: SpaceRobot) -> Rig:
+    rig = Rig(PlannerCommander, config(PlannerConfig, **METHOD), robot.n)
+    rig.use(robot)
+    rig.commander.activate()
+    return rig
+
+
+@pytest.fixture
+def controller(arm: SpaceRobot) -> Rig:
+    rig = Rig(ControllerCommander, config(ControllerConfig), arm.n)
+    rig.use(arm)
+    rig.commander.activate()
+    return rig
+
+
+# -- states -----------------------------------------------------------------------------------
+
+
+def test_every_state_is_answered_once_by_its_stamp(planner: Rig, controller: Rig) -> None:
+    for rig in (planner, controller):
+        for tick in (1, 2, 3):
+            rig.state(tick)
+        assert rig.host.commands == [1, 2, 3]
+
+
+def test_an_inactive_commander_answers_nothing_until_it_is_active(planner: Rig) -> None:
+    planner.commander.deactivate()
+    planner.state(1)
+    assert planner.host.commands == []
+    planner.commander.activate()
+    assert planner.host.commands == [1], "the state that has waited"
+
+
+def test_after_a_standstill_only_the_last_state_is_answered(planner: Rig) -> None:
+    for tick in range(1, 6):
+        planner.wall += 0.05
+        planner.state(tick)
+    planner.wall += 1.0
+    planner.host.waiting = (
+        [planner.stamped(tick) for tick in (6, 7, 8)],
+        [planner.stamped(7), planner.stamped(8), planner.stamped(900), planner.stamped(9, n=2)],
+    )
+    planner.joints(6)
+    assert planner.host.commands == [1, 2, 3, 4, 5, 8]
+    planner.wall += 0.001
+    planner.joints(9)
+    assert planner.host.commands[-1] == 9
+
+
+def test_joints_of_another_robot_are_skipped_and_logged_once(planner: Rig) -> None:
+    planner.state(1)
+    for _ in range(3):
+        planner.joints(2, n=5)
+    planner.state(2)
+    errors = [line for level, line in planner.host.lines if level == "error"]
+    assert len(errors) == 1
+    assert "wing" in errors[0]
+    assert planner.host.commands == [1, 2]
+    planner.wall += 6.0
+    planner.joints(3, n=5)
+    assert len([1 for level, _ in planner.host.lines if level == "error"]) == 2
+
+
+def test_a_jump_is_answered_with_its_pose_once_its_time_is_accepted(controller: Rig) -> None:
+    for tick in range(1, 4):
+        controller.state(tick)
+        controller.wall += 0.001
+    controller.state(5000)
+    assert controller.host.commands == [1, 2, 3]
+    for _ in range(4):
+        controller.wall += 0.1
+        controller.commander.look()
+    assert controller.host.commands == [1, 2, 3, 5000]
+    assert controller.commander.executive.state.value == "holding"
+
+
+def test_while_the_plant_is_paused_no_jump_is_accepted(planner: Rig) -> None:
+    planner.state(1)
+    planner.commander.receive_plant_status(PlantStatus(PlantState.PAUSED, "Time stands still."))
+    planner.state(5000)
+    for _ in range(10):
+        planner.wall += 0.1
+        planner.commander.look()
+    assert planner.host.commands == [1]
+
+
+def test_ignored_states_are_reported_once_a_second(planner: Rig) -> None:
+    planner.state(1)
+    warned = []
+    for tick in range(2, 32):
+        planner.wall += 0.05
+        planner.joints(tick + 3000)
+        planner.state(tick)
+        warned += [text for text in [planner.commander.look()] if text]
+    assert 1 <= len(warned) <= 2
+    assert "ahead of" in warned[0]
+    assert ("warning", warned[0]) in planner.host.lines
+
+
+def test_a_pose_that_is_unreadable_is_no_pose(planner: Rig, controller: Rig) -> None:
+    for rig in (planner, controller):
+        rig.goal()
+        rig.odom(1, posed=False)
+        rig.joints(1)
+        assert any("no Odometry" in line for _, line in rig.host.lines)
+    assert planner.host.commands == [1]
+    assert controller.host.commands == []
+
+
+# -- the references of a controller -----------------------------------------------------------
+
+
+def test_a_state_waits_for_a_reference_that_has_a_publisher(arm: SpaceRobot) -> None:
+    rig = Rig(ControllerCommander, config(ControllerConfig), arm.n)
+    rig.host.publishers.add(JOINT_REFERENCE)
+    rig.use(arm)
+    rig.commander.activate()
+    rig.state(1)
+    assert rig.host.commands == []
+    rig.commander.receive_reference(JOINT_REFERENCE, *rig.stamped(1))
+    assert rig.host.commands == [1]
+
+
+def test_a_pose_is_lost_only_after_odom_was_connected(controller: Rig) -> None:
+    controller.host.publishers.clear()
+    for tick in range(1, 5):
+        controller.joints(tick)
+    assert controller.host.statuses == []
+    controller.host.publishers.add("odom")
+    for tick in range(5, 8):
+        controller.joints(tick)
+    # State 5 was answered a tick late, which nobody is sent; the later ones at once.
+    assert controller.host.commands == [6, 7]
+    assert controller.host.states[-1] == "stopped"
+
+
+# -- goals ------------------------------------------------------------------------------------
+
+
+def test_goals_that_come_before_the_robot_wait_for_it(robot: SpaceRobot, arm: SpaceRobot) -> None:
+    for make, kind, settings, model in (
+        (PlannerCommander, PlannerConfig, METHOD, robot),
+        (ControllerCommander, ControllerConfig, {}, arm),
+    ):
+        rig = Rig(make, config(kind, **settings), model.n)
+        rig.commander.activate()
+        assert rig.goal(sec=7) == IdentifiedGoal(GOAL, "7.000000000")
+        rig.state(1)
+        assert rig.host.commands == []
+        rig.use(model)
+        rig.commander.answer()
+        assert rig.host.commands == [1]
+        accepted = [e for e in rig.host.events if e.kind is EventKind.GOAL_ACCEPTED]
+        assert [event.goal_id for event in accepted] == ["7.000000000"]
+
+
+def test_a_goal_is_never_lost_without_a_word(planner: Rig, controller: Rig) -> None:
+    def unreadable() -> Goal:
+        raise PlanningError("The goal is in another frame.")
+
+    for rig in (planner, controller):
+        commander, host = rig.commander, rig.host
+        commander.receive_goal(BASE, 1, 0, unreadable)
+        commander.deactivate()
+        rig.goal(sec=2)
+        commander.activate()
+        commander.receive_plant_status(LATCHED, "/a/plant")
+        rig.goal(sec=3)
+        refused = [status for status in host.statuses if status.state.value == "refused"]
+        assert [each.goal_id for each in refused] == [f"{n}.000000000" for n in (1, 2, 3)]
+        for status, word in zip(refused, ("frame", "inactive", "/a/plant/rearm"), strict=True):
+            assert_one_sentence(status.message, word)
+        told = [event.goal_id for event in host.events if event.kind is EventKind.GOAL_REFUSED]
+        assert told == [status.goal_id for status in refused]
+
+
+def test_a_commander_that_is_to_stop_with_the_decision_answers_no_later_state(
+    robot: SpaceRobot,
+) -> None:
+    settings = config(PlannerConfig, **METHOD, stop_when_decided=True)
+    rig = Rig(PlannerCommander, settings, robot.n)
+    rig.use(robot)
+    rig.commander.activate()
+    rig.state(1)
+    assert rig.commander.active
+    rig.goal(goal=Goal.checked(np.zeros(3), [0.0, 0.0, 0.0, 1.0]))
+    for tick in range(2, 6):
+        rig.state(tick)
+    assert rig.host.states[-1] == "reached"
+    assert rig.commander.activity is Activity.DECIDED
+    assert rig.host.commands[-1] < 5
+    rig.commander.deactivate()
+    rig.commander.activate()
+    assert rig.commander.active
+
+
+def test_an_abort_gives_up_goals_with_and_without_a_robot(robot: SpaceRobot) -> None:
+    rig = Rig(PlannerCommander, config(PlannerConfig, **METHOD), robot.n)
+    rig.commander.activate()
+    assert rig.commander.abort() is None
+    rig.goal(sec=4)
+    answer = rig.commander.abort()
+    assert_one_sentence(answer, "before the robot was known")
+    assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("aborted", "4.000000000")
+    assert rig.host.events[-1].kind is EventKind.GOAL_ABORTED
+    rig.use(robot)
+    rig.goal(sec=5)
+    rig.state(1)
+    assert rig.commander.abort() is not None
+    assert rig.host.statuses[-1].goal_id == "5.000000000"
+
+
+def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(
+    robot: SpaceRobot, tmp_path: Path
+) -> None:
+    path = tmp_path / "goal.json"
+    GoalFile(str(path)).save({BASE: IdentifiedGoal(GOAL, "9.000000000")})
+    rig = Rig(PlannerCommander, config(PlannerConfig, resume_file=str(path), **METHOD), robot.n)
+    rig.commander.activate()
+    assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("planning", "9.000000000")
+    rig.commander.plant_silent("Node '/plant' is silent.")
+    assert_one_sentence(rig.host.statuses[-1].message, "Aborted", "silent")
+    assert not path.exists()
+
+
+# -- the plant and its robot ------------------------------------------------------------------
+
+
+def test_a_robot_that_is_replaced_takes_its_goals_along(planner: Rig, robot: SpaceRobot) -> None:
+    planner.goal(sec=6)
+    planner.state(1)
+    planner.commander.leave_robot("robot_description describes another robot now.")
+    assert (planner.host.states[-1], planner.host.statuses[-1].goal_id) == (
+        "aborted",
+        "6.000000000",
+    )
+    assert "another robot" in planner.host.statuses[-1].message
+    planner.state(2)
+    assert planner.host.commands == [1]
+    planner.use(robot)
+    planner.commander.answer()
+    planner.goal(sec=8)
+    planner.state(3)
+    assert planner.host.commands == [1, 2, 3]
+    assert planner.host.statuses[-1].goal_id == "8.000000000"
+
+
+def test_a_plant_that_is_reset_shows_another_pose_of_one_time(controller: Rig) -> None:
+    controller.state(1)
+    running = PlantStatus(PlantState.RUNNING, "A command is in force.")
+    controller.commander.receive_plant_status(running)
+    controller.commander.receive_plant_status(
+        PlantStatus(PlantState.RUNNING, "A command is in force.", resets=1)
+    )
+    controller.state(1)
+    assert controller.host.commands == [1, 1]
+    assert not any("differ" in line for _, line in controller.host.lines)
+    controller.odom(1)
+    controller.odom(1)
+    assert any("differ" in line for _, line in controller.host.lines)
