@@ -17,6 +17,7 @@ import secrets
 import stat
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from spacerobot_ros.errors import SpaceRobotError
 
@@ -32,6 +33,15 @@ _LARGEST = 256 * 2**20
 
 _MCAP = b"\x89MCAP"
 """First bytes of a bag."""
+
+_MOST_YAML = 1_000_000
+"""Largest number of characters of a YAML text."""
+
+_MOST_VALUES = 100_000
+"""Largest number of values of a YAML text, with those that aliases repeat."""
+
+_DEEPEST = 50
+"""Largest number of levels of a YAML text."""
 
 _reported: set[str] = set()
 
@@ -127,6 +137,69 @@ def _write_output(path: Path, data: bytes, mode: int) -> None:
 def _is_bag(path: Path) -> bool:
     with path.open("rb") as file:
         return file.read(len(_MCAP)) == _MCAP
+
+
+# -- YAML -------------------------------------------------------------------------------------
+
+
+def load_yaml(text: str, loader: Any = None) -> Any:
+    """Return the content of a YAML text of a stranger, within bounds.
+
+    Parameters
+    ----------
+    text
+        One document of at most a million characters.
+    loader
+        Class of the loader; None: ``yaml.SafeLoader``.
+
+    Raises
+    ------
+    ValueError
+        The text is no YAML or is too long, too deeply nested, or refers to itself; or its aliases
+        stand for too much (a file of 1 kB may hold a thousand million values).
+    """
+    import yaml
+
+    if len(text) > _MOST_YAML:
+        raise ValueError(f"it has more than {_MOST_YAML} characters")
+    try:
+        reader = (loader or yaml.SafeLoader)(text)
+        try:
+            node = reader.get_single_node()
+            if node is None:
+                return None
+            _size(node, {})
+            return reader.construct_document(node)
+        finally:
+            reader.dispose()
+    except yaml.YAMLError as error:
+        raise ValueError(" ".join(str(error).split())) from error
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def _size(node: Any, known: dict[int, tuple[int, int] | None]) -> tuple[int, int]:
+    """Return the number of values that a node stands for, and its depth.
+
+    ``known`` has those of nodes by their id, and None for the nodes around this one.
+    """
+    if id(node) not in known:
+        known[id(node)] = None
+        parts = () if isinstance(node.value, str) else node.value
+        count, depth = 1, 0
+        for part in parts:
+            for each in part if isinstance(part, tuple) else (part,):
+                more, below = _size(each, known)
+                count, depth = count + more, max(depth, below)
+            if count > _MOST_VALUES:
+                raise ValueError(f"its aliases stand for more than {_MOST_VALUES} values")
+        if depth >= _DEEPEST:
+            raise ValueError("it is nested too deeply")
+        known[id(node)] = count, depth + 1
+    size = known[id(node)]
+    if size is None:
+        raise ValueError("it refers to itself")
+    return size
 
 
 # -- files of this user -----------------------------------------------------------------------

@@ -18,6 +18,7 @@ from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.files import load_yaml
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
 from spacerobot_ros.parameters import Value, configured, declared, reconfigured, values_of
 from spacerobot_ros.planning import Goal
@@ -598,10 +599,9 @@ def read_content(path: Path) -> dict[Any, Any]:
         The file cannot be read.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise ParameterError(f"The scenario file {path} cannot be read: {reason}.") from error
+        content = load_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ParameterError(f"The scenario file {path} cannot be read: {error}.") from error
     return content if isinstance(content, dict) else {}
 
 
@@ -649,8 +649,8 @@ def parse_setting(text: str) -> tuple[str, str, Any]:
             f"'{text}' is not node.parameter=value with one of the nodes {', '.join(NODES)}."
         )
     try:
-        parsed = yaml.safe_load(value)
-    except yaml.YAMLError:
+        parsed = load_yaml(value)
+    except ValueError:
         raise ParameterError(f"The value in '{text}' cannot be read.") from None
     return node, name, number_in(parsed) if isinstance(parsed, str) else parsed
 

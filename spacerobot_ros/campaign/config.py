@@ -13,6 +13,7 @@ import yaml
 
 from spacerobot_ros.campaign.targets import DrawnFlight, Target, description_of, targets_of
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.files import load_yaml
 from spacerobot_ros.measures import METRICS, metric_names
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import suggestion
@@ -165,10 +166,9 @@ def load_campaign(path: Path, flights: int | None = None) -> Campaign:
         It cannot be read, or a value in it is refused; the message names the place.
     """
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), _EveryKeyOnce)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise ParameterError(f"The campaign file {path} cannot be read: {reason}.") from error
+        content = load_yaml(path.read_text(encoding="utf-8"), _EveryKeyOnce)
+    except (OSError, ValueError) as error:
+        raise ParameterError(f"The campaign file {path} cannot be read: {error}.") from error
     section = content.get("campaign") if isinstance(content, dict) else None
     if not isinstance(section, dict):
         raise ParameterError(f"The campaign file {path} has no section 'campaign:'.")

@@ -21,6 +21,7 @@ from spacerobot_ros.campaign.draws import needed
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import ParameterError, RecordingError
+from spacerobot_ros.files import load_yaml
 from spacerobot_ros.measures import metric_names
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.resources import is_path
@@ -184,11 +185,11 @@ class Dataset:
         """
         facts = self._facts()
         try:
-            content = yaml.safe_load((self.folder / _CAMPAIGN).read_text(encoding="utf-8"))
+            content = load_yaml((self.folder / _CAMPAIGN).read_text(encoding="utf-8"))
             section = dict(content["campaign"])
             scenario = replace(load_scenario(str(self.folder / _SCENARIO)), name=facts["scenario"])
             return parse_campaign(facts["name"], section, self.folder, scenario)
-        except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError) as error:
+        except (OSError, ValueError, TypeError, KeyError) as error:
             raise _damaged(self.folder / _CAMPAIGN, error) from error
         except ParameterError as error:
             raise ParameterError(f"The campaign in {self.folder} is refused: {error}") from error

@@ -23,7 +23,26 @@ if TYPE_CHECKING:
 else:  # Generic in new versions only.
     _Choice = click.Choice
 
-PATH = click.Path(path_type=Path)
+
+class _TextPath(click.Path):
+    """A path whose name is text: messages, parameters and bags hold no other ones."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path.
+
+        Raises
+        ------
+        click.BadParameter
+            The name has bytes that are not UTF-8.
+        """
+        try:
+            str(value).encode()
+        except UnicodeEncodeError:
+            self.fail(f"the name {str(value)!a} has bytes that are not UTF-8.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PATH = _TextPath(path_type=Path)
 
 
 class DefaultGroup(click.Group):

@@ -22,9 +22,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError, SpaceRobotError
+from spacerobot_ros.files import load_yaml
 from spacerobot_ros.model.compilation import BufferedFunction, dense_function
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_rpy
@@ -182,10 +182,9 @@ def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
         The file cannot be read, or a thruster is refused.
     """
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise ParameterError(f"The thruster file {path} cannot be read: {reason}.") from error
+        content = load_yaml(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ParameterError(f"The thruster file {path} cannot be read: {error}.") from error
     entries = content.get("thrusters") if isinstance(content, dict) else None
     defaults = content.get("defaults", {}) if isinstance(content, dict) else {}
     if not (isinstance(entries, list) and entries and isinstance(defaults, dict)):

@@ -13,7 +13,6 @@ from typing import Any
 
 import rclpy
 from rclpy.experimental import EventsExecutor
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from spacerobot_ros.errors import SpaceRobotError
@@ -24,7 +23,11 @@ from spacerobot_ros.flight.reading import (
     with_propellant,
 )
 from spacerobot_ros.measures import Outcome
-from spacerobot_ros.nodes.common.process import use_loopback_discovery, use_private_discovery
+from spacerobot_ros.nodes.common.process import (
+    start_ros,
+    use_loopback_discovery,
+    use_private_discovery,
+)
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.session.mission_client import MissionClient
@@ -56,10 +59,16 @@ class RunResult:
 
 @contextmanager
 def ros(*, private: bool) -> Iterator[None]:
-    """Have rclpy initialised, signals left to Python; discovery private to us or on loopback."""
+    """Have rclpy initialised, signals left to Python; discovery private to us or on loopback.
+
+    Raises
+    ------
+    SpaceRobotError
+        ROS does not start: an environment variable is refused.
+    """
     (use_private_discovery if private else use_loopback_discovery)()
     quiet = ["--ros-args", "--log-level", "WARN"]
-    rclpy.init(args=quiet, signal_handler_options=SignalHandlerOptions.NO)
+    start_ros(quiet)
     try:
         yield
     finally:

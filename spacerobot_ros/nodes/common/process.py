@@ -24,6 +24,9 @@ _LOG = logging.getLogger(__name__)
 _LONGEST_DELIVERY = 1.0
 """Wall time after a signal in which readers may still confirm messages, s."""
 
+_LAST_DOMAIN = 232
+"""Largest ROS_DOMAIN_ID: ports of larger ones do not exist."""
+
 _DISCOVERY_CHOICES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
 
 
@@ -102,11 +105,31 @@ def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = No
             return 0
 
 
-def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) -> int:
+def start_ros(arguments: list[str] | None) -> None:
+    """Initialise rclpy; signals are left to Python.
+
+    Raises
+    ------
+    SpaceRobotError
+        ROS does not start: an argument, a parameter file or an environment variable is refused.
+    """
+    domain = os.environ.get("ROS_DOMAIN_ID", "")
+    # Beyond the last domain the middleware ends the process.
+    if domain and not (domain.isascii() and domain.isdigit() and int(domain) <= _LAST_DOMAIN):
+        raise SpaceRobotError(
+            f"ROS_DOMAIN_ID is '{domain}'; it must be a whole number from 0 to {_LAST_DOMAIN}."
+        )
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # The middleware's errors: arguments, parameter files.
-        print(f"ROS 2 does not start: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
+        raise SpaceRobotError(f"ROS 2 does not start: {error}") from error
+
+
+def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) -> int:
+    try:
+        start_ros(arguments)
+    except SpaceRobotError as error:
+        print(f"{error}", file=sys.stderr, flush=True)
         return 2
     stop = rclpy.task.Future()
     node = None
