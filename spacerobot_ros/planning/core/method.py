@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,6 +15,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, RobotState, Tolerance
+from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
 _AT_REST = 1e-9
@@ -129,10 +131,23 @@ class GaitMethod(ABC):
         self.control_period = control_period
         self.integration_step = integration_step
         self.options = self.Options() if options is None else options
-        self._setup()
+        self._setup_refusal: PlanningError | None = None
+        try:
+            self._setup()
+        except PlanningError as refusal:
+            # Planners exist before goals: an unsuitable robot is refused with the first one.
+            self._setup_refusal = refusal
 
     def _setup(self) -> None:  # noqa: B027 - methods that delegate have nothing to set up here
-        """Set up everything that depends on robot and options alone; called once."""
+        """Set up everything that depends on robot and options alone; called once.
+
+        A `PlanningError` refuses the robot: :meth:`_require_rest` raises it for every goal.
+        """
+
+    @cached_property
+    def _prediction(self) -> BasePrediction:
+        """The prediction of the base motion under held commands, as the plant integrates it."""
+        return BasePrediction(self.robot, self.control_period, self.integration_step)
 
     @classmethod  # noqa: B027 - any robot is suitable by default
     def require_suitable(cls, robot: SpaceRobot) -> None:
@@ -213,7 +228,9 @@ class GaitMethod(ABC):
         return np.clip(wanted, robot.lower, robot.upper)
 
     def _require_rest(self, state: RobotState) -> None:
-        """Refuse a robot whose total momentum is not zero; for methods that plan without it."""
+        """Refuse an unsuitable robot, and one whose total momentum is not zero."""
+        if self._setup_refusal is not None:
+            raise PlanningError(str(self._setup_refusal))
         p, L = np.linalg.norm(state.linear_momentum), np.linalg.norm(state.angular_momentum)
         if max(p, L) > _AT_REST * self.robot.total_mass:
             raise PlanningError(

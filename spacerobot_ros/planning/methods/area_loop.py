@@ -30,7 +30,6 @@ from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import brackets_anywhere
 from spacerobot_ros.planning.core.goal import Controlled, PoseError
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
-from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes, straight_motion
 from spacerobot_ros.planning.methods.nominal_shape import PLANES, NominalChoice, NominalShape
 
@@ -109,14 +108,8 @@ class AreaLoopGait(GaitMethod):
     def _setup(self) -> None:
         robot, chosen = self.robot, self.options
         self._nominal = NominalChoice(robot, chosen.largest_edge, chosen.joints, chosen.nominal)
-        self._prediction = BasePrediction(robot, self.control_period, self.integration_step)
-        # Planners exist before goals: an unsuitable robot is refused with the first one.
-        self._refusal: PlanningError | None = None
-        try:
-            self.require_suitable(robot)
-            self._nominal.prepare()
-        except PlanningError as refusal:
-            self._refusal = refusal
+        self.require_suitable(robot)
+        self._nominal.prepare()
 
     @classmethod
     def require_suitable(cls, robot: SpaceRobot) -> None:
@@ -134,8 +127,6 @@ class AreaLoopGait(GaitMethod):
         The schedule is ``partial`` unless its own prediction reaches the goal. ``most_cycles`` and
         ``longest`` bound the cycles for the goal, with those before (``request.previous``).
         """
-        if self._refusal is not None:
-            raise PlanningError(str(self._refusal))
         state, goal, tolerance = request.state, request.goal, request.tolerance
         self._require_rest(state)
         final = self._goal_shape(goal)

@@ -38,7 +38,6 @@ from spacerobot_ros.planning.core.controllability import (
 )
 from spacerobot_ros.planning.core.goal import POSITION_SLACK, Goal, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
-from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
 _FEWEST_TICKS_A_CYCLE = 12
@@ -98,7 +97,6 @@ class LieBracketGait(GaitMethod):
             round(self.options.cycle_period / self.control_period), _FEWEST_TICKS_A_CYCLE
         )
         self.sliders = sliders_of(robot)
-        self._prediction = BasePrediction(robot, self.control_period, self.integration_step)
 
     @classmethod
     def require_suitable(cls, robot: SpaceRobot) -> None:

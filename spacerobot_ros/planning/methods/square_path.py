@@ -33,7 +33,6 @@ from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import tilted_goal
 from spacerobot_ros.planning.core.goal import Controlled, PoseError
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
-from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes, straight_motion
 from spacerobot_ros.planning.methods.geometric_phase import (
     PhasePlane,
@@ -119,18 +118,11 @@ class SquarePathGait(GaitMethod):
                 "each must be later than the one before."
             )
         self._durations = tuple(float(x) for x in np.diff(instants))
-        self._refusal: PlanningError | None = None
-        try:
-            self._phase = PlanarPhase(robot)
-        except PlanningError as refusal:
-            # Planners exist before goals: the robot is refused with the first one.
-            self._refusal = refusal
-            return
+        self._phase = PlanarPhase(robot)
         centre = np.array([chosen.centre_1, chosen.centre_2])
         self._search = SquareSearch(
             robot, self._phase, chosen.most_loops, centre if chosen.given_centre else None
         )
-        self._prediction = BasePrediction(robot, self.control_period, self.integration_step)
 
     @classmethod
     def require_suitable(cls, robot: SpaceRobot) -> None:
@@ -141,8 +133,6 @@ class SquarePathGait(GaitMethod):
         """Plan steps 1 to 4; see :meth:`GaitMethod.plan`."""
         cancellation.raise_if_requested()
         state, goal, tolerance = request.state, request.goal, request.tolerance
-        if self._refusal is not None:
-            raise PlanningError(str(self._refusal))
         self._require_rest(state)
         turn = self._turn(request)
         psi_e = self._goal_shape(goal)

@@ -157,17 +157,6 @@ class EffortLimitedShooting(MultipleShooting):
         super().__init__(stages(()), intervals, tolerance)
         self._stages, self._efforts, self._tolerance = stages, efforts, tolerance
         self._limited: MultipleShooting | None = None
-        self._last: MultipleShooting | None = None
-
-    @property
-    def iterations(self) -> int:
-        """Steps that the last solution took."""
-        return super().iterations if self._last is None else self._last.iterations
-
-    @property
-    def converged(self) -> bool:
-        """Whether the solver has converged on the last solution."""
-        return super().converged if self._last is None else self._last.converged
 
     def solve(
         self,
@@ -178,7 +167,6 @@ class EffortLimitedShooting(MultipleShooting):
         duration: DurationBounds,
     ) -> Trajectory | None:
         """Solve as :class:`MultipleShooting` does, within the limits of the efforts."""
-        self._last = None
         # A guess that uses the efforts just up to their limits was made for them.
         if not _AT_LIMITS <= self._efforts.peak(guess) <= 1 + _WITHIN:
             solution = super().solve(boundary, limits, guess, stop, duration)
@@ -188,5 +176,6 @@ class EffortLimitedShooting(MultipleShooting):
         if self._limited is None:
             stages = self._stages((self._efforts.inequality,))
             self._limited = MultipleShooting(stages, self.intervals, self._tolerance)
-        self._last = self._limited
-        return self._limited.solve(boundary, limits, guess, stop, duration)
+        solution = self._limited.solve(boundary, limits, guess, stop, duration)
+        self.iterations, self.converged = self._limited.iterations, self._limited.converged
+        return solution

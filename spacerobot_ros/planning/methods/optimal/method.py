@@ -35,7 +35,6 @@ from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
-from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
 from spacerobot_ros.planning.methods.optimal.held_commands import ManoeuvreModel
@@ -105,7 +104,6 @@ class OptimalGait(GaitMethod):
             self._margin = per_joint(robot, "joint_margin", chosen.joint_margin)
         self._constraints = PathConstraints.of(robot, chosen)
         self._efforts = JointEfforts.of(robot, chosen, self.control_period)
-        self._prediction = BasePrediction(robot, self.control_period, self.integration_step)
         model = ManoeuvreModel(
             robot,
             self._prediction,

@@ -92,6 +92,8 @@ class MultipleShooting:
 
     def __init__(self, stages: Stages, intervals: int, tolerance: float = TOLERANCE) -> None:
         self.intervals = intervals
+        self.iterations, self.converged = 0, False
+        """Steps of the solver for the last solution, and whether it has converged on that."""
         self.turn = stages.turn
         self._program = program(stages, intervals)
         # The solver's matrices are small: threads of its linear algebra would wait for each other.
@@ -109,16 +111,6 @@ class MultipleShooting:
                 "iteration_callback": self._watch,
             },
         )
-
-    @property
-    def iterations(self) -> int:
-        """Steps that the last solution took."""
-        return int(self._solver.stats()["iter_count"])
-
-    @property
-    def converged(self) -> bool:
-        """Whether the solver has converged on the last solution."""
-        return bool(self._solver.stats()["success"])
 
     def solve(
         self,
@@ -165,6 +157,8 @@ class MultipleShooting:
             ubg=self._program.upper,
             p=_parameters(boundary, limits, guess if duration.fixed else None),
         )
+        stats = self._solver.stats()
+        self.iterations, self.converged = int(stats["iter_count"]), bool(stats["success"])
         x = result["x"].full().ravel()
         if not self.converged:
             if self._watch.best is None:
