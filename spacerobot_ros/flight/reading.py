@@ -7,7 +7,6 @@ which must be complete.
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -160,22 +159,28 @@ class FlightBag:
         """Return a field of ``odom`` or ``joint_states`` as with perfect sensors.
 
         That is ``<name>_true``, which a plant publishes while its sensors err, and ``name`` before
-        that begins.
+        and after that.
         """
         measured = self.quantity(name, TOPICS[name].state[number])
         true = self.quantity(f"{name}_true", TOPICS[f"{name}_true"].state[number])
         if not len(true):
             return measured
-        before = measured.time < true.time[0]
+        before, after = measured.time < true.time[0], measured.time > true.time[-1]
+        parts = [
+            Signal(measured.time[before], measured.values[before]),
+            true,
+            Signal(measured.time[after], measured.values[after]),
+        ]
         return Signal(
-            np.concatenate([measured.time[before], true.time]),
-            np.concatenate([measured.values[before], true.values]),
+            np.concatenate([part.time for part in parts]),
+            np.concatenate([part.values for part in parts]),
         )
 
     def sensed(self, name: str, number: int) -> Signal:
-        """Return a field of ``odom`` or ``joint_states`` from the time on when sensors err."""
-        began = self._times(self.all(f"{name}_true")[0])[0]
-        return self.quantity(name, TOPICS[name].state[number]).between(began, math.inf)
+        """Return a field of ``odom`` or ``joint_states`` while sensors err."""
+        true = self.all(f"{name}_true")
+        began, ended = self._times(true[0])[0], self._times(true[-1])[-1]
+        return self.quantity(name, TOPICS[name].state[number]).between(began, ended)
 
     def series(self) -> Mapping[str, Signal]:
         """Return all quantities of :attr:`Flight.series` that the bag has."""
@@ -426,33 +431,42 @@ def _read_statuses(bag: FlightBag, commander: str) -> list[tuple[int, Status]]:
 
 def _scenario(bag: FlightBag) -> Scenario:
     """Return the scenario of a flight, as far as its bag holds it."""
-    metadata = bag.metadata
-    about = metadata.get("scenario", {})
+    about = bag.metadata.get("scenario", {})
     nodes = {
-        node: {name: _json(text) for name, text in metadata[f"parameters/{node}"].items()}
+        node: {name: _json(text) for name, text in bag.metadata[f"parameters/{node}"].items()}
         for node in CONFIGS
-        if f"parameters/{node}" in metadata
+        if f"parameters/{node}" in bag.metadata
     }
+    urdf, own = bag.parts[0].urdf, nodes.get("plant", {}).get("robot", "")
+    for values in nodes.values():
+        if urdf is not None and values.get("robot") in ("", own):
+            values["robot_description"] = urdf.decode(errors="replace")
     published: tuple[Published, ...] = ()
-    rows = _json(about.get("published", "[]"))
+    goal = end_effector_goal = None
     with suppress(KeyError, TypeError, ValueError):
         published = tuple(
             Published(str(r["quantity"]), [float(x) for x in r["printed"]], str(r["note"]))
-            for r in rows
+            for r in _json(about.get("published", "[]"))
         )
+    with suppress(KeyError, ValueError):
+        goal, end_effector_goal = _goal(about, "goal"), _goal(about, "end_effector_goal")
+    shape = next(bag.messages("goal_joint_states"), None)
+    # Without any joint positions the shape was free.
+    if goal is not None and shape is not None and len(shape[1].position):
+        goal = replace(goal, joint_positions=np.array(shape[1].position))
     return Scenario(
         name=about.get("name", "") or bag.path.stem,
         path=bag.path,
         description=about.get("description", ""),
-        goal=Goal.checked([0, 0, 0], [0, 0, 0, 1]),
-        end_effector_goal=None,
+        goal=goal or Goal.checked([0, 0, 0], [0, 0, 0, 1]),
+        end_effector_goal=end_effector_goal,
         commanders=tuple(name for name in COMMANDERS if name in nodes) or COMMANDERS[:1],
         published=published,
         published_method="",
         kills=(),
         in_file=nodes,
         overrides={},
-        has_goal=False,
+        has_goal=goal is not None,
     )
 
 
@@ -475,53 +489,13 @@ def recorded_scenario(bag: Bag) -> Scenario:
     RecordingError
         The bag lacks the goal or the parameters.
     """
-    robot = RecordedRobot(bag)
-    about = bag.metadata.get("scenario", {})
-    nodes = {
-        node: bag.metadata[f"parameters/{node}"]
-        for node in CONFIGS
-        if f"parameters/{node}" in bag.metadata
-    }
-    if "plant" not in nodes or "goal_position" not in about:
+    scenario = _scenario(FlightBag([bag]))
+    if not scenario.has_goal or "plant" not in scenario.in_file:
         raise RecordingError(
             f"The bag {bag.path} lacks the goal or the parameters of its flight, which bags of "
             "'spacerobot run' hold."
         )
-    try:
-        values = {
-            node: {name: json.loads(text) for name, text in texts.items()}
-            for node, texts in nodes.items()
-        }
-        urdf = robot.urdf
-        if urdf is not None:
-            for given in values.values():
-                if "robot" in given and given["robot"] in ("", values["plant"]["robot"]):
-                    given["robot_description"] = urdf.decode()
-        shapes = robot.get("goal_joint_states")
-        goal = _goal(about, "goal")
-        assert goal is not None
-        if shapes is not None:
-            first = next(shapes.messages())[1]
-            if len(first.position):  # Without any, the shape was free.
-                goal = Goal(goal.position, goal.quaternion, np.array(first.position))
-        end_effector_goal = _goal(about, "end_effector_goal")
-    except (ValueError, KeyError, RecursionError) as error:
-        raise RecordingError(
-            f"The scenario in the bag {bag.path} cannot be read: {error!r}."
-        ) from error
-    return Scenario(
-        name=about.get("name", bag.path.stem),
-        path=bag.path,
-        description=about.get("description", ""),
-        goal=goal,
-        end_effector_goal=end_effector_goal,
-        commanders=tuple(name for name in COMMANDERS if name in values),
-        published=(),
-        published_method="",
-        kills=(),
-        in_file=values,
-        overrides={},
-    )
+    return scenario
 
 
 def _goal(about: Mapping[str, str], name: str) -> Goal | None:

@@ -17,7 +17,7 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.files import write_output
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
-from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
+from spacerobot_ros.model.rotations import matrices_from_quaternions, rotvec_from_quaternion
 from spacerobot_ros.topics import TOPICS
 
 if TYPE_CHECKING:
@@ -179,11 +179,11 @@ def animation(flight: Flight, seconds: float, frames: int) -> Animation:
         raise ParameterError(f"An animation lasts more than 0 s, and not {seconds!r}.")
     rows = np.unique(np.linspace(0, len(flight.time) - 1, frames).round().astype(int))
     skeleton = _Skeleton(flight.required_robot())
-    shapes = np.array([skeleton.points(flight.pose[i], flight.q[i]) for i in rows])
+    shapes = skeleton.points(flight.pose[rows], flight.q[rows])
     ghost = np.zeros((0, 3))
     if flight.goal is not None:
         goal = np.concatenate([flight.goal.position, flight.goal.quaternion])
-        ghost = skeleton.points(goal, flight.q[-1])
+        ghost = skeleton.points(goal[None], flight.q[-1:])[0]
     made = Figure(figsize=(5.6, 5.0), dpi=72)
     FigureCanvasAgg(made)
     axes = made.add_subplot(projection="3d")
@@ -241,22 +241,26 @@ def _offline(html: str) -> str:
 class _Skeleton:
     """The links of a robot as points: the origins of their frames, and their centres of mass."""
 
-    def __init__(self, description: RobotDescription) -> None:
-        self._kinematics = ForwardKinematics(description)
-        names, count = self._kinematics.links, len(self._kinematics.links)
-        inertias = {link.name: link.inertia for link in description.links}
-        self._com = np.array([inertias[name].com for name in names])
+    def __init__(self, robot: RobotDescription) -> None:
+        self._kinematics = ForwardKinematics(robot)
+        coms = {link.name: link.inertia.com for link in robot.links}
+        names = self._kinematics.links
+        self._com = np.array([coms[name] for name in names])
         # From a link's frame to its centre of mass, and from its parent's centre of mass to it.
-        self.links = [(i, count + i) for i in range(count)]
+        self.links = [(i, len(names) + i) for i in range(len(names))]
         self.links += [
-            (count + names.index(joint.parent), names.index(joint.child))
-            for joint in description.joints
+            (len(names) + names.index(j.parent), names.index(j.child)) for j in robot.joints
         ]
 
-    def points(self, pose: Array, q: Array) -> Array:
-        """Return (2 L, 3) in the world, m: the frames, and the centres of mass."""
+    def points(self, poses: Array, q: Array) -> Array:
+        """Return the points (K, 2 L, 3) in the world, m: the frames, then the centres of mass.
+
+        Parameters
+        ----------
+        poses, q
+            Poses (K, 7) of the base in the world, and joint positions (K, n).
+        """
         R_BL, r_BL = self._kinematics.link_poses(q)
-        centres = r_BL + (R_BL @ self._com[:, :, None])[:, :, 0]
-        return np.asarray(
-            pose[:3] + np.concatenate([r_BL, centres]) @ matrix_from_quaternion(pose[3:]).T
-        )
+        points_B = np.concatenate([r_BL, r_BL + np.einsum("klij,lj->kli", R_BL, self._com)], axis=1)
+        R_WB = matrices_from_quaternions(poses[:, 3:])
+        return np.asarray(poses[:, None, :3] + np.einsum("kij,klj->kli", R_WB, points_B))

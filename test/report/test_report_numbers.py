@@ -430,6 +430,17 @@ def test_where_sensors_err_the_numbers_are_true_and_the_measured_ones_beside_the
     assert "Errors as measured" not in rows_of(plain)
 
 
+def test_sensors_that_err_for_a_while_are_right_before_and_after(tmp_path: Path) -> None:
+    def more(say: Any, time: float, k: int) -> None:
+        if k in (1, 2):
+            true = (0.95, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+            say("/odom_true", odometry(time, *true, *STILL), time)
+
+    found = flight(tmp_path, more=more)
+    np.testing.assert_array_equal(found.position.time, [0.0, 0.5, 1.0, 1.5])
+    np.testing.assert_array_equal(found.position.values[:, 0], [0.7, 0.95, 0.95, 0.7])
+
+
 def test_an_attitude_error_is_along_axes_of_the_world(tmp_path: Path) -> None:
     """A base turned by 90 deg about z, whose goal is turned by 0.1 rad more about the world's x."""
     c = math.sqrt(0.5)
