@@ -29,8 +29,17 @@ from spacerobot_ros.model.symbolic_rotations import quaternion_from_rotvec, quat
 from spacerobot_ros.times import SECOND
 
 CONTROL_INPUTS = (
-    *("state", "pose", "twist", "normals", "bias", "sigma"),
-    *("time", "profile", "gains", "bounds", "monitor"),
+    "state",
+    "pose",
+    "twist",
+    "normals",
+    "bias",
+    "sigma",
+    "time",
+    "profile",
+    "gains",
+    "bounds",
+    "monitor",
 )
 """Arguments of :meth:`BatchController.function`."""
 

@@ -196,14 +196,13 @@ class Driver:
         self.unit = vector_unit()
         self._library = _library(functions, declarations, self.unit, thrusters)
         job, whole = ctypes.POINTER(Job), ctypes.c_longlong
-        for name, arguments, result in (
-            ("start_flights", [job], None),
-            ("fly_until", [job, whole], whole),
-            *((("measure_starts", [job], None),) if "CONTROL" in functions else ()),
-            *((("end_flights", [job], None),) if "CONTROL" in functions else ()),
-        ):
+        names = ["start_flights"]
+        names += ["measure_starts", "end_flights"] if "CONTROL" in functions else []
+        for name in names:
             function = getattr(self._library, name)
-            function.argtypes, function.restype = arguments, result
+            function.argtypes, function.restype = [job], None
+        self._library.fly_until.argtypes = [job, whole]
+        self._library.fly_until.restype = whole
 
     def start(self, job: Job) -> None:
         """Evaluate and report the state at the start."""
@@ -375,18 +374,22 @@ _TICKS = {
     "velocity": _TickNames(
         ("state", "command", "momenta", "r_cm", "h"),
         (
-            *("next_state", "pose", "twist", "qdot", "momentum"),
-            *("link_R", "link_r", "limited", "next_r_cm"),
+            "next_state",
+            "pose",
+            "twist",
+            "qdot",
+            "momentum",
+            "link_R",
+            "link_r",
+            "limited",
+            "next_r_cm",
         ),
         ("next_state", "qdot", "limited", "next_r_cm"),
         {"next_state": "state", "next_r_cm": "r_cm"},
     ),
     "effort": _TickNames(
         ("state", "command", "h"),
-        (
-            *("next_state", "pose", "twist", "realised"),
-            *("momentum", "link_R", "link_r", "limited"),
-        ),
+        ("next_state", "pose", "twist", "realised", "momentum", "link_R", "link_r", "limited"),
         ("next_state", "realised", "limited"),
         {"next_state": "state"},
     ),

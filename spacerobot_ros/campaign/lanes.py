@@ -71,15 +71,28 @@ _GAINS = "coordinated_control.gains."
 """Prefix of the controller's parameters that may differ from lane to lane."""
 
 _COMMON = (
-    *("plant.tick_rate", "plant.integration_step", "plant.thrusters", "plant.end_effector_frame"),
-    *("plant.beyond_limits", "plant.latched_faults", "plant.actuation", "plant.robot"),
+    "plant.tick_rate",
+    "plant.integration_step",
+    "plant.thrusters",
+    "plant.end_effector_frame",
+    "plant.beyond_limits",
+    "plant.latched_faults",
+    "plant.actuation",
+    "plant.robot",
 )
 """Prefixes of the plant's parameters that all lanes share."""
 
 _COMMON_TO_SCHEDULES = (
-    *("plant.tick_rate", "plant.integration_step", "planner.tick_rate"),
-    *("planner.averaging", "planner.drift", "planner.replan", "planner.shape_"),
-    *("planner.max_corrections", "planner.output", "plant.actuation"),
+    "plant.tick_rate",
+    "plant.integration_step",
+    "plant.actuation",
+    "planner.tick_rate",
+    "planner.averaging",
+    "planner.drift",
+    "planner.replan",
+    "planner.shape_",
+    "planner.max_corrections",
+    "planner.output",
 )
 """Prefixes of the parameters that all lanes along schedules share."""
 
