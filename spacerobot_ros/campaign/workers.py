@@ -23,7 +23,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from threading import Thread
-from typing import Any, Protocol
+from typing import Any
 
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import self_contained
@@ -142,33 +142,6 @@ def fly_task(
 
 class WorkerDeath(Exception):  # noqa: N818
     """A worker died during a task."""
-
-
-class Workers(Protocol):
-    """Processes that run :func:`fly_task`."""
-
-    def count(self) -> int:
-        """Return the number of workers, at least 1: others may join later."""
-
-    def submit(self, *task: Any, all_of_them: bool) -> Any:
-        """Queue a task with arguments of :func:`fly_task`; return a handle of it."""
-
-    def ended(self, tasks: list[Any]) -> list[Any]:
-        """Return those of the tasks that have ended, after a while also none."""
-
-    def result(self, task: Any) -> list[Row | Fallback]:
-        """Return the result of a task that has ended.
-
-        Raises
-        ------
-        WorkerDeath
-            The worker died.
-        SpaceRobotError
-            The workers cannot fly at all.
-        """
-
-    def cancel(self, tasks: list[Any]) -> None:
-        """Stop tasks that have not ended."""
 
 
 class _LocalTask:
@@ -378,7 +351,15 @@ class DaskWorkers:
         return [task for task in tasks if task.done()]
 
     def result(self, task: Any) -> list[Row | Fallback]:
-        """Return the result of a task that has ended; see :meth:`Workers.result`."""
+        """Return the result of a task that has ended.
+
+        Raises
+        ------
+        WorkerDeath
+            The worker died.
+        SpaceRobotError
+            The scheduler is gone, or cannot load the task.
+        """
         from distributed.scheduler import KilledWorker
 
         try:
@@ -422,6 +403,9 @@ def _lost() -> SpaceRobotError:
     return SpaceRobotError(
         "The scheduler is gone. Finished flights are kept: the same command goes on from there."
     )
+
+
+Workers = LocalWorkers | DaskWorkers
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What a robot is: rigid links and the joints between them, as read from a URDF."""
+"""Description of a robot: rigid links and the joints between them, as read from a URDF."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from spacerobot_ros.model.rotations import Array as Array
 from spacerobot_ros.model.rotations import matrix_about_axis
 
 DEFAULT_END_EFFECTOR = "end_effector"
-"""Name of the link that is the end-effector of a robot where no parameter names another."""
+"""Default name of the link that is the end-effector."""
 
 
 class JointKind(str, Enum):
@@ -28,7 +28,7 @@ class JointKind(str, Enum):
 
 @dataclass(frozen=True)
 class JointLimits:
-    """Range, rate and effort of a joint (m or rad, /s, N or N m); infinite where free."""
+    """Limits of position, rate and effort of a joint (m or rad, /s, N or N m); infinite: none."""
 
     lower: float = -np.inf
     upper: float = np.inf
@@ -57,11 +57,11 @@ class Inertia:
     about_com: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     def moved(self, pose: Pose) -> Inertia:
-        """Express the same body in the frame in which this one has ``pose``."""
+        """Return the inertia of the same body in the frame in which its own frame has ``pose``."""
         return Inertia(self.mass, pose.r + pose.R @ self.com, pose.R @ self.about_com @ pose.R.T)
 
     def __add__(self, other: Inertia) -> Inertia:
-        """Weld two bodies given in the same frame (parallel-axis theorem)."""
+        """Return the inertia of two welded bodies given in one frame (parallel-axis theorem)."""
         mass = self.mass + other.mass
         com = (self.mass * self.com + other.mass * other.com) / mass if mass > 0 else np.zeros(3)
         about = np.zeros((3, 3))
@@ -88,7 +88,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Link:
-    """A named frame that may carry mass and may be drawn."""
+    """A named frame with mass properties and visuals, both optional."""
 
     name: str
     inertia: Inertia = field(default_factory=Inertia)
@@ -97,7 +97,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Mimic:
-    """What a coupled joint follows: it is at ``multiplier`` times that joint plus ``offset``."""
+    """Coupling of a mimic joint: its position is ``multiplier`` times ``joint`` plus ``offset``."""
 
     joint: str
     multiplier: float
@@ -108,7 +108,7 @@ class Mimic:
 class Joint:
     """A joint between two links; ``origin``: the child's pose at zero, ``axis``: a unit vector.
 
-    A joint with ``mimic`` follows another, which follows none: it is no coordinate of its own.
+    A joint with ``mimic`` follows an independent joint: it is no coordinate of its own.
     """
 
     name: str
@@ -126,7 +126,7 @@ class Joint:
         return "m" if self.kind is JointKind.PRISMATIC else "rad"
 
     def locked(self, position: float) -> Joint:
-        """Return the fixed joint that holds the child where this one has it at ``position``."""
+        """Return a fixed joint that holds the child at ``position`` of this one."""
         moved = Pose(r=position * self.axis)
         if self.kind is not JointKind.PRISMATIC:
             moved = Pose(matrix_about_axis(self.axis, position))
@@ -213,23 +213,22 @@ class RobotDescription:
         """Mass of the whole system, kg."""
         return float(sum(body.inertia.mass for body in self.bodies))
 
-    def limits(self, what: str) -> Array:
+    def limits(self, kind: str) -> Array:
         """Return one limit (n,) of the movable joints: lower, upper, velocity or effort.
 
-        Those of the joints that follow one count too, except for effort.
+        Limits of mimic joints restrict the joint that they follow, except for effort.
         """
-        values: list[Any] = [getattr(joint.limits, what) for joint in self.movable_joints]
+        values: list[Any] = [getattr(joint.limits, kind) for joint in self.movable_joints]
         for joint in self.moving_joints:
-            if joint.mimic is not None and what != "effort":
+            if joint.mimic is not None and kind != "effort":
                 i = self.joint_names.index(joint.mimic.joint)
-                bound = _leading_limit(joint.limits, joint.mimic, what)
-                values[i] = (max if what == "lower" else min)(values[i], bound)
+                bound = _leading_limit(joint.limits, joint.mimic, kind)
+                values[i] = (max if kind == "lower" else min)(values[i], bound)
         return np.array(values, dtype=float)
 
     def end_effector(self, link: str = "") -> str:
-        """Return the link that is the end-effector; empty: the robot has none.
-
-        ``link`` names it; without a name it is the link ``end_effector``, if there is one.
+        """Return the name of the end-effector link: ``link`` if given, else ``end_effector`` if the
+        robot has such a link, else an empty text.
         """
         names = [each.name for each in self.links]
         return link or (DEFAULT_END_EFFECTOR if DEFAULT_END_EFFECTOR in names else "")
@@ -241,7 +240,7 @@ class RobotDescription:
     def with_locked(self, positions: Mapping[str, float]) -> RobotDescription:
         """Return the robot with joints fixed at positions (m or rad) by their names.
 
-        Links and the other joints keep their names and their order; ``urdf`` stays what it was.
+        Links and the other joints keep their names and their order; ``urdf`` is not changed.
 
         Raises
         ------
@@ -264,11 +263,11 @@ class RobotDescription:
         return self._rebuilt(self.links, tuple(joints))
 
     def with_model_error(self, error: float, seed: int) -> RobotDescription:
-        """Return the robot with every mass and every inertia off by a factor of its own.
+        """Return the robot with random errors of all masses and inertias.
 
-        The factors are drawn uniformly from ``[1 - error, 1 + error]``, two a link in the order of
-        the links. A tensor of inertia stays a possible one, since its principal moments keep their
-        ratios; centres of mass stay where they are.
+        Each is multiplied by a factor of its own, drawn uniformly from ``[1 - error, 1 + error]``,
+        two per link in the order of the links. Inertia tensors stay physical, since their principal
+        moments keep their ratios; centres of mass do not change.
 
         Raises
         ------
@@ -290,19 +289,19 @@ class RobotDescription:
         return replace(self, links=links, joints=joints, bodies=tuple(bodies), frames=frames)
 
 
-def _leading_limit(limits: JointLimits, mimic: Mimic, what: str) -> float:
-    """Return what a limit of a joint that follows demands of the one that leads."""
+def _leading_limit(limits: JointLimits, mimic: Mimic, kind: str) -> float:
+    """Return the limit on the leading joint that a limit of its mimic joint implies."""
     k = mimic.multiplier
-    if what == "velocity":
+    if kind == "velocity":
         return limits.velocity / abs(k)
     bounds = sorted(((limits.lower - mimic.offset) / k, (limits.upper - mimic.offset) / k))
-    return bounds[0] if what == "lower" else bounds[1]
+    return bounds[0] if kind == "lower" else bounds[1]
 
 
 def weld(
     links: Mapping[str, Link], joints: Sequence[Joint]
 ) -> tuple[list[Body], dict[str, tuple[int, Pose]]]:
-    """Order the tree from the root and merge what fixed joints hold together.
+    """Order the tree from the root, and merge links that fixed joints weld together.
 
     Returns ``bodies`` and ``frames`` of a :class:`RobotDescription`.
 

@@ -1,15 +1,15 @@
-"""Triangles of the meshes that a URDF names, for whatever draws a robot.
+"""Meshes of a URDF: their files and their triangles.
 
 :func:`shape_mesh` returns the triangles of a visual in the frame of its link::
 
     for link in robot.links:
         for shape in link.shapes:
             if shape.kind == "mesh":
-                mesh = shape_mesh(shape, most=20_000)   # MeshError: a sentence for the user
+                mesh = shape_mesh(shape, most=20_000)   # MeshError: a message for the user
                 draw(mesh.vertices, mesh.faces, shape.rgba)
 
-STL and OBJ are read here; COLLADA, glTF and PLY by trimesh, where it is installed. Files come from
-strangers, also by way of bags: what is read is bounded, and no sentence quotes what a file holds.
+STL and OBJ are read here; COLLADA, glTF and PLY by trimesh, where it is installed. Files may come
+from strangers, also inside bags: sizes are bounded, and no message quotes the content of a file.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def shape_mesh(shape: Shape, most: int = _MOST_TRIANGLES) -> TriangleMesh:
     Raises
     ------
     MeshError
-        The file is not found or cannot be read; the sentence says what to do.
+        The file is not found or cannot be read.
     """
     path = mesh_file(shape.resource)
     if path is None:
@@ -225,7 +225,7 @@ def mesh_of_stl(data: bytes, name: str) -> TriangleMesh:
     Raises
     ------
     MeshError
-        It is damaged or too large; the sentence calls it ``name``.
+        It is damaged or too large; the message calls it ``name``.
     """
     try:
         return _checked(_read_stl(data))
@@ -246,7 +246,7 @@ def stl_of(mesh: TriangleMesh) -> bytes:
 
 
 class _DamagedError(Exception):
-    """What is wrong with the contents of a file, as the end of a sentence."""
+    """A flaw of the content of a file, as a clause."""
 
 
 def _checked(mesh: TriangleMesh) -> TriangleMesh:
@@ -361,7 +361,7 @@ def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
         found = load(path, force="mesh", process=False, skip_materials=True)
         vertices = np.asarray(found.vertices, dtype=float).reshape(-1, 3)
         faces = np.asarray(found.faces, dtype=np.int32).reshape(-1, 3)
-    except Exception as error:  # Of many parsers, by what is broken
+    except Exception as error:  # Each parser of trimesh has its own.
         raise _DamagedError(f"trimesh says {type(error).__name__}") from error
     return TriangleMesh(vertices * _unit(path, data), faces)
 

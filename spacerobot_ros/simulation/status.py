@@ -41,7 +41,7 @@ class PlantStatus:
     state
         State of the plant.
     message
-        State and reason in a sentence.
+        State and reason as a text for the user.
     reason
         Reason as a word. Latched, or paused and latched: the reason to refuse a command, ``abort``
         or ``watchdog``; resting: ``no_command`` or ``timeout``; failed: ``model`` or ``exception``;
