@@ -263,7 +263,7 @@ _TABLE = (
         _JOINTS,
         ("planner", "coordinated_control"),
         "velocities or efforts (by `actuation`), by joint name, stamped with the state that they "
-        "answer",
+        "answer, of all joints in any order",
     ),
     Topic(
         "base_wrench",

@@ -28,7 +28,7 @@ from spacerobot_ros.bag.mcap_reading import (
 )
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.bag.tables import TopicTable, table_of, to_pandas, to_xarray
-from spacerobot_ros.errors import RecordingError, RobotDescriptionError
+from spacerobot_ros.errors import RecordingError, RobotDescriptionError, printable
 from spacerobot_ros.messages.definitions import MessageTypes
 from spacerobot_ros.resources import suggestion
 from spacerobot_ros.times import SECOND
@@ -179,7 +179,11 @@ class Bag:
         """Name, number of messages and type of every topic, by name."""
         counts = self._statistics.channel_message_counts
         return [
-            (topic, sum(counts.get(c.id, 0) for c in channels), self.topics[topic])
+            (
+                printable(topic),
+                sum(counts.get(c.id, 0) for c in channels),
+                printable(self.topics[topic]),
+            )
             for topic, channels in sorted(self._channels_by_topic.items())
         ]
 

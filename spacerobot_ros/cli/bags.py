@@ -22,6 +22,7 @@ from spacerobot_ros.cli.options import (
     view_option,
     viewing_if,
 )
+from spacerobot_ros.errors import printable
 
 
 @click.command("export")
@@ -48,7 +49,9 @@ def export_command(bag: Path, format_name: str, out: Path | None, topics: tuple[
     made = export(tables, out or beside, ExportFormat(format_name))
     for topic in chosen:
         rows = made.rows.get(topic)
-        click.echo(f"{topic:<27} {'no messages, left out' if rows is None else f'{rows} rows'}")
+        click.echo(
+            f"{printable(topic):<27} {'no messages, left out' if rows is None else f'{rows} rows'}"
+        )
     click.echo(f"{'tables':<27} {made.path}")
 
 

@@ -11,9 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zstandard
+from mcap.opcode import Opcode
 
 from spacerobot_ros.bag import BagWriter, Recording, RecordingError, free_name, iterate_raw
 from spacerobot_ros.bag.mcap_file import McapFile
+from spacerobot_ros.bag.mcap_reading import open_bag, read_summary, record_at, unpacked
 from spacerobot_ros.bag.salvage import is_complete, salvage_bag
 
 STRING = "std_msgs/msg/String"
@@ -252,3 +255,24 @@ def test_a_kill_in_any_step_of_a_split_loses_nothing_that_was_written(
     assert len(parts) >= 3
     assert found == list(range(40))
     assert steps > 20
+
+
+def test_the_fastest_compression_makes_telemetry_little_larger() -> None:
+    """By the numbers of docs/records.md, for chunks of a recorder's size."""
+    ratios: dict[int, list[float]] = {1: [], 3: []}
+    for path in sorted((Path(__file__).parents[2] / "bags").glob("*.mcap")):
+        with open_bag(path) as file:
+            places = [i.chunk_start_offset for i in read_summary(path, file).chunk_indexes]
+            chunks = [unpacked(record_at(file, place, Opcode.CHUNK), place) for place in places]
+        records = b"".join(chunks)
+        size = {
+            level: sum(
+                len(zstandard.ZstdCompressor(level=level).compress(records[k : k + 262_144]))
+                for k in range(0, len(records), 262_144)
+            )
+            for level in (-1, 1, 3)
+        }
+        for level, found in ratios.items():
+            found.append(size[-1] / size[level] - 1.0)
+    assert 0.005 < min(ratios[1]) <= max(ratios[1]) < 0.045
+    assert 0.025 < min(ratios[3]) <= max(ratios[3]) < 0.085

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.msg import Log
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from support.control_loop import STATUS, Loop, pose
@@ -233,6 +234,25 @@ def test_a_latched_plant_ends_the_goals_of_the_controller(harness: Harness, tmp_
     loop.aim(base=pose([1.0, 0.0, 0.0]))
     loop.answer()
     loop.wait_for("tracking")
+
+
+def test_control_characters_of_a_status_reach_no_status_and_no_log(harness: Harness) -> None:
+    """A status that clears the terminal of whoever reads the controller's log."""
+    hostile = "Nothing moves: \x1b[2J\x1b]0;title\x07 a\rfuse.\n"
+    loop = Loop(harness)
+    logs = harness.probe({"/rosout": Log}, name="reader")
+    plant_status(loop, RUNNING)
+    loop.aim(base=pose([1.0, 0.0, 0.0]))
+    loop.answer()
+    loop.wait_for("tracking")
+    plant_status(loop, PlantStatus(PlantState.LATCHED, hostile, "abort", hostile))
+    status = loop.wait_for("aborted")
+    harness.spin_until(
+        lambda: any("fuse" in line.msg for line in logs.messages["/rosout"]), "the log of the end"
+    )
+    texts = [status.message, *(line.msg for line in logs.messages["/rosout"])]
+    texts += [text for pair in status.values for text in (pair.key, pair.value)]
+    assert all(text.isprintable() for text in texts)
 
 
 def test_states_of_another_time_do_not_disturb_the_controller(harness: Harness) -> None:

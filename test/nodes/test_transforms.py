@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
+from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 from support.planner_flight import NEAR, Flight, goal_at, values_of
 from support.ros_harness import Harness, nanoseconds
@@ -20,12 +22,17 @@ from spacerobot_ros.bag import Bag, RecordedRobot, read_bag, type_hash
 from spacerobot_ros.bag.reader import columns
 from spacerobot_ros.messages.builders import TRANSFORM_TYPE, TransformTemplate
 from spacerobot_ros.messages.definitions import _OWN_DEFINITIONS
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
 from spacerobot_ros.nodes.common.messages import KnownFrames, chained
+from spacerobot_ros.nodes.plant.publisher import TransformPublisher
 from spacerobot_ros.resources import resource_names, robot_file
+from spacerobot_ros.simulation.actuators import build_plant
+from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
+from spacerobot_ros.simulation.sensors import ReportedState
 
 TOLERANCE = 1e-12
 
@@ -217,6 +224,55 @@ def test_the_topic_has_the_frames_of_odom(harness: Harness) -> None:
         seen += 1
     assert seen >= 2
     assert plant.is_active
+
+
+def test_transforms_have_the_measured_pose_and_shape_and_not_the_true_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where the sensors err; without tf2_msgs, whose type only the publisher would need."""
+    monkeypatch.setattr(
+        "spacerobot_ros.nodes.plant.publisher.transform_class", lambda: TransformStamped
+    )
+    robot = SpaceRobot.from_file(robot_file("three_joint_arm"))
+    config = PlantConfig(
+        initial_position=(0.4, -0.2, 0.3),
+        sensors=SensorConfig(position_noise=0.05, attitude_noise=0.05, joint_noise=0.05, seed=3),
+    )
+    plant = build_plant(robot, config)
+    state = ReportedState(plant, config)
+    sent: dict[str, list[bytes]] = {}
+    node: Any = SimpleNamespace(
+        send_raw=lambda kind, topic, qos=None: SimpleNamespace(
+            take=sent.setdefault(topic, []).append
+        )
+    )
+    publisher = TransformPublisher(node, robot, state, config)
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for tick in range(1, 4):
+        plant.step(np.array([0.3, -0.2, 0.1]))
+        state.update()
+        publisher.publish(tick * 50_000_000)
+        message: Any = store.deserialize_cdr(sent["/tf"][-1], TRANSFORM_TYPE)
+        base, *links = message.transforms
+        R, r = placed(base.transform)
+        pose = state.quantities["measured_pose"]
+        np.testing.assert_allclose(r, pose[:3], atol=TOLERANCE)
+        np.testing.assert_allclose(R, matrix_from_quaternion(pose[3:]), atol=TOLERANCE)
+        assert np.linalg.norm(r - plant.pose[:3]) > 1e-3, "that is the true pose"
+        assert np.abs(R - matrix_from_quaternion(plant.pose[3:])).max() > 1e-3
+        expected = ForwardKinematics(robot.description)
+        expected.update(state.quantities["measured_q"])
+        places = {child: pose for (_, child), pose in zip(
+            expected.moving, expected.transforms.copy(), strict=True
+        )}  # fmt: skip
+        true = ForwardKinematics(robot.description)
+        true.update(plant.q)
+        for link in links:
+            R, r = placed(link.transform)
+            np.testing.assert_allclose(r, places[link.child_frame_id][:3], atol=TOLERANCE)
+            turn = matrix_from_quaternion(places[link.child_frame_id][3:])
+            np.testing.assert_allclose(R, turn, atol=TOLERANCE)
+        assert np.abs(expected.transforms - true.transforms).max() > 1e-3
 
 
 LINK = next(joint for joint in load_robot(robot_file("sliding_masses")).joints).child

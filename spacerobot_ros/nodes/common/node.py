@@ -117,7 +117,7 @@ class FlightNode(LifecycleNode):
         self._liveness: Liveness | None = None
         self._event_stream: RawOutput | None = None
         self.events_have_wall_time = True
-        """False in a run that must be repeatable to the last message."""
+        """False in a run whose recorded values must be repeatable."""
         self._raising = False
         self._guard_transitions()
         try:
