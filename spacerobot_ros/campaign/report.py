@@ -19,7 +19,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from spacerobot_ros.campaign.config import Campaign, Criterion, meets
 from spacerobot_ros.campaign.dataset import DRAWN, Dataset
-from spacerobot_ros.campaign.draws import Draws
+from spacerobot_ros.campaign.draws import Draws, needed
 from spacerobot_ros.campaign.statistics import (
     PERCENTILES,
     Influence,
@@ -92,12 +92,14 @@ class Results:
         dataset = Dataset(folder)
         campaign, table = dataset.campaign(), dataset.table()
         columns: dict[str, Any] = {}
+        text = needed("pyarrow").string()
         for name in table.column_names:
-            values = table[name].to_pylist()
-            if name in _TEXTS or _is_text(values):
-                columns[name] = values
+            column = table[name]
+            if name in _TEXTS or column.type == text:
+                columns[name] = column.to_pylist()
             else:
-                columns[name] = np.array([np.nan if v is None else v for v in values], dtype=float)
+                # Missing numbers become NaN; a seed may have more digits than a double.
+                columns[name] = column.cast("double", safe=False).to_numpy()
         return cls(campaign, folder, columns["flight"], columns, len(Draws(campaign)))
 
     def __len__(self) -> int:
@@ -187,10 +189,6 @@ class Results:
         badness += 1e3 * ~self.passed
         order = np.lexsort((self.numbers, -badness))
         return [int(row) for row in order[:_WORST]]
-
-
-def _is_text(values: Sequence[Any]) -> bool:
-    return any(isinstance(value, str) for value in values)
 
 
 def write_campaign_report(folder: Path, path: Path) -> list[str]:

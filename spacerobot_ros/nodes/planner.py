@@ -158,11 +158,10 @@ class PlannerNode(CommanderNode):
     def _publish_schedule(self, start: ScheduleStart) -> None:
         schedule, stamp, frame = start.schedule, start.stamp_ns, self.config.world_frame
         assert self.commander.robot is not None
-        base = self.commander.robot.description
-        self._schedule_topic.publish(trajectory_message(schedule, stamp, base.base_link))
+        robot = self.commander.robot.description
+        self._schedule_topic.publish(trajectory_message(schedule, stamp, robot.base_link))
         self._path_topic.publish(path_message(schedule.path, stamp, frame))
-        shapes = base.links[0].shapes
-        self._markers_topic.publish(goal_markers(schedule.goal, schedule.path, shapes, frame))
+        self._markers_topic.publish(goal_markers(schedule.goal, schedule.path, robot, frame))
 
 
 def main() -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from visualization_msgs.msg import Marker
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.messages.builders import path_message
-from spacerobot_ros.model import SpaceRobot, parse_robot
+from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.nodes.common.messages import goal_markers, goal_of, shape_marker, shape_of
@@ -66,20 +68,66 @@ PATH = BasePath(
 )
 
 
+def homogeneous(goal: Goal) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(goal.quaternion).as_matrix(), goal.position
+    return matrix
+
+
 def numbers(pose: Any) -> list[float]:
     p, o = pose.position, pose.orientation
     return [p.x, p.y, p.z, o.x, o.y, o.z, o.w]
 
 
-def test_the_goal_is_a_ghost_and_the_path_a_line() -> None:
-    shapes = [shape("box", (1.0, 2.0, 3.0)), shape("sphere", (0.5,))]
-    first, second, line = goal_markers(GOAL, PATH, shapes, "map").markers
-    for number, ghost in enumerate((first, second)):
+def transform(element: Any) -> np.ndarray:
+    """Return the ``origin`` of an element of a URDF as a matrix (4, 4), read with scipy."""
+    origin = element.find("origin")
+    matrix = np.eye(4)
+    if origin is not None:
+        angles = [float(x) for x in origin.get("rpy", "0 0 0").split()]
+        matrix[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
+        matrix[:3, 3] = [float(x) for x in origin.get("xyz", "0 0 0").split()]
+    return matrix
+
+
+def base_visuals(urdf: str) -> list[np.ndarray]:
+    """Return where the visuals of the base and of the links fixed to it are in the base."""
+    tree = ElementTree.fromstring(urdf)
+    above: dict[Any, Any] = {
+        child.get("link"): joint for joint in tree.iter("joint") for child in joint.iter("child")
+    }
+    found = []
+    for link in tree.iter("link"):
+        name, placed = link.get("name"), np.eye(4)
+        while name in above and above[name].get("type") == "fixed":
+            placed = transform(above[name]) @ placed
+            name = above[name].find("parent").get("link")
+        if name not in above:
+            found += [placed @ transform(visual) for visual in link.iter("visual")]
+    return found
+
+
+ROBOTS = ["servicer", "station_arm", "dual_arm", "seven_joint_arm", "planar_chain", "surveyor"]
+
+
+@pytest.mark.parametrize("name", [*ROBOTS, "sliding_masses"])
+def test_the_goal_is_a_ghost_of_the_base_and_the_path_a_line(name: str) -> None:
+    robot = load_robot(robot_file(name))
+    # The order of the links in a file says nothing: the base is the root of the tree.
+    robot = replace(robot, links=robot.links[::-1])
+    *ghosts, line = goal_markers(GOAL, PATH, robot, "map").markers
+    expected = [homogeneous(GOAL) @ each for each in base_visuals(robot.urdf)]
+    assert expected
+    found = []
+    for number, ghost in enumerate(ghosts):
         assert (ghost.ns, ghost.id, ghost.header.frame_id) == ("goal", number, "map")
         assert ghost.color.a == 0.25
-        assert ghost.color.r == pytest.approx(RED[0])
-        assert numbers(ghost.pose) == pytest.approx([1.0, -2.0, 3.0, *TURNED])
-    assert (line.ns, line.id, line.type) == ("planned_path", 2, Marker.LINE_STRIP)
+        pose = numbers(ghost.pose)
+        found.append(homogeneous(Goal(np.array(pose[:3]), np.array(pose[3:]))))
+    assert len(found) == len(expected)
+    for each in expected:
+        assert min(np.abs(each - other).max() for other in found) < 1e-9
+    assert (line.ns, line.id, line.type) == ("planned_path", len(ghosts), Marker.LINE_STRIP)
     assert line.header.frame_id == "map"
     assert [[p.x, p.y, p.z] for p in line.points] == PATH.position.tolist()
     assert numbers(line.pose) == [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]

@@ -8,8 +8,10 @@ from typing import Any
 
 import pytest
 from matplotlib.figure import Figure
+from support.command_line import CliRunner
 from support.flight_bags import GOAL, TICK, Story, goal_value, still, tell
 
+from spacerobot_ros.cli.main import main
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.report import figures_over_time
 from spacerobot_ros.report.events import _MARKS
@@ -103,6 +105,20 @@ def test_a_bag_without_events_has_no_lane(tmp_path: Path, events: list[Any]) -> 
     assert not isinstance(made, str)
     assert "Below the time axis" not in made.caption
     assert not lanes(made.figure)
+
+
+def test_figures_for_papers_show_events_only_if_asked(tmp_path: Path) -> None:
+    words = ["figures", str(story(tmp_path)), "--only", "position", "--format", "svg"]
+    for option in ([], ["--events"]):
+        folder = tmp_path / "_".join(["figures", *option])
+        result = CliRunner().invoke(main, [*words, *option, "-o", str(folder)])
+        assert result.exit_code == 0, result.output
+        text = (folder / "position.svg").read_text("utf-8")
+        # The goal has an entry in the legend of the figure itself.
+        labels = {_MARKS[EventKind(kind)].label for kind in TIMES} - {"goal"}
+        assert len(labels) > 3
+        for label in labels:
+            assert (f">{label}<" in text) == bool(option), (label, option)
 
 
 def test_every_kind_is_a_mark_of_its_own() -> None:

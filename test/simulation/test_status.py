@@ -187,3 +187,15 @@ def test_a_status_of_nothing_is_at_the_begin() -> None:
     status = PlantStatus(PlantState.INACTIVE, "It is not active.")
     assert (status.time_s, status.rearms, status.resets, status.timeouts) == (0.0, 0, 0, 0)
     assert (status.faults, status.last_command_s, status.reason) == ((), None, "")
+
+
+@pytest.mark.parametrize("state", list(PlantState))
+@pytest.mark.parametrize("faults", [(), ("joint_stuck slider_1",), ("a", "b")])
+@pytest.mark.parametrize(("reason", "latched"), [("", ""), ("timeout", ""), ("abort", "abort")])
+def test_a_status_is_ok_only_without_faults_timeouts_and_latches(
+    state: PlantState, faults: tuple[str, ...], reason: str, latched: str
+) -> None:
+    status = PlantStatus(state, reason=reason, latched_fault=latched, faults=faults)
+    stopped = state in (PlantState.LATCHED, PlantState.FAILED) or bool(latched)
+    assert status.level == (2 if stopped else 1 if faults or reason == "timeout" else 0)
+    assert PlantStatus.from_values(status.to_values()).level == status.level

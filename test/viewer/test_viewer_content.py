@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from html import escape
 from typing import Any
@@ -148,6 +149,20 @@ def test_joints_stand_beside_their_limits() -> None:
     assert beyond.count("#d23c3c") == 3
     tiny = np.full(3, -1e-9)
     assert "-0.0" not in content.joints_html(robot, tiny, tiny, tiny), "zero has no sign"
+
+
+def test_rates_and_efforts_stand_beside_their_own_limits() -> None:
+    robot = load_robot(robot_file("surveyor"))
+    rates, efforts = robot.limits("velocity"), robot.limits("effort")
+    assert not set(rates) & set(efforts)
+    n = len(robot.joint_names)
+    at, qdot, effort = np.zeros(n), np.linspace(0.01, 0.02, n), np.linspace(-1.0, -7.0, n)
+    rows = content.joints_html(robot, at, qdot, effort).split("<tr>")
+    titles = re.findall("<th>(.*?)</th>", rows[1])
+    for k, row in enumerate(rows[2:]):
+        cells = dict(zip(titles, re.findall("<td>(.*?)</td>", row), strict=True))
+        assert cells["rate"] == f"{qdot[k]:.2f} of {rates[k]:g}"
+        assert cells["effort"] == f"{effort[k]:.2f} of {efforts[k]:g}"
 
 
 def test_errors_are_to_the_goal() -> None:

@@ -18,8 +18,12 @@ from visualization_msgs.msg import Marker, MarkerArray
 from spacerobot_ros.errors import PlanningError, RecordingError, SpaceRobotError, printable
 from spacerobot_ros.messages.builders import STATIC_TRANSFORMS, TRANSFORM_TYPE, TRANSFORMS
 from spacerobot_ros.messages.definitions import message_definition
-from spacerobot_ros.model.description import Array, Shape
-from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_multiply
+from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
+from spacerobot_ros.model.rotations import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_multiply,
+)
 from spacerobot_ros.planning import BasePath, Goal
 
 _KINDS = {
@@ -89,19 +93,24 @@ def shape_marker(shape: Shape, frame: str, namespace: str, number: int) -> Marke
     return marker
 
 
-def goal_markers(
-    goal: Goal, path: BasePath, base_shapes: Sequence[Shape], frame: str
-) -> MarkerArray:
-    """Return the base as a ghost at the goal, and the planned path of the base as a line."""
+def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str) -> MarkerArray:
+    """Return the base as a ghost at the goal, and the planned path of the base as a line.
+
+    The ghost has the visuals of the base link and of the links that are fixed to it.
+    """
     markers: list[Marker] = []
-    for shape in base_shapes:
+    base = Pose(matrix_from_quaternion(goal.quaternion), goal.position)
+    visuals = [(link, shape) for link in robot.links for shape in link.shapes]
+    for link, shape in visuals:
+        body, link_pose = robot.frames[link.name]
+        if body != 0:
+            continue
         marker = shape_marker(shape, frame, "goal", len(markers))
         marker.color.a = 0.25
-        marker.pose.position.x, marker.pose.position.y, marker.pose.position.z = (
-            goal.position.tolist()
-        )
-        o = marker.pose.orientation
-        o.x, o.y, o.z, o.w = goal.quaternion.tolist()
+        placed = base @ link_pose @ shape.pose
+        p, o = marker.pose.position, marker.pose.orientation
+        p.x, p.y, p.z = placed.r.tolist()
+        o.x, o.y, o.z, o.w = quaternion_from_matrix(placed.R).tolist()
         markers.append(marker)
     line = Marker(ns="planned_path", id=len(markers), type=Marker.LINE_STRIP, action=Marker.ADD)
     line.header.frame_id = frame
