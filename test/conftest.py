@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import atexit
 import fcntl
 import gc
 import itertools
 import os
+import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,9 +53,33 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(20_000, 20, 50)
 
 
+OPTIONAL = {
+    *("SALib", "collada", "dask", "distributed", "mermaidx", "mkdocs", "pandas"),
+    *("pyarrow", "trimesh", "viser", "websockets", "xarray", "ziamath"),
+}
+"""Packages of extras: package.xml names none of them, and the test command of colcon has none."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Skip a module of tests whose optional package is not installed, and say so in one line."""
+    report = yield
+    found = re.search(r"No module named '(\w+)", str(report.longrepr)) if report.failed else None
+    if found is not None and found[1] in OPTIONAL:
+        reason = f"Skipped: {found[1]} is not installed (pip install 'spacerobot_ros[test]')"
+        report.outcome = "skipped"
+        report.longrepr = (str(collector.path), 0, reason)
+    return report
+
+
 def pytest_unconfigure() -> None:
     if _scratch is not None:
         shutil.rmtree(_scratch, ignore_errors=True)
+    # nanobind (Pinocchio's and others' bindings) lists every object that is alive when Python ends,
+    # as pytest's are: pages after the summary.
+    atexit.register(os.dup2, os.open(os.devnull, os.O_WRONLY), 2)
 
 
 @contextmanager

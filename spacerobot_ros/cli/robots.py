@@ -244,9 +244,9 @@ def robots_command() -> None:
     from spacerobot_ros.model import load_robot
     from spacerobot_ros.resources import resource_names, robot_file
 
-    click.echo(f"{'robot':<22}{'joints':>6}{'mass':>12}{'base':>12}")
+    click.echo(f"{'robot':<22}{'joints':>6}{'mass':>15}{'base':>15}")
     for name in resource_names("urdf", ".urdf"):
         robot = load_robot(robot_file(name))
         base = robot.bodies[0].inertia.mass
         joints = len(robot.joint_names)
-        click.echo(f"{name:<22}{joints:>6}{robot.total_mass:>9.4g} kg{base:>9.4g} kg")
+        click.echo(f"{name:<22}{joints:>6}{robot.total_mass:>12.4g} kg{base:>12.4g} kg")

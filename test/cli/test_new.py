@@ -130,3 +130,14 @@ def test_limits_in_degrees_are_remarked() -> None:
     found = [each for each in remarks(parse_robot(text)) if "not in degrees" in each]
     assert len(found) == 1
     assert "'shoulder_yaw' turns from -166 to 2.9 rad" in found[0]
+
+
+def test_columns_of_the_list_of_robots_are_apart() -> None:
+    lines = CliRunner().invoke(main, ["robots"]).output.splitlines()
+    assert lines[0].split() == ["robot", "joints", "mass", "base"]
+    for line in lines[1:]:
+        name, joints, mass, first, base, second = line.split()
+        assert (first, second) == ("kg", "kg"), name
+        assert int(joints) > 0
+        assert float(mass) > float(base) > 0
+    assert len({len(line) for line in lines}) == 1

@@ -1,0 +1,70 @@
+"""Tests without optional packages: modules are skipped, and nothing follows the summary."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+WITHOUT_PANDAS = """
+import sys
+
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "pandas":
+            raise ModuleNotFoundError(f"No module named '{name}'", name=name)
+
+sys.meta_path.insert(0, Finder())
+"""
+
+
+def test_a_module_without_its_package_is_skipped_with_one_line(tmp_path: Path) -> None:
+    (tmp_path / "without_pandas.py").write_text(WITHOUT_PANDAS)
+    (tmp_path / "test_tables.py").write_text("import pandas.api\n\ndef test_table(): pass\n")
+    (tmp_path / "test_other.py").write_text(
+        "import atexit, sys\n\ndef test_other():\n"
+        "    atexit.register(print, 'leaked', file=sys.__stderr__, flush=True)\n"
+    )
+    (tmp_path / "test_wrong.py").write_text("import pandaz\n")
+    folders = os.pathsep.join(str(each) for each in (tmp_path, ROOT / "test", ROOT))
+    words = ["-c", str(ROOT / "pyproject.toml"), "--rootdir", str(tmp_path), "-p", "without_pandas"]
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", *words, "-p", "conftest", str(tmp_path)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": folders},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert run.returncode == 2, run.stdout + run.stderr
+    assert "leaked" not in run.stderr
+    (line,) = [line for line in run.stdout.splitlines() if line.startswith("SKIPPED")]
+    assert line.endswith("pandas is not installed (pip install 'spacerobot_ros[test]')")
+    assert "test_tables.py" in line
+    assert "ERROR test_wrong.py" in run.stdout, "only optional packages may be missing"
+
+
+def test_the_documentation_has_the_packages_of_its_notebook() -> None:
+    tree = ast.parse((ROOT / "setup.py").read_text("utf-8"))
+    (extras,) = [
+        keyword.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        for keyword in node.keywords
+        if keyword.arg == "extras_require"
+    ]
+    assert isinstance(extras, ast.Dict)
+    by_name = {
+        ast.literal_eval(key): value
+        for key, value in zip(extras.keys, extras.values, strict=True)
+        if key is not None
+    }
+    named = {each.id for each in ast.walk(by_name["docs"]) if isinstance(each, ast.Name)}
+    assert named == {"DOCS", "DATA"}
+    notebook = (ROOT / "docs" / "notebooks" / "first_flight.py").read_text("utf-8")
+    assert "to_pandas" in notebook
