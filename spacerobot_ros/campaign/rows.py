@@ -102,8 +102,8 @@ class Engine(Protocol):
     def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
         """Return why this engine does not fly a campaign, as a clause; empty if it does.
 
-        ``asked``: it is named, not chosen; what it flies then may differ from other engines by more
-        than rounding.
+        ``asked``: the user has named it; its flights may then differ from those of other engines by
+        more than rounding.
         """
 
     def fly(

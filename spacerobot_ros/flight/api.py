@@ -120,7 +120,7 @@ def plan(
     Raises
     ------
     PlanningError
-        The goal is refused or cannot be reached; the sentence says why.
+        The goal is refused or cannot be reached; the message says why.
     ParameterError
         There is no such scenario, robot, method or option, or one is refused.
     """

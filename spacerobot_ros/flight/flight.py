@@ -249,7 +249,7 @@ class Flight:
 
     @property
     def sentence(self) -> str:
-        """Earlier name of :attr:`message`."""
+        """Earlier name of :attr:`message`; deprecated."""
         return self.message
 
     @property

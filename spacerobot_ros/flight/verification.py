@@ -87,7 +87,7 @@ class Verification:
     messages, topics
         Number of messages that were compared, and the topics that they are on.
     missing
-        A sentence on states that the bag lacks, by its own counts; empty: it lacks none.
+        Message about states that the bag lacks, by its own counts; empty: it lacks none.
     largest, largest_at
         The largest deviation before the first difference, as a share of max(1, expected value), and
         where it is.
@@ -373,7 +373,7 @@ def _published(flight: _RecordedPlant) -> list[_Published]:
 def _missing(
     flight: _RecordedPlant, published: list[_Published], resimulation: _Resimulation
 ) -> str:
-    """Return a sentence on states that the bag lacks; empty for none.
+    """Return a message about states that the bag lacks; empty for none.
 
     Every command answers a state, and a recorder counts its messages: those that it wrote, and
     those that never reached it.

@@ -403,9 +403,9 @@ def twist_figure(flight: FlightReport) -> ReportFigure | None:
 
     None if it rests, and for a gait of many equal cycles, in which it oscillates.
     """
-    if flight.cycles is not None or not flight.twist.values.any():
+    if flight.cycles is not None or not flight.signal("twist").values.any():
         return None
-    groups = axis_groups(flight.twist, (("velocity", "m/s"), ("rate", "rad/s")))
+    groups = axis_groups(flight.signal("twist"), (("velocity", "m/s"), ("rate", "rad/s")))
     caption = (
         "Velocity of the base link's origin and its angular velocity, in the base link's frame"
     )
@@ -472,11 +472,12 @@ def window_of(signal: Signal) -> tuple[float, float] | None:
 
 def thrusters_figure(flight: FlightReport) -> ReportFigure | None:
     """Duty cycles of the thrusters, their impulse, and the propellant."""
-    names = flight.thruster_names
-    if not len(flight.duty) or not flight.duty.values.any():
+    names = flight.bag.names("thrusters")
+    if not len(flight.signal("thruster_duty")) or not flight.signal("thruster_duty").values.any():
         return None
-    used = [k for k in range(len(names)) if flight.duty.values[:, k].any()]
-    duty = Signal(flight.duty.time, flight.duty.values[:, used])
+    whole = flight.signal("thruster_duty")
+    used = [k for k in range(len(names)) if whole.values[:, k].any()]
+    duty = Signal(whole.time, whole.values[:, used])
     tints = [colour(k) for k in range(len(used))]
     label, unit = "thrusters", "share of each tick that they are on"
     groups = [TraceGroup(duty, [short(names[k]) for k in used], label, unit, tints, rows=True)]
@@ -619,7 +620,7 @@ def sensors_figure(flight: FlightReport) -> ReportFigure | None:
     offset = pose.values[:, :3] - true.values[at, :3]
     errors = Signal(pose.time, np.hstack([offset, rotvecs_from_quaternions(turn)]))
     groups = axis_groups(errors, (("base position", "m"), ("base attitude", "rad")))
-    shape, at = _at_the_same_times(flight.sensed_shape, flight.shape)
+    shape, at = _at_the_same_times(flight.signal("measured_q"), flight.shape)
     if len(shape):
         off = Signal(shape.time, shape.values - flight.shape.values[at])
         units = {"m": "m", "rad": "rad"}

@@ -170,11 +170,6 @@ class FlightReport:
         """True velocities of the joints (N, n), m/s or rad/s."""
         return self.signal("qdot")
 
-    @property
-    def twist(self) -> Signal:
-        """True velocities of the base link in its frame (N, 6), m/s and rad/s."""
-        return self.signal("twist")
-
     @cached_property
     def momentum(self) -> Signal:
         """Momenta and energy (N, 7), without the momenta that the thrusters have put in."""
@@ -209,29 +204,9 @@ class FlightReport:
         return Signal(efforts.time, efforts.values[:, [given.index(name) for name in names]])
 
     @property
-    def duty(self) -> Signal:
-        """Share of each tick for which each thruster was on (N, m)."""
-        return self.signal("thruster_duty")
-
-    @property
-    def thrust(self) -> Signal:
-        """Mean force of each thruster in each tick (N, m), N."""
-        return self.signal("thruster_force")
-
-    @cached_property
-    def thruster_names(self) -> list[str]:
-        """Names of the thrusters."""
-        return self.bag.names("thrusters")
-
-    @property
     def sensed_pose(self) -> Signal:
         """Pose of the base link as measured while sensors err (M, 7)."""
         return self.signal("measured_pose")
-
-    @property
-    def sensed_shape(self) -> Signal:
-        """Joint positions as measured while sensors err (M, n)."""
-        return self.signal("measured_q")
 
     @cached_property
     def planned(self) -> list[Array]:
@@ -251,25 +226,10 @@ class FlightReport:
         return self.bag.path.name
 
     @property
-    def namespace(self) -> str:
-        """Namespace of the robot's topics, such as ``/robot_1``."""
-        return self.bag.namespace
-
-    @property
     def other_robots(self) -> list[str]:
         """Namespaces of the other robots in the bag."""
         others = namespaces(self.bag.parts[0].bag)
         return [name or "/" for name in others if name != self.bag.namespace]
-
-    @property
-    def message_count(self) -> int:
-        """Number of messages in the bag."""
-        return self.bag.message_count
-
-    @property
-    def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata records of the bag."""
-        return self.bag.metadata
 
     @property
     def robot(self) -> RobotDescription | None:
@@ -528,7 +488,8 @@ class FlightReport:
     @cached_property
     def impulse(self) -> Signal:
         """Impulse that all thrusters together have given (N, 1), N s."""
-        return impulse(self.thrust, np.ones(self.thrust.width))
+        thrust = self.signal("thruster_force")
+        return impulse(thrust, np.ones(thrust.width))
 
     @property
     def propellant(self) -> Signal | None:

@@ -94,8 +94,8 @@ def _facts(flight: FlightReport) -> str:
         count = len(flight.robot.joint_names)
         joints = "1 joint" if count == 1 else f"{count} joints"
         found.append(f"robot {flight.robot_name}: {joints}, {flight.robot.total_mass:.5g} kg")
-    if flight.namespace:
-        found.append(f"namespace {flight.namespace}")
+    if flight.bag.namespace:
+        found.append(f"namespace {flight.bag.namespace}")
     if flight.other_robots:
         found.append(f"the bag also has {', '.join(flight.other_robots)}")
     return facts(found)
@@ -189,7 +189,7 @@ def _events(events: Sequence[FlightEvent]) -> list[str]:
 def _parameters(flight: FlightReport) -> list[str]:
     nodes = {
         name.partition("/")[2]: values
-        for name, values in flight.metadata.items()
+        for name, values in flight.bag.metadata.items()
         if name.startswith("parameters/")
     }
     if not nodes:
@@ -207,9 +207,9 @@ def _parameters(flight: FlightReport) -> list[str]:
 
 
 def _footer(flight: FlightReport) -> str:
-    version = flight.metadata.get("spacerobot", {}).get("version", "")
+    version = flight.bag.metadata.get("spacerobot", {}).get("version", "")
     by = f", recorded by spacerobot_ros {version}" if version else ""
-    return f"Made from the bag {flight.file_name} alone: {flight.message_count} messages{by}."
+    return f"Made from the bag {flight.file_name} alone: {flight.bag.message_count} messages{by}."
 
 
 # -- charts -------------------------------------------------------------------------------------

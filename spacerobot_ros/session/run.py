@@ -53,8 +53,11 @@ class RunResult:
 
     @property
     def message(self) -> str:
-        """Its end, for the user."""
+        """The end of the goal, for people."""
         return str(self.summary["message"])
+
+    sentence = message
+    """Earlier name of :attr:`message`."""
 
 
 @contextmanager

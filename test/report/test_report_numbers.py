@@ -523,11 +523,11 @@ def test_what_the_page_says_of_a_flight(tmp_path: Path) -> None:
         "Attitude error0.3 rad17.2°",
         "Figure 1. Heading. Caption.",
         "tick_rate20.0",
-        f"Made from the bag flight.mcap alone: {found.message_count} messages, "
+        f"Made from the bag flight.mcap alone: {found.bag.message_count} messages, "
         "recorded by spacerobot_ros 1.2.3.",
     ):
         assert words in content.text, words
-    assert found.message_count == 1 + 3 + 4 * 3
+    assert found.bag.message_count == 1 + 3 + 4 * 3
     assert "nobody" not in content.text
     assert "<title>a_scenario, lie_bracket, tester</title>" in text
     cut = flight(tmp_path, FLOWN[:2], name="cut.mcap")

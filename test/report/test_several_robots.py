@@ -54,7 +54,7 @@ def test_the_robot_that_is_named_is_the_one_that_is_shown(name: str, bag: Path) 
         distance = 1 + list(JOINTS).index(name)
         row = ("Position error", f"{distance} m (tolerance {TOLERANCES[name]} m)")
         assert row in result_table(flight).rows
-    assert read_report(bag).namespace == "/fleet/a"
+    assert read_report(bag).bag.namespace == "/fleet/a"
 
 
 def test_the_page_says_which_robot_it_shows_and_which_it_does_not(

@@ -43,7 +43,7 @@ class Client:
     outcome: Outcome | None = Outcome.REACHED
     status: Any = None
     gait: PlannerStatus | None = None
-    sentence: str = "The goal is reached."
+    message: str = "The goal is reached."
 
 
 @dataclass
@@ -212,7 +212,7 @@ def test_what_the_planner_reports(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("outcome", [None, Outcome.INTERRUPTED])
 def test_an_interrupted_flight_says_so(tmp_path: Path, outcome: Outcome | None) -> None:
-    found = summary(tmp_path / "a.mcap", client=Client(outcome, sentence="Flying."))
+    found = summary(tmp_path / "a.mcap", client=Client(outcome, message="Flying."))
     assert found["message"] == "Interrupted after 0.75 s of simulated time."
     assert (found["succeeded"], found["state"]) == (False, "interrupted")
     assert found["method"] == load_scenario("sliding_masses").planner.method
