@@ -40,7 +40,7 @@ INLINE V operator!=(V a, V b) { return flag(a.x != b.x); }
 INLINE V operator!(V a) { return a == V(0.0); }
 INLINE V operator&&(V a, V b) { return flag((a.x != 0.0) & (b.x != 0.0)); }
 INLINE V operator||(V a, V b) { return flag((a.x != 0.0) | (b.x != 0.0)); }
-// What is not a number is left out, as by the functions of the C library.
+// NaN is ignored, as by the functions of the C library.
 INLINE V fmin(V a, V b) { return V((a.x < b.x) | (b.x != b.x) ? a.x : b.x); }
 INLINE V fmax(V a, V b) { return V((a.x > b.x) | (b.x != b.x) ? a.x : b.x); }
 INLINE V fabs(V a) {

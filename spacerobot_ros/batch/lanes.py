@@ -246,12 +246,12 @@ class _Block:
         program = self._flights.program
         match program:
             case FollowedSchedule():
-                table = self._of_lanes(program.positions)
+                table = self._per_lane(program.positions)
             case HeldCommands():
-                parts = [self._of_lanes(program.joints)]
+                parts = [self._per_lane(program.joints)]
                 if self._flights.actuation == "effort":
                     wrench = program.wrench
-                    parts.append(np.zeros((1, 6)) if wrench is None else self._of_lanes(wrench))
+                    parts.append(np.zeros((1, 6)) if wrench is None else self._per_lane(wrench))
                 ticks = max(part.shape[-2] for part in parts)
                 each = max(part.ndim for part in parts)
                 table = np.concatenate(
@@ -265,7 +265,7 @@ class _Block:
             table = np.moveaxis(grouped, 1, 3)
         return np.ascontiguousarray(table)
 
-    def _of_lanes(self, table: Array) -> Array:
+    def _per_lane(self, table: Array) -> Array:
         return table if table.ndim == 2 else np.asarray(table[self._rows_of_lanes])
 
     # -- flying -------------------------------------------------------------------------------
@@ -290,17 +290,17 @@ class _Block:
             if not begin:
                 self._begin_control(failures)
             while driver.fly_until(job, end):
-                self._help(result, failures)
+                self._step_outside_lanes(result, failures)
         if self._tick.controller is not None:
             driver.end(job)
         self._write(result)
 
-    def _end(self, index: int, tick: int, why: str, failures: dict[int, str]) -> None:
+    def _fail(self, index: int, tick: int, message: str, failures: dict[int, str]) -> None:
         """End the flight of a lane that fails at a tick."""
         group, lane = divmod(index, self._lanes)
         self._memory[group, self._rows["alive"], lane] = 0.0
         if index < len(self._flown):
-            failures[int(self._flown[index])] = why
+            failures[int(self._flown[index])] = message
             self._ended[index] = tick
 
     def _begin_control(self, failures: dict[int, str]) -> None:
@@ -316,18 +316,18 @@ class _Block:
             try:
                 profile, most[index] = controller.begin(int(row), ControlState.unstack(state))
             except SpaceRobotError as error:
-                self._end(index, 0, str(error), failures)
+                self._fail(index, 0, str(error), failures)
                 continue
             self._profiles[index] = profile
             numbers[index] = controller.numbers(profile)
         self._set("profile", numbers)
         self._set("bounds", most)
 
-    def _help(self, result: BatchResult, failures: dict[int, str]) -> None:
+    def _step_outside_lanes(self, result: BatchResult, failures: dict[int, str]) -> None:
         """Do the step that lanes wait for: a command, an allocation, or a tick of the plant."""
         rows, alive = self._rows, self._rows.first("alive")
         steps: dict[Pending, tuple[int, Callable[[int, int, int, BatchResult], None]]] = {
-            Pending.COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._take),
+            Pending.COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._step_plant),
         }
         if self._tick.controller is not None:
             steps[Pending.TICK] = rows.first("exact"), self._command
@@ -341,7 +341,7 @@ class _Block:
                 try:
                     step(int(group), int(lane), index, result)
                 except SpaceRobotError as error:
-                    self._end(index, int(self._at[group]), str(error), failures)
+                    self._fail(index, int(self._at[group]), str(error), failures)
                 else:
                     if index < len(self._flown):
                         result.fallback_ticks[self._flown[index]] += 1
@@ -368,7 +368,7 @@ class _Block:
         most = modulator.table.min_on_time + period - rows("remaining")
         rows("levels")[:] = modulator.allocation.allocate(impulse, most).levels
 
-    def _take(self, group: int, lane: int, index: int, result: BatchResult) -> None:
+    def _step_plant(self, group: int, lane: int, index: int, result: BatchResult) -> None:
         """Step the scalar plant, in which a joint touches its stop."""
         row, n = int(self._rows_of_lanes[index]), self._flights.robot.n
         if index not in self._stopped:

@@ -29,7 +29,7 @@ class ComputedTorqueLaw(ControlLaw):
 
     @classmethod
     def accepted_outputs(cls, robot: SpaceRobot, outputs: OutputSelection) -> OutputSelection:
-        """Return all the joints in the order of q, whatever order they were named in.
+        """Return all the joints, in the order of q.
 
         Raises
         ------

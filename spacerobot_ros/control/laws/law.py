@@ -62,7 +62,7 @@ class Gains:
     Raises
     ------
     ParameterError
-        A gain is not positive and finite; the sentence names it.
+        A gain is not positive and finite; the message names it.
     """
 
     base_position: GainPair = group(GainPair(30.0, 60.0))
