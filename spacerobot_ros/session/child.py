@@ -1,6 +1,6 @@
 """``python -m spacerobot_ros.session.child MODULE ...``: a node that ends with its supervisor.
 
-The module of a node takes a second to import: the process is guarded before.
+The module of a node takes a second to import: signals are guarded before.
 """
 
 from __future__ import annotations
@@ -11,15 +11,19 @@ from importlib import import_module
 from spacerobot_ros.termination import Terminated, guarded
 
 
-def main() -> None:
-    """Run the module that the first word names, with the other words as its own."""
-    del sys.argv[0]
+def run_module(name: str) -> int | None:
+    """Import the module of a node and run its ``main``; return the exit code.
+
+    A signal ends it without a traceback, also while it imports.
+    """
     with guarded():
         try:
-            import_module(sys.argv[0]).main()
+            code: int | None = import_module(name).main()
+            return code
         except Terminated:
-            sys.exit(0)
+            return 0
 
 
 if __name__ == "__main__":
-    main()
+    del sys.argv[0]
+    sys.exit(run_module(sys.argv[0]))
