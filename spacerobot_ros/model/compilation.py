@@ -24,7 +24,7 @@ import sys
 import sysconfig
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -74,6 +74,9 @@ ANNOUNCEMENT = "announcement"
 _LOG = logging.getLogger(__name__)
 
 _Loaded = TypeVar("_Loaded")
+
+contexts: list[Callable[[], AbstractContextManager[None]]] = []
+"""Contexts in which the compiler runs, for those that have to say that they are busy then."""
 
 _hung: set[str] = set()
 """Compilers that have exceeded the time limit: they are not called again."""
@@ -443,7 +446,12 @@ def _made(
     if build.compiler in _hung:
         raise _CompilationError(f"{build.compiler} did not end before, and is not called again")
     try:
-        with tempfile.TemporaryDirectory(prefix="spacerobot_ros_") as folder:
+        with (
+            ExitStack() as entered,
+            tempfile.TemporaryDirectory(prefix="spacerobot_ros_") as folder,
+        ):
+            for context in tuple(contexts):
+                entered.enter_context(context())
             built = _built(build, Path(folder), limit)
             for each in tried:
                 _try(each, built)

@@ -139,8 +139,20 @@ class MissionClient:
         )
 
     def has_decider(self) -> bool:
-        """Whether a commander reports what becomes of goals."""
-        return bool(self._status_topic.get_publisher_count())
+        """Whether a commander is connected that publishes its status and reads goals.
+
+        A recorder reads goals, too, and may be known before the commander.
+        """
+        if not self._status_topic.get_publisher_count():
+            return False
+        deciders, readers = (
+            {(each.node_namespace, each.node_name) for each in endpoints}
+            for endpoints in (
+                self.node.get_publishers_info_by_topic(self._status_topic.topic_name),
+                self.node.get_subscriptions_info_by_topic(self._goal_topic.topic_name),
+            )
+        )
+        return bool(deciders & readers)
 
     def send(self, goal: Goal, end_effector: Goal | None = None) -> None:
         """Publish goal poses of the base and, where there is one, of the end-effector.

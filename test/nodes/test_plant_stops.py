@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import Log
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from support.control_loop import STATUS, Loop, pose
 from support.planner_flight import NEAR, PLANNER, Flight, stamp_of, values_of
-from support.ros_harness import LATCHED, Harness
+from support.ros_harness import LATCHED, Harness, Probe
 from support.sentences import assert_one_sentence
 
+from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
 pytestmark = pytest.mark.usefixtures("one_plant")
@@ -186,13 +188,66 @@ def test_a_state_of_another_time_does_not_end_a_flight(harness: Harness, ahead: 
     assert values_of(status)["ignored"] == "1"
 
 
+# -- statuses of others -----------------------------------------------------------------------
+
+
+def forged(harness: Harness, name: str) -> tuple[Probe, Publisher]:
+    """Return a node that publishes statuses in the name of the plant, and its publisher."""
+    forger = harness.probe({}, name=name)
+    topic = forger.create_publisher(DiagnosticStatus, "plant/status", LATCHED)
+    harness.matched(topic)
+    return forger, topic
+
+
+def latched_message() -> DiagnosticStatus:
+    return diagnostic_status("/plant", b"\2", "Nothing moves.", LATCHED_PLANT.to_values())
+
+
+def test_a_status_of_another_node_stops_nothing_and_is_reported(harness: Harness) -> None:
+    flight = Flight(harness, SLOW)
+    flight.probe.watch("/rosout", Log, latched=True)
+    flight.start()
+    flight.send(NEAR)
+    flight.wait("executing")
+    flight.ticks(5)
+    forger, topic = forged(harness, "forger")
+    topic.publish(latched_message())
+    harness.spin_until(
+        lambda: any("/forger publishes it" in line.msg for line in flight.probe.messages["/rosout"])
+    )
+    flight.ticks(5)
+    assert flight.states == ["idle", "executing"]
+    # The plant's own statuses count again, the one that was not heard first, once it is alone.
+    call(flight, "abort")
+    harness.remove(forger)
+    status = flight.wait("aborted")
+    assert_one_sentence(status.message, "aborted on request", "'~/rearm'")
+    call(flight, "rearm")
+    flies_again(flight, "idle", "executing", "aborted")
+
+
+def test_a_status_of_a_node_that_has_left_stops_nothing(harness: Harness) -> None:
+    flight = Flight(harness, SLOW)
+    flight.start()
+    flight.send(NEAR)
+    flight.wait("executing")
+    flight.ticks(5)
+    harness.executor.remove_node(flight.planner)
+    forger, topic = forged(harness, "forger")
+    topic.publish(latched_message())
+    harness.remove(forger)
+    own = flight.planner.resolve_topic_name("plant/status")
+    harness.spin_until(lambda: len(flight.planner.get_publishers_info_by_topic(own)) == 1)
+    harness.executor.add_node(flight.planner)
+    flight.wait("reached")
+    assert flight.states == ["idle", "executing", "reached"]
+
+
 # -- the controller ---------------------------------------------------------------------------
 
 
 def plant_status(loop: Loop, status: PlantStatus) -> None:
     """Publish a status of the plant, and let it arrive."""
-    from spacerobot_ros.nodes.common.messages import diagnostic_status
-
     if not hasattr(loop, "plant_topic"):
         loop.plant_topic = loop.probe.create_publisher(  # type: ignore[attr-defined]
             DiagnosticStatus, "plant/status", LATCHED

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 from support.planner_flight import NEAR, PLANNER, Flight, values_of
 from support.ros_harness import Harness
 
+from spacerobot_ros.model.compilation import c_compiler, compiled
 from spacerobot_ros.nodes import RecorderNode
 from spacerobot_ros.nodes.common.watchdog import Liveness, Pulse, Role, Silence, Watchdog
 from spacerobot_ros.simulation.status import PlantState
@@ -252,3 +255,27 @@ def test_a_planner_that_plans_is_busy_and_not_silent(
     at = heard.index("busy")
     assert heard[at : at + 2] == ["busy", "active"]
     assert flight.events("node_silent") == []
+
+
+def test_an_active_node_that_compiles_is_busy_and_not_silent(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """At a first start functions are compiled when a state needs them: that took 0.88 s here."""
+    if c_compiler() is None:
+        pytest.skip("there is no C compiler")
+    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
+    monkeypatch.delenv("SPACEROBOT_COMPILE", raising=False)
+    flight = Watched(harness)
+    heard: list[str] = []
+
+    def publish(pulse: Pulse) -> None:
+        heard.append(pulse.value)
+
+    monkeypatch.setattr(flight.planner._liveness, "_publish", publish)
+    x = ca.SX.sym("x", 3)
+    with flight.planner.long_work():
+        compiled(ca.Function("watched_sine", [x], [ca.sin(1.7 * x)]))
+    assert heard == ["busy", "busy", "busy", "active"], "not active before the whole work is done"
+    flight.planner.trigger_deactivate()
+    compiled(ca.Function("watched_cosine", [x], [ca.cos(1.7 * x)]))
+    assert heard[4:] == ["inactive"]

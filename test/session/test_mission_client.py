@@ -185,3 +185,19 @@ def test_a_goal_waits_for_a_commander_that_is_known_beside_a_viewer(
     known = client.node.count_subscribers("goal_pose") + 1
     monkeypatch.setattr(client.node, "count_subscribers", lambda topic: known)
     assert not client.is_connected()
+
+
+def test_a_recorder_that_reads_goals_is_no_commander(harness: Harness) -> None:
+    """It may be known before the commander: then a goal would be lost without a word."""
+    client = MissionClient("planner", "world", lambda: NOW, context=harness.context)
+    harness.add(client.node)
+    recorder = harness.probe({"goal_pose": PoseStamped}, name="recorder")
+    commander = harness.probe({}, name="commander")
+    status = commander.create_publisher(DiagnosticStatus, "planner/status", LATCHED)
+    harness.spin_until(lambda: status.get_subscription_count() and client.is_connected())
+    harness.settle(recorder)
+    assert not client.has_decider()
+    commander.watch("goal_pose", PoseStamped)
+    harness.spin_until(lambda: client.has_decider() and client.is_connected(2))
+    client.send(GOAL)
+    harness.spin_until(lambda: commander.count("goal_pose"), "the goal")

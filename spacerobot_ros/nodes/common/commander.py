@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import time
 from abc import abstractmethod
@@ -13,6 +14,7 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
@@ -47,6 +49,9 @@ from spacerobot_ros.times import SECOND, first_time_ns, set_stamp
 _LOOK_PERIOD = 0.1
 """Wall s between two looks at states that were set aside."""
 
+_COMPLAINT_PERIOD = 5.0
+"""Least wall s between two lines about another publisher of plant/status."""
+
 _DIAGNOSED = 1.0
 """Longest wall s between two diagnostics, where a run need not be repeatable."""
 
@@ -68,6 +73,8 @@ class CommanderNode(FlightNode):
     config: PlannerConfig | ControllerConfig
     commander: Commander
     """Made anew whenever the node is configured."""
+
+    _statuses: Subscription | None = None
 
     # -- life ---------------------------------------------------------------------------------
 
@@ -94,9 +101,8 @@ class CommanderNode(FlightNode):
         self._diagnostics_period_ns = (config.diagnostics_period or math.inf) * SECOND
         self._diagnosed_ns, self._diagnosed = 0, time.monotonic()
         self._known_frames = KnownFrames(self)
-        self._statuses = self.create_subscription(
-            DiagnosticStatus, "plant/status", self._on_plant_status, _STATUSES
-        )
+        self._last_complaint, self._statuses = -math.inf, None
+        self._subscribe_plant_status()
         self._best_effort = config.state_reliability == "best_effort"
         self._unheard = ""
         """A topic of the state with a publisher that this node cannot hear as it subscribes."""
@@ -223,7 +229,50 @@ class CommanderNode(FlightNode):
         response.message = answer or "There is no goal to abort."
         return response
 
-    def _on_plant_status(self, message: DiagnosticStatus) -> None:
+    def _subscribe_plant_status(self) -> None:
+        """Subscribe (again): the last status of every publisher that is there comes first."""
+        if self._statuses is not None:
+            self.destroy_subscription(self._statuses)
+        self._status_number: int | None = None
+        """Number that the plant gave to its last status; None: that of the next one counts."""
+        self._doubted = False
+        """Whether a status came that was perhaps not the plant's."""
+        receive = self._guarded(self._on_plant_status, "a message on 'plant/status'")
+
+        def callback(message: Any, information: Any = None) -> None:
+            # rclpy's events executor hands over message and information as one tuple (7.1).
+            receive(*(message if information is None else (message, information)))
+
+        # By the number of parameters rclpy finds out that the information is wanted.
+        callback.__signature__ = inspect.signature(lambda message, information: None)  # type: ignore[attr-defined]
+        self._statuses = LifecycleNode.create_subscription(
+            self, DiagnosticStatus, "plant/status", callback, _STATUSES
+        )
+
+    def _on_plant_status(self, message: DiagnosticStatus, information: Any) -> None:
+        """React to a status of the plant that publishes odom.
+
+        Messages do not name their publisher. A status counts while nobody else publishes any, and
+        only with the number after the last one: otherwise it is taken again from the publishers
+        that are there then. So tests, tools and plants of other stacks stop no goal.
+        """
+        number = information["publication_sequence_number"] or 0
+        last, foreign = self._status_number, self._foreign_plants()
+        if foreign:
+            self._doubted = True
+            now = time.monotonic()
+            if now - self._last_complaint > _COMPLAINT_PERIOD:
+                self._last_complaint = now
+                self.log(
+                    "error",
+                    f"plant/status: {', '.join(foreign)} publishes it beside the plant; no status "
+                    "counts until only the plant does.",
+                )
+            return
+        if last is not None and number and number != last + 1:
+            self._subscribe_plant_status()
+            return
+        self._status_number = number
         record = read_status(message)
         try:
             status = PlantStatus.from_values(record.values, record.message)
@@ -231,6 +280,16 @@ class CommanderNode(FlightNode):
             self.get_logger().warning(f"plant/status: {error}", throttle_duration_sec=5.0)
             return
         self.commander.receive_plant_status(status, record.name or "plant")
+
+    def _foreign_plants(self) -> list[str]:
+        """Return the nodes that publish plant/status and not odom; none where there is no odom."""
+        found = []
+        for topic in ("plant/status", "odom"):
+            endpoints = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
+            names = {f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in endpoints}
+            found.append({name for name in names if "_UNKNOWN_" not in name})
+        statuses, odoms = found
+        return sorted(statuses - odoms) if odoms else []
 
     def _on_odom(self, raw: bytes) -> None:
         self.commander.receive_odom(first_time_ns(raw), raw)
@@ -284,11 +343,14 @@ class CommanderNode(FlightNode):
 
     def _look(self) -> None:
         """Take statuses that wait, and a state that was set aside once its time is accepted."""
+        assert self._statuses is not None
         commander, handle = self.commander, self._statuses.handle
         # An executor that is busy may lose a callback.
         with handle:
             while (taken := handle.take_message(DiagnosticStatus, False)) is not None:
-                self._on_plant_status(taken[0])
+                self._on_plant_status(*taken)
+        if self._doubted and not self._foreign_plants():
+            self._subscribe_plant_status()
         if self._unheard:
             self._resubscribe_best_effort()
         ignored = commander.look()

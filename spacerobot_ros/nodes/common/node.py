@@ -33,7 +33,7 @@ from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
 from spacerobot_ros.nodes.common.streams import Connections, RawInput, RawOutput, RawStream, Take
-from spacerobot_ros.nodes.common.watchdog import Liveness, Pulse, Role, Silence
+from spacerobot_ros.nodes.common.watchdog import Liveness, Role, Silence
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
@@ -392,11 +392,8 @@ class FlightNode(LifecycleNode):
         if self._liveness is None:
             yield
             return
-        self._liveness.beat(Pulse.BUSY)
-        try:
+        with self._liveness.busy():
             yield
-        finally:
-            self._liveness.beat()
 
     def drain(self, executor: EventsExecutor) -> None:
         """Complete pending work before the node ends; about a second is left."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import Enum
 
@@ -16,6 +16,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 
 from spacerobot_ros.messages.statuses import read_status
+from spacerobot_ros.model.compilation import contexts
 from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
 
 TOPIC = "heartbeat"
@@ -166,6 +167,8 @@ class Liveness:
         self._watched = {each.value for each in depends_on}
         self._timeout = 0.0
         self._watchdog: Watchdog | None = None
+        self._busy = 0
+        """Number of computations under way that may take long."""
 
     def configure(self, timeout: float) -> None:
         """Prepare to watch, until the entities created since the construction are destroyed.
@@ -179,6 +182,8 @@ class Liveness:
     def begin(self) -> None:
         """Give heartbeats, and watch, from now on."""
         self._end_timers()
+        # Functions are compiled when they are first called: a node may be active long before.
+        contexts.append(self.busy)
         node = self._node
         beat = node.create_timer(HEARTBEAT_PERIOD, self.beat, clock=self._steady)
         self._timers.append(beat)
@@ -204,10 +209,21 @@ class Liveness:
         """Note that the entities created since the construction are destroyed."""
         self._diagnostics = None
 
-    def beat(self, pulse: Pulse = Pulse.ACTIVE) -> None:
+    def beat(self) -> None:
         """Give a heartbeat, if the node is active."""
         if self._timers:
-            self._publish(pulse)
+            self._publish(Pulse.BUSY if self._busy else Pulse.ACTIVE)
+
+    @contextmanager
+    def busy(self) -> Iterator[None]:
+        """Tell the watchdogs of other nodes that a computation may take long."""
+        self._busy += 1
+        self.beat()
+        try:
+            yield
+        finally:
+            self._busy -= 1
+            self.beat()
 
     def _publish(self, pulse: Pulse) -> None:
         name, role = self._node.get_fully_qualified_name(), self._role
@@ -218,6 +234,8 @@ class Liveness:
         )
 
     def _end_timers(self) -> None:
+        if self.busy in contexts:
+            contexts.remove(self.busy)
         for timer in self._timers:
             self._node.destroy_timer(timer)
         self._timers.clear()
