@@ -112,7 +112,7 @@ def test_a_node_has_a_script_that_runs_its_module() -> None:
     for node in NODES:
         script = ROOT / "scripts" / node
         assert os.access(script, os.X_OK)
-        assert f"from {module_of(node)} import main\n" in script.read_text()
+        assert f'sys.exit(run_module("{module_of(node)}"))\n' in script.read_text()
 
 
 @pytest.mark.slow
