@@ -169,11 +169,12 @@ def _names(tree: ast.Module) -> Iterator[str]:
 
 def _texts(source: str) -> Iterator[str]:
     """Yield first sentences of docstrings, comments, and messages of five words or more."""
-    strings = set()
-    for node in ast.walk(ast.parse(source)):
+    strings, parts = set(), set()
+    for node in ast.walk(ast.parse(source)):  # An f-string comes before its parts.
         if isinstance(node, ast.JoinedStr):
             strings.add(ast.unparse(node))
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            parts |= set(node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in parts:
             strings.add(" ".join(re.split(r"(?<=[.:])\s", node.value.strip())[0].split()))
     yield from sorted(text for text in strings if len(text.split()) > 4)
     comments = [
@@ -181,7 +182,7 @@ def _texts(source: str) -> Iterator[str]:
         for token in tokenize.generate_tokens(io.StringIO(source).readline)
         if token.type == tokenize.COMMENT
     ]
-    yield from (comment for comment in comments if len(comment.split()) > 4)
+    yield from (comment for comment in comments if len(comment.split()) > 4 and comment[0] != "-")
 
 
 def main() -> None:
