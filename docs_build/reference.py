@@ -157,7 +157,7 @@ def _range(declaration: Parameter) -> str:
 
 def command_line() -> str:
     """Return a section for every command: what it does, its usage, its options."""
-    context = click.Context(main, info_name="spacerobot")
+    context = click.Context(main, info_name="spacerobot", **main.context_settings)
     sections = []
     for name in main.list_commands(context):
         command = main.get_command(context, name)

@@ -13,7 +13,7 @@ from spacerobot_ros.cli.main import COMMANDS, CommandGroup, main
 
 def commands() -> dict[str, click.Command]:
     """Return every command by its words."""
-    group, context = CommandGroup(), click.Context(main)
+    group, context = CommandGroup(), click.Context(main, **main.context_settings)
     found = {name: group.get_command(context, name) for name in COMMANDS}
     return {
         **{name: each for name, each in found.items() if each is not None},

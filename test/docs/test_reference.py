@@ -68,7 +68,7 @@ def test_every_command_and_option_is_documented() -> None:
     sections = dict(re.findall(headings, reference.command_line(), re.MULTILINE | re.DOTALL))
     commands: dict[str, click.Command] = {}
     for name in COMMANDS:
-        command = main.get_command(click.Context(main), name)
+        command = main.get_command(click.Context(main, **main.context_settings), name)
         assert command is not None
         commands[name] = command
         if isinstance(command, click.Group):
@@ -96,9 +96,12 @@ def test_every_service_is_documented_with_its_type() -> None:
     for path in nodes.rglob("*.py"):
         relative = path.relative_to(nodes)
         folder = relative.parts[0] if len(relative.parts) > 1 else path.stem
-        node = {"controller": "coordinated_control", "common": "NODE"}.get(folder, folder)
+        names = {
+            "controller": ("coordinated_control",),
+            "common": ("planner", "coordinated_control") if path.stem == "commander" else ("NODE",),
+        }.get(folder, (folder,))
         source = path.read_text(encoding="utf-8")
         for kind, name in re.findall(r'create_service\((\w+), "~/(\w+)"', source):
-            found.add((f"{node}/{name}", f"std_srvs/{kind}"))
+            found |= {(f"{node}/{name}", f"std_srvs/{kind}") for node in names}
     assert len(found) >= 9
     assert documented == found

@@ -99,15 +99,22 @@ def test_a_bad_command_is_logged(
     rig.wait_for_log(reason)
 
 
-def test_joints_that_are_not_named_stay_at_rest(harness: Harness) -> None:
+@pytest.mark.parametrize(
+    ("velocity", "names", "missing"),
+    [
+        ([0.2], ["slider_2"], "slider_1"),
+        ([0.5, -0.5], ["slider_3", "slider_1"], "slider_2"),
+        ([], [], "slider_1"),
+    ],
+)
+def test_a_command_that_leaves_a_joint_out_is_a_tick_at_rest(
+    harness: Harness, velocity: list[float], names: list[str], missing: str
+) -> None:
     rig = Rig(harness)
-    rig.step([0.3, 0.3, 0.3])
-    np.testing.assert_array_equal(rig.step([0.2], ["slider_2"]).velocity, [0, 0.2, 0])
-    np.testing.assert_array_equal(rig.step([0.1], ["slider_2"]).velocity, [0, 0.1, 0])
-    joints = rig.step([0.5, -0.5], ["slider_3", "slider_1"])
-    np.testing.assert_array_equal(joints.velocity, [-0.5, 0, 0.5])
-    np.testing.assert_array_equal(rig.step([], []).velocity, np.zeros(3))
-    assert rig.diagnosed("commands", "refused") == 0
+    rig.step([0.3, 0.2, 0.1])
+    np.testing.assert_array_equal(rig.step(velocity, names).velocity, np.zeros(3))
+    assert_one_sentence(rig.diagnosis("commands").message, f"joint '{missing}' is missing")
+    assert rig.diagnosed("commands", "refused") == 1
 
 
 def test_joints_go_by_name_and_not_by_place(harness: Harness) -> None:

@@ -15,5 +15,5 @@ BAD_COMMANDS = {
     "too few velocities": ([0.1, 0.1], SLIDERS, "3 joint(s) are named but 2"),
     "too many velocities": ([0.1] * 4, SLIDERS, "3 joint(s) are named but 4"),
     "no velocities": ([], SLIDERS, "3 joint(s) are named but 0"),
-    "no names": ([0.1, 0.1, 0.1], [], "0 joint(s) are named but 3"),
+    "no names": ([0.1, 0.1, 0.1], [], "joint 'slider_1' is missing"),
 }
