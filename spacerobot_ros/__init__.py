@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["__version__", "fly", "load_scenario", "plan", "read_bag"]
 
 
-_TOO_LITTLE = 16 * 2**10
+_LEAST_SHARED_MEMORY = 16 * 2**10
 """Bytes of shared memory without which libraries of ROS end the process that loads them."""
 
 
@@ -26,7 +26,7 @@ def _warn_of_full_shared_memory() -> None:
         facts = os.statvfs("/dev/shm")
     except OSError:
         return
-    if facts.f_blocks and facts.f_bavail * facts.f_frsize < _TOO_LITTLE:
+    if facts.f_blocks and facts.f_bavail * facts.f_frsize < _LEAST_SHARED_MEMORY:
         logging.getLogger(__name__).warning(
             "/dev/shm is full: ROS may end here with SIGBUS (bus error). Free it; what killed "
             "processes have left, fastrtps_*, may be deleted while nothing runs."

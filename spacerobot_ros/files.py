@@ -25,25 +25,25 @@ _LOG = logging.getLogger(__name__)
 
 _OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
-_MAGIC = b"spacerobot_ros cache 2"
+_CACHE_MAGIC = b"spacerobot_ros cache 2"
 """Begins the last line of a file of the cache; the number is that of the format."""
 
-_LARGEST = 256 * 2**20
+_LARGEST_PRIVATE_FILE = 256 * 2**20
 """Largest file that :func:`read_private` reads, bytes."""
 
-_MCAP = b"\x89MCAP"
+_MCAP_MAGIC = b"\x89MCAP"
 """First bytes of a bag."""
 
-_MOST_YAML = 1_000_000
+_MOST_YAML_CHARACTERS = 1_000_000
 """Largest number of characters of a YAML text."""
 
-_MOST_VALUES = 100_000
+_MOST_YAML_VALUES = 100_000
 """Largest number of values of a YAML text, with those that aliases repeat."""
 
-_DEEPEST = 50
+_MOST_YAML_DEPTH = 50
 """Largest number of levels of a YAML text."""
 
-_reported: set[str] = set()
+_logged_warnings: set[str] = set()
 
 
 class UntrustedFileError(SpaceRobotError):
@@ -52,8 +52,8 @@ class UntrustedFileError(SpaceRobotError):
 
 def warn_once(message: str) -> None:
     """Log a warning, once in a process."""
-    if message not in _reported:
-        _reported.add(message)
+    if message not in _logged_warnings:
+        _logged_warnings.add(message)
         _LOG.warning("%s", message)
 
 
@@ -136,7 +136,7 @@ def _write_output(path: Path, data: bytes, mode: int) -> None:
 
 def _is_bag(path: Path) -> bool:
     with path.open("rb") as file:
-        return file.read(len(_MCAP)) == _MCAP
+        return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
 
 
 # -- YAML -------------------------------------------------------------------------------------
@@ -160,15 +160,15 @@ def load_yaml(text: str, loader: Any = None) -> Any:
     """
     import yaml
 
-    if len(text) > _MOST_YAML:
-        raise ValueError(f"it has more than {_MOST_YAML} characters")
+    if len(text) > _MOST_YAML_CHARACTERS:
+        raise ValueError(f"it has more than {_MOST_YAML_CHARACTERS} characters")
     try:
         reader = (loader or yaml.SafeLoader)(text)
         try:
             node = reader.get_single_node()
             if node is None:
                 return None
-            _size(node, {})
+            _count_values(node, {})
             return reader.construct_document(node)
         finally:
             reader.dispose()
@@ -178,7 +178,7 @@ def load_yaml(text: str, loader: Any = None) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
-def _size(node: Any, known: dict[int, tuple[int, int] | None]) -> tuple[int, int]:
+def _count_values(node: Any, known: dict[int, tuple[int, int] | None]) -> tuple[int, int]:
     """Return the number of values that a node stands for, and its depth.
 
     ``known`` has those of nodes by their id, and None for the nodes around this one.
@@ -189,11 +189,11 @@ def _size(node: Any, known: dict[int, tuple[int, int] | None]) -> tuple[int, int
         count, depth = 1, 0
         for part in parts:
             for each in part if isinstance(part, tuple) else (part,):
-                more, below = _size(each, known)
+                more, below = _count_values(each, known)
                 count, depth = count + more, max(depth, below)
-            if count > _MOST_VALUES:
-                raise ValueError(f"its aliases stand for more than {_MOST_VALUES} values")
-        if depth >= _DEEPEST:
+            if count > _MOST_YAML_VALUES:
+                raise ValueError(f"its aliases stand for more than {_MOST_YAML_VALUES} values")
+        if depth >= _MOST_YAML_DEPTH:
             raise ValueError("it is nested too deeply")
         known[id(node)] = count, depth + 1
     size = known[id(node)]
@@ -221,8 +221,8 @@ def read_private(path: Path) -> bytes:
         facts = os.fstat(file.fileno())
         if not stat.S_ISREG(facts.st_mode):
             raise UntrustedFileError(f"'{path}' is not a regular file; remove it.")
-        _require_own(path, facts)
-        if facts.st_size > _LARGEST:
+        _require_own_path(path, facts)
+        if facts.st_size > _LARGEST_PRIVATE_FILE:
             raise UntrustedFileError(f"'{path}' has {facts.st_size} bytes; remove it.")
         return file.read(facts.st_size)
 
@@ -240,30 +240,32 @@ def trusted_folder(folder: Path) -> Path:
     real = folder.resolve(strict=True)
     if not real.is_dir():
         raise UntrustedFileError(f"'{folder}' is not a folder; remove it.")
-    _require_own(real, real.stat())
+    _require_own_path(real, real.stat())
     for parent in real.parents:
         mode = parent.stat().st_mode
         # In a folder with the sticky bit, as /tmp, no user renames files of another.
         if mode & _OTHERS_MAY_WRITE and not mode & stat.S_ISVTX:
-            raise UntrustedFileError(_writable(parent, mode))
+            raise UntrustedFileError(_writable_by_others(parent, mode))
     return real
 
 
-def _require_own(path: Path, facts: os.stat_result) -> None:
+def _require_own_path(path: Path, facts: os.stat_result) -> None:
     if facts.st_uid not in (0, os.geteuid()):
-        raise UntrustedFileError(f"'{path}' belongs to {_user(facts.st_uid)}; use one of your own.")
+        raise UntrustedFileError(
+            f"'{path}' belongs to {_user_name(facts.st_uid)}; use one of your own."
+        )
     if facts.st_mode & _OTHERS_MAY_WRITE:
-        raise UntrustedFileError(_writable(path, facts.st_mode))
+        raise UntrustedFileError(_writable_by_others(path, facts.st_mode))
 
 
-def _writable(path: Path, mode: int) -> str:
+def _writable_by_others(path: Path, mode: int) -> str:
     return (
         f"others may write '{path}' (mode {stat.S_IMODE(mode):o}); make it yours alone with "
         f"chmod go-w '{path}'."
     )
 
 
-def _user(number: int) -> str:
+def _user_name(number: int) -> str:
     try:
         return f"user {number} ({pwd.getpwuid(number).pw_name})"
     except KeyError:
@@ -291,29 +293,33 @@ class Cache:
         try:
             path = trusted_folder(self.folder) / name
         except UntrustedFileError as error:
-            self._refuse(error)
+            self._warn_of_untrusted_cache(error)
             return None
         except OSError:
             return None
         try:
-            return path, _checked(read_private(path), key)
+            return path, _content_of_entry(read_private(path), key)
         except FileNotFoundError:
             return None
         except (OSError, ValueError, UntrustedFileError) as error:
-            self.discard(name, _reason(error) if isinstance(error, OSError) else str(error))
+            self.discard(
+                name, _os_error_reason(error) if isinstance(error, OSError) else str(error)
+            )
             return None
 
     def store(self, name: str, key: str, content: bytes) -> Path | None:
         """Store a content under a key; return its path, None if it cannot be stored."""
         try:
-            _make(self.folder)
+            _make_private_folder(self.folder)
             path = trusted_folder(self.folder) / name
             write_whole(path, content + _trailer(content, key))
         except UntrustedFileError as error:
-            self._refuse(error)
+            self._warn_of_untrusted_cache(error)
             return None
         except OSError as error:
-            warn_once(f"Nothing can be kept in the cache '{self.folder}': {_reason(error)}.")
+            warn_once(
+                f"Nothing can be kept in the cache '{self.folder}': {_os_error_reason(error)}."
+            )
             return None
         return path
 
@@ -324,18 +330,18 @@ class Cache:
         with suppress(OSError):
             path.unlink()
 
-    def _refuse(self, error: UntrustedFileError) -> None:
+    def _warn_of_untrusted_cache(self, error: UntrustedFileError) -> None:
         warn_once(
             f"The cache '{self.folder}' is not used, for its files are executed and flown: {error} "
             "(SPACEROBOT_CACHE_DIR chooses another folder.)"
         )
 
 
-def _reason(error: OSError) -> str:
+def _os_error_reason(error: OSError) -> str:
     return error.strerror or str(error)
 
 
-def _make(folder: Path) -> None:
+def _make_private_folder(folder: Path) -> None:
     """Make a folder and the folders above it, for this user alone whatever the umask."""
     for each in (*reversed(folder.parents), folder):
         if not each.exists():
@@ -345,10 +351,10 @@ def _make(folder: Path) -> None:
 
 def _trailer(content: bytes, key: str) -> bytes:
     digest = hashlib.sha256(content).hexdigest()
-    return b"\n%s %s %d %s\n" % (_MAGIC, key.encode(), len(content), digest.encode())
+    return b"\n%s %s %d %s\n" % (_CACHE_MAGIC, key.encode(), len(content), digest.encode())
 
 
-def _checked(whole: bytes, key: str) -> bytes:
+def _content_of_entry(whole: bytes, key: str) -> bytes:
     """Return the content of a file without its last line.
 
     Raises
@@ -356,7 +362,7 @@ def _checked(whole: bytes, key: str) -> bytes:
     ValueError
         The line is not that of this content and key.
     """
-    content = whole[: whole.rfind(b"\n" + _MAGIC + b" ")]
+    content = whole[: whole.rfind(b"\n" + _CACHE_MAGIC + b" ")]
     if not whole.endswith(_trailer(content, key)):
         raise ValueError("it is damaged, or of something else")
     return content

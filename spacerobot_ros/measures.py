@@ -180,7 +180,7 @@ class Metric:
     least: bool = False
 
 
-def _part(error: PoseError | None, part: str) -> float:
+def _error_part(error: PoseError | None, part: str) -> float:
     return math.nan if error is None else float(getattr(error, part))
 
 
@@ -189,7 +189,7 @@ def _joint_margin(measures: Measures, robot: RobotDescription) -> Array:
     return np.minimum(measures.lowest - lower, upper - measures.highest)
 
 
-def _margin(limited: str, limit: str, values: Callable[[Measures], Array]) -> Metric:
+def _margin_metric(limited: str, limit: str, values: Callable[[Measures], Array]) -> Metric:
     return Metric(
         "",
         f"unused share of the {limited} limit of a joint",
@@ -203,18 +203,22 @@ METRICS: dict[str, Metric] = {
     "position_error_m": Metric(
         "m",
         "distance of the last true position of the base from the goal",
-        lambda m, _: _part(m.error, "distance"),
+        lambda m, _: _error_part(m.error, "distance"),
     ),
     "attitude_error_rad": Metric(
         "rad",
         "angle between the last true attitude of the base and the goal",
-        lambda m, _: _part(m.error, "angle"),
+        lambda m, _: _error_part(m.error, "angle"),
     ),
     "end_effector_position_error_m": Metric(
-        "m", "likewise, of the end-effector", lambda m, _: _part(m.end_effector_error, "distance")
+        "m",
+        "likewise, of the end-effector",
+        lambda m, _: _error_part(m.end_effector_error, "distance"),
     ),
     "end_effector_attitude_error_rad": Metric(
-        "rad", "likewise, of the end-effector", lambda m, _: _part(m.end_effector_error, "angle")
+        "rad",
+        "likewise, of the end-effector",
+        lambda m, _: _error_part(m.end_effector_error, "angle"),
     ),
     "duration_s": Metric("s", "simulated time of the flight", lambda m, _: m.duration),
     "manoeuvre_time_s": Metric("s", "duration of all schedules", lambda m, _: m.manoeuvre_time),
@@ -239,8 +243,8 @@ METRICS: dict[str, Metric] = {
         by_joint=True,
         least=True,
     ),
-    "rate_margin": _margin("rate", "velocity", lambda m: m.peak_rate),
-    "effort_margin": _margin("effort", "effort", lambda m: m.peak_effort),
+    "rate_margin": _margin_metric("rate", "velocity", lambda m: m.peak_rate),
+    "effort_margin": _margin_metric("effort", "effort", lambda m: m.peak_effort),
     "momentum_drift": Metric(
         "kg m/s, kg m^2/s",
         "largest change of a momentum that thrust does not explain",

@@ -80,16 +80,16 @@ class Parameter:
                 raise self._refusal(value, "true or false")
             return value
         if isinstance(wanted, (int, float)):
-            return self._number(value, isinstance(wanted, int))
+            return self._check_number(value, isinstance(wanted, int))
         if isinstance(wanted, str):
             if not isinstance(value, str):
                 raise self._refusal(value, "a text")
             if self.choices and value not in self.choices:
                 raise self._refusal(value, f"one of {', '.join(self.choices)}")
             return value
-        return self._lines(value) if self.texts else self._numbers(value)
+        return self._check_lines(value) if self.texts else self._check_numbers(value)
 
-    def _number(self, value: Any, whole: bool) -> int | float:
+    def _check_number(self, value: Any, whole: bool) -> int | float:
         if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
             raise self._refusal(value, "a number")
         if not -sys.float_info.max <= value <= sys.float_info.max:  # Whole numbers are larger.
@@ -99,10 +99,10 @@ class Parameter:
         if whole and not -(2**63) <= value < 2**63:  # The range of a ROS parameter.
             raise self._refusal(float(value), "a whole number of 64 bits")
         if not self.minimum <= value <= self.maximum:
-            raise self._refusal(value, f"a number{self._range()}")
+            raise self._refusal(value, f"a number{self._range_text()}")
         return int(value) if whole else float(value)
 
-    def _numbers(self, value: Any) -> tuple[float, ...]:
+    def _check_numbers(self, value: Any) -> tuple[float, ...]:
         try:
             numbers = tuple(float(x) for x in value)
         except (TypeError, ValueError, OverflowError):
@@ -110,17 +110,17 @@ class Parameter:
         if self.length is not None and len(numbers) not in (0, self.length):
             raise self._refusal(value, f"a list of {self.length} numbers")
         if not all(math.isfinite(x) and self.minimum <= x <= self.maximum for x in numbers):
-            raise self._refusal(value, f"finite numbers{self._range()}")
+            raise self._refusal(value, f"finite numbers{self._range_text()}")
         return numbers
 
-    def _lines(self, value: Any) -> tuple[str, ...]:
+    def _check_lines(self, value: Any) -> tuple[str, ...]:
         if isinstance(value, str):
             value = value.replace("\n", ";").split(";")
         if not isinstance(value, Sequence) or not all(isinstance(line, str) for line in value):
             raise self._refusal(value, "a list of texts")
         return tuple(line.strip() for line in value if line.strip())
 
-    def _range(self) -> str:
+    def _range_text(self) -> str:
         if math.isinf(self.maximum):
             return "" if math.isinf(self.minimum) else f" of at least {self.minimum:g}"
         return f" from {self.minimum:g} to {self.maximum:g}"
@@ -179,7 +179,7 @@ def declared(config: type[Any] | Any, prefix: str = "") -> tuple[Parameter, ...]
     """
     if isinstance(config, type):
         return _declared(config, prefix, _registered(config()))
-    return tuple(parameter for parameter, _ in _leaves(config, prefix))
+    return tuple(parameter for parameter, _ in _parameters_with_values(config, prefix))
 
 
 def _registered(config: Any) -> tuple[tuple[str, type[Any]], ...]:
@@ -197,7 +197,7 @@ def _declared(
     config: type[Any], prefix: str, registered: tuple[tuple[str, type[Any]], ...]
 ) -> tuple[Parameter, ...]:
     """Return the parameters of a class; the registries are part of the cache's key."""
-    return tuple(parameter for parameter, _ in _leaves(config, prefix))
+    return tuple(parameter for parameter, _ in _parameters_with_values(config, prefix))
 
 
 def configured(kind: type[C], values: Mapping[str, Any], prefix: str = "") -> C:
@@ -250,10 +250,10 @@ def _reconfigured(config: C, defaults: Any, values: Mapping[str, Any], prefix: s
         name, default = f"{prefix}{each.name}", getattr(defaults, each.name)
         if _PARAMETER in each.metadata:
             if name in values:
-                declaration = _named(each.metadata[_PARAMETER], name, default)
+                declaration = _with_name_and_default(each.metadata[_PARAMETER], name, default)
                 chosen[each.name] = declaration.checked(values[name])
         elif _GROUP in each.metadata:
-            if _any_below(f"{name}.", values):
+            if _has_parameter_below(f"{name}.", values):
                 before = getattr(config, each.name)
                 chosen[each.name] = _reconfigured(before, default, values, f"{name}.")
         elif _REGISTERED in each.metadata:
@@ -263,21 +263,23 @@ def _reconfigured(config: C, defaults: Any, values: Mapping[str, Any], prefix: s
                     before.get(entry, options), options, values, f"{prefix}{entry}."
                 )
                 for entry, options in default.items()
-                if _any_below(f"{prefix}{entry}.", values)
+                if _has_parameter_below(f"{prefix}{entry}.", values)
             }
             if changed:
                 chosen[each.name] = {**before, **changed}
     return replace(config, **chosen) if chosen else config  # type: ignore[type-var]
 
 
-def _any_below(prefix: str, names: Iterable[str]) -> bool:
+def _has_parameter_below(prefix: str, names: Iterable[str]) -> bool:
     return any(name.startswith(prefix) for name in names)
 
 
-def _leaves(config: type[Any] | Any, prefix: str) -> Iterator[tuple[Parameter, Value]]:
+def _parameters_with_values(
+    config: type[Any] | Any, prefix: str
+) -> Iterator[tuple[Parameter, Value]]:
     """Yield every parameter with its value in a configuration."""
     for name, declaration, value in _fields_of(config):
-        yield _named(declaration, f"{prefix}{name}", value), value
+        yield _with_name_and_default(declaration, f"{prefix}{name}", value), value
 
 
 def _fields_of(config: type[Any] | Any) -> Iterator[tuple[str, Parameter, Value]]:
@@ -297,5 +299,5 @@ def _fields_of(config: type[Any] | Any) -> Iterator[tuple[str, Parameter, Value]
                     yield f"{entry}.{name}", declaration, inner
 
 
-def _named(declaration: Parameter, name: str, default: Value) -> Parameter:
+def _with_name_and_default(declaration: Parameter, name: str, default: Value) -> Parameter:
     return replace(declaration, name=name, default=default)

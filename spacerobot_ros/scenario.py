@@ -49,26 +49,26 @@ NODES = tuple(CONFIGS)
 COMMANDERS = ("planner", "coordinated_control")
 """The nodes that take goals; a scenario runs those that its file has a section for."""
 
-_OF_EVERY_NODE = ("autostart", "use_sim_time")
+_PARAMETERS_OF_EVERY_NODE = ("autostart", "use_sim_time")
 """Parameters of every node, beside those of its configuration."""
 
-_GOALS = ("goal", "end_effector_goal")
-_KEYS = (
+_GOAL_NAMES = ("goal", "end_effector_goal")
+_SCENARIO_KEYS = (
     "description",
     "published",
     "published_method",
     "kills",
     "goal_joint_positions",
-    *(f"{goal}_{part}" for goal in _GOALS for part in ("position", "orientation", "rotvec")),
+    *(f"{goal}_{part}" for goal in _GOAL_NAMES for part in ("position", "orientation", "rotvec")),
 )
 
-_LOCKSTEP: Mapping[str, Mapping[str, Any]] = {"plant": {"time_mode": "lockstep"}}
+_LOCKSTEP_OVERRIDES: Mapping[str, Mapping[str, Any]] = {"plant": {"time_mode": "lockstep"}}
 """The overrides of every scenario that is loaded."""
 
-_VIEWED = 0.1
+_LONGEST_TF_PERIOD = 0.1
 """Longest wall time between transforms of a flight in real time, s."""
 
-_KILL = re.compile(r"(\S+) at (\S+)(?: until (\S+))?")
+_KILL_PATTERN = re.compile(r"(\S+) at (\S+)(?: until (\S+))?")
 
 
 @dataclass(frozen=True)
@@ -148,9 +148,9 @@ class Scenario:
 
     def _configured(self, node: str) -> Any:
         known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
-        before, values = self._changes.get(node, (None, self._given(node)))
+        before, values = self._changes.get(node, (None, self._parameters_as_written(node)))
         for name, value in values.items():
-            if name not in (*known, *_OF_EVERY_NODE):
+            if name not in (*known, *_PARAMETERS_OF_EVERY_NODE):
                 raise ParameterError(f"Node '{node}' has no parameter '{name}'.")
             if isinstance(value, str) and name in known:
                 is_number = isinstance(known[name].default, (int, float))
@@ -162,7 +162,7 @@ class Scenario:
         except ParameterError as error:
             raise ParameterError(f"Node '{node}': {error}") from error
 
-    def _given(self, node: str) -> dict[str, Any]:
+    def _parameters_as_written(self, node: str) -> dict[str, Any]:
         """Return the parameters of a node in the file and the overrides, as written there."""
         return {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
 
@@ -200,7 +200,7 @@ class Scenario:
             A parameter of the node is refused.
         """
         values = values_of(self.config(node))
-        given = self._given(node)
+        given = self._parameters_as_written(node)
         # An empty list is every list's default, and has no type that ROS could know it by.
         found = {name: values[name] for name in given if name in values and values[name] != ()}
         if "use_sim_time" in given:
@@ -264,7 +264,7 @@ class Scenario:
     def with_overrides(self, node: str, values: Mapping[str, Any]) -> Scenario:
         """Return the scenario with more parameters of one node set."""
         merged = {**self.overrides, node: {**self.overrides.get(node, {}), **values}}
-        made = self._replaced(overrides=merged)
+        made = self._replace_fields(overrides=merged)
         known = made._configs.pop(node, None)
         if known is not None:
             made._changes[node] = known, dict(values)
@@ -275,9 +275,9 @@ class Scenario:
 
     def with_poses(self, goal: Goal, end_effector_goal: Goal | None) -> Scenario:
         """Return the scenario with other goals."""
-        return self._replaced(goal=goal, end_effector_goal=end_effector_goal)
+        return self._replace_fields(goal=goal, end_effector_goal=end_effector_goal)
 
-    def _replaced(self, **changes: Any) -> Scenario:
+    def _replace_fields(self, **changes: Any) -> Scenario:
         """Return another scenario with the configurations that are known of this one."""
         made = replace(self, **changes)
         made._configs.update(self._configs)
@@ -294,7 +294,7 @@ class Scenario:
         shown = {"diagnostics_period": 1.0}
         period = self.config("recorder").tf_period
         if period:
-            shown["tf_period"] = min(period, _VIEWED * factor)
+            shown["tf_period"] = min(period, _LONGEST_TF_PERIOD * factor)
         return scenario.with_overrides("recorder", shown)
 
     def with_method(self, method: str) -> Scenario:
@@ -425,28 +425,28 @@ def load_scenario(name: str) -> Scenario:
             f"The scenario file {path} has no 'scenario: ros__parameters:' section with a goal."
         )
     in_file = sections_of(content, path)
-    unknown = sorted(set(map(str, values)) - set(_KEYS))
+    unknown = sorted(set(map(str, values)) - set(_SCENARIO_KEYS))
     if unknown:
         raise ParameterError(
             f"The scenario file {path} has an unknown key '{unknown[0]}' in its scenario section; "
-            f"it takes {', '.join(_KEYS)}."
+            f"it takes {', '.join(_SCENARIO_KEYS)}."
         )
     return Scenario(
         name=path.stem,
         path=path.resolve(),
         description=str(values.get("description", "")),
-        goal=_goal("goal", values, path),
+        goal=_parse_goal("goal", values, path),
         end_effector_goal=(
-            _goal("end_effector_goal", values, path)
+            _parse_goal("end_effector_goal", values, path)
             if any(key.startswith("end_effector_goal") for key in values)
             else None
         ),
         commanders=tuple(name for name in COMMANDERS if name in in_file) or ("planner",),
-        published=_published(values.get("published", {}), path),
+        published=_parse_published(values.get("published", {}), path),
         published_method=str(values.get("published_method", "")),
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
         in_file={node: _with_robot_beside(path, values) for node, values in in_file.items()},
-        overrides=_LOCKSTEP,
+        overrides=_LOCKSTEP_OVERRIDES,
     )
 
 
@@ -479,15 +479,15 @@ def scenario_or_robot(name: str) -> Scenario:
     path = path if path.is_file() else robot_file(name)
     load_robot(path)  # Another file is refused before a goal is asked for.
     robot = {"robot": str(path.resolve()) if path == Path(name) else name}
-    return _of_robot(path.name.split(".")[0], path, robot)
+    return _scenario_without_goal(path.name.split(".")[0], path, robot)
 
 
 def scenario_of(robot: RobotDescription) -> Scenario:
     """Return a scenario without a goal of a robot alone, as :func:`scenario_or_robot` does."""
-    return _of_robot(robot.name, Path(), {"robot_description": robot.urdf})
+    return _scenario_without_goal(robot.name, Path(), {"robot_description": robot.urdf})
 
 
-def _of_robot(name: str, path: Path, robot: dict[str, str]) -> Scenario:
+def _scenario_without_goal(name: str, path: Path, robot: dict[str, str]) -> Scenario:
     return Scenario(
         name=name,
         path=path,
@@ -499,7 +499,7 @@ def _of_robot(name: str, path: Path, robot: dict[str, str]) -> Scenario:
         published_method="",
         kills=(),
         in_file={"plant": robot, "planner": robot},
-        overrides=_LOCKSTEP,
+        overrides=_LOCKSTEP_OVERRIDES,
         has_goal=False,
     )
 
@@ -522,11 +522,11 @@ def parse_kills(lines: object, where: str) -> tuple[Kill, ...]:
         raise ParameterError(
             f"'kills' in {where} is {lines!r}, not a list of lines NODE at SECONDS."
         )
-    return tuple(sorted((_kill(line, where) for line in lines), key=lambda k: k.at))
+    return tuple(sorted((_parse_kill(line, where) for line in lines), key=lambda k: k.at))
 
 
-def _kill(line: object, where: str) -> Kill:
-    match = _KILL.fullmatch(" ".join(str(line).split()))
+def _parse_kill(line: object, where: str) -> Kill:
+    match = _KILL_PATTERN.fullmatch(" ".join(str(line).split()))
     if match is None:
         raise ParameterError(
             f"The kill {str(line)!r} in {where} is not NODE at SECONDS [until SECONDS]."
@@ -548,7 +548,7 @@ def _kill(line: object, where: str) -> Kill:
     return kill
 
 
-def _published(rows: Any, path: Path) -> tuple[Published, ...]:
+def _parse_published(rows: Any, path: Path) -> tuple[Published, ...]:
     try:
         return tuple(
             Published(quantity, [float(x) for x in row["printed"]], str(row.get("note", "")))
@@ -561,7 +561,7 @@ def _published(rows: Any, path: Path) -> tuple[Published, ...]:
         ) from error
 
 
-def _goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
+def _parse_goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
     try:
         position = values.get(f"{name}_position", [0.0, 0.0, 0.0])
         orientation = values.get(f"{name}_orientation", [0.0, 0.0, 0.0, 1.0])
@@ -626,7 +626,7 @@ def sections_of(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, A
                 f"The section '{key}' of the scenario file {path} is not 'ros__parameters:' with "
                 "the parameters under it."
             )
-        (of_all if node == "**" else found.setdefault(node, {})).update(_flat(values))
+        (of_all if node == "**" else found.setdefault(node, {})).update(_flatten_section(values))
     for node, values in found.items():
         known = {parameter.name for parameter in declared(CONFIGS[node])}
         shared = {name: value for name, value in of_all.items() if name in known}
@@ -663,12 +663,12 @@ def number_in(text: str) -> float | str:
         return text
 
 
-def _flat(section: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flatten_section(section: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return parameters by full name: a map within a section is a group of them."""
     flat: dict[str, Any] = {}
     for key, value in section.items():
         if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{key}.")
+            flat |= _flatten_section(value, f"{prefix}{key}.")
         else:
             flat[f"{prefix}{key}"] = value
     return flat

@@ -27,36 +27,36 @@ from typing import TYPE_CHECKING, Any, TextIO
 if TYPE_CHECKING:
     import subprocess
 
-_SENTENCES = {
+_MESSAGE_BY_SIGNAL = {
     signal.SIGINT: "Interrupted.",
     signal.SIGTERM: "Terminated.",
     signal.SIGHUP: "Hung up.",
 }
 
-_UNWINDING = 1.2
+_UNWINDING_TIME = 1.2
 """Wall time that the main thread has to end after the exception of a signal, s."""
 
-_NOTICING = 5.0
+_NOTICE_TIME = 5.0
 """Wall time in which work must notice a request, s: a plan may have to end first."""
 
-_WITHOUT_PARENT = 1.7
+_TIME_WITHOUT_PARENT = 1.7
 """Wall time that a process has to end without its parent, s."""
 
-_SAME = 0.5
+_SAME_SIGNAL_TIME = 0.5
 """Signals closer together count as one, wall s: launchers and terminals both send them."""
 
-_DYING = 0.3
+_KILL_WAIT = 0.3
 """Longest wait for the end of killed processes, wall s."""
 
-_LIFELINE = "SPACEROBOT_LIFELINE"
+_LIFELINE_VARIABLE = "SPACEROBOT_LIFELINE"
 """Environment variable of a child: the pipe that its parent holds open, and who that is."""
 
-_ORPHANED = signal.SIGUSR2
+_PARENT_ENDED_SIGNAL = signal.SIGUSR2
 """Signal of the kernel to a child whose parent has ended (Linux)."""
 
 _PR_SET_PDEATHSIG = 1
 
-_END = b"\0"
+_END_BYTE = b"\0"
 
 
 class Terminated(KeyboardInterrupt):
@@ -69,7 +69,7 @@ class Terminated(KeyboardInterrupt):
     """
 
     def __init__(self, number: int) -> None:
-        super().__init__(_SENTENCES.get(signal.Signals(number), "Terminated."))
+        super().__init__(_MESSAGE_BY_SIGNAL.get(signal.Signals(number), "Terminated."))
         self.number = number
 
     @property
@@ -104,18 +104,18 @@ class _Guard:
         os.set_blocking(self._writer, False)
         self._handlers = {
             number: signal.signal(number, self._on_signal)
-            for number in _SENTENCES
+            for number in _MESSAGE_BY_SIGNAL
             # nohup has a process ignore the end of its terminal.
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN
         }
         if self._lifeline is not None:
-            signal.signal(_ORPHANED, lambda *_: None)
+            signal.signal(_PARENT_ENDED_SIGNAL, lambda *_: None)
             _die_with_parent()
         self._wakeup = signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
-        self._thread = threading.Thread(target=self._watch, name="termination", daemon=True)
+        self._thread = threading.Thread(target=self._watch_for_end, name="termination", daemon=True)
         self._thread.start()
         if self._lifeline is not None and os.getppid() != self._parent:
-            self._lose_parent()
+            self._on_parent_end()
 
     def remove(self) -> None:
         """Give the signals back."""
@@ -123,7 +123,7 @@ class _Guard:
         signal.set_wakeup_fd(self._wakeup)
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
-        os.write(self._writer, _END)
+        os.write(self._writer, _END_BYTE)
         self._thread.join()
         os.close(self._reader)
         os.close(self._writer)
@@ -136,7 +136,7 @@ class _Guard:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         """Python's handler, in the main thread as soon as that runs Python again."""
-        self._note(number)
+        self._note_signal(number)
         if self.request is not None:
             self.request.main()
         elif not self._raised:
@@ -151,17 +151,17 @@ class _Guard:
         if self._errors is not None:
             self._errors, sys.stderr = None, self._errors
 
-    def _note(self, number: int) -> bool:
+    def _note_signal(self, number: int) -> bool:
         """Take note of a signal; return whether it is the first."""
         if self.number is not None:
             return False
         self._since = time.monotonic()
         self.number = number
-        grace = _UNWINDING if self.request is None else _NOTICING
+        grace = _UNWINDING_TIME if self.request is None else _NOTICE_TIME
         self._notice_by = self._since + grace
         return True
 
-    def _watch(self) -> None:
+    def _watch_for_end(self) -> None:
         poll = select.poll()
         poll.register(self._reader, select.POLLIN)
         if self._lifeline is not None:
@@ -174,40 +174,40 @@ class _Guard:
             for file, _ in poll.poll(wait):
                 if file == self._lifeline:
                     poll.unregister(file)
-                    self._lose_parent()
+                    self._on_parent_end()
                     continue
                 for number in os.read(self._reader, 64):
-                    if number == _END[0]:
+                    if number == _END_BYTE[0]:
                         return
-                    if number == _ORPHANED and os.getppid() != self._parent:
-                        self._lose_parent()
-                    elif number in _SENTENCES:
-                        self._note(number)
-                        if told and time.monotonic() - self._since > _SAME:
-                            self._end()
+                    if number == _PARENT_ENDED_SIGNAL and os.getppid() != self._parent:
+                        self._on_parent_end()
+                    elif number in _MESSAGE_BY_SIGNAL:
+                        self._note_signal(number)
+                        if told and time.monotonic() - self._since > _SAME_SIGNAL_TIME:
+                            self._end_process()
             if self.number is not None and not told:
                 told = True
-                self._stop_tools()
+                self._kill_tools()
                 if self.request is not None:
                     self.request.at_once()
             now = time.monotonic()
             if any(by is not None and now >= by for by in (self._notice_by, self._end_by)):
-                self._end()
+                self._end_process()
 
-    def _lose_parent(self) -> None:
+    def _on_parent_end(self) -> None:
         """End as by SIGTERM, and soon."""
         if self._end_by is None:
-            self._end_by = time.monotonic() + _WITHOUT_PARENT
+            self._end_by = time.monotonic() + _TIME_WITHOUT_PARENT
             signal.raise_signal(signal.SIGTERM)
 
-    def _stop_tools(self) -> None:
+    def _kill_tools(self) -> None:
         for tool in tuple(self.tools):
             with suppress(OSError):
                 os.killpg(tool.pid, signal.SIGKILL)
 
-    def _end(self) -> None:
+    def _end_process(self) -> None:
         """End the process now, whatever the main thread does."""
-        self._stop_tools()
+        self._kill_tools()
         error = Terminated(self.number or signal.SIGTERM)
         if self._announcing:
             with suppress(OSError):
@@ -304,7 +304,7 @@ def child_options(environment: Mapping[str, str] | None = None) -> dict[str, Any
     reader = _lifeline()
     variables = os.environ if environment is None else environment
     return {
-        "env": {**variables, _LIFELINE: f"{reader}:{os.getpid()}"},
+        "env": {**variables, _LIFELINE_VARIABLE: f"{reader}:{os.getpid()}"},
         "pass_fds": (reader,),
     }
 
@@ -389,7 +389,7 @@ def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[byte
     reader, writer = os.pipe()
     try:
         process = subprocess.Popen(
-            [sys.executable, "-I", "-S", "-c", _KEEPER, str(reader), *words],
+            [sys.executable, "-I", "-S", "-c", _TOOL_KEEPER_SCRIPT, str(reader), *words],
             stdin=subprocess.DEVNULL,
             pass_fds=(reader,),
             **options,
@@ -403,7 +403,7 @@ def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[byte
             if guard is not None:
                 guard.tools.discard(process)
             if process.poll() is None:
-                _kill(process)
+                _kill_tool(process)
     finally:
         os.close(writer)
         os.close(reader)
@@ -412,21 +412,21 @@ def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[byte
         raise ending
 
 
-def _kill(process: subprocess.Popen[bytes]) -> None:
+def _kill_tool(process: subprocess.Popen[bytes]) -> None:
     """Kill a tool and its children."""
     # Its session may not be there yet; closing the pipe then does the rest.
     with suppress(OSError):
         os.killpg(process.pid, signal.SIGKILL)
     process.kill()
     process.wait()
-    end = time.monotonic() + _DYING
+    end = time.monotonic() + _KILL_WAIT
     with suppress(OSError):
         while time.monotonic() < end:
             os.killpg(process.pid, 0)
             time.sleep(0.005)
 
 
-_KEEPER = """
+_TOOL_KEEPER_SCRIPT = """
 import os, signal, sys
 lifeline, words = int(sys.argv[1]), sys.argv[2:]
 os.setsid()
@@ -457,7 +457,7 @@ def _lifeline() -> int:
 
 def _own_lifeline() -> tuple[int | None, int]:
     """Return the pipe that a parent of ours holds open, None without one, and the parent."""
-    text = os.environ.pop(_LIFELINE, "")
+    text = os.environ.pop(_LIFELINE_VARIABLE, "")
     if not text:
         return None, 0
     file, _, parent = text.partition(":")
@@ -470,4 +470,4 @@ def _die_with_parent() -> None:
     with suppress(ImportError, OSError, AttributeError):
         import ctypes
 
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(_ORPHANED), 0, 0, 0)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(_PARENT_ENDED_SIGNAL), 0, 0, 0)

@@ -16,7 +16,7 @@ LATEST_NS = 2**31 * SECOND - 1
 HEADER_STAMP = slice(4, 12)
 """Bytes of the stamp in a serialised message that begins with a header or a time."""
 
-_TIME = struct.Struct("<iI")
+_TIME_LAYOUT = struct.Struct("<iI")
 
 unpack_stamp = struct.Struct(f"<{HEADER_STAMP.start}xiI").unpack_from
 """Returns seconds and nanoseconds of the time at the beginning of a serialised message."""
@@ -31,7 +31,7 @@ def stamp_bytes(time_ns: int) -> bytes:
         The time is beyond the range of stamps.
     """
     try:
-        return _TIME.pack(*divmod(time_ns, SECOND))
+        return _TIME_LAYOUT.pack(*divmod(time_ns, SECOND))
     except struct.error:
         raise SpaceRobotError(
             f"Stamps carry times up to 2^31 s (68 years), not {time_ns / SECOND:.10g} s."

@@ -132,7 +132,7 @@ _WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 
 # The plant publishes its state in this order: the clock first, so that a subscriber that sees a
 # state has seen its time; odom and joint_states late, because they set the commanders off.
-_TABLE = (
+_TOPIC_TABLE = (
     Topic("/clock", "rosgraph_msgs/msg/Clock", _PLANT, "simulated time"),
     Topic(
         "base_pose",
@@ -365,7 +365,7 @@ _TABLE = (
     ),
 )
 
-TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
+TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TOPIC_TABLE}
 """Every topic of the stack by its name; those of the plant in the order of publication."""
 
 GLOBAL_TOPICS = ("/clock", "/tf", "/tf_static")

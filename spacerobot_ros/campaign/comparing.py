@@ -90,21 +90,21 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
             facts([f"{len(common)} common draws"]),
             f'<p class="outcome">{escape(sentence)}</p></header>',
             "<h2>Paired differences</h2>",
-            _table(found, a, b),
-            _figure(first, second, rows_a, rows_b, names[:6]),
+            _difference_table(found, a, b),
+            _difference_figure(first, second, rows_a, rows_b, names[:6]),
         ]
     write_output(path, html_page(f"{a} and {b}", body, MADE_BY))
-    return [sentence, *(_line(each, b, a) for each in found)]
+    return [sentence, *(_difference_line(each, b, a) for each in found)]
 
 
-def _line(each: Paired, second: str, first: str) -> str:
+def _difference_line(each: Paired, second: str, first: str) -> str:
     return (
         f"{each.metric}: {second} minus {first} is {each.difference:.4g} "
         f"({each.low:.4g} to {each.high:.4g})"
     )
 
 
-def _table(found: list[Paired], first: str, second: str) -> str:
+def _difference_table(found: list[Paired], first: str, second: str) -> str:
     rows = [
         [
             named(each.metric),
@@ -121,7 +121,7 @@ def _table(found: list[Paired], first: str, second: str) -> str:
     return table("paired", [*head, "95 % interval", "interval excludes 0"], rows)
 
 
-def _figure(
+def _difference_figure(
     first: Results, second: Results, rows_a: np.ndarray, rows_b: np.ndarray, names: list[str]
 ) -> str:
     if not names:

@@ -25,7 +25,7 @@ SAMPLERS = ("random", "latin_hypercube", "sobol", "halton", "saltelli")
 OF_ALL = ("latin_hypercube", "saltelli")
 """Samplers whose draws depend on the number of flights."""
 
-_KEYS = (
+_CAMPAIGN_KEYS = (
     *("scenario", "flights", "seed", "sampler", "method", "set", "longest", "disperse"),
     *("criteria", "engine", "description"),
 )
@@ -59,7 +59,9 @@ class Distribution:
             return [self.choices[min(int(u * (last + 1)), last)] for u in shares.tolist()]
         # Values that are not finite are refused by the flight that draws them.
         with np.errstate(all="ignore"):
-            found = np.asarray(_scipy(self.name).ppf(shares, **self.arguments), dtype=float)
+            found = np.asarray(
+                _load_scipy_distribution(self.name).ppf(shares, **self.arguments), dtype=float
+            )
         return list(found.tolist())
 
     def __str__(self) -> str:
@@ -141,7 +143,7 @@ class Campaign:
         return tuple(dispersion.name for dispersion in self.dispersions)
 
 
-class _EveryKeyOnce(yaml.SafeLoader):
+class _UniqueKeyLoader(yaml.SafeLoader):
     """Refuses duplicate keys, of which YAML would silently keep the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
@@ -166,7 +168,7 @@ def load_campaign(path: Path, flights: int | None = None) -> Campaign:
         It cannot be read, or a value in it is refused; the message names the place.
     """
     try:
-        content = load_yaml(path.read_text(encoding="utf-8"), _EveryKeyOnce)
+        content = load_yaml(path.read_text(encoding="utf-8"), _UniqueKeyLoader)
     except (OSError, ValueError) as error:
         raise ParameterError(f"The campaign file {path} cannot be read: {error}.") from error
     section = content.get("campaign") if isinstance(content, dict) else None
@@ -205,13 +207,13 @@ def parse_campaign(
         A key or value is refused.
     """
     for key in section:
-        if key not in _KEYS:
+        if key not in _CAMPAIGN_KEYS:
             raise ParameterError(
-                f"there is no key '{key}'; there are {', '.join(_KEYS)}."
-                f"{suggestion(str(key), _KEYS)}"
+                f"there is no key '{key}'; there are {', '.join(_CAMPAIGN_KEYS)}."
+                f"{suggestion(str(key), _CAMPAIGN_KEYS)}"
             )
-    scenario = scenario or _scenario(section, folder)
-    flights = _whole(section, "flights", 100, 1, _MOST_FLIGHTS)
+    scenario = scenario or _read_scenario(section, folder)
+    flights = _read_whole_number(section, "flights", 100, 1, _MOST_FLIGHTS)
     sampler = str(section.get("sampler", "random"))
     if sampler not in SAMPLERS:
         known = ", ".join(SAMPLERS)
@@ -224,32 +226,32 @@ def parse_campaign(
         raise ParameterError(
             f"there is no engine '{engine}'; there are {known}.{suggestion(engine, ENGINES)}"
         )
-    dispersions = _dispersions(_mapping(section, "disperse"), scenario)
+    dispersions = _read_dispersions(_read_mapping(section, "disperse"), scenario)
     if sampler == "saltelli" and not dispersions:
         raise ParameterError("the sampler 'saltelli' needs at least one dispersion.")
     return Campaign(
         name=name,
         scenario=scenario,
         flights=flights,
-        seed=_whole(section, "seed", 0, 0, 2**63 - 1),
+        seed=_read_whole_number(section, "seed", 0, 0, 2**63 - 1),
         sampler=sampler,
-        longest=_real("longest", section.get("longest", 100_000.0), 0.0),
+        longest=_read_real_number("longest", section.get("longest", 100_000.0), 0.0),
         dispersions=dispersions,
-        criteria=_criteria(_mapping(section, "criteria"), scenario),
+        criteria=_read_criteria(_read_mapping(section, "criteria"), scenario),
         engine=engine,
         description=str(section.get("description", "")),
         section=dict(section),
     )
 
 
-def _scenario(section: Mapping[str, Any], folder: Path) -> Scenario:
+def _read_scenario(section: Mapping[str, Any], folder: Path) -> Scenario:
     given = section.get("scenario")
     if not isinstance(given, str):
         raise ParameterError("'scenario' must be the name or the file of a scenario.")
     beside = folder / given
     scenario = scenario_or_robot(str(beside) if beside.is_file() else given)
     scenario.require_goal()
-    for key, value in _mapping(section, "set").items():
+    for key, value in _read_mapping(section, "set").items():
         node, _, parameter = str(key).partition(".")
         if node not in CONFIGS or not parameter:
             raise ParameterError(
@@ -266,7 +268,7 @@ def _scenario(section: Mapping[str, Any], folder: Path) -> Scenario:
     return scenario
 
 
-def _mapping(section: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+def _read_mapping(section: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     value = section.get(key)
     value = {} if value is None else value
     if not isinstance(value, dict):
@@ -274,7 +276,9 @@ def _mapping(section: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     return value
 
 
-def _whole(section: Mapping[str, Any], key: str, default: int, least: int, most: int) -> int:
+def _read_whole_number(
+    section: Mapping[str, Any], key: str, default: int, least: int, most: int
+) -> int:
     value = section.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
         raise ParameterError(
@@ -283,7 +287,7 @@ def _whole(section: Mapping[str, Any], key: str, default: int, least: int, most:
     return value
 
 
-def _real(key: str, value: Any, least: float = -math.inf) -> float:
+def _read_real_number(key: str, value: Any, least: float = -math.inf) -> float:
     try:
         number = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError):
@@ -297,13 +301,13 @@ def _real(key: str, value: Any, least: float = -math.inf) -> float:
 # -- dispersions ------------------------------------------------------------------------------
 
 
-def _dispersions(section: Mapping[str, Any], scenario: Scenario) -> tuple[Dispersion, ...]:
+def _read_dispersions(section: Mapping[str, Any], scenario: Scenario) -> tuple[Dispersion, ...]:
     found: dict[str, Dispersion] = {}
     for name, given in section.items():
         for target in targets_of(str(name), scenario):
-            distribution = _distribution(target, given)
+            distribution = _read_distribution(target, given)
             for choice in distribution.choices:
-                _require_taken(target, choice, scenario)
+                _require_node_accepts(target, choice, scenario)
             if target.name in found:
                 raise ParameterError(f"'{target.name}' is dispersed twice.")
             for other in found.values():
@@ -315,17 +319,17 @@ def _dispersions(section: Mapping[str, Any], scenario: Scenario) -> tuple[Disper
     return tuple(found.values())
 
 
-_KNOWN_AS = {"normal": "norm", "gauss": "norm", "gaussian": "norm", "exponential": "expon"}
+_SCIPY_NAMES = {"normal": "norm", "gauss": "norm", "gaussian": "norm", "exponential": "expon"}
 """Common names of distributions, with those of scipy.stats."""
 
-_WORDS = {
+_ARGUMENT_HELP = {
     "norm": "loc is its mean and scale its standard deviation",
     "uniform": "loc is its least value and scale its width",
 }
 """Meaning of loc and scale in messages about unknown arguments."""
 
 
-def _distribution(target: Target, given: Any) -> Distribution:
+def _read_distribution(target: Target, given: Any) -> Distribution:
     name = target.name
     if not isinstance(given, dict) or len(given) != 1:
         raise ParameterError(
@@ -335,10 +339,10 @@ def _distribution(target: Target, given: Any) -> Distribution:
     if kind == "choice":
         if not isinstance(arguments, list) or not arguments:
             raise ParameterError(f"'{name}' must have a list of values to choose from.")
-        return Distribution("choice", {}, tuple(_choice(target, each) for each in arguments))
+        return Distribution("choice", {}, tuple(_read_choice(target, each) for each in arguments))
     if target.text:
         raise ParameterError(f"'{name}' is a text: it must have a 'choice' of texts.")
-    distribution = _scipy(str(kind))
+    distribution = _load_scipy_distribution(str(kind))
     shapes = (distribution.shapes or "").replace(" ", "").split(",")
     words = [*filter(None, shapes), "loc", *(["scale"] if hasattr(distribution, "pdf") else [])]
     if isinstance(arguments, list):
@@ -353,13 +357,15 @@ def _distribution(target: Target, given: Any) -> Distribution:
         if word not in words:
             raise ParameterError(
                 f"'{name}': {kind} has no argument '{word}'; it takes {', '.join(words)}"
-                f"{': ' + _WORDS[kind] if kind in _WORDS else ''}."
+                f"{': ' + _ARGUMENT_HELP[kind] if kind in _ARGUMENT_HELP else ''}."
                 f"{suggestion(str(word), words)}"
             )
     missing = [word for word in filter(None, shapes) if word not in arguments]
     if missing:
         raise ParameterError(f"'{name}': {kind} needs its argument '{missing[0]}'.")
-    values = {word: _real(f"{name}: {word}", value) for word, value in arguments.items()}
+    values = {
+        word: _read_real_number(f"{name}: {word}", value) for word, value in arguments.items()
+    }
     with np.errstate(all="ignore"):
         middle = float(distribution.ppf(0.5, **values))
     if not math.isfinite(middle):
@@ -370,23 +376,25 @@ def _distribution(target: Target, given: Any) -> Distribution:
     return Distribution(str(kind), values)
 
 
-def _choice(target: Target, value: Any) -> Any:
+def _read_choice(target: Target, value: Any) -> Any:
     """Return a value to choose from, a text or a finite number as its target takes it."""
     if target.text:
         if not isinstance(value, str):
             raise ParameterError(f"'{target.name}' is a text; the choice has {value!r}.")
         return value
-    return _real(f"{target.name}: choice", number_in(value) if isinstance(value, str) else value)
+    return _read_real_number(
+        f"{target.name}: choice", number_in(value) if isinstance(value, str) else value
+    )
 
 
-def _require_taken(target: Target, value: Any, scenario: Scenario) -> None:
+def _require_node_accepts(target: Target, value: Any, scenario: Scenario) -> None:
     """Refuse a value that a node would refuse in every flight."""
     flight = target.apply(DrawnFlight.of(scenario), value)
     for node in ("plant", *scenario.commanders):
         flight.scenario.config(node)
 
 
-def _scipy(name: str) -> Any:
+def _load_scipy_distribution(name: str) -> Any:
     """Return a distribution of scipy.stats, which takes a second to load."""
     from scipy import stats
 
@@ -399,7 +407,7 @@ def _scipy(name: str) -> Any:
         ]
         raise ParameterError(
             f"scipy.stats has no distribution '{name}'."
-            f"{suggestion(_KNOWN_AS.get(name.lower(), name), [*known, 'choice'])}"
+            f"{suggestion(_SCIPY_NAMES.get(name.lower(), name), [*known, 'choice'])}"
         )
     return found
 
@@ -407,7 +415,7 @@ def _scipy(name: str) -> Any:
 # -- criteria ---------------------------------------------------------------------------------
 
 
-def _criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Criterion, ...]:
+def _read_criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Criterion, ...]:
     found, known = [], metric_names(description_of(scenario).joint_names)
     for name, given in section.items():
         if str(name) not in known:
@@ -417,8 +425,8 @@ def _criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Criterion
             )
         if not isinstance(given, dict) or not given or set(given) - {"min", "max"}:
             raise ParameterError(f"the criterion of '{name}' must have 'min' or 'max', or both.")
-        least = _real(f"{name}: min", given["min"]) if "min" in given else -math.inf
-        most = _real(f"{name}: max", given["max"]) if "max" in given else math.inf
+        least = _read_real_number(f"{name}: min", given["min"]) if "min" in given else -math.inf
+        most = _read_real_number(f"{name}: max", given["max"]) if "max" in given else math.inf
         if least > most:
             raise ParameterError(f"the criterion of '{name}' has min {least} above max {most}.")
         found.append(Criterion(str(name), least, most))

@@ -31,7 +31,8 @@ from spacerobot_ros.version import __version__
 DRAWN = "draw."
 """Prefix of the columns of drawn quantities."""
 
-_ABOUT, _CAMPAIGN, _SCENARIO, _FLIGHTS = "about.json", "campaign.yaml", "scenario.yaml", "flights"
+_ABOUT_FILE, _CAMPAIGN_FILE, _SCENARIO_FILE = "about.json", "campaign.yaml", "scenario.yaml"
+_FLIGHTS_FOLDER = "flights"
 
 _FLUSH_PERIOD, _FLUSH_ROWS = 5.0, 2000
 """Wall time (s) and number of rows after which rows are written: a kill loses no more of them."""
@@ -76,18 +77,20 @@ class Dataset:
         SpaceRobotError
             pyarrow is not installed.
         """
-        self._schema = _schema(campaign)
-        if (self.folder / _ABOUT).exists():
-            self._require_same(campaign)
+        self._schema = _row_schema(campaign)
+        if (self.folder / _ABOUT_FILE).exists():
+            self._require_same_campaign(campaign)
         else:
-            self._require_nothing_else()
+            self._require_no_other_files()
         try:
-            (self.folder / _FLIGHTS).mkdir(parents=True, exist_ok=True)
+            (self.folder / _FLIGHTS_FOLDER).mkdir(parents=True, exist_ok=True)
             self._lock()
-            for left in (self.folder / _FLIGHTS).glob(".*"):
+            for left in (self.folder / _FLIGHTS_FOLDER).glob(".*"):
                 left.unlink()  # An earlier process was killed while it wrote this.
             done = self.done()
-            self._describe(campaign, max([campaign.flights, *(number + 1 for number in done)]))
+            self._write_description(
+                campaign, max([campaign.flights, *(number + 1 for number in done)])
+            )
             return done
         except OSError as error:
             self.close()
@@ -96,12 +99,12 @@ class Dataset:
             self.close()
             raise
 
-    def _require_same(self, campaign: Campaign) -> None:
+    def _require_same_campaign(self, campaign: Campaign) -> None:
         """Refuse another campaign than the one in the folder; the message names the differences."""
-        facts = self._facts()
-        if facts["fingerprint"] == _fingerprint(campaign):
+        facts = self._read_identity()
+        if facts["fingerprint"] == _fingerprint_of(campaign):
             return
-        known, wanted = _drawn_from(self.campaign()), _drawn_from(campaign)
+        known, wanted = _settings_of_draws(self.campaign()), _settings_of_draws(campaign)
         differing = [key for key in {**known, **wanted} if known.get(key) != wanted.get(key)]
         difference = " and ".join(f"another '{key}'" for key in differing)
         difference = difference or "another scenario, or other parameters of it"
@@ -110,39 +113,41 @@ class Dataset:
             f"{difference}. Name another folder, or remove it."
         )
 
-    def _require_nothing_else(self) -> None:
+    def _require_no_other_files(self) -> None:
         """Refuse a folder with other files than those of a campaign that was about to begin."""
         if not self.folder.exists():
             return
         if not self.folder.is_dir():
             raise ParameterError(f"{self.folder} is a file: name a folder for the campaign.")
-        own = {_FLIGHTS, _CAMPAIGN, _SCENARIO}
+        own = {_FLIGHTS_FOLDER, _CAMPAIGN_FILE, _SCENARIO_FILE}
         others = [path for path in self.folder.iterdir() if path.name.lstrip(".") not in own]
-        if others or self._parts():
+        if others or self._row_files():
             raise ParameterError(
                 f"The folder {self.folder} is not empty and holds no campaign: name another one."
             )
 
-    def _describe(self, campaign: Campaign, flights: int) -> None:
+    def _write_description(self, campaign: Campaign, flights: int) -> None:
         """Write the files that describe the campaign; the last one marks the folder as complete.
 
         ``flights``: the largest number of flights that was ever asked for.
         """
-        section = {**campaign.section, "scenario": _SCENARIO, "flights": flights}
+        section = {**campaign.section, "scenario": _SCENARIO_FILE, "flights": flights}
         for key in ("set", "method"):
             section.pop(key, None)
         facts = {
             "name": campaign.name,
-            "fingerprint": _fingerprint(campaign),
+            "fingerprint": _fingerprint_of(campaign),
             "versions": VERSIONS,
             "scenario": campaign.scenario.name,
         }
         content = {"campaign": section}
-        self._write(_SCENARIO, scenario_text(self_contained(campaign).scenario))
-        self._write(_CAMPAIGN, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
-        self._write(_ABOUT, json.dumps(facts, indent=1))
+        self._write_file(_SCENARIO_FILE, scenario_text(self_contained(campaign).scenario))
+        self._write_file(
+            _CAMPAIGN_FILE, yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+        )
+        self._write_file(_ABOUT_FILE, json.dumps(facts, indent=1))
 
-    def _write(self, name: str, text: str) -> None:
+    def _write_file(self, name: str, text: str) -> None:
         """Replace a file as a whole or not at all: a full disk does not damage it."""
         path, new = self.folder / name, self.folder / f".{name}"
         new.write_text(text, encoding="utf-8")
@@ -156,7 +161,7 @@ class Dataset:
         ParameterError
             Another process has locked it.
         """
-        descriptor = os.open(self.folder / _FLIGHTS, os.O_RDONLY | os.O_CLOEXEC)
+        descriptor = os.open(self.folder / _FLIGHTS_FOLDER, os.O_RDONLY | os.O_CLOEXEC)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -183,20 +188,22 @@ class Dataset:
         ParameterError
             It holds none.
         """
-        facts = self._facts()
+        facts = self._read_identity()
         try:
-            content = load_yaml((self.folder / _CAMPAIGN).read_text(encoding="utf-8"))
+            content = load_yaml((self.folder / _CAMPAIGN_FILE).read_text(encoding="utf-8"))
             section = dict(content["campaign"])
-            scenario = replace(load_scenario(str(self.folder / _SCENARIO)), name=facts["scenario"])
+            scenario = replace(
+                load_scenario(str(self.folder / _SCENARIO_FILE)), name=facts["scenario"]
+            )
             return parse_campaign(facts["name"], section, self.folder, scenario)
         except (OSError, ValueError, TypeError, KeyError) as error:
-            raise _damaged(self.folder / _CAMPAIGN, error) from error
+            raise _damaged_file_error(self.folder / _CAMPAIGN_FILE, error) from error
         except ParameterError as error:
             raise ParameterError(f"The campaign in {self.folder} is refused: {error}") from error
 
-    def _facts(self) -> dict[str, str]:
+    def _read_identity(self) -> dict[str, str]:
         """Return name, scenario and fingerprint of the campaign in the folder."""
-        path = self.folder / _ABOUT
+        path = self.folder / _ABOUT_FILE
         try:
             facts = json.loads(path.read_text(encoding="utf-8"))
             return {key: str(facts[key]) for key in ("name", "scenario", "fingerprint")}
@@ -206,15 +213,15 @@ class Dataset:
                 f"The folder {self.folder} holds no campaign: {path.name}: {reason}."
             ) from error
         except (ValueError, TypeError, KeyError) as error:
-            raise _damaged(path, error) from error
+            raise _damaged_file_error(path, error) from error
 
     # -- rows ---------------------------------------------------------------------------------
 
     def done(self) -> set[int]:
         """Return the numbers of the flights that are there."""
         found: set[int] = set()
-        for part in self._parts():
-            found.update(_read(part, ["flight"])["flight"].to_pylist())
+        for part in self._row_files():
+            found.update(_read_row_file(part, ["flight"])["flight"].to_pylist())
         return found
 
     def add(self, rows: Iterable[Row]) -> None:
@@ -236,9 +243,9 @@ class Dataset:
         if not self._rows:
             return
         arrow, parquet = needed("pyarrow"), needed("pyarrow.parquet")
-        records = [_record(row) for row in self._rows]
+        records = [_record_of_row(row) for row in self._rows]
         table = arrow.Table.from_pylist(records, schema=self._schema)
-        folder = self.folder / _FLIGHTS
+        folder = self.folder / _FLIGHTS_FOLDER
         while (path := folder / f"part-{self._part:06d}.parquet").exists():
             self._part += 1
         try:
@@ -260,17 +267,17 @@ class Dataset:
             There are none.
         """
         arrow = needed("pyarrow")
-        parts = [_read(part) for part in self._parts()]
+        parts = [_read_row_file(part) for part in self._row_files()]
         if not parts:
             raise ParameterError(f"The folder {self.folder} has no flights yet.")
         # Parts that an earlier version has written may lack columns.
         return arrow.concat_tables(parts, promote_options="default").sort_by("flight")
 
-    def _parts(self) -> Sequence[Path]:
-        return sorted((self.folder / _FLIGHTS).glob("part-*.parquet"))
+    def _row_files(self) -> Sequence[Path]:
+        return sorted((self.folder / _FLIGHTS_FOLDER).glob("part-*.parquet"))
 
 
-def _read(part: Path, columns: Sequence[str] | None = None) -> Any:
+def _read_row_file(part: Path, columns: Sequence[str] | None = None) -> Any:
     """Return a file of rows as a pyarrow table.
 
     Raises
@@ -289,13 +296,13 @@ def _read(part: Path, columns: Sequence[str] | None = None) -> Any:
         ) from error
 
 
-def _damaged(path: Path, error: Exception) -> ParameterError:
+def _damaged_file_error(path: Path, error: Exception) -> ParameterError:
     return ParameterError(
         f"The file {path} is damaged ({type(error).__name__}: {error}): the campaign cannot go on."
     )
 
 
-def _schema(campaign: Campaign) -> Any:
+def _row_schema(campaign: Campaign) -> Any:
     arrow = needed("pyarrow")
     real, text = arrow.float64(), arrow.string()
     fields = [("flight", arrow.int64()), ("seed", arrow.int64()), ("passed", arrow.bool_())]
@@ -308,7 +315,7 @@ def _schema(campaign: Campaign) -> Any:
     return arrow.schema(fields)
 
 
-def _record(row: Row) -> dict[str, Any]:
+def _record_of_row(row: Row) -> dict[str, Any]:
     return {
         "flight": row.draw.number,
         "seed": row.draw.seed,
@@ -325,14 +332,14 @@ def _record(row: Row) -> dict[str, Any]:
     }
 
 
-def _fingerprint(campaign: Campaign) -> str:
+def _fingerprint_of(campaign: Campaign) -> str:
     """Return a hash, equal for campaigns whose draws of one number are the same flight."""
-    text = json.dumps(_drawn_from(campaign), sort_keys=True, default=str)
+    text = json.dumps(_settings_of_draws(campaign), sort_keys=True, default=str)
     flown = scenario_text(self_contained(campaign).scenario)
     return hashlib.sha256(f"{text}{flown}".encode()).hexdigest()
 
 
-def _drawn_from(campaign: Campaign) -> dict[str, Any]:
+def _settings_of_draws(campaign: Campaign) -> dict[str, Any]:
     """Return the settings that determine the rows of a campaign, beside the scenario."""
     own = {"flights", "engine", "description", "scenario", "set", "method"}
     section = {key: value for key, value in campaign.section.items() if key not in own}

@@ -20,10 +20,10 @@ from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model.description import Array
 
-_SMALLEST = 1e-12
+_LEAST_SHARE = 1e-12
 """Least distance of shares from 0 and 1, where many distributions are infinite."""
 
-_BLOCK = 256
+_BLOCK_SIZE = 256
 """Number of draws that are made together."""
 
 
@@ -59,7 +59,7 @@ class Draws:
         self._campaign = campaign
         self._block, self._made = -1, list[Draw]()
         """The block of draws that was made last."""
-        self.shares = self._spread()
+        self.shares = self._sampler_shares()
         """(N, D) cumulative probabilities of the values; None with the sampler ``random``, with
         which each flight draws from a generator of its own."""
 
@@ -70,28 +70,28 @@ class Draws:
         """Return a draw by its number."""
         if not 0 <= number < len(self):
             raise IndexError(f"There is no draw {number} of {len(self)}.")
-        block, place = divmod(number, _BLOCK)
+        block, place = divmod(number, _BLOCK_SIZE)
         if block != self._block:
-            self._made, self._block = self._drawn(block * _BLOCK), block
+            self._made, self._block = self._draw_block(block * _BLOCK_SIZE), block
         return self._made[place]
 
-    def _drawn(self, first: int) -> list[Draw]:
+    def _draw_block(self, first: int) -> list[Draw]:
         """Return the draws of a block, whose values are computed together.
 
         The block is whole even where the campaign ends within it: values do not depend on the
         number of flights.
         """
         campaign = self._campaign
-        numbers = range(first, first + _BLOCK)
+        numbers = range(first, first + _BLOCK_SIZE)
         seeds = [np.random.SeedSequence(campaign.seed, spawn_key=(number,)) for number in numbers]
-        shares = np.full((_BLOCK, len(campaign.dispersions)), 0.5)
+        shares = np.full((_BLOCK_SIZE, len(campaign.dispersions)), 0.5)
         if self.shares is None:
             for row, own in zip(shares, seeds, strict=True):
                 row[:] = np.random.default_rng(own.spawn(1)[0]).random(len(row))
         else:
-            given = self.shares[first : first + _BLOCK]
+            given = self.shares[first : first + _BLOCK_SIZE]
             shares[: len(given)] = given
-        shares = np.clip(shares, _SMALLEST, 1.0 - _SMALLEST)
+        shares = np.clip(shares, _LEAST_SHARE, 1.0 - _LEAST_SHARE)
         columns = [
             each.distribution.at(u) for each, u in zip(campaign.dispersions, shares.T, strict=True)
         ]
@@ -104,12 +104,12 @@ class Draws:
     def __iter__(self) -> Iterator[Draw]:
         return (self[number] for number in range(len(self)))
 
-    def _spread(self) -> Array | None:
+    def _sampler_shares(self) -> Array | None:
         campaign, size = self._campaign, len(self._campaign.dispersions)
         if campaign.sampler == "random" or not size:
             return None
         if campaign.sampler == "saltelli":
-            return self._saltelli(size)
+            return self._saltelli_shares(size)
         from scipy.stats import qmc
 
         kinds = {
@@ -126,7 +126,7 @@ class Draws:
             return np.asarray(engine.random_base2(power))[: campaign.flights]
         return np.asarray(engine.random(campaign.flights))
 
-    def _saltelli(self, size: int) -> Array:
+    def _saltelli_shares(self, size: int) -> Array:
         base = self._campaign.flights // (size + 2)
         if base < 2:
             raise ParameterError(

@@ -54,23 +54,23 @@ from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
 
-_INSTANTS = 40
+_STATES_PER_FLIGHT = 40
 """States of a flight along a schedule that are evaluated, beside its last one."""
 
-_MOST_TICKS = 4_000_000
+_MOST_BATCH_TICKS = 4_000_000
 """Largest number of ticks of one batch, whose schedules are in memory."""
 
-_LONGEST_BATCH = 4.0
+_LONGEST_BATCH_PREPARATION = 4.0
 """Wall time, s, after which a batch is flown with the draws that are ready; an interruption of the
 campaign loses no more."""
 
-_AT_END = 1e-6
+_END_POSITION_TOLERANCE = 1e-6
 """Largest distance of a joint from its last position at the end of a schedule, m or rad."""
 
-_GAINS = "coordinated_control.gains."
+_GAIN_PREFIX = "coordinated_control.gains."
 """Prefix of the controller's parameters that may differ from lane to lane."""
 
-_COMMON = (
+_COMMON_TO_LANES = (
     "plant.tick_rate",
     "plant.integration_step",
     "plant.thrusters",
@@ -96,7 +96,7 @@ _COMMON_TO_SCHEDULES = (
 )
 """Prefixes of the parameters that all lanes along schedules share."""
 
-_OUTCOMES = {
+_OUTCOME_OF_DECISION = {
     Decision.REACHED: (Outcome.REACHED, ControllerState.REACHED),
     Decision.FAILED: (Outcome.FAILED, ControllerState.FAILED),
 }
@@ -111,7 +111,7 @@ class _Plan:
 
 
 @dataclass(frozen=True)
-class _Ready:
+class _ReadyDraw:
     """A draw that is ready for lanes: with its plan, if it follows one, and wall time for it, s."""
 
     draw: Draw
@@ -159,7 +159,7 @@ class LanesEngine:
         lanes: _ScheduledLanes | _ControlledLanes = self._controlled
         if "planner" in campaign.scenario.commanders:
             lanes = self._scheduled
-        common, batch, ticks = DrawnFlight.of(campaign.scenario), list[_Ready](), 0
+        common, batch, ticks = DrawnFlight.of(campaign.scenario), list[_ReadyDraw](), 0
         began = time.perf_counter()
         for draw in draws:
             if stopped():
@@ -174,18 +174,18 @@ class LanesEngine:
                 continue
             batch.append(ready)
             ticks += 0 if ready.plan is None else ready.schedule.ticks
-            late = time.perf_counter() - began > _LONGEST_BATCH
-            if late or len(batch) >= lanes.most or ticks > _MOST_TICKS:
-                yield from self._flown(campaign, lanes, batch)
+            late = time.perf_counter() - began > _LONGEST_BATCH_PREPARATION
+            if late or len(batch) >= lanes.most or ticks > _MOST_BATCH_TICKS:
+                yield from self._fly_batch(campaign, lanes, batch)
                 batch, ticks, began = [], 0, time.perf_counter()
         if batch:
-            yield from self._flown(campaign, lanes, batch)
+            yield from self._fly_batch(campaign, lanes, batch)
 
-    def _flown(
+    def _fly_batch(
         self,
         campaign: Campaign,
         lanes: _ScheduledLanes | _ControlledLanes,
-        batch: Sequence[_Ready],
+        batch: Sequence[_ReadyDraw],
     ) -> Iterator[Row | Fallback]:
         """Fly a batch."""
         began = time.perf_counter()
@@ -238,15 +238,17 @@ class _ScheduledLanes:
             return "the joints are measured with errors"
         return ""
 
-    def prepared(self, campaign: Campaign, draw: Draw, flight: DrawnFlight) -> _Ready | Fallback:
+    def prepared(
+        self, campaign: Campaign, draw: Draw, flight: DrawnFlight
+    ) -> _ReadyDraw | Fallback:
         """Let the executive plan a draw."""
         began = time.perf_counter()
-        plan = self._plan(flight)
+        plan = self._plan_first_state(flight)
         if plan is None:
             return Fallback(draw, "had no schedule at the first state")
-        return _Ready(draw, flight, plan, time.perf_counter() - began)
+        return _ReadyDraw(draw, flight, plan, time.perf_counter() - began)
 
-    def _plan(self, flight: DrawnFlight) -> _Plan | None:
+    def _plan_first_state(self, flight: DrawnFlight) -> _Plan | None:
         """Return the plan for the first state; the last one if the same values determine it."""
         if _has_noise(flight):
             return _first_plan(flight)
@@ -258,7 +260,7 @@ class _ScheduledLanes:
             self._last = key, _first_plan(flight)
         return self._last[1]
 
-    def flights(self, campaign: Campaign, batch: Sequence[_Ready]) -> Flights:
+    def flights(self, campaign: Campaign, batch: Sequence[_ReadyDraw]) -> Flights:
         """Return the batch of some draws."""
         planner = batch[0].flight.scenario.planner
         first, ticks = batch[0].schedule, [each.schedule.ticks for each in batch]
@@ -266,9 +268,9 @@ class _ScheduledLanes:
         if all(each.schedule is first for each in batch):
             positions = first.positions
         else:
-            positions = np.array([_padded(each.schedule.positions, most) for each in batch])
-        instants = np.unique([*np.linspace(0, most, _INSTANTS).astype(int), *ticks])
-        return _flights(
+            positions = np.array([_pad_positions(each.schedule.positions, most) for each in batch])
+        instants = np.unique([*np.linspace(0, most, _STATES_PER_FLIGHT).astype(int), *ticks])
+        return _batch_of_flights(
             [each.flight for each in batch],
             FollowedSchedule(positions, planner.shape_gain, planner.shape_deadband),
             most,
@@ -276,7 +278,7 @@ class _ScheduledLanes:
         )
 
     def measures(
-        self, result: BatchResult, row: int, ready: _Ready, flights: Flights
+        self, result: BatchResult, row: int, ready: _ReadyDraw, flights: Flights
     ) -> Measures | str:
         """Return the measures of a flight whose goal is decided at the end of its schedule, or the
         reason for a fallback.
@@ -286,7 +288,7 @@ class _ScheduledLanes:
         scenario, schedule = ready.flight.scenario, ready.schedule
         end = flights.instants.index(schedule.ticks)
         measured, q = result.measured_pose[row, end], result.measured_q[row, end]
-        band = max(_AT_END, scenario.planner.shape_deadband)
+        band = max(_END_POSITION_TOLERANCE, scenario.planner.shape_deadband)
         if np.abs(schedule.positions[-1] - q).max(initial=0.0) > band:
             return "had a joint that did not follow its schedule"
         error = PoseError.between(measured[:3], measured[3:], scenario.goal, q)
@@ -344,8 +346,8 @@ class _ControlledLanes:
             return "the plant refuses commands beyond limits"
         for dispersion in campaign.dispersions:
             name = dispersion.name
-            own = name.startswith("coordinated_control.") and not name.startswith(_GAINS)
-            if own or name.startswith(_COMMON):
+            own = name.startswith("coordinated_control.") and not name.startswith(_GAIN_PREFIX)
+            if own or name.startswith(_COMMON_TO_LANES):
                 return f"'{name}' is dispersed, and all lanes share it"
         try:
             law = build_controller(nominal_robots(scenario).controller, scenario.controller).law
@@ -353,21 +355,23 @@ class _ControlledLanes:
             return str(error)
         if law.fixed_inputs is None:
             return f"the law '{law.name}' with these options is more than one function"
-        for key, goal in _goals(scenario).items():
+        for key, goal in _goals_by_name(scenario).items():
             if goal is not None and not getattr(law.outputs.selection, key):
                 return f"the law '{law.name}' does not control the {key.replace('_', '-')}"
         return ""
 
-    def prepared(self, campaign: Campaign, draw: Draw, flight: DrawnFlight) -> _Ready | Fallback:
+    def prepared(
+        self, campaign: Campaign, draw: Draw, flight: DrawnFlight
+    ) -> _ReadyDraw | Fallback:
         """Check that a draw can be in a batch, whose other flights its error would end."""
-        ready = _Ready(draw, flight)
+        ready = _ReadyDraw(draw, flight)
         try:
             self.flights(campaign, [ready])
         except SpaceRobotError as error:
             return Fallback(draw, str(error))
         return ready
 
-    def flights(self, campaign: Campaign, batch: Sequence[_Ready]) -> Flights:
+    def flights(self, campaign: Campaign, batch: Sequence[_ReadyDraw]) -> Flights:
         """Return the batch of some draws.
 
         Raises
@@ -377,21 +381,23 @@ class _ControlledLanes:
         """
         scenario = campaign.scenario
         drawn = [each.flight for each in batch]
-        goals = [_goals(each.scenario) for each in drawn]
-        dispersed = any(each.name.startswith(_GAINS) for each in campaign.dispersions)
+        goals = [_goals_by_name(each.scenario) for each in drawn]
+        dispersed = any(each.name.startswith(_GAIN_PREFIX) for each in campaign.dispersions)
         gains = tuple(each.scenario.controller.gains for each in drawn) if dispersed else ()
         program = Controlled(
             scenario.controller,
-            base=_poses([each["base"] for each in goals]),
-            end_effector=_poses([each["end_effector"] for each in goals]),
+            base=_goal_poses([each["base"] for each in goals]),
+            end_effector=_goal_poses([each["end_effector"] for each in goals]),
             gains=gains,
             robot=nominal_robots(scenario).controller,
             until_decided=True,
         )
-        return _flights(drawn, program, _ticks(campaign.longest, scenario.plant.period_ns))
+        return _batch_of_flights(
+            drawn, program, _ticks_until(campaign.longest, scenario.plant.period_ns)
+        )
 
     def measures(
-        self, result: BatchResult, row: int, ready: _Ready, flights: Flights
+        self, result: BatchResult, row: int, ready: _ReadyDraw, flights: Flights
     ) -> Measures | str:
         """Return the measures of a flight, or the reason for a fallback."""
         decision, period_ns = Decision(result.decision[row]), ready.flight.scenario.plant.period_ns
@@ -407,7 +413,7 @@ class _ControlledLanes:
             outcome, flown = Outcome.INTERRUPTED, duration
             message = f"Interrupted after {duration:.6g} s of simulated time."
         else:
-            outcome, state = _OUTCOMES[decision]
+            outcome, state = _OUTCOME_OF_DECISION[decision]
             message = decided_message(state, OutputDistance(*result.decided_distance[row].tolist()))
             flown = decided * period_ns / SECOND
         return Measures(
@@ -428,7 +434,7 @@ class _ControlledLanes:
         )
 
 
-def _flights(
+def _batch_of_flights(
     drawn: Sequence[DrawnFlight],
     program: FollowedSchedule | Controlled,
     ticks: int,
@@ -504,7 +510,7 @@ def _plan_key(flight: DrawnFlight) -> str:
     return f"{plant} {(goal, None if shape is None else shape.tolist(), masses)}"
 
 
-def _padded(positions: Array, ticks: int) -> Array:
+def _pad_positions(positions: Array, ticks: int) -> Array:
     missing = ticks + 1 - len(positions)
     return np.vstack([positions, np.repeat(positions[-1:], missing, axis=0)])
 
@@ -512,11 +518,11 @@ def _padded(positions: Array, ticks: int) -> Array:
 # -- control ----------------------------------------------------------------------------------
 
 
-def _goals(scenario: Scenario) -> dict[str, Goal | None]:
+def _goals_by_name(scenario: Scenario) -> dict[str, Goal | None]:
     return {"base": scenario.goal, "end_effector": scenario.end_effector_goal}
 
 
-def _poses(goals: Sequence[Goal | None]) -> Array | None:
+def _goal_poses(goals: Sequence[Goal | None]) -> Array | None:
     """Return goals as a controller receives them, (N, 7); None without any."""
     checked = [Goal.checked(each.position, each.quaternion) for each in goals if each is not None]
     if not checked:
@@ -524,7 +530,7 @@ def _poses(goals: Sequence[Goal | None]) -> Array | None:
     return np.array([np.concatenate([each.position, each.quaternion]) for each in checked])
 
 
-def _ticks(longest: float, period_ns: int) -> int:
+def _ticks_until(longest: float, period_ns: int) -> int:
     """Return the first tick at which a flight is interrupted."""
     tick = max(1, int(longest * SECOND / period_ns) - 1)
     while tick * period_ns / SECOND < longest:

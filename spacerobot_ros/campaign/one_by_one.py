@@ -100,7 +100,7 @@ def robots_of(flight: DrawnFlight) -> Robots:
     scenario = flight.scenario
     robots = nominal_robots(scenario)
     if "planner" in scenario.commanders:
-        robots = replace(robots, method=_method(robots.planner, scenario.planner))
+        robots = replace(robots, method=_method_of_planner(robots.planner, scenario.planner))
     if flight.inertial is None:
         return robots
     weighing = node_robot("plant", flight).with_inertial(flight.inertial)
@@ -115,7 +115,7 @@ def nominal_robots(scenario: Scenario) -> Robots:
         text = config.robot_description
         if not (config.robot or text):
             text = plant  # The robot of commanders that name none.
-        return _built(node, text, config)
+        return _robot_of_node(node, text, config)
 
     return Robots.of(scenario, built)
 
@@ -137,7 +137,7 @@ _last_method: _BuiltMethod | None = None
 """The method of the last flight: its solvers serve all flights, and no plan depends on another."""
 
 
-def _method(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
+def _method_of_planner(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
     """Return the method of a planner: that of the last flight if its planner was equal."""
     global _last_method
     if _last_method is None or not _last_method.serves(robot, config):
@@ -151,21 +151,21 @@ def _method(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
 
 def node_robot(node: str, flight: DrawnFlight) -> SpaceRobot:
     """Return the robot of a node without dispersions of its masses."""
-    robot = _built_once(node, flight.nominal.urdf, "", 0.0, 0)
+    robot = _build_robot(node, flight.nominal.urdf, "", 0.0, 0)
     assert robot is not None
     return robot
 
 
-def _built(node: str, text: str, config: RobotConfig) -> SpaceRobot | None:
+def _robot_of_node(node: str, text: str, config: RobotConfig) -> SpaceRobot | None:
     """Return the robot that a node assumes, the same object as long as it assumes it."""
     error, seed = 0.0, 0
     if isinstance(config, BelievedRobotConfig):
         error, seed = config.model_error, config.model_error_seed
-    return _built_once(node, text, config.robot, error, seed)
+    return _build_robot(node, text, config.robot, error, seed)
 
 
 @lru_cache(maxsize=32)
-def _built_once(node: str, text: str, name: str, error: float, seed: int) -> SpaceRobot | None:
+def _build_robot(node: str, text: str, name: str, error: float, seed: int) -> SpaceRobot | None:
     # Of each node its own: a robot's functions have buffers.
     if error:
         return robot_of(BelievedRobotConfig(text, name, error, seed))
@@ -187,14 +187,14 @@ class RosEngine(_OneByOneEngine):
         with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
             bag = Path(folder, "flight.mcap")
             scenario = flight.finished().scenario
-            self._run(scenario, Path(folder, "draw.yaml"), bag, campaign.longest)
+            self._run_scenario(scenario, Path(folder, "draw.yaml"), bag, campaign.longest)
             flown = read_run(bag)
         if flown.duration > campaign.longest:  # The stack looks five times a second of wall time.
             message = f"Interrupted after {flown.duration:.6g} s of simulated time."
             flown = replace(flown, outcome=Outcome.INTERRUPTED, message=message)
         return replace(flown, wall_time=time.perf_counter() - began)
 
-    def _run(self, scenario: Scenario, file: Path, bag: Path, longest: float) -> None:
+    def _run_scenario(self, scenario: Scenario, file: Path, bag: Path, longest: float) -> None:
         """Fly a scenario in another process: signals and the contexts of ROS are a process's."""
         file.write_text(scenario_text(scenario), encoding="utf-8")
         command = ["-m", "spacerobot_ros", "run", str(file), "--bag", str(bag)]

@@ -39,21 +39,21 @@ from spacerobot_ros.version import __version__
 MADE_BY = f"Made by spacerobot_ros {__version__}."
 """Footer of the pages of campaigns."""
 
-_WORST = 10
-_FAR = 100.0
+_WORST_FLIGHTS_SHOWN = 10
+_MAX_BADNESS = 100.0
 """Distance from a bound at which the order of the worst flights saturates, standard deviations."""
 
-_SHOWN = 6
+_MOST_PLOTS = 6
 """Largest number of metrics with a histogram."""
 
 Flags = npt.NDArray[np.bool_]
 
-_SHARES = (0.01, 0.5, 0.99)
+_QUANTILES_SHOWN = (0.01, 0.5, 0.99)
 """Quantiles shown of each distribution."""
 
-_TEXTS = ("outcome", "reason", "engine", "fallback", "versions")
+_TEXT_COLUMNS = ("outcome", "reason", "engine", "fallback", "versions")
 
-_ALWAYS = ("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "propellant_kg")
+_MAIN_METRICS = ("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "propellant_kg")
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Results:
         text = needed("pyarrow").string()
         for name in table.column_names:
             column = table[name]
-            if name in _TEXTS or column.type == text:
+            if name in _TEXT_COLUMNS or column.type == text:
                 columns[name] = column.to_pylist()
             else:
                 # Missing numbers become NaN; a seed may have more digits than a double.
@@ -141,7 +141,7 @@ class Results:
     def shown(self) -> list[str]:
         """Metrics of the report: those with a criterion, and the main ones that have values."""
         names = [criterion.metric for criterion in self.campaign.criteria]
-        names += [name for name in _ALWAYS if name not in names]
+        names += [name for name in _MAIN_METRICS if name not in names]
         return [name for name in names if np.isfinite(self.columns[name]).any()]
 
     def metrics(self) -> dict[str, Array]:
@@ -175,20 +175,22 @@ class Results:
 
         Flights that passed are ordered by their distance from a bound, in standard deviations.
         """
-        badness = np.full(len(self), -_FAR)
+        badness = np.full(len(self), -_MAX_BADNESS)
         for criterion in self.campaign.criteria:
             x = self.columns[criterion.metric]
             spread = x[np.isfinite(x)].std() if np.isfinite(x).any() else 1.0
             spread = spread or 1.0
             over = np.maximum(x - criterion.maximum, criterion.minimum - x) / spread
             # A missing metric counts as beyond its bounds.
-            badness = np.maximum(badness, np.clip(np.nan_to_num(over, nan=_FAR), -_FAR, _FAR))
+            badness = np.maximum(
+                badness, np.clip(np.nan_to_num(over, nan=_MAX_BADNESS), -_MAX_BADNESS, _MAX_BADNESS)
+            )
         if not self.campaign.criteria:
             badness = np.nan_to_num(self.columns["position_error_m"])
         badness += 1e6 * (np.array(self.columns["outcome"]) != "reached")
         badness += 1e3 * ~self.passed
         order = np.lexsort((self.numbers, -badness))
-        return [int(row) for row in order[:_WORST]]
+        return [int(row) for row in order[:_WORST_FLIGHTS_SHOWN]]
 
 
 def write_campaign_report(folder: Path, path: Path) -> list[str]:
@@ -203,7 +205,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     """
     results = Results.of(folder)
     title = f"Campaign {results.campaign.name}"
-    write_output(path, html_page(title, _body(results), MADE_BY))
+    write_output(path, html_page(title, _page_body(results), MADE_BY))
     lines = [f"success     {results.success}"]
     lines += [f"note        {results.bias}"] if results.bias else []
     lines += [f"required    {c}: {results.requirement(c)}" for c in results.campaign.criteria]
@@ -241,35 +243,35 @@ def named(metric: str) -> str:
 # -- parts of the page ------------------------------------------------------------------------
 
 
-def _body(results: Results) -> list[str]:
+def _page_body(results: Results) -> list[str]:
     campaign, found = results.campaign, results.influences()
     with drawing():
         return [
             f"<header><h1>{escape(campaign.name)}</h1>",
             f"<p>{escape(campaign.description)}</p>" if campaign.description else "",
-            _facts(results),
-            _headline(results),
+            _facts_section(results),
+            _success_section(results),
             "</header>",
             "<h2>Requirements</h2>",
-            _requirements(results),
+            _criteria_section(results),
             "<h2>Outcomes</h2>",
-            _outcomes(results),
+            _outcomes_section(results),
             "<h2>Distributions</h2>",
-            _percentiles(results),
-            _histograms(results),
+            _percentiles_section(results),
+            _histograms_section(results),
             "<h2>Drivers of the result</h2>",
-            _drivers(results, found),
-            _scatter(results, found),
+            _sensitivity_section(results, found),
+            _scatter_section(results, found),
             "<h2>The worst flights</h2>",
-            _worst_table(results),
+            _worst_flights_section(results),
             "<h2>Convergence</h2>",
-            _convergence(results),
+            _convergence_section(results),
             "<h2>Dispersions</h2>",
-            _dispersed(campaign),
+            _dispersions_section(campaign),
         ]
 
 
-def _facts(results: Results) -> str:
+def _facts_section(results: Results) -> str:
     campaign = results.campaign
     engines = Counter(results.columns["engine"])
     found = [
@@ -282,7 +284,7 @@ def _facts(results: Results) -> str:
     return f"{facts(found)}{note}"
 
 
-def _headline(results: Results) -> str:
+def _success_section(results: Results) -> str:
     success = results.success
     low, high = success.exact
     wall = float(np.nansum(results.columns["wall_time_s"]))
@@ -295,28 +297,28 @@ def _headline(results: Results) -> str:
     return tiles(rows)
 
 
-def _requirements(results: Results) -> str:
+def _criteria_section(results: Results) -> str:
     outcomes = results.columns["outcome"]
     reached = share(sum(outcome == "reached" for outcome in outcomes), len(results))
-    rows = [["the goal is reached", *_shared(reached), "", ""]]
+    rows = [["the goal is reached", *_share_cells(reached), "", ""]]
     for criterion in results.campaign.criteria:
         values = percentiles(results.columns[criterion.metric])
         middle, high = values[PERCENTILES.index(50.0)], values[PERCENTILES.index(95.0)]
         met = results.requirement(criterion)
-        rows.append([str(criterion), *_shared(met), f"{middle:.4g}", f"{high:.4g}"])
-    rows.append(["all together", *_shared(results.success), "", ""])
+        rows.append([str(criterion), *_share_cells(met), f"{middle:.4g}", f"{high:.4g}"])
+    rows.append(["all together", *_share_cells(results.success), "", ""])
     head = ["requirement", "met by", "95 % interval", "median", "95 percentile"]
     return table("requirements", head, rows)
 
 
-def _shared(met: Share) -> list[str]:
+def _share_cells(met: Share) -> list[str]:
     return [
         f"{100 * met.value:.4g} % ({met.count} of {met.total})",
         f"{100 * met.low:.4g} to {100 * met.high:.4g} %",
     ]
 
 
-def _outcomes(results: Results) -> str:
+def _outcomes_section(results: Results) -> str:
     kinds: dict[str, list[str]] = {}
     for outcome, reason in zip(results.columns["outcome"], results.columns["reason"], strict=True):
         kinds.setdefault(outcome, []).append(reason or "")
@@ -338,7 +340,7 @@ def _outcomes(results: Results) -> str:
     return made
 
 
-def _percentiles(results: Results) -> str:
+def _percentiles_section(results: Results) -> str:
     if not results.shown:
         return '<p class="missing">No flight has any metric.</p>'
     rows = []
@@ -350,8 +352,8 @@ def _percentiles(results: Results) -> str:
     return table("percentiles", head, rows)
 
 
-def _histograms(results: Results) -> str:
-    names = results.shown[:_SHOWN]
+def _histograms_section(results: Results) -> str:
+    names = results.shown[:_MOST_PLOTS]
     if not names:
         return ""
     figure, axes = panels(len(names), 2)
@@ -376,7 +378,7 @@ def _histograms(results: Results) -> str:
     return picture(figure, "distributions", caption)
 
 
-def _drivers(results: Results, found: Sequence[Influence]) -> str:
+def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
     if not found:
         return '<p class="missing">No drawn number varies with a metric.</p>'
     sobol = any(each.total is not None for each in found)
@@ -404,8 +406,8 @@ def _drivers(results: Results, found: Sequence[Influence]) -> str:
     return f'<p class="facts">{escape(note)}</p>' + table("drivers", head, rows)
 
 
-def _scatter(results: Results, found: Sequence[Influence]) -> str:
-    chosen = list(found[:_SHOWN])
+def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
+    chosen = list(found[:_MOST_PLOTS])
     if not chosen:
         return ""
     figure, axes = panels(len(chosen), 3, 2.4)
@@ -424,7 +426,7 @@ def _scatter(results: Results, found: Sequence[Influence]) -> str:
     return picture(figure, "scatter", caption)
 
 
-def _worst_table(results: Results) -> str:
+def _worst_flights_section(results: Results) -> str:
     names = results.shown
     rows = []
     for row in results.worst():
@@ -436,7 +438,7 @@ def _worst_table(results: Results) -> str:
     return table("worst", head, rows)
 
 
-def _convergence(results: Results) -> str:
+def _convergence_section(results: Results) -> str:
     count = len(results)
     at = np.unique(np.geomspace(min(10, count), count, 60).astype(int))
     passed = np.cumsum(results.passed)
@@ -465,14 +467,19 @@ def _convergence(results: Results) -> str:
     return picture(figure, "convergence", "Convergence of the numbers with the number of flights.")
 
 
-def _dispersed(campaign: Campaign) -> str:
+def _dispersions_section(campaign: Campaign) -> str:
     rows = []
     for each in campaign.dispersions:
-        numbers = [""] * len(_SHARES)
+        numbers = [""] * len(_QUANTILES_SHOWN)
         if not each.distribution.choices:
-            numbers = [f"{value:.4g}" for value in each.distribution.at(np.array(_SHARES))]
+            numbers = [f"{value:.4g}" for value in each.distribution.at(np.array(_QUANTILES_SHOWN))]
         rows.append([each.name, str(each.distribution), each.target.unit or "", *numbers])
     if not rows:
         return '<p class="missing">No dispersions: flights differ in their noise only.</p>'
-    head = ["parameter", "distribution", "unit", *(f"{100 * share:g} %" for share in _SHARES)]
+    head = [
+        "parameter",
+        "distribution",
+        "unit",
+        *(f"{100 * share:g} %" for share in _QUANTILES_SHOWN),
+    ]
     return table("dispersed", head, rows)

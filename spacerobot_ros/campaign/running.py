@@ -95,7 +95,7 @@ def run_campaign(
         return Progress(before + flown, len(draws), rate, seconds)
 
     flown = 0
-    rows = _rows(campaign, draws, numbers, chosen.name, cluster, stopped)
+    rows = _fly_rows(campaign, draws, numbers, chosen.name, cluster, stopped)
     try:
         for batch in rows:
             dataset.add(batch)
@@ -106,7 +106,7 @@ def run_campaign(
     return progress(flown)
 
 
-def _rows(
+def _fly_rows(
     campaign: Campaign,
     draws: Draws,
     numbers: list[int],
@@ -118,14 +118,16 @@ def _rows(
     if not numbers:
         return
     if not cluster.workers and not cluster.scheduler:
-        for row in fly_all(engine_called(engine), campaign, _Chosen(draws, numbers), stopped):
+        for row in fly_all(
+            engine_called(engine), campaign, _SelectedDraws(draws, numbers), stopped
+        ):
             yield [row]
         return
     with workers_of(cluster, len(numbers)) as workers:
         yield from Distribution(workers, campaign, draws, engine, stopped).rows(numbers)
 
 
-class _Chosen(Sequence[Draw]):
+class _SelectedDraws(Sequence[Draw]):
     """The draws of a list of numbers, each made when it is used."""
 
     def __init__(self, draws: Draws, numbers: list[int]) -> None:

@@ -24,14 +24,14 @@ from spacerobot_ros.simulation.faults import KINDS
 
 AXES = ("x", "y", "z")
 
-_INDEXED = re.compile(r"(.+)\[([^\]]+)\]")
-_FAULT = re.compile(r"faults\[(\d+)\]\.(at|until|value)")
-_OF_ALL_FLIGHTS = (
+_INDEXED_NAME_PATTERN = re.compile(r"(.+)\[([^\]]+)\]")
+_FAULT_NAME_PATTERN = re.compile(r"faults\[(\d+)\]\.(at|until|value)")
+_SAME_IN_ALL_FLIGHTS = (
     *("plant.robot", "plant.robot_description", "plant.time_mode", "plant.resume_bag"),
     *("planner.resume_file", "coordinated_control.resume_file"),
 )
 """Parameters that are the same in all flights of a campaign."""
-_POSES = ("goal", "end_effector_goal", "initial")
+_POSE_NAMES = ("goal", "end_effector_goal", "initial")
 
 KINDS_OF_TARGETS = (
     ("NODE.PARAMETER", "a parameter of a node; NODE.PARAMETER[i] a number of a list, by joint too"),
@@ -144,11 +144,11 @@ def description_of(scenario: Scenario) -> RobotDescription:
         raise ParameterError(
             f"the scenario '{scenario.name}' names no robot for its plant: set plant.robot."
         )
-    return _description(plant.robot, plant.robot_description)
+    return _load_description(plant.robot, plant.robot_description)
 
 
 @cache
-def _description(robot: str, text: str) -> RobotDescription:
+def _load_description(robot: str, text: str) -> RobotDescription:
     return parse_robot(text) if text else load_robot(robot_file(robot))
 
 
@@ -165,31 +165,31 @@ def targets_of(name: str, scenario: Scenario) -> list[Target]:
     """
     kind, dot, rest = name.partition(".")
     if kind in CONFIGS:
-        return [_parameter(name, kind, rest, scenario)]
+        return [_parameter_target(name, kind, rest, scenario)]
     if kind in ("mass", "inertia"):
-        return _weights(kind, dot, rest, scenario)
+        return _mass_property_targets(kind, dot, rest, scenario)
     if kind == "com":
-        return _centers(rest, scenario)
-    if kind in _POSES:
-        return [_pose(name, kind, rest, scenario)]
-    match = _FAULT.fullmatch(name)
+        return _center_targets(rest, scenario)
+    if kind in _POSE_NAMES:
+        return [_pose_target(name, kind, rest, scenario)]
+    match = _FAULT_NAME_PATTERN.fullmatch(name)
     if match is not None:
-        return [_fault(name, int(match[1]), match[2], scenario)]
+        return [_fault_target(name, int(match[1]), match[2], scenario)]
     known = [f"{node}.{p.name}" for node in CONFIGS for p in declared(CONFIGS[node])]
-    known += ["mass", "inertia", "com", *_POSES, "faults[0].at", "faults[0].until"]
+    known += ["mass", "inertia", "com", *_POSE_NAMES, "faults[0].at", "faults[0].until"]
     kinds = "; ".join(names for names, _ in KINDS_OF_TARGETS)
     raise ParameterError(
         f"'{name}' is nothing that can be dispersed; there are {kinds}.{suggestion(name, known)}"
     )
 
 
-def _parameter(name: str, node: str, rest: str, scenario: Scenario) -> Target:
+def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> Target:
     if node not in ("plant", *scenario.commanders):
         raise ParameterError(
             f"'{name}' is of a node that does not fly: the scenario '{scenario.name}' flies with "
             f"{' and '.join(scenario.commanders)}."
         )
-    match = _INDEXED.fullmatch(rest)
+    match = _INDEXED_NAME_PATTERN.fullmatch(rest)
     bare, index = (match[1], match[2]) if match else (rest, "")
     known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
     if bare not in known:
@@ -198,7 +198,7 @@ def _parameter(name: str, node: str, rest: str, scenario: Scenario) -> Target:
     value = values_of(scenario.config(node))[bare]
     if isinstance(value, bool) or declaration.texts:
         raise ParameterError(f"'{name}' is neither a number nor a text: it cannot be dispersed.")
-    if name in _OF_ALL_FLIGHTS:
+    if name in _SAME_IN_ALL_FLIGHTS:
         raise ParameterError(f"'{name}' is the same in all flights of a campaign.")
     if isinstance(value, tuple) and bare.startswith("initial_orientation"):
         raise ParameterError(f"'{name}' is a quaternion: disperse initial.rotvec.x, y and z.")
@@ -206,12 +206,12 @@ def _parameter(name: str, node: str, rest: str, scenario: Scenario) -> Target:
         how = f"say which number of the list: {name}[0]" if not index else "it is no list"
         raise ParameterError(f"'{name}': {how}.")
     if not index:
-        return _plain(name, node, declaration, value)
+        return _scalar_target(name, node, declaration, value)
     assert isinstance(value, tuple)
-    return _entry(name, node, declaration, index, scenario)
+    return _entry_target(name, node, declaration, index, scenario)
 
 
-def _plain(name: str, node: str, declaration: Parameter, value: Any) -> Target:
+def _scalar_target(name: str, node: str, declaration: Parameter, value: Any) -> Target:
     whole = isinstance(declaration.default, int)
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
@@ -222,9 +222,11 @@ def _plain(name: str, node: str, declaration: Parameter, value: Any) -> Target:
     return Target(name, apply, declaration.unit, isinstance(value, str), frozenset({name}))
 
 
-def _entry(name: str, node: str, declaration: Parameter, index: str, scenario: Scenario) -> Target:
+def _entry_target(
+    name: str, node: str, declaration: Parameter, index: str, scenario: Scenario
+) -> Target:
     """Return the target of a number in a list, by its index or by its joint."""
-    values = _list(name, node, declaration, scenario)
+    values = _list_values(name, node, declaration, scenario)
     of_joints = declaration.of_joints or (node == "plant" and declaration.length is None)
     joints = list(description_of(scenario).joint_names) if of_joints else []
     if index in joints:
@@ -239,7 +241,7 @@ def _entry(name: str, node: str, declaration: Parameter, index: str, scenario: S
         )
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
-        values = _list(name, node, declaration, flight.scenario)
+        values = _list_values(name, node, declaration, flight.scenario)
         values[place] = float(drawn)
         scenario = flight.scenario.with_overrides(node, {declaration.name: values})
         return replace(flight, scenario=scenario)
@@ -248,20 +250,24 @@ def _entry(name: str, node: str, declaration: Parameter, index: str, scenario: S
     return Target(name, apply, declaration.unit, False, one)
 
 
-def _list(name: str, node: str, declaration: Parameter, scenario: Scenario) -> list[float]:
+def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenario) -> list[float]:
     """Return the numbers of a list parameter; an empty list for joints is zeros."""
     values = values_of(scenario.config(node))[declaration.name]
     assert isinstance(values, tuple)
     if values:
         return [float(x) for x in values]
     if node == "plant" and declaration.length is None:
-        return _start(scenario) if "positions" in name else [0.0] * len(_start(scenario))
+        return (
+            _start_positions(scenario)
+            if "positions" in name
+            else [0.0] * len(_start_positions(scenario))
+        )
     raise ParameterError(
         f"'{name}': the list is empty, which has a meaning of its own: give all of it under 'set'."
     )
 
 
-def _start(scenario: Scenario) -> list[float]:
+def _start_positions(scenario: Scenario) -> list[float]:
     """Return the joint positions at the start; by default, as near to zero as limits allow."""
     given, robot = scenario.plant.initial_joint_positions, description_of(scenario)
     if given:
@@ -270,7 +276,7 @@ def _start(scenario: Scenario) -> list[float]:
     return [float(x) for x in np.clip(zero, robot.limits("lower"), robot.limits("upper"))]
 
 
-def _bodies(name: str, scenario: Scenario) -> list[tuple[int, str]]:
+def _bodies_called(name: str, scenario: Scenario) -> list[tuple[int, str]]:
     """Return the bodies of a name, all for ``*``, each with its index."""
     names = [body.name for body in description_of(scenario).bodies]
     if name == "*":
@@ -282,7 +288,7 @@ def _bodies(name: str, scenario: Scenario) -> list[tuple[int, str]]:
     return [(names.index(name), name)]
 
 
-def _weights(kind: str, dot: str, rest: str, scenario: Scenario) -> list[Target]:
+def _mass_property_targets(kind: str, dot: str, rest: str, scenario: Scenario) -> list[Target]:
     def target(bodies: Sequence[tuple[int, str]], name: str) -> Target:
         indices = [index for index, _ in bodies]
 
@@ -294,28 +300,28 @@ def _weights(kind: str, dot: str, rest: str, scenario: Scenario) -> list[Target]
         return Target(name, apply, "1", False, frozenset(f"{kind}.{body}" for _, body in bodies))
 
     if not dot:
-        return [target(_bodies("*", scenario), kind)]
-    return [target([body], f"{kind}.{body[1]}") for body in _bodies(rest, scenario)]
+        return [target(_bodies_called("*", scenario), kind)]
+    return [target([body], f"{kind}.{body[1]}") for body in _bodies_called(rest, scenario)]
 
 
-def _centers(rest: str, scenario: Scenario) -> list[Target]:
+def _center_targets(rest: str, scenario: Scenario) -> list[Target]:
     body, dot, axis = rest.rpartition(".")
     if rest == "*":
         body, dot, axis = "*", ".", "*"
     if not dot or axis not in (*AXES, "*"):
         raise ParameterError(
             f"'{f'com.{rest}'.rstrip('.')}' must be com.BODY.x, y, z or *, or com.*; the bodies "
-            f"are {', '.join(name for _, name in _bodies('*', scenario))}."
+            f"are {', '.join(name for _, name in _bodies_called('*', scenario))}."
         )
     found = []
-    for index, name in _bodies(body, scenario):
+    for index, name in _bodies_called(body, scenario):
         for column, letter in enumerate(AXES):
             if axis in (letter, "*"):
-                found.append(_center(index, column, f"com.{name}.{letter}"))
+                found.append(_center_target(index, column, f"com.{name}.{letter}"))
     return found
 
 
-def _center(index: int, column: int, name: str) -> Target:
+def _center_target(index: int, column: int, name: str) -> Target:
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
         com = flight.com.copy()
         com[index, column] += float(drawn)
@@ -324,10 +330,10 @@ def _center(index: int, column: int, name: str) -> Target:
     return Target(name, apply, "m", False, frozenset({name}))
 
 
-def _pose(name: str, kind: str, rest: str, scenario: Scenario) -> Target:
+def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> Target:
     part, _, axis = rest.partition(".")
     if kind == "initial" and part == "joints":
-        return _initial_joint(name, axis, scenario)
+        return _initial_joint_target(name, axis, scenario)
     if part not in ("position", "rotvec") or axis not in AXES:
         known = [f"{kind}.{p}.{a}" for p in ("position", "rotvec") for a in AXES]
         if kind == "initial":
@@ -341,7 +347,7 @@ def _pose(name: str, kind: str, rest: str, scenario: Scenario) -> Target:
         offset = np.zeros(3)
         offset[column] = float(drawn)
         if kind == "initial":
-            return replace(flight, scenario=_moved_start(flight.scenario, part, offset))
+            return replace(flight, scenario=_move_start(flight.scenario, part, offset))
         goal: Goal = getattr(flight.scenario, kind)
         if part == "position":
             goal = replace(goal, position=goal.position + offset)
@@ -361,7 +367,7 @@ def _pose(name: str, kind: str, rest: str, scenario: Scenario) -> Target:
     return Target(name, apply, "m" if part == "position" else "rad", False, frozenset(sets))
 
 
-def _moved_start(scenario: Scenario, part: str, offset: Array) -> Scenario:
+def _move_start(scenario: Scenario, part: str, offset: Array) -> Scenario:
     plant = scenario.plant
     if part == "position":
         where = "initial_center_of_mass" if plant.initial_center_of_mass else "initial_position"
@@ -372,7 +378,7 @@ def _moved_start(scenario: Scenario, part: str, offset: Array) -> Scenario:
     return scenario.with_overrides("plant", {"initial_orientation": turned.tolist()})
 
 
-def _initial_joint(name: str, joint: str, scenario: Scenario) -> Target:
+def _initial_joint_target(name: str, joint: str, scenario: Scenario) -> Target:
     joints = list(description_of(scenario).joint_names)
     if joint not in joints:
         raise ParameterError(
@@ -382,7 +388,7 @@ def _initial_joint(name: str, joint: str, scenario: Scenario) -> Target:
     index = joints.index(joint)
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
-        values = _start(flight.scenario)
+        values = _start_positions(flight.scenario)
         values[index] += float(drawn)
         scenario = flight.scenario.with_overrides("plant", {"initial_joint_positions": values})
         return replace(flight, scenario=scenario)
@@ -391,7 +397,7 @@ def _initial_joint(name: str, joint: str, scenario: Scenario) -> Target:
     return Target(name, apply, "m or rad", False, one)
 
 
-def _fault(name: str, index: int, part: str, scenario: Scenario) -> Target:
+def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Target:
     faults = scenario.plant.faults
     if index >= len(faults):
         raise ParameterError(
@@ -403,14 +409,14 @@ def _fault(name: str, index: int, part: str, scenario: Scenario) -> Target:
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
         lines = list(flight.scenario.plant.faults)
-        lines[index] = _line(lines[index].split(), part, repr(float(drawn)))
+        lines[index] = _edit_fault_line(lines[index].split(), part, repr(float(drawn)))
         scenario = flight.scenario.with_overrides("plant", {"faults": lines})
         return replace(flight, scenario=scenario)
 
     return Target(name, apply, "" if part == "value" else "s", False, frozenset({name}))
 
 
-def _line(words: list[str], part: str, text: str) -> str:
+def _edit_fault_line(words: list[str], part: str, text: str) -> str:
     """Return the line of a fault with another time or value."""
     if part == "value":
         return " ".join([*words[:2], text, *words[3:]])
@@ -442,7 +448,7 @@ def urdf_with(robot: RobotDescription, parameters: InertialParameters) -> str:
         if link.get("name") in of_body:
             mass, center, tensor = of_body[link.get("name", "")]
             inertial = ET.SubElement(link, "inertial")
-            ET.SubElement(inertial, "origin", xyz=_numbers(center), rpy="0 0 0")
+            ET.SubElement(inertial, "origin", xyz=_format_numbers(center), rpy="0 0 0")
             ET.SubElement(inertial, "mass", value=repr(float(mass)))
             entries = {
                 f"i{a}{b}": repr(float(tensor[i, j]))
@@ -454,5 +460,5 @@ def urdf_with(robot: RobotDescription, parameters: InertialParameters) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-def _numbers(values: Array) -> str:
+def _format_numbers(values: Array) -> str:
     return " ".join(repr(float(x)) for x in values)

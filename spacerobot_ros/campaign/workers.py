@@ -37,24 +37,24 @@ from spacerobot_ros.version import __version__
 TASK_TIME = 2.0
 """Wall time that a task should take, s: the overhead of its distribution is small beside it."""
 
-_FIRST, _MOST = 4, 2000
+_FIRST_TASK_FLIGHTS, _MOST_TASK_FLIGHTS = 4, 2000
 """Numbers of flights in the first tasks, and in the largest."""
 
-_AHEAD = 2
+_TASKS_PER_WORKER = 2
 """Tasks per worker that are submitted at a time, the running one included."""
 
-_MOST_DEATHS = 2
+_MOST_WORKER_DEATHS = 2
 """Workers that may die during a flight; then it is reported as killed and not repeated."""
 
 _PACKAGE = "spacerobot_ros"
 
-_LOOK_PERIOD = 0.2
+_POLL_PERIOD = 0.2
 """Longest wall time between two looks at tasks, signals and the dataset, s."""
 
 _NO_WORKER_WARNING = 5.0
 """Wall time without a worker after which a warning is printed, s."""
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+_THREAD_COUNT_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """Environment variables for the number of threads of a worker."""
 
 KILLED = "killed"
@@ -94,7 +94,7 @@ class Specification:
 
     def campaign(self) -> Campaign:
         """Return the campaign, parsed once in each process."""
-        return _parsed(self)
+        return _parse_specification(self)
 
     def __hash__(self) -> int:
         return hash(self.key)
@@ -104,7 +104,7 @@ class Specification:
 
 
 @lru_cache(maxsize=4)
-def _parsed(specification: Specification) -> Campaign:
+def _parse_specification(specification: Specification) -> Campaign:
     return parse_campaign(
         specification.name, specification.section, scenario=specification.scenario
     )
@@ -159,11 +159,11 @@ class _LocalWorker:
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, other = context.Pipe()
-        self.process = context.Process(target=_work, args=(other,), daemon=True)
+        self.process = context.Process(target=_run_worker, args=(other,), daemon=True)
         self.task: _LocalTask | None = None
         # Compilers and linear algebra of several workers would compete for the cores.
-        before = {name: os.environ.get(name) for name in _THREADS}
-        os.environ.update(dict.fromkeys(_THREADS, "1"))
+        before = {name: os.environ.get(name) for name in _THREAD_COUNT_VARIABLES}
+        os.environ.update(dict.fromkeys(_THREAD_COUNT_VARIABLES, "1"))
         # A worker never takes the Ctrl-C of a terminal: this process ends it. The resource tracker
         # would unblock the signal when it starts.
         resource_tracker.ensure_running()
@@ -227,18 +227,18 @@ class LocalWorkers:
         """Queue a task."""
         made = _LocalTask(task, all_of_them=all_of_them)
         self._queue.append(made)
-        self._assign()
+        self._assign_tasks()
         return made
 
     def ended(self, tasks: list[_LocalTask]) -> list[_LocalTask]:
         """Return those of the tasks that have ended, after a while also none."""
         busy = {worker.connection: worker for worker in self._workers if worker.task is not None}
-        for ready in wait(list(busy), timeout=_LOOK_PERIOD):
+        for ready in wait(list(busy), timeout=_POLL_PERIOD):
             busy.pop(ready).finish()  # type: ignore[call-overload]
         for worker in busy.values():
             if _resident_bytes(worker.process.pid) > self._memory:
                 worker.process.kill()
-        self._assign()
+        self._assign_tasks()
         return [task for task in tasks if task.ended]
 
     def result(self, task: _LocalTask) -> list[Row | Fallback]:
@@ -256,7 +256,7 @@ class LocalWorkers:
         for worker in self._workers:
             worker.close()
 
-    def _assign(self) -> None:
+    def _assign_tasks(self) -> None:
         """Send waiting tasks to idle workers."""
         for place, worker in enumerate(self._workers):
             if worker.task is None and self._queue:
@@ -266,7 +266,7 @@ class LocalWorkers:
                 self._workers[place].begin(self._queue.popleft())
 
 
-def _work(connection: Connection) -> None:
+def _run_worker(connection: Connection) -> None:
     """Fly the tasks that come through a pipe until it is closed."""
     Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError):
@@ -322,11 +322,11 @@ class DaskWorkers:
         """
         try:
             if self._client.status != "running":
-                raise _lost()
+                raise _lost_scheduler_error()
             threads = self._client.nthreads()
             self._require_package(threads)
         except (OSError, AttributeError) as error:  # The client was about to notice it.
-            raise _lost() from error
+            raise _lost_scheduler_error() from error
         workers = sum(threads.values())
         now = time.monotonic()
         self._empty_since = math.inf if workers else min(self._empty_since, now)
@@ -343,11 +343,11 @@ class DaskWorkers:
         import distributed
 
         try:
-            distributed.wait(tasks, timeout=_LOOK_PERIOD, return_when="FIRST_COMPLETED")
+            distributed.wait(tasks, timeout=_POLL_PERIOD, return_when="FIRST_COMPLETED")
         except TimeoutError:
             return []
         except CancelledError as error:
-            raise _lost() from error
+            raise _lost_scheduler_error() from error
         return [task for task in tasks if task.done()]
 
     def result(self, task: Any) -> list[Row | Fallback]:
@@ -367,7 +367,7 @@ class DaskWorkers:
         except KilledWorker as error:
             raise WorkerDeath from error
         except CancelledError as error:
-            raise _lost() from error
+            raise _lost_scheduler_error() from error
         except (ImportError, RuntimeError) as error:
             # dask.distributed raises these for a task that cannot be loaded.
             if isinstance(error, RuntimeError) and "deserialization" not in str(error):
@@ -399,7 +399,7 @@ class DaskWorkers:
                 self._checked.add(address)
 
 
-def _lost() -> SpaceRobotError:
+def _lost_scheduler_error() -> SpaceRobotError:
     return SpaceRobotError(
         "The scheduler is gone. Finished flights are kept: the same command goes on from there."
     )
@@ -451,7 +451,7 @@ def workers_of(cluster: Cluster, flights: int) -> Iterator[Workers]:
 
 
 @dataclass(frozen=True)
-class _Task:
+class _SubmittedTask:
     """Numbers of the draws that a worker flies now, and the name of the engine."""
 
     numbers: list[int]
@@ -489,14 +489,15 @@ class Distribution:
         self._workers, self._specification = workers, Specification(self_contained(campaign))
         self._draws, self._engine, self._stopped = draws, engine, stopped
         self._sizes = {
-            name: float(max(_FIRST, engine_called(name).least)) for name in (engine, FLIGHTS)
+            name: float(max(_FIRST_TASK_FLIGHTS, engine_called(name).least))
+            for name in (engine, FLIGHTS)
         }
         """Flights of a task, by the engine."""
         self._fallbacks: deque[int] = deque()
         """Draws that the engine passes on to the engine ``flights``."""
         self._reasons: dict[int, str] = {}
         """The reason of each of them."""
-        self._running: dict[Any, _Task] = {}
+        self._running: dict[Any, _SubmittedTask] = {}
         self._retry_alone: deque[int] = deque()
         """Draws of tasks whose worker died."""
         self._deaths: Counter[int] = Counter()
@@ -509,36 +510,36 @@ class Distribution:
         while (
             waiting or self._fallbacks or self._retry_alone or self._running
         ) and not self._stopped():
-            self._submit(waiting)
+            self._submit_tasks(waiting)
             ended = self._workers.ended(list(self._running))
             if not ended:
                 yield []
             for task in ended:
-                yield self._taken(task)
+                yield self._take_rows(task)
         if self._running:
             self._workers.cancel(list(self._running))
 
-    def _submit(self, waiting: deque[int]) -> None:
+    def _submit_tasks(self, waiting: deque[int]) -> None:
         """Keep the workers busy."""
         if self._retry_alone and self._alone is None:
-            self._alone = self._task([self._retry_alone.popleft()], self._engine, alone=True)
+            self._alone = self._submit_task([self._retry_alone.popleft()], self._engine, alone=True)
         workers = self._workers.count()
-        while (self._fallbacks or waiting) and len(self._running) < _AHEAD * workers:
+        while (self._fallbacks or waiting) and len(self._running) < _TASKS_PER_WORKER * workers:
             queue, engine = (
                 (self._fallbacks, FLIGHTS) if self._fallbacks else (waiting, self._engine)
             )
             # The last tasks are smaller, so that no worker is alone at the end.
             share = max(engine_called(engine).least, len(queue) / workers)
             count = min(len(queue), max(1, round(min(self._sizes[engine], share))))
-            self._task([queue.popleft() for _ in range(count)], engine)
+            self._submit_task([queue.popleft() for _ in range(count)], engine)
 
-    def _task(self, numbers: list[int], engine: str, *, alone: bool = False) -> Any:
+    def _submit_task(self, numbers: list[int], engine: str, *, alone: bool = False) -> Any:
         draws = [self._draws[number] for number in numbers]
         task = self._workers.submit(self._specification, draws, engine, all_of_them=alone)
-        self._running[task] = _Task(numbers, engine)
+        self._running[task] = _SubmittedTask(numbers, engine)
         return task
 
-    def _taken(self, ended: Any) -> list[Row]:
+    def _take_rows(self, ended: Any) -> list[Row]:
         """Return the rows of a task; none if its worker died."""
         task = self._running.pop(ended)
         alone = ended is self._alone
@@ -557,7 +558,7 @@ class Distribution:
             if took > 0:
                 size = 0.5 * self._sizes[task.engine] + 0.5 * len(rows) * TASK_TIME / took
                 least = engine_called(task.engine).least
-                self._sizes[task.engine] = max(least, min(_MOST, size))
+                self._sizes[task.engine] = max(least, min(_MOST_TASK_FLIGHTS, size))
         return [
             replace(row, fallback=self._reasons[number])
             if (number := row.draw.number) in self._reasons
@@ -571,8 +572,8 @@ class Distribution:
         for number in numbers:
             if alone or not self._deaths[number]:
                 self._deaths[number] += 1
-            if self._deaths[number] >= _MOST_DEATHS:
-                reason = f"The process that flew it died {_MOST_DEATHS} times."
+            if self._deaths[number] >= _MOST_WORKER_DEATHS:
+                reason = f"The process that flew it died {_MOST_WORKER_DEATHS} times."
                 row = Row(self._draws[number], KILLED, reason, engine=self._engine)
                 given_up.append(row)
             else:

@@ -47,7 +47,7 @@ _LONG_FLAGS = ("-O0", *_COMMON_FLAGS)
 """For functions of ten thousands of operations: a tenth of the time to compile, half the speed,
 still seven times that of the virtual machine."""
 
-_WORTH_KEEPING = 5000
+_LEAST_OPERATIONS_TO_KEEP = 5000
 """Number of operations of a function that takes a tenth of a second to derive, ten times as long
 as to read."""
 
@@ -57,15 +57,15 @@ _COMPILE_TIMEOUT = 120.0
 _TRIAL_TIMEOUT = 20.0
 """Time limit for trying a new object, s."""
 
-_SAME = 1e-6
+_LARGEST_DIFFERENCE = 1e-6
 """Largest relative difference between a compiled function and the virtual machine."""
 
-_BEYOND = 1e9
+_LARGEST_COMPARED_RESULT = 1e9
 """Results above it are near a singularity and depend on rounding."""
 
-_MOST_AT_HAND = 12
+_MOST_FUNCTIONS_IN_MEMORY = 12
 
-_at_hand: dict[tuple[str, ...], ca.Function] = {}
+_functions_in_memory: dict[tuple[str, ...], ca.Function] = {}
 """The kept functions that were used last, by name, key and settings of the compilation."""
 
 ANNOUNCEMENT = "announcement"
@@ -78,7 +78,7 @@ _Loaded = TypeVar("_Loaded")
 contexts: list[Callable[[], AbstractContextManager[None]]] = []
 """Contexts in which the compiler runs, for those that have to say that they are busy then."""
 
-_hung: set[str] = set()
+_hung_compilations: set[str] = set()
 """Compilers that have exceeded the time limit: they are not called again."""
 
 
@@ -104,19 +104,23 @@ class BufferedFunction:
         self.function = function
         self._buffer, self.evaluate = function.buffer()
         self.inputs: tuple[Array, ...] = tuple(
-            self._attach(function.size_in(i), function.sparsity_in(i), i, self._buffer.set_arg)
+            self._attach_buffers(
+                function.size_in(i), function.sparsity_in(i), i, self._buffer.set_arg
+            )
             for i in range(function.n_in())
         )
         if held is not None:
             *inputs, last = self.inputs
             last[:], self.inputs, self._held = held, tuple(inputs), last
         self.outputs: tuple[Array, ...] = tuple(
-            self._attach(function.size_out(i), function.sparsity_out(i), i, self._buffer.set_res)
+            self._attach_buffers(
+                function.size_out(i), function.sparsity_out(i), i, self._buffer.set_res
+            )
             for i in range(function.n_out())
         )
 
     @staticmethod
-    def _attach(
+    def _attach_buffers(
         size: tuple[int, int], sparsity: ca.Sparsity, index: int, setter: Callable[..., None]
     ) -> Array:
         if not sparsity.is_dense():
@@ -165,17 +169,17 @@ def compiled(function: ca.Function) -> ca.Function:
     ParameterError
         ``SPACEROBOT_COMPILE_TIMEOUT`` is not a number of seconds.
     """
-    if not _is_wanted():
+    if not _is_compilation_enabled():
         return function
     compiler = c_compiler()
-    _time_limit()
+    _compile_time_limit()
     try:
         if compiler is None:
             raise _CompilationError("no C compiler (cc, gcc, clang or $CC) was found")
-        key = _hash(f"{_built_for(compiler, _FLAGS)}\n{_source(function)}")
-        if found := _loaded(Cache(cache_directory()), function.name(), key):
+        key = _hash_text(f"{_platform_key(compiler, _FLAGS)}\n{_c_source(function)}")
+        if found := _load_compiled(Cache(cache_directory()), function.name(), key):
             return found
-        return _compiled(function, key, _FLAGS, compiler)
+        return _compile_function(function, key, _FLAGS, compiler)
     except _CompilationError as reason:
         _warn_of_virtual_machine(reason)
         return function
@@ -185,7 +189,7 @@ def compiled(function: ca.Function) -> ca.Function:
 def source_of(*names: str) -> str:
     """Return a hash of modules of this package, and of CasADi's version, for keys of functions."""
     texts = [Path(str(sys.modules[name].__file__)).read_text("utf-8") for name in names]
-    return _hash("\n".join([ca.__version__, *texts]))
+    return _hash_text("\n".join([ca.__version__, *texts]))
 
 
 def _warn_of_virtual_machine(reason: _CompilationError) -> None:
@@ -222,21 +226,23 @@ def kept_function(
         ``SPACEROBOT_COMPILE_TIMEOUT`` is not a number of seconds.
     """
     place = (name, key, str(compiling), *compilation_settings())
-    function = _at_hand.pop(place, None) or _kept_or_derived(name, key, build, compiling=compiling)
-    _at_hand[place] = function
-    if len(_at_hand) > _MOST_AT_HAND:
-        del _at_hand[next(iter(_at_hand))]
+    function = _functions_in_memory.pop(place, None) or _load_or_derive(
+        name, key, build, compiling=compiling
+    )
+    _functions_in_memory[place] = function
+    if len(_functions_in_memory) > _MOST_FUNCTIONS_IN_MEMORY:
+        del _functions_in_memory[next(iter(_functions_in_memory))]
     return function
 
 
-def _kept_or_derived(
+def _load_or_derive(
     name: str, key: str, build: Callable[[], ca.Function], *, compiling: bool
 ) -> ca.Function:
     cache, compiler = Cache(cache_directory()), c_compiler()
     compiled_key = ""
     if compiler is not None:
-        compiled_key = _hash(f"{_built_for(compiler, _LONG_FLAGS)}\n{name}\n{key}")
-        if found := _loaded(cache, name, compiled_key):
+        compiled_key = _hash_text(f"{_platform_key(compiler, _LONG_FLAGS)}\n{name}\n{key}")
+        if found := _load_compiled(cache, name, compiled_key):
             return found
     serialised = f"{name}-{key[:32]}.casadi"
     if (kept := cache.load(serialised, key)) and not (compiling and compiler):
@@ -247,10 +253,10 @@ def _kept_or_derived(
     function = build()
     if compiling and compiler is not None:
         try:
-            return _compiled(function, compiled_key, _LONG_FLAGS, compiler)
+            return _compile_function(function, compiled_key, _LONG_FLAGS, compiler)
         except _CompilationError as reason:
             _warn_of_virtual_machine(reason)
-    if function.n_instructions() >= _WORTH_KEEPING:
+    if function.n_instructions() >= _LEAST_OPERATIONS_TO_KEEP:
         cache.store(serialised, key, function.serialize().encode())
     return function
 
@@ -287,12 +293,12 @@ def native_library(
     if compiler is None:
         raise NoLibraryError("no C++ compiler (c++, g++, clang++ or $CXX) was found")
     flags = [*flags, *_COMMON_FLAGS]
-    key = _hash(f"{_built_for(compiler, flags)} {' '.join(libraries)}\n{source}")
-    if kept := Cache(cache_directory()).load(_file(name, key), key):
+    key = _hash_text(f"{_platform_key(compiler, flags)} {' '.join(libraries)}\n{source}")
+    if kept := Cache(cache_directory()).load(_object_file_name(name, key), key):
         with suppress(OSError):
             return ctypes.CDLL(str(kept[0]))
     try:
-        return _made(
+        return _make_object(
             name, key, _Build(source, compiler, flags, libraries, "cpp"), tried, ctypes.CDLL
         )
     except _CompilationError as reason:
@@ -324,7 +330,7 @@ def cxx_compiler() -> str | None:
 
 
 def _compiler(*candidates: str | None) -> str | None:
-    if not _is_wanted():
+    if not _is_compilation_enabled():
         return None
     for candidate in candidates:
         found = shutil.which(candidate) if candidate else None
@@ -342,11 +348,11 @@ def cache_directory() -> Path:
     return Path(base).expanduser() / "spacerobot_ros"
 
 
-def _is_wanted() -> bool:
+def _is_compilation_enabled() -> bool:
     return os.environ.get("SPACEROBOT_COMPILE", "1") != "0"
 
 
-def _time_limit() -> float:
+def _compile_time_limit() -> float:
     text = os.environ.get("SPACEROBOT_COMPILE_TIMEOUT")
     if not text:
         return _COMPILE_TIMEOUT
@@ -362,27 +368,27 @@ def _time_limit() -> float:
     return limit
 
 
-def _hash(text: str) -> str:
+def _hash_text(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _built_for(compiler: str, flags: Sequence[str]) -> str:
-    return f"{sysconfig.get_platform()} {_c_library()} {compiler} {' '.join(flags)}"
+def _platform_key(compiler: str, flags: Sequence[str]) -> str:
+    return f"{sysconfig.get_platform()} {_c_library_version()} {compiler} {' '.join(flags)}"
 
 
-def _source(function: ca.Function) -> str:
+def _c_source(function: ca.Function) -> str:
     generator = ca.CodeGenerator(function.name(), {"with_header": False})
     generator.add(function)
     return str(generator.dump())
 
 
-def _file(name: str, key: str) -> str:
+def _object_file_name(name: str, key: str) -> str:
     return f"{name}-{key[:32]}.so"
 
 
-def _loaded(cache: Cache, name: str, key: str) -> ca.Function | None:
+def _load_compiled(cache: Cache, name: str, key: str) -> ca.Function | None:
     """Return a compiled function from the cache, None if it is not there."""
-    if kept := cache.load(_file(name, key), key):
+    if kept := cache.load(_object_file_name(name, key), key):
         try:
             return ca.external(name, str(kept[0]))
         except RuntimeError:
@@ -393,7 +399,9 @@ def _loaded(cache: Cache, name: str, key: str) -> ca.Function | None:
     return None
 
 
-def _compiled(function: ca.Function, key: str, flags: Sequence[str], compiler: str) -> ca.Function:
+def _compile_function(
+    function: ca.Function, key: str, flags: Sequence[str], compiler: str
+) -> ca.Function:
     """Return the function newly compiled, and keep it in the cache.
 
     Raises
@@ -402,9 +410,9 @@ def _compiled(function: ca.Function, key: str, flags: Sequence[str], compiler: s
         It cannot be compiled.
     """
     name = function.name()
-    _announce()
-    build = _Build(_source(function), compiler, flags)
-    return _made(name, key, build, [function], lambda path: ca.external(name, path))
+    _announce_compilation()
+    build = _Build(_c_source(function), compiler, flags)
+    return _make_object(name, key, build, [function], lambda path: ca.external(name, path))
 
 
 @dataclass(frozen=True)
@@ -428,7 +436,7 @@ class _Build:
     suffix: str = "c"
 
 
-def _made(
+def _make_object(
     name: str,
     key: str,
     build: _Build,
@@ -442,8 +450,8 @@ def _made(
     _CompilationError
         There is no object that can be used.
     """
-    limit = _time_limit()
-    if build.compiler in _hung:
+    limit = _compile_time_limit()
+    if build.compiler in _hung_compilations:
         raise _CompilationError(f"{build.compiler} did not end before, and is not called again")
     try:
         with (
@@ -452,10 +460,12 @@ def _made(
         ):
             for context in tuple(contexts):
                 entered.enter_context(context())
-            built = _built(build, Path(folder), limit)
+            built = _compile_object(build, Path(folder), limit)
             for each in tried:
-                _try(each, built)
-            stored = Cache(cache_directory()).store(_file(name, key), key, built.read_bytes())
+                _try_object(each, built)
+            stored = Cache(cache_directory()).store(
+                _object_file_name(name, key), key, built.read_bytes()
+            )
             for path in (stored, built):
                 # A folder may forbid execution; a loaded object stays when its file is deleted.
                 with suppress(OSError, RuntimeError):
@@ -467,7 +477,7 @@ def _made(
 
 
 @lru_cache(maxsize=1)
-def _announce() -> None:
+def _announce_compilation() -> None:
     """Log, once in a process, that the first flight of a robot waits for the compiler."""
     _LOG.info(
         "Compiling the equations of this robot: once, some seconds.", extra={ANNOUNCEMENT: True}
@@ -475,14 +485,14 @@ def _announce() -> None:
 
 
 @lru_cache(maxsize=1)
-def _c_library() -> str:
+def _c_library_version() -> str:
     """Return name and version of the C library, which objects refer to."""
     with suppress(AttributeError, ValueError, OSError):
         return os.confstr("CS_GNU_LIBC_VERSION") or ""
     return ""
 
 
-def _built(build: _Build, folder: Path, limit: float) -> Path:
+def _compile_object(build: _Build, folder: Path, limit: float) -> Path:
     """Return the object that the compiler makes in a folder."""
     source, built, output = (
         folder / f"function.{build.suffix}",
@@ -492,9 +502,9 @@ def _built(build: _Build, folder: Path, limit: float) -> Path:
     source.write_text(build.source, encoding="utf-8")
     compiler = build.compiler
     command = [compiler, *build.flags, "-o", str(built), str(source), *build.libraries, "-lm"]
-    code = _run(command, output, limit)
+    code = _run_compiler(command, output, limit)
     if code is None:
-        _hung.add(compiler)
+        _hung_compilations.add(compiler)
         raise _CompilationError(
             f"{compiler} did not end within {limit:g} s (SPACEROBOT_COMPILE_TIMEOUT)"
         )
@@ -507,7 +517,7 @@ def _built(build: _Build, folder: Path, limit: float) -> Path:
     return built
 
 
-def _run(command: list[str], output: Path, limit: float) -> int | None:
+def _run_compiler(command: list[str], output: Path, limit: float) -> int | None:
     """Run a command that ends with this process; return its exit code, None beyond the limit."""
     # Into a file: children of the command may hold a pipe open longer than the command runs. Its
     # temporary files are deleted with the folder.
@@ -524,7 +534,7 @@ def _run(command: list[str], output: Path, limit: float) -> int | None:
 
 # -- new objects ------------------------------------------------------------------------------
 
-_TRIAL = """
+_TRIAL_SCRIPT = """
 import ctypes, json, sys
 path, name, sizes, values, work = json.loads(sys.argv[1])
 library = ctypes.CDLL(path)
@@ -543,7 +553,7 @@ print(json.dumps([code, [list(o) for o in outputs]]))
 """
 
 
-def _try(function: ca.Function, path: Path) -> None:
+def _try_object(function: ca.Function, path: Path) -> None:
     """Have another process call a new object, and compare with the virtual machine.
 
     Raises
@@ -560,7 +570,9 @@ def _try(function: ca.Function, path: Path) -> None:
     task = json.dumps([str(path), function.name(), sizes, [v.tolist() for v in values], work])
     output = path.with_name("trial")
     # Isolated and without site: it starts in a few hundredths of a second.
-    code = _run([sys.executable, "-I", "-S", "-c", _TRIAL, task], output, _TRIAL_TIMEOUT)
+    code = _run_compiler(
+        [sys.executable, "-I", "-S", "-c", _TRIAL_SCRIPT, task], output, _TRIAL_TIMEOUT
+    )
     new = f"the compiled object of {function.name()}"
     if code != 0:
         raise _CompilationError(f"{new} failed when it was tried")
@@ -571,7 +583,9 @@ def _try(function: ca.Function, path: Path) -> None:
     for result, wanted in zip(results, expected, strict=True):
         there, here = np.array(result), np.array(wanted.nonzeros())
         with np.errstate(invalid="ignore"):
-            judged = np.isfinite(here) & (np.abs(here) < _BEYOND)
-            near = np.abs(there - here) <= _SAME * (1 + np.abs(here).max(initial=0, where=judged))
+            judged = np.isfinite(here) & (np.abs(here) < _LARGEST_COMPARED_RESULT)
+            near = np.abs(there - here) <= _LARGEST_DIFFERENCE * (
+                1 + np.abs(here).max(initial=0, where=judged)
+            )
         if failed or not np.all(near[judged]):
             raise _CompilationError(f"{new} gives other numbers than it should")

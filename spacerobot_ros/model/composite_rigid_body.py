@@ -240,18 +240,18 @@ def motion_forces(
     kin, qdot = parts.kin, parts.kin.spread(qdot)
     qddot = None if qddot is None else kin.spread(qddot)
     omegas, alphas = [omega], [ca.SX(3, 1)]
-    A, accelerations = [_turning(omega, ca.SX(3, 1))], [ca.SX(3, 1)]
+    A, accelerations = [_angular_operator(omega, ca.SX(3, 1))], [ca.SX(3, 1)]
     for k in range(1, kin.moving + 1):
         i = kin.parent(k)
         rate = kin.axis[k] * qdot[k - 1]
         push = ca.SX(3, 1) if qddot is None else kin.axis[k] * qddot[k - 1]
         # Not as a difference of origins, in which CasADi finds nothing to cancel or to share.
-        arm = kin.R[i] @ _constant(kin.robot.bodies[k].origin.r)
+        arm = kin.R[i] @ _to_constant(kin.robot.bodies[k].origin.r)
         if kin.is_revolute(k):
             accelerations.append(accelerations[i] + A[i] @ arm)
             omegas.append(omegas[i] + rate)
             alphas.append(alphas[i] + ca.cross(omegas[i], rate) + push)
-            A.append(_turning(omegas[k], alphas[k]))
+            A.append(_angular_operator(omegas[k], alphas[k]))
         else:
             arm = arm + kin.axis[k] * kin.theta[k - 1]
             accelerations.append(
@@ -350,7 +350,7 @@ def state_slices(n: int) -> tuple[slice, ...]:
 
 def shape_equations(kin: TreeKinematics) -> ca.Function:
     """Return the function ``(x, command) -> (K, Q)`` of ``K qddot = Q``."""
-    x, command = _symbols(kin)
+    x, command = _state_symbols(kin)
     system, _, _, Q = _equations(kin, x, command)
     inputs = {"x": x, "command": command, **kin.mass_properties.inputs}
     return dense_function("shape_equations", inputs, {"K": system.K, "Q": Q})
@@ -362,7 +362,7 @@ def state_rate(kin: TreeKinematics, *, holding: bool = False) -> ca.Function:
     With ``holding`` it takes a third argument ``free`` (n,): 1 for a joint that moves, 0 for one
     that is held at its present rate.
     """
-    x, command = _symbols(kin)
+    x, command = _state_symbols(kin)
     free = ca.SX.sym("free", kin.n) if holding else ca.DM.ones(kin.n)
     _, quaternion, qdot, p_W, _, _ = (x[part] for part in state_slices(kin.n))
     system, omega, external, Q = _equations(kin, x, command)
@@ -386,7 +386,7 @@ def state_rate(kin: TreeKinematics, *, holding: bool = False) -> ca.Function:
     return dense_function("holding_rate" if holding else "flight_rate", inputs, {"x_dot": x_dot})
 
 
-def _symbols(kin: TreeKinematics) -> tuple[ca.SX, ca.SX]:
+def _state_symbols(kin: TreeKinematics) -> tuple[ca.SX, ca.SX]:
     parts = [
         kin.q if name == "q" else ca.SX.sym(name, part.stop - part.start)
         for name, part in zip(
@@ -416,11 +416,11 @@ def _joint_motion(kin: TreeKinematics, k: int) -> ca.SX:
     return ca.vertcat(ca.SX(3, 1), kin.axis[k])
 
 
-def _turning(omega: ca.SX, alpha: ca.SX) -> ca.SX:
+def _angular_operator(omega: ca.SX, alpha: ca.SX) -> ca.SX:
     """Return ``hat(alpha) + hat(omega)^2`` (3, 3)."""
     squares = symmetric(omega @ omega.T)
     return ca.skew(alpha) - rotational(squares)
 
 
-def _constant(vector: Array) -> ca.DM:
+def _to_constant(vector: Array) -> ca.DM:
     return ca.sparsify(ca.DM(vector))

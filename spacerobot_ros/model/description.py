@@ -235,7 +235,7 @@ class RobotDescription:
 
     def with_links(self, links: tuple[Link, ...]) -> RobotDescription:
         """Return the robot with other links of the same names and the same ``urdf``."""
-        return self._rebuilt(links, self.joints)
+        return self._with_tree(links, self.joints)
 
     def with_locked(self, positions: Mapping[str, float]) -> RobotDescription:
         """Return the robot with joints fixed at positions (m or rad) by their names.
@@ -260,7 +260,7 @@ class RobotDescription:
                 joints.append(joint.locked(at))
             else:
                 joints.append(joint)
-        return self._rebuilt(self.links, tuple(joints))
+        return self._with_tree(self.links, tuple(joints))
 
     def with_model_error(self, error: float, seed: int) -> RobotDescription:
         """Return the robot with random errors of all masses and inertias.
@@ -284,7 +284,7 @@ class RobotDescription:
             links.append(replace(link, inertia=believed))
         return self.with_links(tuple(links))
 
-    def _rebuilt(self, links: tuple[Link, ...], joints: tuple[Joint, ...]) -> RobotDescription:
+    def _with_tree(self, links: tuple[Link, ...], joints: tuple[Joint, ...]) -> RobotDescription:
         bodies, frames = weld({link.name: link for link in links}, joints)
         return replace(self, links=links, joints=joints, bodies=tuple(bodies), frames=frames)
 

@@ -21,7 +21,7 @@ from spacerobot_ros.model.description import Array, Inertia, RobotDescription
 TRIANGLE_SLACK = 0.01
 """Relative violation of the triangle inequality that rounded principal moments may have."""
 
-_ROUNDING = 1e-12
+_ROUNDING_ERROR = 1e-12
 
 PER_BODY = 10
 """Numbers per body in :attr:`InertialParameters.vector`."""
@@ -171,7 +171,7 @@ class InertialParameters:
             raise RobotDescriptionError("The total mass of the robot is zero.")
         tensors = self.inertias.reshape(-1, len(names), 3, 3)
         low, middle, high = np.moveaxis(np.linalg.eigvalsh(tensors), -1, 0)
-        slack = _ROUNDING * np.maximum(1.0, high)
+        slack = _ROUNDING_ERROR * np.maximum(1.0, high)
         impossible = (low < -slack) | (high > (1 + TRIANGLE_SLACK) * (low + middle) + slack)
         if impossible.any():
             row, body_index = np.argwhere(impossible)[0]
@@ -216,14 +216,14 @@ class MassProperties:
         self._inertias = [body.inertia for body in robot.bodies]
         self.masses: tuple[float | ca.SX, ...] = tuple(each.mass for each in self._inertias)
         self.centers: tuple[ca.DM | ca.SX, ...] = tuple(
-            _constant(each.com) for each in self._inertias
+            _to_constant(each.com) for each in self._inertias
         )
         self.total: float | ca.SX = robot.total_mass
         self.inputs: dict[str, ca.SX] = {}
 
     def inertia(self, k: int, R: ca.SX) -> ca.SX:
         """Return the inertia (3, 3) of body k about its centre, turned by R, kg m^2."""
-        return R @ _constant(self._inertias[k].about_com) @ R.T
+        return R @ _to_constant(self._inertias[k].about_com) @ R.T
 
     def second_moment(self, k: int, R: ca.SX) -> ca.SX:
         """Return the second moment of mass ``tr(I)/2 1 - I`` (3, 3) of body k, turned by R, kg m^2.
@@ -235,7 +235,7 @@ class MassProperties:
         moments, axes = np.linalg.eigh(np.trace(about) / 2 * np.eye(3) - about)
         J = moments[1] * ca.SX.eye(3)
         for moment, axis in ((moments[0], axes[:, 0]), (moments[2], axes[:, 2])):
-            u = R @ _constant(axis)
+            u = R @ _to_constant(axis)
             J = J + symmetric(((moment - moments[1]) * u) @ u.T)
         return J
 
@@ -308,5 +308,5 @@ def symmetric(matrix: ca.SX) -> ca.SX:
     return ca.tril2symm(ca.tril(matrix))
 
 
-def _constant(array: Array) -> ca.DM:
+def _to_constant(array: Array) -> ca.DM:
     return ca.sparsify(ca.DM(array))

@@ -39,7 +39,7 @@ def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
     after the step. The four stages call one piece of code: inlined it would be 6 % faster and take
     six times as long to compile.
     """
-    x, held = _arguments(rate)
+    x, held = _symbols_for_inputs(rate)
     h = ca.MX.sym("h")
     k1 = rate(x, *held)
     k2 = rate(x + h / 2 * k1, *held)
@@ -59,7 +59,7 @@ def repeated(step: ca.Function, count: int) -> ca.Function:
     """
     if count == 1:
         return step
-    x, held = _arguments(step)
+    x, held = _symbols_for_inputs(step)
     half = repeated(step, count // 2)
     x_next = half(half(x, *held), *held)
     if count % 2:
@@ -104,7 +104,7 @@ def attitude_step(locked_inertia: ca.Function) -> ca.Function:
     return ca.Function("attitude_step", [x, qdot, L_W, h, *p], [ca.cse(x_next)])
 
 
-def _arguments(function: ca.Function) -> tuple[ca.MX, list[ca.MX]]:
+def _symbols_for_inputs(function: ca.Function) -> tuple[ca.MX, list[ca.MX]]:
     x, *held = (
         ca.MX.sym(function.name_in(i), function.size1_in(i)) for i in range(function.n_in())
     )

@@ -119,7 +119,7 @@ class TreeKinematics:
     def frame(self, link: str) -> tuple[ca.SX, ca.SX, int]:
         """Return attitude (3, 3), position (3,) in B, and the body, of a link's frame."""
         body, pose = self.robot.frames[link]
-        R, r = _chain(self.R[body], self.p[body], pose)
+        R, r = _chain_pose(self.R[body], self.p[body], pose)
         return R, r, body
 
     def angular_jacobian(self, k: int) -> ca.SX:
@@ -131,7 +131,7 @@ class TreeKinematics:
         return self.gather(F.T).T
 
 
-def _chain(R: ca.SX, p: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
+def _chain_pose(R: ca.SX, p: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
     return R @ ca.sparsify(ca.DM(pose.R)), p + R @ ca.sparsify(ca.DM(pose.r))
 
 
@@ -164,7 +164,7 @@ def tree_kinematics(
     for k, body in enumerate(robot.bodies[1:], start=1):
         joint = body.joint
         assert joint is not None
-        R_joint, p_joint = _chain(R[body.parent], p[body.parent], body.origin)
+        R_joint, p_joint = _chain_pose(R[body.parent], p[body.parent], body.origin)
         direction = R_joint @ ca.sparsify(ca.DM(joint.axis))
         if joint.kind is JointKind.PRISMATIC:
             R.append(R_joint)
@@ -186,7 +186,7 @@ def tree_kinematics(
 def link_quaternion(description: RobotDescription, link: str, q: ca.SX) -> ca.SX:
     """Return the quaternion (4,) of ``R_BL``, smooth in q: no matrix is turned into it."""
     index, pose = description.frames[link]
-    quaternion, theta = _constant(pose.R), joint_positions(description, q)
+    quaternion, theta = _to_constant(pose.R), joint_positions(description, q)
     while index > 0:
         body = description.bodies[index]
         assert body.joint is not None
@@ -194,12 +194,12 @@ def link_quaternion(description: RobotDescription, link: str, q: ca.SX) -> ca.SX
             half = theta[index - 1] / 2
             turn = ca.vertcat(ca.sin(half) * ca.DM(body.joint.axis), ca.cos(half))
             quaternion = quaternion_multiply(turn, quaternion)
-        quaternion = quaternion_multiply(_constant(body.origin.R), quaternion)
+        quaternion = quaternion_multiply(_to_constant(body.origin.R), quaternion)
         index = body.parent
     return quaternion
 
 
-def _constant(R: Array) -> ca.DM:
+def _to_constant(R: Array) -> ca.DM:
     return ca.sparsify(ca.DM(quaternion_from_matrix(R)))
 
 
@@ -244,8 +244,10 @@ class ForwardKinematics:
         fixed = [joint for joint in robot.joints if joint.kind is JointKind.FIXED]
         self.moving: Frames = tuple((joint.parent, joint.child) for joint in moving)
         self.fixed: Frames = tuple((joint.parent, joint.child) for joint in fixed)
-        self.fixed_transforms = np.array([_at_zero(joint) for joint in fixed]).reshape(-1, 7)
-        self.transforms = np.array([_at_zero(joint) for joint in moving]).reshape(-1, 7)
+        self.fixed_transforms = np.array([_transform_at_zero(joint) for joint in fixed]).reshape(
+            -1, 7
+        )
+        self.transforms = np.array([_transform_at_zero(joint) for joint in moving]).reshape(-1, 7)
         follows = [joint.mimic or Mimic(joint.name, 1.0, 0.0) for joint in moving]
         self._index = np.array([names.index(each.joint) for each in follows], dtype=int)
         self._factor = np.array([each.multiplier for each in follows])
@@ -267,15 +269,15 @@ class ForwardKinematics:
 
     def update(self, q: Array) -> None:
         """Write the transforms at positions (n,) of the joints, m or rad."""
-        self._write(self.transforms, q)
+        self._write_transforms(self.transforms, q)
 
     def transforms_at(self, q: Array) -> Array:
         """Return the transforms (..., k, 7) at positions (..., n) of the joints, m or rad."""
         transforms = np.empty((*q.shape[:-1], *self.transforms.shape))
-        self._write(transforms, q)
+        self._write_transforms(transforms, q)
         return transforms
 
-    def _write(self, transforms: Array, q: Array) -> None:
+    def _write_transforms(self, transforms: Array, q: Array) -> None:
         moved = self._factor * q[..., self._index] + self._offset
         half = self._half * moved
         transforms[..., :3] = self._position + moved[..., None] * self._direction
@@ -304,5 +306,5 @@ class ForwardKinematics:
         return R, r
 
 
-def _at_zero(joint: Joint) -> Array:
+def _transform_at_zero(joint: Joint) -> Array:
     return np.concatenate([joint.origin.r, quaternion_from_matrix(joint.origin.R)])

@@ -30,24 +30,24 @@ from spacerobot_ros.errors import MeshError, SpaceRobotError
 from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.resources import share_directory
 
-_MOST_BYTES = 100_000_000
+_MOST_MESH_BYTES = 100_000_000
 _MOST_TRIANGLES = 2_000_000
 
-_LARGEST = 1e6
+_LARGEST_COORDINATE = 1e6
 """Coordinates beyond that are a damaged file's, in whatever unit."""
 
-_HEADER = 84
+_STL_HEADER_BYTES = 84
 """Bytes of a binary STL before its triangles: a text of 80, and their number."""
 
-_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
-_VERTEX = re.compile(rb"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)\s*$", re.MULTILINE)
+_STL_VERTEX_PATTERN = re.compile(rb"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)\s*$", re.MULTILINE)
 
-_MESH_NAME = re.compile(
+_MESH_FILE_PATTERN = re.compile(
     r"""(?P<before><mesh\b[^>]*?\bfilename\s*=\s*["'])(?P<file>[^"']+)(?P<after>["'])"""
 )
 
-_OF_TRIMESH = (".dae", ".glb", ".gltf", ".ply")
+_TRIMESH_SUFFIXES = (".dae", ".glb", ".gltf", ".ply")
 
 Faces = npt.NDArray[np.int32]
 
@@ -114,7 +114,7 @@ def with_mesh_files(text: str, find: Callable[[str], Path | None]) -> str:
             return match[0]
         return f"{match['before']}file://{quote(str(found))}{match['after']}"
 
-    return _MESH_NAME.sub(absolute, text)
+    return _MESH_FILE_PATTERN.sub(absolute, text)
 
 
 def mesh_beside(resource: str, folder: Path) -> Path | None:
@@ -139,7 +139,7 @@ def mesh_file(resource: str) -> Path | None:
     """
     url = urlparse(resource)
     if url.scheme == "package":
-        folder = _package(url.netloc)
+        folder = _package_folder(url.netloc)
         path = None if folder is None else folder / unquote(url.path).lstrip("/")
     elif url.scheme in ("file", ""):
         path = Path(unquote(url.path))
@@ -148,7 +148,7 @@ def mesh_file(resource: str) -> Path | None:
     return path if path is not None and path.is_file() else None
 
 
-def _package(name: str) -> Path | None:
+def _package_folder(name: str) -> Path | None:
     if name == "spacerobot_ros":
         return share_directory()
     try:
@@ -193,16 +193,16 @@ def read_mesh(path: str | Path) -> TriangleMesh:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in (".stl", ".obj", *_OF_TRIMESH):
+    if suffix not in (".stl", ".obj", *_TRIMESH_SUFFIXES):
         raise MeshError(
             f"The mesh {path} is of no kind that can be read (STL, OBJ, COLLADA, glTF, PLY): "
             "convert it to STL."
         )
     try:
-        if (size := path.stat().st_size) > _MOST_BYTES:
+        if (size := path.stat().st_size) > _MOST_MESH_BYTES:
             raise MeshError(
-                f"The mesh {path} has {size / 1e6:.0f} MB; at most {_MOST_BYTES / 1e6:.0f} MB are "
-                "read. Make it coarser."
+                f"The mesh {path} has {size / 1e6:.0f} MB; at most "
+                f"{_MOST_MESH_BYTES / 1e6:.0f} MB are read. Make it coarser."
             )
         data = path.read_bytes()
     except OSError as error:
@@ -214,7 +214,7 @@ def read_mesh(path: str | Path) -> TriangleMesh:
             mesh = _read_obj(data)
         else:
             mesh = _read_by_trimesh(path, data)
-        return _checked(mesh)
+        return _require_sound_mesh(mesh)
     except _DamagedError as error:
         raise MeshError(f"The mesh {path} cannot be read: {error}.") from error
 
@@ -228,7 +228,7 @@ def mesh_of_stl(data: bytes, name: str) -> TriangleMesh:
         It is damaged or too large; the message calls it ``name``.
     """
     try:
-        return _checked(_read_stl(data))
+        return _require_sound_mesh(_read_stl(data))
     except _DamagedError as error:
         raise MeshError(f"The mesh {name} cannot be read: {error}.") from error
 
@@ -236,7 +236,7 @@ def mesh_of_stl(data: bytes, name: str) -> TriangleMesh:
 def stl_of(mesh: TriangleMesh) -> bytes:
     """Return a mesh as binary STL, which has no unit and whose numbers have seven digits."""
     corners = mesh.vertices[mesh.faces]
-    made = np.zeros(len(corners), _TRIANGLE)
+    made = np.zeros(len(corners), _STL_TRIANGLE)
     made["corners"] = corners
     a, b, c = np.moveaxis(corners, 1, 0)
     normals = np.cross(b - a, c - a)
@@ -249,15 +249,15 @@ class _DamagedError(Exception):
     """A flaw of the content of a file, as a clause."""
 
 
-def _checked(mesh: TriangleMesh) -> TriangleMesh:
+def _require_sound_mesh(mesh: TriangleMesh) -> TriangleMesh:
     """Return a mesh without faces of no area, refusing numbers and indices that none has."""
     vertices, faces = mesh.vertices, mesh.faces
     if len(faces) > _MOST_TRIANGLES:
         raise _DamagedError(
             f"it has {len(faces)} triangles, and at most {_MOST_TRIANGLES} are read"
         )
-    if not np.all(np.abs(vertices) < _LARGEST):  # A NaN is not below it either.
-        raise _DamagedError(f"a coordinate is not finite, or beyond {_LARGEST:g}")
+    if not np.all(np.abs(vertices) < _LARGEST_COORDINATE):  # A NaN is not below it either.
+        raise _DamagedError(f"a coordinate is not finite, or beyond {_LARGEST_COORDINATE:g}")
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise _DamagedError("a face names a vertex that is not there")
     faces = _without_slivers(faces)
@@ -274,22 +274,22 @@ def _without_slivers(faces: Faces) -> Faces:
 
 def _read_stl(data: bytes) -> TriangleMesh:
     """Read STL, binary where its length is what its header says, or else text."""
-    if len(data) >= _HEADER:
-        count = int.from_bytes(data[80:_HEADER], "little")
-        if len(data) >= _HEADER + count * _TRIANGLE.itemsize and (
+    if len(data) >= _STL_HEADER_BYTES:
+        count = int.from_bytes(data[80:_STL_HEADER_BYTES], "little")
+        if len(data) >= _STL_HEADER_BYTES + count * _STL_TRIANGLE.itemsize and (
             not data[:80].lstrip().startswith(b"solid")
-            or len(data) == _HEADER + count * _TRIANGLE.itemsize
+            or len(data) == _STL_HEADER_BYTES + count * _STL_TRIANGLE.itemsize
         ):
-            triangles = np.frombuffer(data, _TRIANGLE, count, _HEADER)
+            triangles = np.frombuffer(data, _STL_TRIANGLE, count, _STL_HEADER_BYTES)
             return joined(triangles["corners"].reshape(-1, 3))
     if not data.lstrip().startswith(b"solid"):
         raise _DamagedError("it is no STL, or the file is cut")
     if b"endsolid" not in data:
         raise _DamagedError("its end is missing: the file is cut")
-    corners = _VERTEX.findall(data)
+    corners = _STL_VERTEX_PATTERN.findall(data)
     if len(corners) % 3:
         raise _DamagedError("a triangle has not three corners")
-    return joined(_numbers(corners).reshape(-1, 3))
+    return joined(_parse_coordinates(corners).reshape(-1, 3))
 
 
 def joined(corners: npt.NDArray[Any]) -> TriangleMesh:
@@ -303,7 +303,7 @@ def joined(corners: npt.NDArray[Any]) -> TriangleMesh:
     return TriangleMesh(rows[first].astype(float), inverse.reshape(-1, 3).astype(np.int32))
 
 
-def _numbers(texts: Any) -> Array:
+def _parse_coordinates(texts: Any) -> Array:
     try:
         return np.array(texts, dtype=bytes).astype(float)
     except ValueError:
@@ -323,22 +323,22 @@ def _read_obj(data: bytes) -> TriangleMesh:
                 raise _DamagedError("a vertex has not three coordinates")
             corners.append(words[1:4])
         elif words[0] == b"f":
-            face = [_index(word, len(corners)) for word in words[1:]]
+            face = [_parse_corner_index(word, len(corners)) for word in words[1:]]
             faces += [(face[0], a, b) for a, b in pairwise(face[1:])]
             if len(faces) > _MOST_TRIANGLES:
                 raise _DamagedError(f"it has more than {_MOST_TRIANGLES} triangles")
     return TriangleMesh(
-        _numbers(corners).reshape(-1, 3), np.array(faces, dtype=np.int32).reshape(-1, 3)
+        _parse_coordinates(corners).reshape(-1, 3), np.array(faces, dtype=np.int32).reshape(-1, 3)
     )
 
 
-def _index(word: bytes, count: int) -> int:
+def _parse_corner_index(word: bytes, count: int) -> int:
     """Return the index from 0 of a corner ``v/vt/vn``; files count from 1, or from the last -1."""
     try:
         number = int(word.split(b"/")[0])
     except ValueError:
         raise _DamagedError("a corner of a face is no number") from None
-    if not 0 < abs(number) <= _MOST_BYTES:
+    if not 0 < abs(number) <= _MOST_MESH_BYTES:
         raise _DamagedError("a face names a vertex that is not there")
     return number - 1 if number > 0 else count + number
 
@@ -363,15 +363,15 @@ def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
         faces = np.asarray(found.faces, dtype=np.int32).reshape(-1, 3)
     except Exception as error:  # Each parser of trimesh has its own.
         raise _DamagedError(f"trimesh says {type(error).__name__}") from error
-    return TriangleMesh(vertices * _unit(path, data), faces)
+    return TriangleMesh(vertices * _unit_in_metres(path, data), faces)
 
 
-def _unit(path: Path, data: bytes) -> float:
+def _unit_in_metres(path: Path, data: bytes) -> float:
     """Return the unit of a COLLADA file in m; those of the other formats are m."""
     if path.suffix.lower() != ".dae":
         return 1.0
     found = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']+)[\"']", data)
-    unit = 1.0 if found is None else float(_numbers([found[1]])[0])
-    if not 0 < unit < _LARGEST:
+    unit = 1.0 if found is None else float(_parse_coordinates([found[1]])[0])
+    if not 0 < unit < _LARGEST_COORDINATE:
         raise _DamagedError("its unit is no length")
     return unit

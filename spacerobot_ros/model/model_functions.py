@@ -80,7 +80,7 @@ class ModelFunctions:
     @classmethod
     def of(cls, robot: RobotDescription) -> ModelFunctions:
         """Return the model with a robot's constants; equal robots of a process share it."""
-        return _of_equal(_Equal(hashlib.sha256(pickle.dumps(robot)).hexdigest(), robot))
+        return _model_of_key(_RobotKey(hashlib.sha256(pickle.dumps(robot)).hexdigest(), robot))
 
     def function(self, name: str, *, compile: bool = True) -> ca.Function:
         """Return a function of the model by name (the keys of ``_builders``).
@@ -152,7 +152,7 @@ class ModelFunctions:
             "holding_step": lambda: self._flight_step(holding=True),
             "joint_efforts": self._joint_efforts,
             "jacobian": self._jacobian,
-            "connection": lambda: self._shape_function("connection", self._A),
+            "connection": lambda: self._shape_function("connection", self._connection),
             "curvature": self._curvature,
             "momentum": self._momentum,
             "base_twist": self._base_twist,
@@ -162,16 +162,20 @@ class ModelFunctions:
         }
 
     @cached_property
-    def _A(self) -> ca.SX:
+    def _connection(self) -> ca.SX:
         return connection(self._kin, self._inertia)
 
-    def _dense(self, name: str, inputs: dict[str, ca.SX], outputs: dict[str, ca.SX]) -> ca.Function:
+    def _dense_model_function(
+        self, name: str, inputs: dict[str, ca.SX], outputs: dict[str, ca.SX]
+    ) -> ca.Function:
         """Return a function of the model; symbolic mass properties become its last input."""
         return dense_function(name, inputs | self._kin.mass_properties.inputs, outputs)
 
     def _shape_function(self, name: str, *outputs: ca.SX) -> ca.Function:
         names = ["result"] if len(outputs) == 1 else [f"result_{i}" for i in range(len(outputs))]
-        return self._dense(name, {"q": self._kin.q}, dict(zip(names, outputs, strict=True)))
+        return self._dense_model_function(
+            name, {"q": self._kin.q}, dict(zip(names, outputs, strict=True))
+        )
 
     def _locked_inertia(self) -> ca.Function:
         return self._shape_function("locked_inertia", self._inertia.D, self._inertia.D_q)
@@ -180,9 +184,11 @@ class ModelFunctions:
         frames = [self._kin.frame(link) for link in self.link_names]
         R = ca.horzcat(*(frame[0] for frame in frames))
         r = ca.horzcat(*(frame[1] for frame in frames))
-        return self._dense("link_poses", {"q": self._kin.q}, {"R_BL": R, "r_BL_B": r})
+        return self._dense_model_function(
+            "link_poses", {"q": self._kin.q}, {"R_BL": R, "r_BL_B": r}
+        )
 
-    def _state(self, v: str, *, quaternion: bool = False) -> dict[str, ca.SX]:
+    def _state_symbols(self, v: str, *, quaternion: bool = False) -> dict[str, ca.SX]:
         """Return symbols of shape and velocities by name; ``v`` is the name of the linear one."""
         attitude = {"quaternion_WB": ca.SX.sym("quaternion", 4)} if quaternion else {}
         return {
@@ -194,27 +200,27 @@ class ModelFunctions:
         }
 
     def _bias(self) -> ca.Function:
-        state = self._state("v_cm_B")
+        state = self._state_symbols("v_cm_B")
         _, *velocities = state.values()
-        return self._dense("bias", state, {"C_plus": bias(self._kin, *velocities)})
+        return self._dense_model_function("bias", state, {"C_plus": bias(self._kin, *velocities)})
 
     def _forward_dynamics(self) -> ca.Function:
-        state = self._state("v_cm_B")
+        state = self._state_symbols("v_cm_B")
         _, *velocities = state.values()
         wrench, tau = ca.SX.sym("wrench_B", 6), ca.SX.sym("tau", self.n)
         forces = generalised_forces(self._kin, wrench, tau)
         inertia = barycentric_inertia(self._kin)
         acceleration = forward_dynamics(inertia, bias(self._kin, *velocities), forces)
         inputs = {**state, "wrench_B": wrench, "tau": tau}
-        return self._dense("forward_dynamics", inputs, {"z0ddot": acceleration})
+        return self._dense_model_function("forward_dynamics", inputs, {"z0ddot": acceleration})
 
     def _dynamics(self) -> ca.Function:
         """The same function as ``forward_dynamics``, by fewer operations."""
-        state = self._state("v_cm_B")
+        state = self._state_symbols("v_cm_B")
         _, *velocities = state.values()
         forces = {"wrench_B": ca.SX.sym("wrench_B", 6), "tau": ca.SX.sym("tau", self.n)}
         acceleration = composite_dynamics(self._kin, *velocities, *forces.values())
-        return self._dense("dynamics", {**state, **forces}, {"z0ddot": acceleration})
+        return self._dense_model_function("dynamics", {**state, **forces}, {"z0ddot": acceleration})
 
     def _flight_step(self, *, holding: bool = False) -> ca.Function:
         rate = state_rate(self._kin, holding=holding)
@@ -223,7 +229,9 @@ class ModelFunctions:
     def _joint_efforts(self) -> ca.Function:
         rates = {"qdot": ca.SX.sym("qdot", self.n), "qddot": ca.SX.sym("qddot", self.n)}
         efforts = joint_efforts(self._kin, *rates.values())
-        return self._dense("joint_efforts", {"q": self._kin.q, **rates}, {"tau": efforts})
+        return self._dense_model_function(
+            "joint_efforts", {"q": self._kin.q, **rates}, {"tau": efforts}
+        )
 
     def _jacobian(self, link: str) -> ca.Function:
         index = self.link_index(link)
@@ -231,7 +239,7 @@ class ModelFunctions:
 
     def _curvature(self) -> ca.Function:
         def derived() -> ca.Function:
-            K = curvature(self._A, self._kin.q)
+            K = curvature(self._connection, self._kin.q)
             # Columns run over i fastest: reshaped in Fortran order this is (6, i, j).
             stacked = ca.horzcat(*(K[i][j] for j in range(self.n) for i in range(self.n)))
             return self._shape_function("curvature", stacked)
@@ -241,12 +249,12 @@ class ModelFunctions:
         return kept_function("curvature", key, derived, compiling=False)
 
     def _momentum(self) -> ca.Function:
-        state = self._state("v_WB_B", quaternion=True)
+        state = self._state_symbols("v_WB_B", quaternion=True)
         quaternion, _, *velocities = state.values()
         R_WB = matrix_from_quaternion(quaternion)
         p_B, L_B, energy = momentum_of_bodies(self._kin, *velocities)
         outputs = {"p_W": R_WB @ p_B, "L_W": R_WB @ L_B, "energy": energy}
-        return self._dense("momentum", state, outputs)
+        return self._dense_model_function("momentum", state, outputs)
 
     def _base_twist(self) -> ca.Function:
         qdot = ca.SX.sym("qdot", self.n)
@@ -255,13 +263,13 @@ class ModelFunctions:
         v, omega = base_twist(self._kin, self._inertia, qdot, R_BW @ p_W, R_BW @ L_W)
         inputs = {"quaternion_WB": quaternion, "q": self._kin.q, "qdot": qdot}
         inputs |= {"p_W": p_W, "L_W": L_W}
-        return self._dense("base_twist", inputs, {"v_WB_B": v, "omega_WB_B": omega})
+        return self._dense_model_function("base_twist", inputs, {"v_WB_B": v, "omega_WB_B": omega})
 
     def _rotate(self) -> ca.Function:
         quaternion, vector = ca.SX.sym("quaternion", 4), ca.SX.sym("vector", 3)
         rotated = matrix_from_quaternion(quaternion) @ vector
         inputs = {"quaternion_WB": quaternion, "vector_B": vector}
-        return self._dense("rotate", inputs, {"vector_W": rotated})
+        return self._dense_model_function("rotate", inputs, {"vector_W": rotated})
 
     def _velocity_step(self, substeps: str) -> ca.Function:
         count = int(substeps)
@@ -288,20 +296,20 @@ class ModelFunctions:
         )
 
 
-_MOST_BUILDS = 8
+_MOST_SYMBOLIC_MODELS = 8
 """Number of models in each cache; the least recently used is dropped first."""
 
 
 @dataclass(frozen=True)
-class _Equal:
+class _RobotKey:
     """A robot identified by a hash of its whole description."""
 
     key: str
     robot: RobotDescription = field(compare=False)
 
 
-@lru_cache(maxsize=_MOST_BUILDS)
-def _of_equal(equal: _Equal) -> ModelFunctions:
+@lru_cache(maxsize=_MOST_SYMBOLIC_MODELS)
+def _model_of_key(equal: _RobotKey) -> ModelFunctions:
     return ModelFunctions(equal.robot)
 
 
@@ -346,11 +354,11 @@ class SymbolicModels:
     def of(cls, robot: RobotDescription) -> SymbolicModels:
         """Return the models of all robots that differ from this one in mass properties alone."""
         free = free_entries(InertialParameters.of(robot))
-        key = _build_key(robot, free)
-        found = _builds.pop(key, None) or cls(robot, free)
-        _builds[key] = found
-        if len(_builds) > _MOST_BUILDS:
-            del _builds[next(iter(_builds))]
+        key = _structure_key(robot, free)
+        found = _symbolic_models.pop(key, None) or cls(robot, free)
+        _symbolic_models[key] = found
+        if len(_symbolic_models) > _MOST_SYMBOLIC_MODELS:
+            del _symbolic_models[next(iter(_symbolic_models))]
         return found
 
     def model(self, parameters: InertialParameters) -> tuple[ModelFunctions, Array]:
@@ -367,10 +375,10 @@ class SymbolicModels:
         return self._models[usual], np.ascontiguousarray(vector[..., free])
 
 
-_builds: dict[str, SymbolicModels] = {}
+_symbolic_models: dict[str, SymbolicModels] = {}
 
 
-def _build_key(robot: RobotDescription, free: npt.NDArray[np.bool_]) -> str:
+def _structure_key(robot: RobotDescription, free: npt.NDArray[np.bool_]) -> str:
     """Return a hash of a description without its mass properties."""
     bodies = [(body.name, body.joint, body.parent, body.origin) for body in robot.bodies]
     facts = (robot.name, bodies, robot.frames, [link.name for link in robot.links], free)

@@ -62,7 +62,7 @@ def robot_of(config: RobotConfig) -> SpaceRobot | None:
         path = robot_file(config.robot)
     except ParameterError as error:
         raise ParameterError(f"Parameter 'robot' is '{config.robot}'. {error}") from None
-    return _believed(load_robot(path), config)
+    return _with_model_error(load_robot(path), config)
 
 
 def robot_from_text(text: str, config: RobotConfig) -> SpaceRobot:
@@ -73,10 +73,10 @@ def robot_from_text(text: str, config: RobotConfig) -> SpaceRobot:
     RobotDescriptionError
         The URDF is refused.
     """
-    return _believed(parse_robot(text), config)
+    return _with_model_error(parse_robot(text), config)
 
 
-def _believed(true: RobotDescription, config: RobotConfig) -> SpaceRobot:
+def _with_model_error(true: RobotDescription, config: RobotConfig) -> SpaceRobot:
     believed = config.believed(true)
     # Models with other mass properties share their compiled functions.
     return SpaceRobot(believed, None if believed is true else SymbolicModels.of(true))

@@ -22,7 +22,7 @@ from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions, SymbolicModels
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 
-_NO_MOTION = 1e-6
+_LEAST_RELATIVE_INERTIA = 1e-6
 """Component of a joint in a motion without inertia below which the joint does not take part."""
 
 
@@ -103,7 +103,7 @@ class SpaceRobot:
 
     def center_of_mass(self, q: npt.ArrayLike) -> Array:
         """Return ``r_BC_B`` (3,), m: the system's centre of mass from the base origin."""
-        return self._call("center_of_mass", q)[0]
+        return self._call_function("center_of_mass", q)[0]
 
     def link_pose(self, link: str, q: npt.ArrayLike) -> tuple[Array, Array]:
         """Return ``(R_BL (3, 3), r_BL_B (3,))`` of a link's frame in the base.
@@ -114,12 +114,12 @@ class SpaceRobot:
             There is no such link.
         """
         index = self._model.link_index(link)
-        R, r = self._call("link_poses", q)
+        R, r = self._call_function("link_poses", q)
         return R[:, 3 * index : 3 * index + 3], r.reshape((3, -1), order="F")[:, index]
 
     def inertia_matrix(self, q: npt.ArrayLike) -> Array:
         """Return ``H+`` (6 + n, 6 + n) of ``[v_cm; omega; qdot]``, base components (eq. 15)."""
-        return self._call("inertia_matrix", q)[0]
+        return self._call_function("inertia_matrix", q)[0]
 
     def bias(
         self,
@@ -129,7 +129,7 @@ class SpaceRobot:
         qdot: npt.ArrayLike,
     ) -> Array:
         """Return ``C+`` (6 + n,): the velocity terms of paper 4, eq. (19)."""
-        return self._call("bias", q, v_cm_B, omega_WB_B, qdot)[0]
+        return self._call_function("bias", q, v_cm_B, omega_WB_B, qdot)[0]
 
     def forward_dynamics(
         self,
@@ -144,14 +144,16 @@ class SpaceRobot:
 
         ``wrench_B`` (6,) is force (N) over torque (N m) at the base origin, ``tau`` (n,) efforts.
         """
-        return self._call("forward_dynamics", q, v_cm_B, omega_WB_B, qdot, wrench_B, tau)[0]
+        return self._call_function("forward_dynamics", q, v_cm_B, omega_WB_B, qdot, wrench_B, tau)[
+            0
+        ]
 
     def joint_efforts(self, q: npt.ArrayLike, qdot: npt.ArrayLike, qddot: npt.ArrayLike) -> Array:
         """Return the efforts (n,), N or N m, of a motion of the shape at zero momentum.
 
         No wrench acts on the base, which moves as the momenta demand.
         """
-        return self._call("joint_efforts", q, qdot, qddot)[0]
+        return self._call_function("joint_efforts", q, qdot, qddot)[0]
 
     def jacobian(self, link: str, q: npt.ArrayLike) -> Array:
         """Return ``0J+`` (6, 6 + n) of a link's frame origin (paper 4, eq. 10), base components.
@@ -164,18 +166,18 @@ class SpaceRobot:
             There is no such link.
         """
         self._model.link_index(link)
-        return self._call(f"jacobian:{link}", q)[0]
+        return self._call_function(f"jacobian:{link}", q)[0]
 
     def connection(self, q: npt.ArrayLike) -> Array:
         """Return ``A(q)`` (6, n): ``[v_WB_B; omega_WB_B] = -A qdot`` at zero momentum (paper 1)."""
-        return self._call("connection", q)[0].reshape((6, self.n), order="F")
+        return self._call_function("connection", q)[0].reshape((6, self.n), order="F")
 
     def curvature(self, q: npt.ArrayLike) -> Array:
         """Return ``K`` (6, n, n) of ``F = -A``: ``dF_j/dq_i - dF_i/dq_j + [F_i, F_j]``.
 
         A small loop counter-clockwise in (q_i, q_j) displaces the base by ``K[:, i, j] * area``.
         """
-        stacked = self._call("curvature", q)[0]
+        stacked = self._call_function("curvature", q)[0]
         return stacked.reshape((6, self.n, self.n), order="F")
 
     def lie_brackets(self, q: npt.ArrayLike) -> Array:
@@ -196,7 +198,7 @@ class SpaceRobot:
         """Return linear momentum (3,) in kg m/s and angular momentum about the system's centre of
         mass (3,) in kg m^2/s, both in W, and kinetic energy in J; summed body by body.
         """
-        p, L, energy = self._call("momentum", quaternion_WB, q, v_WB_B, omega_WB_B, qdot)
+        p, L, energy = self._call_function("momentum", quaternion_WB, q, v_WB_B, omega_WB_B, qdot)
         return p, L, float(energy[0])
 
     def base_twist(
@@ -208,7 +210,7 @@ class SpaceRobot:
         L_W: npt.ArrayLike = (0, 0, 0),
     ) -> tuple[Array, Array]:
         """Return ``(v_WB_B, omega_WB_B)`` at given joint rates and momenta (L about the CM)."""
-        v, omega = self._call("base_twist", quaternion_WB, q, qdot, p_W, L_W)
+        v, omega = self._call_function("base_twist", quaternion_WB, q, qdot, p_W, L_W)
         return v, omega
 
     # -- compiled functions -------------------------------------------------------------------
@@ -219,7 +221,7 @@ class SpaceRobot:
 
         ``compile=False`` gives the symbolic function, to compose larger ones from.
         """
-        return self._numbers.function(name, compile=compile)
+        return self._numeric_model.function(name, compile=compile)
 
     def buffered(self, name: str) -> BufferedFunction:
         """Return a function with input and output buffers of its own, for one caller."""
@@ -261,7 +263,7 @@ class SpaceRobot:
     @property
     def equations_key(self) -> str:
         """Hash of the equations at zero momentum, equal for robots that move alike."""
-        return self._numbers.equations_key
+        return self._numeric_model.equations_key
 
     @cached_property
     def _build(self) -> SymbolicModels:
@@ -269,18 +271,18 @@ class SpaceRobot:
 
     def _chosen_model(self, build: SymbolicModels | None) -> tuple[ModelFunctions, Array | None]:
         if build is None:
-            return self._numbers, None
+            return self._numeric_model, None
         self._build = build
         return build.model(self.inertial)
 
     @cached_property
-    def _numbers(self) -> ModelFunctions:
+    def _numeric_model(self) -> ModelFunctions:
         """The model with this robot's mass properties as constants."""
         return ModelFunctions.of(self.description)
 
     # -- helpers ------------------------------------------------------------------------------
 
-    def _call(self, name: str, *arguments: npt.ArrayLike) -> tuple[Array, ...]:
+    def _call_function(self, name: str, *arguments: npt.ArrayLike) -> tuple[Array, ...]:
         if name not in self._buffers:
             self._buffers[name] = self.buffered(name)
         return self._buffers[name](*(np.asarray(a, dtype=float) for a in arguments))
@@ -297,7 +299,7 @@ class SpaceRobot:
             return
         moved = np.abs(vectors[6:, 0])
         box = "an <inertia>, for a box of sides a, b, c ixx = m (b^2 + c^2) / 12 and so on"
-        if not moved.size or moved.max() < _NO_MOTION:
+        if not moved.size or moved.max() < _LEAST_RELATIVE_INERTIA:
             mend = f"it turns without any mass moving. Give '{self.description.base_link}' {box}."
         else:
             joint = self.description.movable_joints[int(moved.argmax())]

@@ -42,15 +42,18 @@ from spacerobot_ros.model.meshes import mesh_beside, with_mesh_files
 from spacerobot_ros.model.rotations import matrix_from_rpy
 from spacerobot_ros.resources import suggestion
 
-_LARGEST = 1e12
+_LARGEST_NUMBER = 1e12
 """Largest number (kg, m, kg m^2): larger ones are typing errors, and their squares overflow."""
 
 _MOST_LINKS = 200
 
-_CPU_TIME = 10
+_XACRO_CPU_TIME = 10
 """Limit of processor time for the expansion of a xacro file, s; six times as much wall time."""
 
-_ENVIRONMENT = ("PATH", "PYTHONPATH", "AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH", "ROS_DISTRO", "LANG")
+_XACRO_VARIABLES = (
+    *("PATH", "PYTHONPATH", "LANG"),
+    *("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH", "ROS_DISTRO"),
+)
 """Environment variables that xacro files may read."""
 
 
@@ -75,7 +78,7 @@ def load_robot(path: str | Path) -> RobotDescription:
             f"The URDF {path} cannot be read: it is no text in UTF-8 ({error}). Save it as UTF-8."
         ) from error
     if path.suffix == ".xacro":
-        text = _expanded(path)
+        text = _expand_xacro(path)
     try:
         folder = path.resolve().parent
         return parse_robot(with_mesh_files(text, lambda mesh: mesh_beside(mesh, folder)))
@@ -86,7 +89,7 @@ def load_robot(path: str | Path) -> RobotDescription:
         raise RobotDescriptionError(f"{path}: {error}{remedy}") from error
 
 
-def _expanded(path: Path) -> str:
+def _expand_xacro(path: Path) -> str:
     """Return the URDF text of a xacro file, which a confined process expands.
 
     Robot files are exchanged between strangers: see :mod:`spacerobot_ros.model.xacro_files`.
@@ -97,19 +100,19 @@ def _expanded(path: Path) -> str:
             f"{path} is a xacro file, and the package xacro is not installed: `pip install xacro`, "
             f"or expand it where it is: {by_hand}."
         )
-    environment = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
+    environment = {name: os.environ[name] for name in _XACRO_VARIABLES if name in os.environ}
     try:
         done = subprocess.run(
-            [sys.executable, xacro_files.__file__, str(path), f"{_CPU_TIME}"],
+            [sys.executable, xacro_files.__file__, str(path), f"{_XACRO_CPU_TIME}"],
             env={**environment, "PYTHONIOENCODING": "utf-8"},
             capture_output=True,
             encoding="utf-8",
             errors="replace",
-            timeout=6 * _CPU_TIME,
+            timeout=6 * _XACRO_CPU_TIME,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        reason = f"it takes longer than {6 * _CPU_TIME} s"
+        reason = f"it takes longer than {6 * _XACRO_CPU_TIME} s"
     else:
         if done.returncode == 0:
             return done.stdout
@@ -137,7 +140,7 @@ def parse_robot(text: str) -> RobotDescription:
         )
     root = _checked_root(text)
     colours = {
-        material.get("name", ""): _colour(color, f"material '{material.get('name', '')}'")
+        material.get("name", ""): _read_colour(color, f"material '{material.get('name', '')}'")
         for material in root.findall("material")
         if (color := material.find("color")) is not None
     }
@@ -148,12 +151,16 @@ def parse_robot(text: str) -> RobotDescription:
             raise RobotDescriptionError(
                 f"The {kind} name '{twice[0]}' is used twice; names are unique."
             )
-    links = {link.name: link for link in (_link(each, colours) for each in root.findall("link"))}
-    joints = _with_leaders([_joint(each, links) for each in root.findall("joint")])
+    links = {
+        link.name: link for link in (_read_link(each, colours) for each in root.findall("link"))
+    }
+    joints = _with_leaders([_read_joint(each, links) for each in root.findall("joint")])
     bodies, frames = weld(links, joints)
     for number, body in enumerate(bodies):
         if flaw_of_inertia(body.inertia.about_com):
-            _refuse_inertia([link for link in links.values() if frames[link.name][0] == number])
+            _refuse_impossible_inertia(
+                [link for link in links.values() if frames[link.name][0] == number]
+            )
     description = RobotDescription(
         name=root.get("name", ""),
         links=tuple(links.values()),
@@ -170,53 +177,57 @@ def parse_robot(text: str) -> RobotDescription:
 # -- links ------------------------------------------------------------------------------------
 
 
-def _values(element: Element | None, name: str, default: str, where: str) -> Array:
+def _read_numbers(element: Element | None, name: str, default: str, where: str) -> Array:
     """Return the numbers of an attribute; those of ``default`` if it or its element is missing."""
     text = default if element is None else element.get(name, default)
-    return _finite([float(word) for word in text.split()], where)
+    return _require_finite([float(word) for word in text.split()], where)
 
 
-def _number(element: Element | None, name: str, where: str) -> float:
-    return float(_finite(0.0 if element is None else float(element.get(name, "0")), where))
+def _read_number(element: Element | None, name: str, where: str) -> float:
+    return float(_require_finite(0.0 if element is None else float(element.get(name, "0")), where))
 
 
-def _finite(values: float | list[float], where: str) -> Array:
+def _require_finite(values: float | list[float], where: str) -> Array:
     array = np.array(values, dtype=float)
     if not np.all(np.isfinite(array)):
         raise RobotDescriptionError(f"A number in {where} is not finite: {array.tolist()}.")
-    if array.size and np.abs(array).max() > _LARGEST:
+    if array.size and np.abs(array).max() > _LARGEST_NUMBER:
         raise RobotDescriptionError(
-            f"A number in {where} is larger than {_LARGEST:g} in its SI unit: {array.tolist()}."
+            f"A number in {where} is larger than {_LARGEST_NUMBER:g} in its SI unit: "
+            f"{array.tolist()}."
         )
     return array
 
 
-def _pose(element: Element, where: str) -> Pose:
+def _read_pose(element: Element, where: str) -> Pose:
     origin = element.find("origin")
     if origin is None:
         return Pose()
-    r = _values(origin, "xyz", "0 0 0", f"the origin of {where}")
-    return Pose(matrix_from_rpy(_values(origin, "rpy", "0 0 0", f"the origin of {where}")), r)
+    r = _read_numbers(origin, "xyz", "0 0 0", f"the origin of {where}")
+    return Pose(matrix_from_rpy(_read_numbers(origin, "rpy", "0 0 0", f"the origin of {where}")), r)
 
 
-def _link(link: Element, colours: dict[str, tuple[float, ...]]) -> Link:
+def _read_link(link: Element, colours: dict[str, tuple[float, ...]]) -> Link:
     name = link.get("name", "")
     where = f"link '{name}'"
     inertia = Inertia()
     if (inertial := link.find("inertial")) is not None:
-        pose = _pose(inertial, where)
-        mass = _number(inertial.find("mass"), "value", where)
+        pose = _read_pose(inertial, where)
+        mass = _read_number(inertial.find("mass"), "value", where)
         moments = inertial.find("inertia")
         about = np.array(
             [
-                [_number(moments, f"i{''.join(sorted(row + column))}", where) for column in "xyz"]
+                [
+                    _read_number(moments, f"i{''.join(sorted(row + column))}", where)
+                    for column in "xyz"
+                ]
                 for row in "xyz"
             ]
         )
         if mass < 0:
             raise RobotDescriptionError(f"The mass of {where} is negative ({mass} kg).")
         inertia = Inertia(mass, np.zeros(3), about).moved(pose)
-    shapes = tuple(_shape(visual, colours, where) for visual in link.findall("visual"))
+    shapes = tuple(_read_shape(visual, colours, where) for visual in link.findall("visual"))
     return Link(name, inertia, shapes)
 
 
@@ -237,7 +248,7 @@ def flaw_of_inertia(about: Array) -> str:
     return ""
 
 
-def _refuse_inertia(welded: list[Link]) -> NoReturn:
+def _refuse_impossible_inertia(welded: list[Link]) -> NoReturn:
     """Refuse a body of impossible inertia; the message names the worst of its welded links."""
 
     def excess(link: Link) -> float:
@@ -250,21 +261,21 @@ def _refuse_inertia(welded: list[Link]) -> NoReturn:
     )
 
 
-def _colour(color: Element, where: str) -> tuple[float, ...]:
-    return tuple(_values(color, "rgba", "", f"a color of {where}").tolist())
+def _read_colour(color: Element, where: str) -> tuple[float, ...]:
+    return tuple(_read_numbers(color, "rgba", "", f"a color of {where}").tolist())
 
 
-def _shape(visual: Element, colours: dict[str, tuple[float, ...]], where: str) -> Shape:
+def _read_shape(visual: Element, colours: dict[str, tuple[float, ...]], where: str) -> Shape:
     geometry = visual.find("geometry")
     assert geometry is not None
     (form,) = geometry
     attributes = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",)}
     if form.tag == "mesh":
         # A negative scale mirrors.
-        size = _values(form, "scale", "1 1 1", f"the scale of a mesh of {where}")
+        size = _read_numbers(form, "scale", "1 1 1", f"the scale of a mesh of {where}")
     else:
         numbers = " ".join(form.get(name, "") for name in attributes[form.tag]).split()
-        size = _finite([float(number) for number in numbers], f"the geometry of {where}")
+        size = _require_finite([float(number) for number in numbers], f"the geometry of {where}")
         if size.min() < 0:
             raise RobotDescriptionError(
                 f"A size in a <geometry> of {where} is negative: {size.tolist()}. "
@@ -274,14 +285,14 @@ def _shape(visual: Element, colours: dict[str, tuple[float, ...]], where: str) -
     if (material := visual.find("material")) is not None:
         color = material.find("color")
         if color is not None:
-            rgba = _colour(color, where)
+            rgba = _read_colour(color, where)
         else:
             rgba = colours.get(material.get("name", ""), rgba)
     red, green, blue, opacity = rgba
     return Shape(
         form.tag,
         tuple(size.tolist()),
-        _pose(visual, where),
+        _read_pose(visual, where),
         (red, green, blue, opacity),
         form.get("filename", "") if form.tag == "mesh" else "",
     )
@@ -290,7 +301,7 @@ def _shape(visual: Element, colours: dict[str, tuple[float, ...]], where: str) -
 # -- joints -----------------------------------------------------------------------------------
 
 
-def _joint(joint: Element, links: dict[str, Link]) -> Joint:
+def _read_joint(joint: Element, links: dict[str, Link]) -> Joint:
     name = joint.get("name", "")
     where = f"joint '{name}'"
     ends = {}
@@ -304,7 +315,7 @@ def _joint(joint: Element, links: dict[str, Link]) -> Joint:
                 f"{suggestion(ends[role], links)}"
             )
     kind = JointKind(joint.get("type"))
-    axis = _values(joint.find("axis"), "xyz", "1 0 0", where)
+    axis = _read_numbers(joint.find("axis"), "xyz", "1 0 0", where)
     if kind is not JointKind.FIXED:
         norm = float(np.linalg.norm(axis))
         if norm < 1e-9:
@@ -315,19 +326,19 @@ def _joint(joint: Element, links: dict[str, Link]) -> Joint:
         kind,
         ends["parent"],
         ends["child"],
-        _pose(joint, where),
+        _read_pose(joint, where),
         axis,
-        _limits(joint.find("limit"), kind, where),
-        _mimic(joint.find("mimic"), where),
+        _read_limits(joint.find("limit"), kind, where),
+        _read_mimic(joint.find("mimic"), where),
     )
 
 
-def _mimic(mimic: Element | None, where: str) -> Mimic | None:
+def _read_mimic(mimic: Element | None, where: str) -> Mimic | None:
     if mimic is None:
         return None
     leader = mimic.get("joint", "")
-    (multiplier,) = _values(mimic, "multiplier", "1", f"<mimic> of {where}")
-    (offset,) = _values(mimic, "offset", "0", f"<mimic> of {where}")
+    (multiplier,) = _read_numbers(mimic, "multiplier", "1", f"<mimic> of {where}")
+    (offset,) = _read_numbers(mimic, "offset", "0", f"<mimic> of {where}")
     if multiplier == 0:
         raise RobotDescriptionError(
             f"The {where} mimics '{leader}' with the multiplier 0: it does not move; make it fixed."
@@ -379,7 +390,7 @@ def _require_common_range(robot: RobotDescription) -> None:
             )
 
 
-def _limits(limit: Element | None, kind: JointKind, where: str) -> JointLimits:
+def _read_limits(limit: Element | None, kind: JointKind, where: str) -> JointLimits:
     if limit is None:
         if kind in (JointKind.FIXED, JointKind.CONTINUOUS):
             return JointLimits()
@@ -441,7 +452,7 @@ def _require_mass(robot: RobotDescription) -> None:
 _OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model", "COLLADA": "a COLLADA file"}
 """File formats by the root element."""
 
-_USED = {
+_ELEMENTS_READ = {
     "robot": ("link", "joint", "material"),
     "link": ("inertial", "visual"),
     "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
@@ -462,13 +473,13 @@ class _Attribute:
     needed: bool = True
 
 
-_ORIGIN = (
+_ORIGIN_ATTRIBUTES = (
     _Attribute("xyz", 3, "m", needed=False),
     _Attribute("rpy", 3, "rad: roll, pitch and yaw", needed=False),
 )
 
 _ATTRIBUTES = {
-    "origin": _ORIGIN,
+    "origin": _ORIGIN_ATTRIBUTES,
     "mass": (_Attribute("value", 1, "kg"),),
     "inertia": tuple(
         _Attribute(name, 1, "kg m^2") for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -497,7 +508,7 @@ _ATTRIBUTES = {
     "color": (_Attribute("rgba", 4, "red, green, blue and opacity, from 0 to 1"),),
 }
 
-_NEEDED = {
+_REQUIRED_ELEMENTS = {
     "inertial": {"mass": '<mass value="..."/> in kg'},
     "visual": {"geometry": f"a <geometry> with one of {', '.join(_GEOMETRIES)}"},
     "joint": {"parent": '<parent link="..."/>', "child": '<child link="..."/>'},
@@ -508,7 +519,7 @@ _JOINT_TYPES = tuple(kind.value for kind in JointKind)
 
 
 def _checked_root(text: str) -> Element:
-    """Return the root of a URDF text, reduced to the elements that are read (:data:`_USED`).
+    """Return the root of a URDF text, reduced to the :data:`_ELEMENTS_READ`.
 
     Raises
     ------
@@ -523,10 +534,10 @@ def _checked_root(text: str) -> Element:
             f"The robot description is not valid URDF: it is no XML ({error})."
         ) from error
     if root.tag != "robot":
-        raise RobotDescriptionError(_of_another_kind(root.tag))
+        raise RobotDescriptionError(_other_root_message(root.tag))
     for element in [root, *root.findall("link"), *root.findall("joint")]:
-        unused = {child.tag for child in element} - set(_USED[element.tag])
-        _leave_out(element, unused)
+        unused = {child.tag for child in element} - set(_ELEMENTS_READ[element.tag])
+        _remove_children(element, unused)
     if not root.get("name"):
         raise _MalformedError("the <robot> has no name", '<robot name="...">')
     for kind in ("link", "joint"):
@@ -539,14 +550,14 @@ def _checked_root(text: str) -> Element:
             if kind == "joint":
                 _require_type(element, where)
                 if element.get("type") == "fixed":
-                    _leave_out(element, ("axis", "limit", "mimic"))
-            _require(element, where)
+                    _remove_children(element, ("axis", "limit", "mimic"))
+            _require_element(element, where)
     for material in root.findall("material"):
-        _require(material, f"material '{material.get('name', '')}'")
+        _require_element(material, f"material '{material.get('name', '')}'")
     return root
 
 
-def _leave_out(element: Element, tags: Collection[object]) -> None:
+def _remove_children(element: Element, tags: Collection[object]) -> None:
     for child in list(element):
         if child.tag in tags:
             element.remove(child)
@@ -559,7 +570,7 @@ class _MalformedError(RobotDescriptionError):
         super().__init__(f"The robot description is not valid URDF: {flaw}; write {remedy}.")
 
 
-def _of_another_kind(tag: str) -> str:
+def _other_root_message(tag: str) -> str:
     namespace = re.fullmatch(r"\{(.*)\}robot", tag)
     if namespace is not None:
         return (
@@ -585,12 +596,14 @@ def _require_type(joint: Element, where: str) -> None:
         )
 
 
-def _require(element: Element, where: str) -> None:
+def _require_element(element: Element, where: str) -> None:
     """Check an element of a link, joint or material, and its children."""
     if element.tag == "material":
-        _leave_out(element, {child.tag for child in element} - set(_USED["material"]))
+        _remove_children(
+            element, {child.tag for child in element} - set(_ELEMENTS_READ["material"])
+        )
     owner = where if element.tag in ("link", "joint") else f"<{element.tag}> of {where}"
-    for child, remedy in _NEEDED.get(element.tag, {}).items():
+    for child, remedy in _REQUIRED_ELEMENTS.get(element.tag, {}).items():
         if element.find(child) is None:
             raise _MalformedError(f"the {owner} has no <{child}>", remedy)
     for tag, count in Counter(child.tag for child in element).items():
@@ -601,7 +614,7 @@ def _require(element: Element, where: str) -> None:
     for attribute in _ATTRIBUTES.get(element.tag, ()):
         _require_attribute(element, attribute, where)
     for child_element in element:
-        _require(child_element, where)
+        _require_element(child_element, where)
 
 
 def _require_geometry(geometry: Element, where: str) -> None:

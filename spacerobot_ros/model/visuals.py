@@ -29,20 +29,20 @@ from spacerobot_ros.model.meshes import (
     with_mesh_files,
 )
 
-_AROUND = 24
+_FACETS_AROUND = 24
 """Facets around a cylinder or a sphere."""
 
-_ROD = 0.05
+_ROD_THICKNESS_RATIO = 0.05
 """Ratio of thickness to length below which a box counts as a rod, drawn as a line."""
 
-_SHARP = math.cos(math.radians(30.0))
-_CARRIED = 20_000
+_SHARP_EDGE_COSINE = math.cos(math.radians(30.0))
+_MOST_FACES_IN_BAG = 20_000
 """Largest number of faces of a mesh in a bag: 1 MB."""
 
-_BALL, _BAR = 0.05, 0.02
+_BALL_RADIUS, _BAR_RADIUS = 0.05, 0.02
 """Radii of the balls and bars that stand for the links and joints of a robot without visuals, m."""
 
-_BOX = (
+_BOX_FACES = (
     *((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)),
     *((2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)),
 )
@@ -87,7 +87,7 @@ class Visual:
     def is_rod(self) -> bool:
         """Whether it is a box too thin to show edges."""
         size = sorted(self.shape.size)
-        return self.shape.kind == "box" and size[1] < _ROD * size[2]
+        return self.shape.kind == "box" and size[1] < _ROD_THICKNESS_RATIO * size[2]
 
     @property
     def outline(self) -> Array:
@@ -100,7 +100,9 @@ class Visual:
         if len(self.edges.lines):
             return self.edges.lines
         low, high = self.mesh.vertices.min(axis=0), self.mesh.vertices.max(axis=0)
-        around = TriangleMesh(_corners() * (high - low) / 2 + (low + high) / 2, np.array(_BOX))
+        around = TriangleMesh(
+            _box_corners() * (high - low) / 2 + (low + high) / 2, np.array(_BOX_FACES)
+        )
         return sharp_edges(around).lines
 
 
@@ -131,11 +133,11 @@ def visuals_of(
                 mesh = meshes[shape.resource].coarsened(most).moved(shape.pose, shape.size)
             if mesh is not None and len(mesh.faces):
                 found.append(Visual(link.name, body, shape, mesh))
-    return tuple(found) or _stand_ins(robot)
+    return tuple(found) or _balls_and_bars(robot)
 
 
-def _stand_ins(robot: RobotDescription) -> tuple[Visual, ...]:
-    shapes = [(link.name, Shape("sphere", (_BALL,), Pose())) for link in robot.links]
+def _balls_and_bars(robot: RobotDescription) -> tuple[Visual, ...]:
+    shapes = [(link.name, Shape("sphere", (_BALL_RADIUS,), Pose())) for link in robot.links]
     for joint in robot.joints:
         length = float(np.linalg.norm(joint.origin.r))
         if length > 1e-6:
@@ -143,7 +145,7 @@ def _stand_ins(robot: RobotDescription) -> tuple[Visual, ...]:
             x = np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))])
             x /= np.linalg.norm(x)
             pose = Pose(np.column_stack([x, np.cross(z, x), z]), joint.origin.r / 2)
-            shapes.append((joint.parent, Shape("cylinder", (_BAR, length), pose)))
+            shapes.append((joint.parent, Shape("cylinder", (_BAR_RADIUS, length), pose)))
     return tuple(
         Visual(link, robot.frames[link][0], shape, solid_mesh(shape)) for link, shape in shapes
     )
@@ -153,26 +155,28 @@ def solid_mesh(shape: Shape) -> TriangleMesh:
     """Return the triangles of a box, a cylinder or a sphere in the frame of its link."""
     match shape.kind:
         case "box":
-            mesh = TriangleMesh(_corners() * np.array(shape.size) / 2, np.array(_BOX))
+            mesh = TriangleMesh(_box_corners() * np.array(shape.size) / 2, np.array(_BOX_FACES))
         case "cylinder":
             radius, length = shape.size
-            mesh = _turned([0.0, radius, radius, 0.0], np.repeat([-length / 2, length / 2], 2))
+            mesh = _surface_of_revolution(
+                [0.0, radius, radius, 0.0], np.repeat([-length / 2, length / 2], 2)
+            )
         case _:
-            polar = np.linspace(-np.pi / 2, np.pi / 2, _AROUND // 2 + 1)
+            polar = np.linspace(-np.pi / 2, np.pi / 2, _FACETS_AROUND // 2 + 1)
             radii = shape.size[0] * np.cos(polar)
             radii[[0, -1]] = 0.0
-            mesh = _turned(radii.tolist(), shape.size[0] * np.sin(polar))
+            mesh = _surface_of_revolution(radii.tolist(), shape.size[0] * np.sin(polar))
     return mesh.moved(shape.pose)
 
 
-def _corners() -> Array:
+def _box_corners() -> Array:
     return np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
-def _turned(radii: list[float], heights: Array) -> TriangleMesh:
+def _surface_of_revolution(radii: list[float], heights: Array) -> TriangleMesh:
     """Return the surface of revolution of a profile in the plane of x and z about z."""
-    angles = np.linspace(0.0, 2 * np.pi, _AROUND, endpoint=False)
-    circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(_AROUND)])
+    angles = np.linspace(0.0, 2 * np.pi, _FACETS_AROUND, endpoint=False)
+    circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(_FACETS_AROUND)])
     rings = [r * circle + [0.0, 0.0, z] for r, z in zip(radii, heights, strict=True)]
     corners = []
     for (low, r), (high, s) in itertools.pairwise(zip(rings, radii, strict=True)):
@@ -196,13 +200,13 @@ def sharp_edges(mesh: TriangleMesh) -> Edges:
     last = np.zeros(len(first), np.int64)
     last[inverse.ravel()] = np.arange(len(pairs))
     beside = np.stack([normals[first // 3], normals[last // 3]], axis=1)
-    sharp = (count != 2) | (np.einsum("ij,ij->i", beside[:, 0], beside[:, 1]) < _SHARP)
+    sharp = (count != 2) | (np.einsum("ij,ij->i", beside[:, 0], beside[:, 1]) < _SHARP_EDGE_COSINE)
     return Edges(mesh.vertices[pairs[first[sharp]]], beside[sharp])
 
 
 # -- meshes in bags -----------------------------------------------------------------------------
 
-_PREFIX = "mesh/"
+_ATTACHMENT_PREFIX = "mesh/"
 
 
 def meshes_from_files(
@@ -220,7 +224,7 @@ def meshes_from_files(
         Called with a message about each mesh that cannot be read.
     """
     found = {}
-    for resource in _resources(robot):
+    for resource in _mesh_uris(robot):
         try:
             shape = Shape("mesh", (1.0,) * 3, Pose(), resource=resource)
             found[resource] = shape_mesh(shape, most)
@@ -231,8 +235,8 @@ def meshes_from_files(
 
 def carried_meshes(robot: RobotDescription) -> dict[str, bytes]:
     """Return the meshes of a robot for a bag, by attachment name, as STL of at most 1 MB each."""
-    meshes = meshes_from_files(robot, _CARRIED)
-    return {f"{_PREFIX}{resource}": stl_of(mesh) for resource, mesh in meshes.items()}
+    meshes = meshes_from_files(robot, _MOST_FACES_IN_BAG)
+    return {f"{_ATTACHMENT_PREFIX}{resource}": stl_of(mesh) for resource, mesh in meshes.items()}
 
 
 def meshes_in(robot: RobotDescription, attachments: Mapping[str, bytes]) -> dict[str, TriangleMesh]:
@@ -241,9 +245,9 @@ def meshes_in(robot: RobotDescription, attachments: Mapping[str, bytes]) -> dict
     No file is read: a stranger's bag may name any file of this machine.
     """
     found = {}
-    for resource in _resources(robot):
+    for resource in _mesh_uris(robot):
         try:
-            data = attachments[f"{_PREFIX}{resource}"]
+            data = attachments[f"{_ATTACHMENT_PREFIX}{resource}"]
             found[resource] = mesh_of_stl(data, resource)
         except (KeyError, MeshError):
             continue
@@ -274,19 +278,19 @@ class MeshFolder:
 
         Other meshes keep their names.
         """
-        return with_mesh_files(urdf, self._file)
+        return with_mesh_files(urdf, self._mesh_file_of)
 
-    def _file(self, resource: str) -> Path | None:
+    def _mesh_file_of(self, resource: str) -> Path | None:
         if resource not in self._files:
-            self._files[resource] = self._written(resource)
+            self._files[resource] = self._write_mesh(resource)
         return self._files[resource]
 
-    def _written(self, resource: str) -> Path | None:
-        data = self._attachments.get(f"{_PREFIX}{resource}")
+    def _write_mesh(self, resource: str) -> Path | None:
+        data = self._attachments.get(f"{_ATTACHMENT_PREFIX}{resource}")
         if data is None or mesh_file(resource) is not None:
             return None
         try:
-            mesh = mesh_of_stl(data, resource).coarsened(_CARRIED)
+            mesh = mesh_of_stl(data, resource).coarsened(_MOST_FACES_IN_BAG)
         except MeshError:
             return None
         # Neither the name nor the bytes of the bag: a stranger may have written both.
@@ -301,10 +305,10 @@ class MeshFolder:
 
 def carries_meshes(attachments: Mapping[str, bytes]) -> bool:
     """Whether a mesh is among the attachments of a bag."""
-    return any(name.startswith(_PREFIX) for name in attachments)
+    return any(name.startswith(_ATTACHMENT_PREFIX) for name in attachments)
 
 
-def _resources(robot: RobotDescription) -> list[str]:
+def _mesh_uris(robot: RobotDescription) -> list[str]:
     """Return the URIs of all meshes, each once."""
     shapes = (shape for link in robot.links for shape in link.shapes if shape.kind == "mesh")
     return list(dict.fromkeys(shape.resource for shape in shapes))

@@ -18,18 +18,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-_MEMORY = 2**30
+_MOST_MEMORY = 2**30
 """Limit of the address space, bytes."""
 
-_OPEN_FILES = 64
+_MOST_OPEN_FILES = 64
 
-_SUFFIXES = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
+_READABLE_SUFFIXES = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 """Files that may be read."""
 
 _LARGEST_TEXT = 20_000_000
 """Longest expanded text, characters."""
 
-_NODES = (
+_ALLOWED_SYNTAX = (
     *(ast.Expression, ast.Constant, ast.Name, ast.Attribute, ast.Load, ast.Call, ast.keyword),
     *(ast.List, ast.Tuple, ast.Dict, ast.Subscript, ast.Slice, ast.IfExp),
     *(ast.BinOp, ast.UnaryOp, ast.BoolOp, ast.Compare),
@@ -47,12 +47,12 @@ def check_expression(expression: str) -> None:
     Raises
     ------
     ValueError
-        It has other syntax than :data:`_NODES`, or a refused name.
+        It has other syntax than :data:`_ALLOWED_SYNTAX`, or a refused name.
     SyntaxError
         It is not an expression of Python.
     """
     for node in ast.walk(ast.parse(expression.strip(), mode="eval")):
-        if not isinstance(node, _NODES):
+        if not isinstance(node, _ALLOWED_SYNTAX):
             raise ValueError(f"the expression '{expression}' has a {type(node).__name__}")
         name = {ast.Name: "id", ast.Attribute: "attr", ast.keyword: "arg"}.get(type(node))
         word = getattr(node, name) or "" if name else ""
@@ -67,7 +67,7 @@ def package_root(file: Path) -> Path:
     return next(packages, folder)
 
 
-def _confined(xacro: Any, substitution: Any, file: Path) -> None:
+def _confine_xacro(xacro: Any, substitution: Any, file: Path) -> None:
     """Have xacro check every expression, and read no files but those of its packages."""
     roots = [package_root(file)]
     find = substitution._eval_find
@@ -90,7 +90,7 @@ def _confined(xacro: Any, substitution: Any, file: Path) -> None:
         if root is None:
             raise ValueError(f"it reads {path}, which is outside of its package {roots[0]}")
         hidden = any(part.startswith(".") for part in real.relative_to(root).parts)
-        if hidden or real.suffix not in _SUFFIXES:
+        if hidden or real.suffix not in _READABLE_SUFFIXES:
             raise ValueError(f"it reads {path}, which is no robot or YAML file")
         return open(path, encoding="utf-8")
 
@@ -106,14 +106,14 @@ def main(file: str, seconds: int) -> int:
     ``seconds`` is the limit of processor time.
     """
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
-    resource.setrlimit(resource.RLIMIT_NOFILE, (_OPEN_FILES, _OPEN_FILES))
+    resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (_MOST_OPEN_FILES, _MOST_OPEN_FILES))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     try:
         import xacro
         from xacro import substitution_args
 
-        _confined(xacro, substitution_args, Path(file))
+        _confine_xacro(xacro, substitution_args, Path(file))
         text = str(xacro.process_file(file).toxml())
         if len(text) > _LARGEST_TEXT:
             raise ValueError(f"its text has {len(text)} characters, and at most {_LARGEST_TEXT}")

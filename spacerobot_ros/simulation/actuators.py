@@ -25,13 +25,13 @@ from spacerobot_ros.simulation.faults import KINDS, WRENCH_AXES, Fault, FaultTim
 from spacerobot_ros.simulation.plant import InitialState, Plant, WrappedPlant
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
-_ROUNDING = 1e-6
+_FAULT_TIME_ROUNDING = 1e-6
 """Rounding error allowed in the time of a fault, share of a tick."""
 
 _SHORTEST_STEP = 1e-5
 """Shorter Runge-Kutta steps lose more to rounding than they gain, s."""
 
-_MOST_STEPS = 1e6
+_MOST_STEPS_PER_TICK = 1e6
 """Most Runge-Kutta steps of a tick: more take minutes."""
 
 
@@ -275,8 +275,8 @@ class FaultyPlant(WrappedPlant):
 
     def look(self) -> None:
         """Apply the faults that are active at the present time."""
-        active = self.timeline.at(self.time + _ROUNDING * self._control_period)
-        self._next_tick = self.timeline.next_change / self._control_period - _ROUNDING
+        active = self.timeline.at(self.time + _FAULT_TIME_ROUNDING * self._control_period)
+        self._next_tick = self.timeline.next_change / self._control_period - _FAULT_TIME_ROUNDING
         if active is self._seen:
             return
         self._seen = active
@@ -328,13 +328,13 @@ class FaultyPlant(WrappedPlant):
         if self._actuators_sound:
             limited = self.plant.step(*commands)
         else:
-            limited = self.plant.step(*self._realised(*commands))
+            limited = self.plant.step(*self._faulty_commands(*commands))
         self.tick += 1
         if self.tick >= self._next_tick:
             self.look()
         return limited
 
-    def _realised(self, joints: Array, *wrench: Array) -> list[Array]:
+    def _faulty_commands(self, joints: Array, *wrench: Array) -> list[Array]:
         """Return the commands as the faulty actuators realise them (new arrays)."""
         disturbed = joints + self._bias
         if self._noise.any():
@@ -405,10 +405,11 @@ def build_plant(
             f"'{config.actuation}' has no wrench on the base: set actuation to effort, or "
             "thrusters to ''."
         )
-    if step and control_period / step > _MOST_STEPS:
+    if step and control_period / step > _MOST_STEPS_PER_TICK:
         raise ParameterError(
-            f"Parameter 'integration_step' is {step:g} s, which is more than {_MOST_STEPS:.0e} "
-            f"steps in a tick of {control_period:g} s; choose longer steps or shorter ticks."
+            f"Parameter 'integration_step' is {step:g} s, which is more than "
+            f"{_MOST_STEPS_PER_TICK:.0e} steps in a tick of {control_period:g} s; "
+            "choose longer steps or shorter ticks."
         )
     start = InitialState.of(config) if initial is None else initial
     plant = kind.plant(robot, control_period, start, step or kind.integration_step)

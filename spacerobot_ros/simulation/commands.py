@@ -33,13 +33,15 @@ NEVER = -math.inf
 """The stamp of no command."""
 
 
-_START = 1.0
+_START_TIME = 1.0
 """Time after the start during which a stamp of zero means the first state, without a timeout, s."""
 
 _STAMP_ROUNDING = 1_000
 """Rounding error allowed in a stamp, of commanders that keep time in floating point, ns."""
 
-_SUPERSEDED = "it answers a state that is older than the last start, reset or stop of the plant"
+_SUPERSEDED_CLAUSE = (
+    "it answers a state that is older than the last start, reset or stop of the plant"
+)
 
 _BRAKING_RATE = 20.0
 """Joint rates decay as exp(-20 t/s) while the motors are strong enough."""
@@ -217,7 +219,7 @@ class CommandValidator:
 
     def __init__(self, plant: Plant, config: PlantConfig) -> None:
         robot = plant.robot
-        silence_ns = round((config.command_timeout or _START) * SECOND)
+        silence_ns = round((config.command_timeout or _START_TIME) * SECOND)
         joints = partial(CommandSource, "joint_commands", senders=Senders(silence_ns))
         self.sources = [joints("velocity", robot.velocity_limit)]
         """Sources in the order of the arguments of a step: the joints' first."""
@@ -235,7 +237,7 @@ class CommandValidator:
         self._earliest = 0
         self._clips = config.beyond_limits == "clip"
         self._one_commander = config.second_commander == "refuse"
-        self._latching = _latching(config.latched_faults)
+        self._latching = _parse_latching_reasons(config.latched_faults)
         self.counts: Counter[Reason] = Counter()
         """Number of refused commands by reason."""
         self.fault = ""
@@ -287,19 +289,23 @@ class CommandValidator:
         unset = False
         if self._lockstep:
             if stamp_ns != now_ns or source.arrived:
-                return self._refuse(source, _not_this_tick(stamp_ns, now_ns), now_ns)
-            refusal = self._unsound(source, values)
+                return self._refuse(source, _not_this_tick_clause(stamp_ns, now_ns), now_ns)
+            refusal = self._refusal_of_values(source, values)
         else:
-            if not stamp_ns and (self._earliest or now_ns > (self._timeout or _START) * SECOND):
+            if not stamp_ns and (
+                self._earliest or now_ns > (self._timeout or _START_TIME) * SECOND
+            ):
                 # An unset stamp means now; at the start it is the first state's.
                 stamp_ns, unset = now_ns, True
             elif stamp_ns % self._period:
-                stamp_ns = self._rounded(stamp_ns)
-            refusal = self._untimely(source, stamp_ns, now_ns) or self._unsound(source, values)
+                stamp_ns = self._round_to_tick(stamp_ns)
+            refusal = self._refusal_of_stamp(source, stamp_ns, now_ns) or self._refusal_of_values(
+                source, values
+            )
         if refusal is None and self.fault:
             refusal = Refusal(Reason.LATCHED, self.fault)
         if stamp_ns < self._earliest and refusal is None and not unset:
-            refusal = Refusal(Reason.STALE, _SUPERSEDED)
+            refusal = Refusal(Reason.STALE, _SUPERSEDED_CLAUSE)
         if refusal is None:
             assert not isinstance(values, CommandError)
             source.accept(values, stamp_ns)
@@ -385,7 +391,9 @@ class CommandValidator:
             self.last_stamp_ns = last
         return silent
 
-    def _unsound(self, source: CommandSource, values: Array | CommandError) -> Refusal | None:
+    def _refusal_of_values(
+        self, source: CommandSource, values: Array | CommandError
+    ) -> Refusal | None:
         """Return the refusal of values that are never accepted, if they are such."""
         if isinstance(values, CommandError):
             return Refusal(Reason.MALFORMED, str(values))
@@ -397,12 +405,14 @@ class CommandValidator:
             return Refusal(Reason.BEYOND_LIMITS, limits)
         return None
 
-    def _rounded(self, stamp_ns: int) -> int:
+    def _round_to_tick(self, stamp_ns: int) -> int:
         """Return the stamp of the nearest tick, if the difference is rounding only."""
         tick = (stamp_ns + self._period // 2) // self._period * self._period
         return tick if abs(stamp_ns - tick) <= _STAMP_ROUNDING else stamp_ns
 
-    def _untimely(self, source: CommandSource, stamp_ns: int, now_ns: int) -> Refusal | None:
+    def _refusal_of_stamp(
+        self, source: CommandSource, stamp_ns: int, now_ns: int
+    ) -> Refusal | None:
         """Return the refusal of a command with an unsuitable stamp in real time, if it has one."""
         if source.senders.multiple_publishers and self._one_commander:
             return Refusal(Reason.SECOND_COMMANDER, "two publishers alternate on the topic")
@@ -440,7 +450,7 @@ class CommandValidator:
         return Refusal(refusal.reason, refusal.clause, latches=True)
 
 
-def _not_this_tick(stamp_ns: int, now_ns: int) -> Refusal:
+def _not_this_tick_clause(stamp_ns: int, now_ns: int) -> Refusal:
     early = stamp_ns > now_ns
     return Refusal(
         Reason.EARLY if early else Reason.STALE,
@@ -449,7 +459,7 @@ def _not_this_tick(stamp_ns: int, now_ns: int) -> Refusal:
     )
 
 
-def _latching(words: str) -> frozenset[Reason]:
+def _parse_latching_reasons(words: str) -> frozenset[Reason]:
     known = [reason.value for reason in Reason if reason is not Reason.LATCHED]
     for word in words.split():
         if word not in known:
@@ -480,7 +490,7 @@ class _JointBrakes:
         return self._law.command(state, Reference(joints=JointReference.at_rest(plant.q))).tau
 
 
-_UNNUMBERED = 2**63
+_LEAST_MISSING_NUMBER = 2**63
 """Middleware without sequence numbers reports a larger number."""
 
 _MOST_PUBLISHERS = 100
@@ -523,7 +533,7 @@ class Senders:
         if number == self._next:
             self._next, self._heard, self.multiple_publishers = number + 1, now_ns, False
             return
-        if not 0 < number < _UNNUMBERED:
+        if not 0 < number < _LEAST_MISSING_NUMBER:
             self.current = None
             return
         if self.current is not None:

@@ -9,10 +9,10 @@ from spacerobot_ros.model.shared_parameters import RobotConfig, WatchdogConfig
 from spacerobot_ros.parameters import group, parameter
 from spacerobot_ros.times import SECOND
 
-_LARGEST = 1e6
+_MAX_ERROR = 1e6
 """Largest error of a sensor, m or rad (/s): squares of much larger ones overflow."""
 
-_FAR = 1e9
+_MAX_START = 1e9
 """Largest quantity of an initial state, and longest time, SI."""
 
 
@@ -27,8 +27,8 @@ def _bias(default: tuple[float, ...], description: str, unit: str) -> Any:
         default,
         description,
         unit=unit,
-        minimum=-_LARGEST,
-        maximum=_LARGEST,
+        minimum=-_MAX_ERROR,
+        maximum=_MAX_ERROR,
         length=len(default) or None,
     )
 
@@ -38,22 +38,22 @@ class SensorConfig:
     """Errors of the sensors: 1 sigma of their noise, their biases, and the seed."""
 
     position_noise: float = parameter(
-        0.0, "1 sigma an axis of odom, in world", unit="m", minimum=0.0, maximum=_LARGEST
+        0.0, "1 sigma an axis of odom, in world", unit="m", minimum=0.0, maximum=_MAX_ERROR
     )
     attitude_noise: float = parameter(
-        0.0, "likewise, a rotation vector in base", unit="rad", minimum=0.0, maximum=_LARGEST
+        0.0, "likewise, a rotation vector in base", unit="rad", minimum=0.0, maximum=_MAX_ERROR
     )
     velocity_noise: float = parameter(
-        0.0, "likewise, of the twist", unit="m/s", minimum=0.0, maximum=_LARGEST
+        0.0, "likewise, of the twist", unit="m/s", minimum=0.0, maximum=_MAX_ERROR
     )
     angular_velocity_noise: float = parameter(
-        0.0, "likewise", unit="rad/s", minimum=0.0, maximum=_LARGEST
+        0.0, "likewise", unit="rad/s", minimum=0.0, maximum=_MAX_ERROR
     )
     joint_noise: float = parameter(
-        0.0, "1 sigma of every joint position", unit="m or rad", minimum=0.0, maximum=_LARGEST
+        0.0, "1 sigma of every joint position", unit="m or rad", minimum=0.0, maximum=_MAX_ERROR
     )
     joint_rate_noise: float = parameter(
-        0.0, "of every joint velocity", unit="m/s or rad/s", minimum=0.0, maximum=_LARGEST
+        0.0, "of every joint velocity", unit="m/s or rad/s", minimum=0.0, maximum=_MAX_ERROR
     )
     position_bias: tuple[float, ...] = _bias((0.0, 0.0, 0.0), "of odom, in world", "m")
     attitude_bias: tuple[float, ...] = _bias((0.0, 0.0, 0.0), "rotation vector in base", "rad")
@@ -80,7 +80,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "realtime: older commands stop the joints; 0: never",
         unit="s",
         minimum=0.0,
-        maximum=_FAR,
+        maximum=_MAX_START,
     )
     beyond_limits: str = parameter(
         "clip", "commands beyond the rate or effort limits of the URDF", choices=("clip", "refuse")
@@ -103,7 +103,11 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         choices=("report", "latch"),
     )
     integration_step: float = parameter(
-        0.0, "longest step; 0: 0.01 (velocity), 0.001 (effort)", unit="s", minimum=0.0, maximum=_FAR
+        0.0,
+        "longest step; 0: 0.01 (velocity), 0.001 (effort)",
+        unit="s",
+        minimum=0.0,
+        maximum=_MAX_START,
     )
     thrusters: str = parameter("", "'urdf': those of the robot's URDF; a YAML file; '': any wrench")
     thrusters_excluded: str = parameter("", "names of thrusters out of use, separated by spaces")
@@ -114,21 +118,21 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "simulated time between base_pose; 0: every tick. Realtime: at most 0.5 s of wall time",
         unit="s",
         minimum=0.0,
-        maximum=_FAR,
+        maximum=_MAX_START,
     )
     marker_period: float = parameter(
         0.5,
         "simulated time between markers; 0: none. Realtime: at most 0.5 s of wall time",
         unit="s",
         minimum=0.0,
-        maximum=_FAR,
+        maximum=_MAX_START,
     )
     tf_period: float = parameter(
         0.1,
         "simulated time between transforms on /tf; 0: none. Realtime: at most 0.1 s of wall time",
         unit="s",
         minimum=0.0,
-        maximum=_FAR,
+        maximum=_MAX_START,
     )
     tf_links: bool = parameter(
         True, "whether all links are on /tf; false: the base alone, beside robot_state_publisher"
@@ -142,40 +146,58 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "time; a paused plant: once a second of wall time",
         unit="s",
         minimum=0.0,
-        maximum=_FAR,
+        maximum=_MAX_START,
     )
     resume_bag: str = parameter(
         "", "bag from whose last state and time to go on; '': the initial state"
     )
     initial_position: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0), "base link in the world", unit="m", minimum=-_FAR, maximum=_FAR, length=3
+        (0.0, 0.0, 0.0),
+        "base link in the world",
+        unit="m",
+        minimum=-_MAX_START,
+        maximum=_MAX_START,
+        length=3,
     )
     initial_orientation: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0, 1.0), "quaternion x, y, z, w", length=4
     )
     initial_joint_positions: tuple[float, ...] = parameter(
-        (), "by joint order of the URDF; []: zero", unit="m or rad", minimum=-_FAR, maximum=_FAR
+        (),
+        "by joint order of the URDF; []: zero",
+        unit="m or rad",
+        minimum=-_MAX_START,
+        maximum=_MAX_START,
     )
     initial_joint_velocities: tuple[float, ...] = parameter(
-        (), "likewise, under efforts; []: zero", unit="m/s or rad/s", minimum=-_FAR, maximum=_FAR
+        (),
+        "likewise, under efforts; []: zero",
+        unit="m/s or rad/s",
+        minimum=-_MAX_START,
+        maximum=_MAX_START,
     )
     initial_center_of_mass: tuple[float, ...] = parameter(
         (),
         "of the system in the world, instead of initial_position",
         unit="m",
-        minimum=-_FAR,
-        maximum=_FAR,
+        minimum=-_MAX_START,
+        maximum=_MAX_START,
         length=3,
     )
     linear_momentum: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0), "total, in world", unit="kg m/s", minimum=-_FAR, maximum=_FAR, length=3
+        (0.0, 0.0, 0.0),
+        "total, in world",
+        unit="kg m/s",
+        minimum=-_MAX_START,
+        maximum=_MAX_START,
+        length=3,
     )
     angular_momentum: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0),
         "total, about the centre of mass, in world",
         unit="kg m^2/s",
-        minimum=-_FAR,
-        maximum=_FAR,
+        minimum=-_MAX_START,
+        maximum=_MAX_START,
         length=3,
     )
     faults: tuple[str, ...] = parameter(

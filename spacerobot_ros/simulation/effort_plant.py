@@ -37,7 +37,7 @@ from spacerobot_ros.simulation.plant import Flags, InitialState
 _BISECTIONS = 40
 """Bisections of the time of arrival: the error is 1e-12 of an integration step."""
 
-_BEYOND = 1e-12
+_STOP_TOLERANCE = 1e-12
 """Distance beyond a limit at which a joint counts as outside: relative, below one in m or rad."""
 
 
@@ -55,8 +55,8 @@ class JointStops:
     def __init__(self, robot: SpaceRobot, integration_step: float) -> None:
         self._integration_step = integration_step
         self._lower, self._upper = robot.lower, robot.upper
-        self._below = robot.lower - _BEYOND * np.maximum(1.0, np.abs(robot.lower))
-        self._above = robot.upper + _BEYOND * np.maximum(1.0, np.abs(robot.upper))
+        self._below = robot.lower - _STOP_TOLERANCE * np.maximum(1.0, np.abs(robot.lower))
+        self._above = robot.upper + _STOP_TOLERANCE * np.maximum(1.0, np.abs(robot.upper))
         self._q, _, self._qdot, *_ = state_slices(robot.n)
         self._step = robot.buffered("holding_step")
         self._equations = robot.buffered("shape_equations")
@@ -77,21 +77,23 @@ class JointStops:
         x, left = state.copy(), duration
         none = np.zeros(self._lower.size, dtype=np.bool_)
         locked = none if locked is None else locked
-        held, stopped = self._rest(x, command, none, locked)
+        held, stopped = self._bring_to_rest(x, command, none, locked)
         while left > 1e-12 * duration:
             step = min(self._integration_step, left)
             fixed = held | locked
-            after = self._move(x, command, fixed, step)
-            if self._outside(after):
-                step = self._arrival(x, command, fixed, step)
-                after = self._move(x, command, fixed, step)
+            after = self._integrate_step(x, command, fixed, step)
+            if self._is_outside_limits(after):
+                step = self._time_to_stop(x, command, fixed, step)
+                after = self._integrate_step(x, command, fixed, step)
                 after[self._q] = np.clip(after[self._q], self._lower, self._upper)
             x, left = after, left - step
-            held, touched = self._rest(x, command, held, locked)
+            held, touched = self._bring_to_rest(x, command, held, locked)
             stopped |= touched
         return x, stopped
 
-    def _rest(self, x: Array, command: Array, held: Flags, locked: Flags) -> tuple[Flags, Flags]:
+    def _bring_to_rest(
+        self, x: Array, command: Array, held: Flags, locked: Flags
+    ) -> tuple[Flags, Flags]:
         """Bring locked joints and joints on their stops to rest, in ``x``.
 
         Returns the joints that their stops hold through the next step, and these with the joints
@@ -122,7 +124,7 @@ class JointStops:
             qdot[:], _ = at_rest(compliance, qdot, held)
         return held, held | touched
 
-    def _move(self, x: Array, command: Array, held: Flags, step: float) -> Array:
+    def _integrate_step(self, x: Array, command: Array, held: Flags, step: float) -> Array:
         after = self._step(x, command, np.where(held, 0.0, 1.0), step)[0]
         if not np.all(np.isfinite(after)):
             raise SpaceRobotError(
@@ -131,16 +133,16 @@ class JointStops:
             )
         return after
 
-    def _outside(self, x: Array) -> bool:
+    def _is_outside_limits(self, x: Array) -> bool:
         q = x[self._q]
         return bool(np.any((q < self._below) | (q > self._above)))
 
-    def _arrival(self, x: Array, command: Array, held: Flags, step: float) -> float:
+    def _time_to_stop(self, x: Array, command: Array, held: Flags, step: float) -> float:
         """Return the time within a step (s) at which the first joint is outside."""
         early, late = 0.0, step
         for _ in range(_BISECTIONS):
             middle = (early + late) / 2
-            if self._outside(self._move(x, command, held, middle)):
+            if self._is_outside_limits(self._integrate_step(x, command, held, middle)):
                 late = middle
             else:
                 early = middle
@@ -187,7 +189,7 @@ With it the energy of a tumbling six-joint arm, its joints turning at several ra
 1e-12 in 100 s, relative; by 2e-10 with four times the step. A step takes some microseconds.
 """
 
-_DIVERGED = 1e100
+_LARGEST_FINITE_STATE = 1e100
 """Magnitude (SI units) beyond which a state counts as diverged."""
 
 
@@ -270,7 +272,7 @@ class EffortPlant:
             ]
         )
         self._command[:] = 0.0
-        self._report()
+        self._update_outputs()
 
     @property
     def state(self) -> Array:
@@ -326,17 +328,17 @@ class EffortPlant:
                 self._state[:], stopped = self._stops.advance(
                     self._state, self._realised, self.control_period, self._held
                 )
-                self._report()
+                self._update_outputs()
         except SpaceRobotError:
             # The state before the tick remains.
             self._command[:] = 0.0
-            self._report()
+            self._update_outputs()
             raise
         self.effort_limited += clipped
         self.stroke_limited += stopped
         return bool(clipped.any() or stopped.any())
 
-    def _report(self) -> None:
+    def _update_outputs(self) -> None:
         """Compute all outputs at ``_state``, by a tick of zero duration."""
         self._h[:] = 0.0
         self._advance.evaluate()
@@ -351,9 +353,11 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     h = ca.MX.sym("h")
     effort = ca.fmin(ca.fmax(command[:n], -robot.effort_limit), robot.effort_limit)
     realised = ca.vertcat(effort, command[n:])
-    march = repeated(_watched_step(robot, model), substeps)
+    march = repeated(_step_counting_stops(robot, model), substeps)
     p = list(model.inputs.values())
-    marched = march(ca.vertcat(state, _touching(robot, state)), realised, h / substeps, *p)
+    marched = march(
+        ca.vertcat(state, _count_touching_joints(robot, state)), realised, h / substeps, *p
+    )
     next_state = marched[:-1]
 
     q, quaternion, qdot, p_W, L_W, r_WC_W = (next_state[part] for part in parts)
@@ -364,7 +368,7 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     link_R, link_r = model("link_poses", q)
     clipped = command[:n] != effort
     # Comparisons with NaN are false.
-    diverged = parts[-1].stop - ca.sum1(ca.fabs(next_state) < _DIVERGED)
+    diverged = parts[-1].stop - ca.sum1(ca.fabs(next_state) < _LARGEST_FINITE_STATE)
     touched = marched[-1] + diverged
     return model.function(
         f"effort_tick_{substeps}",
@@ -382,7 +386,7 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     )
 
 
-def _watched_step(robot: SpaceRobot, model: Composition) -> ca.Function:
+def _step_counting_stops(robot: SpaceRobot, model: Composition) -> ca.Function:
     """Return the step with one more state: the number of joints on or beyond stops so far.
 
     They are counted at the end of each step: a joint cannot swing beyond its limit and back in one.
@@ -390,11 +394,11 @@ def _watched_step(robot: SpaceRobot, model: Composition) -> ca.Function:
     watched = ca.MX.sym("x", state_slices(robot.n)[-1].stop + 1)
     command, h = ca.MX.sym("command", robot.n + 6), ca.MX.sym("h")
     x = model("flight_step", watched[:-1], command, h)
-    counted = ca.vertcat(x, watched[-1] + _touching(robot, x))
+    counted = ca.vertcat(x, watched[-1] + _count_touching_joints(robot, x))
     return model.function("watched_step", [watched, command, h], [counted])
 
 
-def _touching(robot: SpaceRobot, state: ca.MX) -> ca.MX:
+def _count_touching_joints(robot: SpaceRobot, state: ca.MX) -> ca.MX:
     """Return the number of joints that are not strictly inside their limits."""
     q = state[: robot.n]
     return robot.n - ca.sum1(ca.logic_and(q > ca.DM(robot.lower), q < ca.DM(robot.upper)))

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 from spacerobot_ros.errors import ParameterError
 
-_LARGEST = 1e6
+_LARGEST_FAULT_VALUE = 1e6
 """Largest value of a fault, in its unit: squares of much larger ones overflow."""
 
-_LONGEST = 1e9
+_LATEST_FAULT_TIME = 1e9
 """Largest time of a fault, s."""
 
 _MOST_FAULTS = 1000
@@ -57,8 +57,8 @@ class FaultKind:
 
     targets: tuple[str, ...]
     value: str = ""
-    minimum: float = -_LARGEST
-    maximum: float = _LARGEST
+    minimum: float = -_LARGEST_FAULT_VALUE
+    maximum: float = _LARGEST_FAULT_VALUE
     sensor: bool = False
 
 
@@ -160,7 +160,7 @@ def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
     if kind.value:
         if not rest or rest[0] in ("at", "until"):
             raise refusal(f"{name} needs a value: {kind.value}")
-        value = _number(rest.pop(0), refusal)
+        value = _parse_number(rest.pop(0), refusal)
         if not kind.minimum <= value <= kind.maximum:
             raise refusal(
                 f"its value is {value:g} and must be from {kind.minimum:g} to {kind.maximum:g}"
@@ -169,15 +169,17 @@ def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
     if rest[0::2] not in ([], ["at"], ["until"], ["at", "until"]) or len(rest) % 2:
         raise refusal(f"after {name} {target} come only 'at SECONDS' and 'until SECONDS'")
     for word, text in zip(rest[0::2], rest[1::2], strict=True):
-        times[word] = _number(text, refusal)
-        if abs(times[word]) > _LONGEST:
-            raise refusal(f"its time is {times[word]:g} s and must be at most {_LONGEST:g} s")
+        times[word] = _parse_number(text, refusal)
+        if abs(times[word]) > _LATEST_FAULT_TIME:
+            raise refusal(
+                f"its time is {times[word]:g} s and must be at most {_LATEST_FAULT_TIME:g} s"
+            )
     if not times["until"] > times["at"]:
         raise refusal(f"it ends at {times['until']:g} s and begins at {times['at']:g} s")
     return Fault(name, target, value, times["at"], times["until"])
 
 
-def _number(text: str, refusal: Callable[[str], ParameterError]) -> float:
+def _parse_number(text: str, refusal: Callable[[str], ParameterError]) -> float:
     try:
         number = float(text)
     except ValueError:

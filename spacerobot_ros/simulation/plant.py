@@ -133,11 +133,11 @@ class InitialState:
         return cls(
             position=np.array(config.initial_position or (0.0, 0.0, 0.0)),
             quaternion=np.array(config.initial_orientation or (0.0, 0.0, 0.0, 1.0)),
-            joint_positions=_optional(config.initial_joint_positions),
+            joint_positions=_array_or_none(config.initial_joint_positions),
             linear_momentum=np.array(config.linear_momentum or (0.0, 0.0, 0.0)),
             angular_momentum=np.array(config.angular_momentum or (0.0, 0.0, 0.0)),
-            joint_velocities=_optional(config.initial_joint_velocities),
-            center_of_mass=_optional(config.initial_center_of_mass),
+            joint_velocities=_array_or_none(config.initial_joint_velocities),
+            center_of_mass=_array_or_none(config.initial_center_of_mass),
         )
 
     def __post_init__(self) -> None:
@@ -183,7 +183,7 @@ class InitialState:
         """
         if self.joint_positions is None:
             return np.clip(np.zeros(robot.n), robot.lower, robot.upper)
-        q = _of_joints(robot, self.joint_positions, "positions")
+        q = _require_joint_values(robot, self.joint_positions, "positions")
         for name, value, lower, upper in zip(
             robot.joint_names, q, robot.lower, robot.upper, strict=True
         ):
@@ -204,7 +204,7 @@ class InitialState:
         """
         if self.joint_velocities is None:
             return np.zeros(robot.n)
-        return _of_joints(robot, self.joint_velocities, "velocities")
+        return _require_joint_values(robot, self.joint_velocities, "velocities")
 
     def system_position(self, robot: SpaceRobot) -> Array:
         """Return the position of the system's centre of mass in W (3,), m.
@@ -224,11 +224,11 @@ class InitialState:
         return r_WC_W
 
 
-def _optional(values: tuple[float, ...]) -> Array | None:
+def _array_or_none(values: tuple[float, ...]) -> Array | None:
     return np.array(values) if values else None
 
 
-def _of_joints(robot: SpaceRobot, given: Array, quantity: str) -> Array:
+def _require_joint_values(robot: SpaceRobot, given: Array, quantity: str) -> Array:
     values = np.asarray(given, dtype=float)
     if values.shape != (robot.n,):
         raise ParameterError(

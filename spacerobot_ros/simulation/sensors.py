@@ -20,7 +20,7 @@ from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
 from spacerobot_ros.simulation.faults import KINDS, POSE_AXES, Fault
 from spacerobot_ros.topics import Topic, state_topics
 
-_NOISES = {
+_NOISE_PARAMETERS = {
     "position": "position_noise",
     "attitude": "attitude_noise",
     "velocity": "velocity_noise",
@@ -70,14 +70,14 @@ class Sensors:
         self.dropout = False
         """Whether there is no measurement of the pose."""
         self._pose_bias, self._joint_bias = np.zeros(6), np.zeros(n)
-        self._noise = dict.fromkeys(_NOISES, 0.0)
+        self._noise = dict.fromkeys(_NOISE_PARAMETERS, 0.0)
         self.pose_covariance, self.twist_covariance = np.zeros(36), np.zeros(36)
         """Covariances of pose and twist, each 6 x 6 in a row, of the noise alone: a sensor knows
         neither its bias nor its delay."""
         self._delay = 0
         self._past: deque[tuple[Array, Array]] = deque(maxlen=1)
         """True poses and twists of the last ticks, copied."""
-        self._adopt(plant.active)
+        self._apply_faults(plant.active)
         self.used = self.imperfect or any(KINDS[f.kind].sensor for f in plant.timeline.faults)
         """Whether measurements differ from the truth now, did before, or will by a known fault."""
 
@@ -95,7 +95,7 @@ class Sensors:
     def measure(self) -> None:
         """Measure the present state of the plant; does nothing for sensors without errors."""
         if self._plant.active is not self._faults:
-            self._adopt(self._plant.active)
+            self._apply_faults(self._plant.active)
             self.used = self.used or self.imperfect
         if not self.used:
             return
@@ -115,14 +115,14 @@ class Sensors:
         self.q[:] = plant.q + self._joint_bias + noise["joints"] * normal(n)
         self.qdot[:] = plant.qdot + noise["joint_rates"] * normal(n)
 
-    def _adopt(self, faults: tuple[Fault, ...]) -> None:
+    def _apply_faults(self, faults: tuple[Fault, ...]) -> None:
         """Apply the active faults of sensors."""
         self._faults = faults
         config = self._config
         self._pose_bias[:3] = config.position_bias or 0.0
         self._pose_bias[3:] = config.attitude_bias or 0.0
         self._joint_bias[:] = config.joint_bias or 0.0
-        variances = {group: getattr(config, name) ** 2 for group, name in _NOISES.items()}
+        variances = {group: getattr(config, name) ** 2 for group, name in _NOISE_PARAMETERS.items()}
         self.dropout, delay = False, 0.0
         for fault in faults:
             if fault.kind == "sensor_bias" and fault.target in POSE_AXES:
@@ -174,7 +174,7 @@ class ReportedState:
     def __init__(self, plant: FaultyPlant, config: PlantConfig) -> None:
         self._plant = plant
         self.sensors = Sensors(plant, config.sensors, config.control_period)
-        self._link = _end_effector(plant.robot, config.end_effector_frame)
+        self._link = _end_effector_index(plant.robot, config.end_effector_frame)
         self._end_effector_pose = np.zeros(7)
         self._thrusters = thrusters_in(plant)
         self._sensors_used = self.sensors.used
@@ -251,7 +251,7 @@ class ReportedState:
         target[3:] = quaternion_from_matrix(R_WB @ plant.link_R[:, 3 * index : 3 * index + 3])
 
 
-def _end_effector(robot: SpaceRobot, name: str) -> int | None:
+def _end_effector_index(robot: SpaceRobot, name: str) -> int | None:
     """Return the index of the link whose pose is published; None: there is none."""
     links = list(robot.link_names)
     link = robot.description.end_effector(name)

@@ -12,7 +12,7 @@ from spacerobot_ros.simulation.actuators import FaultyPlant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.times import SECOND
 
-_SEPARATOR = "; "
+_FAULT_SEPARATOR = "; "
 
 
 class PlantState(str, Enum):
@@ -91,7 +91,7 @@ class PlantStatus:
         }
         if self.last_command_s is not None:
             values["last_command_s"] = f"{self.last_command_s:.9f}"
-        return values | {"faults": _SEPARATOR.join(self.faults)}
+        return values | {"faults": _FAULT_SEPARATOR.join(self.faults)}
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "") -> PlantStatus:
@@ -114,7 +114,7 @@ class PlantStatus:
                 resets=int(values.get("resets", "0")),
                 timeouts=int(values.get("timeouts", "0")),
                 last_command_s=None if last is None else float(last),
-                faults=tuple(faults.split(_SEPARATOR)) if faults else (),
+                faults=tuple(faults.split(_FAULT_SEPARATOR)) if faults else (),
             )
         except (KeyError, ValueError) as error:
             raise SpaceRobotError(f"The values are not a status of a plant: {error}.") from error
@@ -170,7 +170,7 @@ class PlantMonitor:
         if now == before:
             return []
         self.status = replace(now, time_s=time_s)
-        return _events(before, self.status)
+        return _events_between(before, self.status)
 
     def _status(self, activity: PlantState) -> PlantStatus:
         """Return state, message and reason of this moment."""
@@ -204,7 +204,7 @@ class PlantMonitor:
         return PlantStatus(activity, f"{message}.", commands.fault_reason, fault)
 
 
-def _events(before: PlantStatus, now: PlantStatus) -> list[Event]:
+def _events_between(before: PlantStatus, now: PlantStatus) -> list[Event]:
     """Return the events between two statuses, in a possible order."""
     events: list[Event] = []
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.times import SECOND
 
-_LONGEST_LAG = 10
+_MOST_LATE_TICKS = 10
 """Late ticks that a real-time plant makes up; further ones are lost."""
 
-_CATCH_UP = 2
+_MOST_TICKS_AT_ONCE = 2
 """Ticks that a late plant takes at once, before commands are read again."""
 
 
@@ -111,10 +111,10 @@ class RealTime:
     def due(self, now_ns: int, tick: int) -> int:
         """Return the number of ticks to take now, after ``tick``; lost ticks are dropped."""
         behind = int((now_ns - self._origin) / self._pace) - tick
-        if behind > _LONGEST_LAG:
-            self.ticks_lost += behind - _LONGEST_LAG
-            self._origin += (behind - _LONGEST_LAG) * self._pace
-        return min(behind, _CATCH_UP)
+        if behind > _MOST_LATE_TICKS:
+            self.ticks_lost += behind - _MOST_LATE_TICKS
+            self._origin += (behind - _MOST_LATE_TICKS) * self._pace
+        return min(behind, _MOST_TICKS_AT_ONCE)
 
     def count_tick(self, now_ns: int, tick: int) -> None:
         """Count the tick after ``tick``, which is taken now."""

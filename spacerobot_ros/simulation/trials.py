@@ -32,10 +32,10 @@ from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 from spacerobot_ros.times import SECOND
 
-_MOST_PIECES = 1000
+_MOST_SCHEDULES = 1000
 """Largest number of successive schedules of a method that plans in stages."""
 
-_RANDOM_TOLERANCE = 1e-5
+_RANDOM_GOAL_TOLERANCE = 1e-5
 """Tolerance of random goals, rad and m."""
 
 
@@ -159,7 +159,7 @@ def try_method(problem: Problem, name: str, method: GaitMethod | None = None) ->
     began = time.perf_counter()
     method = method or problem.method(name)
     plan_time = time.perf_counter() - began
-    while not pieces or (pieces[-1].partial and len(pieces) < _MOST_PIECES):
+    while not pieces or (pieces[-1].partial and len(pieces) < _MOST_SCHEDULES):
         began = time.perf_counter()
         previous = pieces[-1] if pieces else None
         schedule = method.plan(
@@ -244,9 +244,9 @@ def try_goals(
     """Plan every goal by every method, fly the plans in the plant, and count the results."""
     tight = replace(
         problem.config,
-        position_tolerance=_RANDOM_TOLERANCE,
-        attitude_tolerance=_RANDOM_TOLERANCE,
-        joint_tolerance=_RANDOM_TOLERANCE,
+        position_tolerance=_RANDOM_GOAL_TOLERANCE,
+        attitude_tolerance=_RANDOM_GOAL_TOLERANCE,
+        joint_tolerance=_RANDOM_GOAL_TOLERANCE,
     )
     problem = replace(problem, config=tight)
     built = {name: problem.method(name) for name in methods}

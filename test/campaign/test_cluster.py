@@ -262,13 +262,13 @@ def test_what_lanes_leave_is_flown_in_small_tasks(
         disperse={"mass.*": {"norm": {"loc": 1.0, "scale": 0.03}}}, flights=70, set=corrected
     )
     tasks: list[tuple[int, str]] = []
-    deal = Distribution._task
+    deal = Distribution._submit_task
 
     def dealt(self: Any, numbers: list[int], engine: str, **options: Any) -> Any:
         tasks.append((len(numbers), engine))
         return deal(self, numbers, engine, **options)
 
-    monkeypatch.setattr(Distribution, "_task", dealt)
+    monkeypatch.setattr(Distribution, "_submit_task", dealt)
     run_campaign(made, tmp_path / "here", engine="lanes")
     run_campaign(made, tmp_path / "there", engine="lanes", cluster=Cluster(workers=2))
     here, there = (

@@ -214,7 +214,7 @@ def test_counts_below_the_convergence_are_plain_numbers(
         for name, values in results.columns.items()
     }
     monkeypatch.setattr(report, "picture", seen)
-    report._convergence(replace(results, columns=columns, numbers=many.astype(float)))
+    report._convergence_section(replace(results, columns=columns, numbers=many.astype(float)))
     assert any(labels)
     assert all(re.fullmatch(r"\d*", label) for label in labels), labels
 

@@ -75,7 +75,7 @@ def limited(limits: JointLimits) -> SpaceRobot:
     description = load_robot(robot_file("planar_chain"))
     first, *others = description.joints
     changed = (replace(first, limits=limits), *others)
-    return SpaceRobot(description._rebuilt(description.links, changed))
+    return SpaceRobot(description._with_tree(description.links, changed))
 
 
 @pytest.mark.parametrize(

@@ -46,8 +46,8 @@ def cache(compiled_code: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     folder = tmp_path / "cache"
     monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(folder))
     monkeypatch.delenv("SPACEROBOT_COMPILE_TIMEOUT", raising=False)
-    monkeypatch.setattr(files, "_reported", set())
-    monkeypatch.setattr(compilation, "_hung", set())
+    monkeypatch.setattr(files, "_logged_warnings", set())
+    monkeypatch.setattr(compilation, "_hung_compilations", set())
     return folder
 
 

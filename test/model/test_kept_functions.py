@@ -27,7 +27,7 @@ class Derivation:
         return ca.Function("bent", [x], [rows, ca.jacobian(rows, x)])
 
     def kept(self, key: str = "a" * 64, *, compiling: bool) -> list[list[float]]:
-        compilation._at_hand.clear()  # As another process.
+        compilation._functions_in_memory.clear()  # As another process.
         function = kept_function("bent", key, self, compiling=compiling)
         return [each.nonzeros() for each in function.call([ca.DM(POINT)])]
 
@@ -35,7 +35,7 @@ class Derivation:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(compilation, "_WORTH_KEEPING", 1)
+    monkeypatch.setattr(compilation, "_LEAST_OPERATIONS_TO_KEEP", 1)
     return tmp_path
 
 
@@ -94,7 +94,7 @@ def test_a_process_reads_and_derives_a_function_once(folder: Path) -> None:
     # Another function, another way of compiling, and what was used long ago.
     assert kept_function("bent", "d" * 64, Derivation(2.0), compiling=False) is not first
     assert kept_function("bent", "c" * 64, derivation, compiling=True) is not first
-    for number in range(compilation._MOST_AT_HAND):
+    for number in range(compilation._MOST_FUNCTIONS_IN_MEMORY):
         kept_function("bent", f"{number:064}", derivation, compiling=False)
     assert kept_function("bent", "c" * 64, derivation, compiling=False) is not first
-    assert len(compilation._at_hand) == compilation._MOST_AT_HAND
+    assert len(compilation._functions_in_memory) == compilation._MOST_FUNCTIONS_IN_MEMORY

@@ -61,7 +61,7 @@ def stl_text(vertices: Any, faces: Any) -> bytes:
 
 
 def stl_binary(vertices: Any, faces: Any, header: bytes = b"") -> bytes:
-    rows = np.zeros(len(faces), module._TRIANGLE)
+    rows = np.zeros(len(faces), module._STL_TRIANGLE)
     rows["corners"] = np.asarray(vertices, dtype=float)[faces]
     return header.ljust(80) + len(faces).to_bytes(4, "little") + rows.tobytes()
 
@@ -164,7 +164,7 @@ def test_sizes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(module, "_MOST_TRIANGLES", 3)
     with pytest.raises(MeshError, match="it has 4 triangles, and at most 3 are read"):
         read_mesh(path)
-    monkeypatch.setattr(module, "_MOST_BYTES", 83)
+    monkeypatch.setattr(module, "_MOST_MESH_BYTES", 83)
     with pytest.raises(MeshError, match=r"at most 0 MB are read\. Make it coarser"):
         read_mesh(path)
     with pytest.raises(MeshError, match=r"cannot be read: No such file or directory[.]"):

@@ -109,7 +109,7 @@ def test_a_xacro_file_is_no_program(
 ) -> None:
     """It computes with numbers and texts, for a second, and reads its package alone."""
     monkeypatch.setenv("SECRET_OF_TEST", "42")
-    monkeypatch.setattr("spacerobot_ros.model.urdf._CPU_TIME", 1)
+    monkeypatch.setattr("spacerobot_ros.model.urdf._XACRO_CPU_TIME", 1)
     for name in (".netrc", "probe.txt"):
         (tmp_path / name).write_text("42")
     path = file_with(tmp_path, urdf(mass=expression, attribute=HEADING), "probe.xacro")

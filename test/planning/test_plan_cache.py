@@ -48,7 +48,7 @@ def cache(
 ) -> Cache:
     """Return a cache of this test's own with that plan; a search for another one fails."""
     monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(files, "_reported", set())
+    monkeypatch.setattr(files, "_logged_warnings", set())
 
     def searching(*arguments: Any, **options: Any) -> None:
         raise PlanningError("searched")

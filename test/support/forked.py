@@ -141,8 +141,8 @@ def _forget() -> None:
     """Forget what was computed while tests were collected: an error is to show in it."""
     for cached in _caches:
         cached.cache_clear()
-    compilation._at_hand.clear()
-    model_functions._builds.clear()
+    compilation._functions_in_memory.clear()
+    model_functions._symbolic_models.clear()
 
 
 @pytest.hookimpl(wrapper=True)
