@@ -21,7 +21,7 @@ _LEAST_SHARED_MEMORY = 16 * 2**10
 
 
 def _warn_of_full_shared_memory() -> None:
-    """Say beforehand what SIGBUS would not: tracing in ROS takes a page of shared memory."""
+    """Warn of full shared memory: tracing in ROS takes a page of it, or ends with SIGBUS."""
     try:
         facts = os.statvfs("/dev/shm")
     except OSError:

@@ -62,7 +62,7 @@ class Proof(Enum):
 
 
 class UnreachableError(PlanningError):
-    """A goal that the robot cannot reach; ``proof`` is of what kind the reason is.
+    """A goal that the robot cannot reach; ``proof`` is the kind of the proof.
 
     A goal to which the search found no manoeuvre is a :class:`NotFoundError`.
     """

@@ -143,7 +143,7 @@ def _is_bag(path: Path) -> bool:
 
 
 def load_yaml(text: str, loader: Any = None) -> Any:
-    """Return the content of a YAML text of a stranger, within bounds.
+    """Return the content of a YAML text of unknown origin, whose size is limited.
 
     Parameters
     ----------

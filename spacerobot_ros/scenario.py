@@ -362,7 +362,7 @@ class Scenario:
         return replace(self, goal=goal, published=(), has_goal=True)
 
     def require_goal(self) -> None:
-        """Refuse a robot alone, which has no goal.
+        """Refuse a scenario without a goal, as that of a robot alone.
 
         Raises
         ------
@@ -459,7 +459,7 @@ def _with_robot_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def scenario_or_robot(name: str) -> Scenario:
-    """Return a scenario, or one without a goal of a robot alone (a name or a URDF file).
+    """Return a scenario by name, or one without a goal for a robot (its name or URDF file).
 
     The planner of a robot alone chooses its method.
 
@@ -606,7 +606,7 @@ def read_content(path: Path) -> dict[Any, Any]:
 
 
 def sections_of(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
-    """Return what :func:`read_sections` does, of a content that was read.
+    """Return the parameters by node and full name in the content of a parameter file.
 
     Raises
     ------

@@ -118,8 +118,8 @@ class _Guard:
             self._on_parent_end()
 
     def remove(self) -> None:
-        """Give the signals back."""
-        self.speak()
+        """Restore the signal handlers from before."""
+        self.restore_stderr()
         signal.set_wakeup_fd(self._wakeup)
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
@@ -146,8 +146,8 @@ class _Guard:
                 self._errors, sys.stderr = sys.stderr, io.StringIO()
             raise Terminated(number)
 
-    def speak(self) -> None:
-        """Have standard error back."""
+    def restore_stderr(self) -> None:
+        """Restore standard error."""
         if self._errors is not None:
             self._errors, sys.stderr = None, self._errors
 
@@ -195,7 +195,7 @@ class _Guard:
                 self._end_process()
 
     def _on_parent_end(self) -> None:
-        """End as by SIGTERM, and soon."""
+        """End this process soon, as by SIGTERM."""
         if self._end_by is None:
             self._end_by = time.monotonic() + _TIME_WITHOUT_PARENT
             signal.raise_signal(signal.SIGTERM)
@@ -290,7 +290,7 @@ def termination() -> Terminated | None:
 def announce(ending: Terminated) -> None:
     """Write the signal that ends this process to standard error, if that is still open."""
     if _guard is not None:
-        _guard.speak()
+        _guard.restore_stderr()
     with suppress(OSError):  # The terminal may be gone.
         sys.stderr.write(f"{ending}\n")
         sys.stderr.flush()

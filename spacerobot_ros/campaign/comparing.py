@@ -9,8 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from spacerobot_ros.campaign.config import Campaign
-from spacerobot_ros.campaign.report import MADE_BY, Results, named, panels, picture
-from spacerobot_ros.campaign.statistics import Paired, paired, paired_success
+from spacerobot_ros.campaign.report import (
+    MADE_BY,
+    Results,
+    figure_with_axes,
+    metric_label,
+    picture_part,
+)
+from spacerobot_ros.campaign.statistics import PairedDifference, paired_difference, paired_success
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.files import write_output
 from spacerobot_ros.report.figures import INK, PALETTE, drawing
@@ -74,7 +80,9 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
     names = [name for name in names if name in first.columns and name in second.columns]
     found = []
     for name in names:
-        difference = paired(name, first.columns[name][rows_a], second.columns[name][rows_b])
+        difference = paired_difference(
+            name, first.columns[name][rows_a], second.columns[name][rows_b]
+        )
         if difference is not None:
             found.append(difference)
     passed_a, passed_b = first.passed[rows_a], second.passed[rows_b]
@@ -97,22 +105,22 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
     return [sentence, *(_difference_line(each, b, a) for each in found)]
 
 
-def _difference_line(each: Paired, second: str, first: str) -> str:
+def _difference_line(each: PairedDifference, second: str, first: str) -> str:
     return (
         f"{each.metric}: {second} minus {first} is {each.difference:.4g} "
-        f"({each.low:.4g} to {each.high:.4g})"
+        f"({each.interval_low:.4g} to {each.interval_high:.4g})"
     )
 
 
-def _difference_table(found: list[Paired], first: str, second: str) -> str:
+def _difference_table(found: list[PairedDifference], first: str, second: str) -> str:
     rows = [
         [
-            named(each.metric),
+            metric_label(each.metric),
             str(each.count),
             f"{each.first:.5g}",
             f"{each.second:.5g}",
             f"{each.difference:+.4g}",
-            f"{each.low:+.4g} to {each.high:+.4g}",
+            f"{each.interval_low:+.4g} to {each.interval_high:+.4g}",
             "yes" if each.certain else "no",
         ]
         for each in found
@@ -126,7 +134,7 @@ def _difference_figure(
 ) -> str:
     if not names:
         return ""
-    figure, axes = panels(len(names), 3, 2.6)
+    figure, axes = figure_with_axes(len(names), 3, 2.6)
     for panel, name in zip(axes, names, strict=True):
         x, y = first.columns[name][rows_a], second.columns[name][rows_b]
         panel.plot(x, y, ".", ms=3, alpha=0.5, color=PALETTE[0], rasterized=True)
@@ -137,4 +145,4 @@ def _difference_figure(
         panel.locator_params(nbins=5)
         panel.set_xlabel(f"{first.campaign.name}: {name}")
         panel.set_ylabel(second.campaign.name)
-    return picture(figure, "pairs", "Each draw in both campaigns; dotted: no difference.")
+    return picture_part(figure, "pairs", "Each draw in both campaigns; dotted: no difference.")

@@ -22,7 +22,7 @@ from spacerobot_ros.scenario import CONFIGS, Scenario, number_in, scenario_or_ro
 SAMPLERS = ("random", "latin_hypercube", "sobol", "halton", "saltelli")
 """Samplers; the last one, for sensitivity indices of all orders, is SALib's, the others scipy's."""
 
-OF_ALL = ("latin_hypercube", "saltelli")
+FIXED_SIZE_SAMPLERS = ("latin_hypercube", "saltelli")
 """Samplers whose draws depend on the number of flights."""
 
 _CAMPAIGN_KEYS = (

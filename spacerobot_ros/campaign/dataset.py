@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from spacerobot_ros.campaign.config import OF_ALL, Campaign, parse_campaign
-from spacerobot_ros.campaign.draws import needed
+from spacerobot_ros.campaign.config import FIXED_SIZE_SAMPLERS, Campaign, parse_campaign
+from spacerobot_ros.campaign.draws import require_module
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import ParameterError, RecordingError
@@ -28,7 +28,7 @@ from spacerobot_ros.resources import is_path
 from spacerobot_ros.scenario import load_scenario, scenario_text
 from spacerobot_ros.version import __version__
 
-DRAWN = "draw."
+DRAW_PREFIX = "draw."
 """Prefix of the columns of drawn quantities."""
 
 _ABOUT_FILE, _CAMPAIGN_FILE, _SCENARIO_FILE = "about.json", "campaign.yaml", "scenario.yaml"
@@ -242,7 +242,7 @@ class Dataset:
         self._written = time.monotonic()
         if not self._rows:
             return
-        arrow, parquet = needed("pyarrow"), needed("pyarrow.parquet")
+        arrow, parquet = require_module("pyarrow"), require_module("pyarrow.parquet")
         records = [_record_of_row(row) for row in self._rows]
         table = arrow.Table.from_pylist(records, schema=self._schema)
         folder = self.folder / _FLIGHTS_FOLDER
@@ -266,7 +266,7 @@ class Dataset:
         ParameterError
             There are none.
         """
-        arrow = needed("pyarrow")
+        arrow = require_module("pyarrow")
         parts = [_read_row_file(part) for part in self._row_files()]
         if not parts:
             raise ParameterError(f"The folder {self.folder} has no flights yet.")
@@ -285,7 +285,7 @@ def _read_row_file(part: Path, columns: Sequence[str] | None = None) -> Any:
     ParameterError
         It is damaged.
     """
-    arrow, parquet = needed("pyarrow"), needed("pyarrow.parquet")
+    arrow, parquet = require_module("pyarrow"), require_module("pyarrow.parquet")
     try:
         return parquet.read_table(part, columns=columns)
     except (OSError, arrow.ArrowException) as error:
@@ -303,12 +303,12 @@ def _damaged_file_error(path: Path, error: Exception) -> ParameterError:
 
 
 def _row_schema(campaign: Campaign) -> Any:
-    arrow = needed("pyarrow")
+    arrow = require_module("pyarrow")
     real, text = arrow.float64(), arrow.string()
     fields = [("flight", arrow.int64()), ("seed", arrow.int64()), ("passed", arrow.bool_())]
     fields += [("outcome", text), ("reason", text)]
     for each in campaign.dispersions:
-        fields.append((f"{DRAWN}{each.name}", text if each.target.text else real))
+        fields.append((f"{DRAW_PREFIX}{each.name}", text if each.target.text else real))
     fields += [(name, real) for name in metric_names(description_of(campaign.scenario).joint_names)]
     fields += [("wall_time_s", real), ("plan_time_s", real), ("engine", text)]
     fields += [("fallback", text), ("versions", text)]
@@ -322,7 +322,7 @@ def _record_of_row(row: Row) -> dict[str, Any]:
         "passed": row.passed,
         "outcome": row.outcome,
         "reason": row.reason,
-        **{f"{DRAWN}{name}": value for name, value in row.draw.values.items()},
+        **{f"{DRAW_PREFIX}{name}": value for name, value in row.draw.values.items()},
         **row.metrics,
         "wall_time_s": row.wall_time,
         "plan_time_s": row.plan_time,
@@ -344,7 +344,7 @@ def _settings_of_draws(campaign: Campaign) -> dict[str, Any]:
     own = {"flights", "engine", "description", "scenario", "set", "method"}
     section = {key: value for key, value in campaign.section.items() if key not in own}
     section |= {"seed": campaign.seed, "sampler": campaign.sampler, "longest": campaign.longest}
-    if campaign.sampler in OF_ALL:
+    if campaign.sampler in FIXED_SIZE_SAMPLERS:
         section["flights"] = campaign.flights
     return section
 

@@ -135,7 +135,7 @@ class Draws:
             )
         base = 2 ** int(np.log2(base))
         problem = sobol_problem(self._campaign.names)
-        sample = salib("sample.sobol").sample
+        sample = import_salib("sample.sobol").sample
         seed = int(np.random.SeedSequence(self._campaign.seed).generate_state(1)[0] >> 1)
         return np.asarray(sample(problem, base, calc_second_order=False, seed=seed))
 
@@ -165,7 +165,7 @@ def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = No
     return flight
 
 
-def needed(module: str) -> Any:
+def require_module(module: str) -> Any:
     """Return a module of the extra ``campaign``.
 
     Raises
@@ -183,9 +183,9 @@ def needed(module: str) -> Any:
         ) from None
 
 
-def salib(module: str) -> Any:
-    """Return a module of SALib; see :func:`needed`."""
-    return needed(f"SALib.{module}")
+def import_salib(module: str) -> Any:
+    """Return a module of SALib; see :func:`require_module`."""
+    return require_module(f"SALib.{module}")
 
 
 def sobol_problem(names: Sequence[str]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
 from spacerobot_ros.campaign.rows import FLIGHTS, Engine, Fallback, Row
 from spacerobot_ros.errors import SpaceRobotError
 
-ALL: Mapping[str, Callable[[], Engine]] = {
+ENGINE_FACTORIES: Mapping[str, Callable[[], Engine]] = {
     "lanes": LanesEngine,
     "flights": FlightsEngine,
     "ros": RosEngine,
@@ -21,22 +21,22 @@ ALL: Mapping[str, Callable[[], Engine]] = {
 """The engines by name, the preferred ones first."""
 
 
-def chosen_engine(campaign: Campaign, wanted: str) -> Engine:
-    """Return the engine ``wanted``; for ``auto`` the first one that can fly a campaign.
+def select_engine(campaign: Campaign, engine_name: str) -> Engine:
+    """Return the engine ``engine_name``; for ``auto`` the first one that can fly a campaign.
 
     Raises
     ------
     SpaceRobotError
         The engine cannot fly it, or none can; the message says why.
     """
-    if wanted != "auto":
-        engine = ALL[wanted]()
+    if engine_name != "auto":
+        engine = ENGINE_FACTORIES[engine_name]()
         reason = engine.refusal(campaign, asked=True)
         if reason:
-            raise SpaceRobotError(f"The engine '{wanted}' cannot fly this campaign: {reason}")
+            raise SpaceRobotError(f"The engine '{engine_name}' cannot fly this campaign: {reason}")
         return engine
     reasons = []
-    for name, make in ALL.items():
+    for name, make in ENGINE_FACTORIES.items():
         engine = make()
         reason = engine.refusal(campaign)
         if not reason:
@@ -46,9 +46,9 @@ def chosen_engine(campaign: Campaign, wanted: str) -> Engine:
 
 
 @cache
-def engine_called(name: str) -> Engine:
+def engine_by_name(name: str) -> Engine:
     """Return an engine by its name, one per process: it reuses the models that it has built."""
-    return ALL[name]()
+    return ENGINE_FACTORIES[name]()
 
 
 def fly_all(
@@ -62,6 +62,6 @@ def fly_all(
         else:
             yield made
     reasons = {each.draw.number: each.reason for each in fallbacks}
-    for row in engine_called(FLIGHTS).fly(campaign, [each.draw for each in fallbacks], stopped):
+    for row in engine_by_name(FLIGHTS).fly(campaign, [each.draw for each in fallbacks], stopped):
         assert isinstance(row, Row), "the engine 'flights' has no fallbacks"
         yield replace(row, fallback=reasons[row.draw.number])

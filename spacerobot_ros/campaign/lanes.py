@@ -165,7 +165,7 @@ class LanesEngine:
             if stopped():
                 return
             try:
-                ready = lanes.prepared(campaign, draw, drawn_flight(campaign, draw, common))
+                ready = lanes.prepare_draw(campaign, draw, drawn_flight(campaign, draw, common))
             except Exception as error:  # The error becomes a row.
                 yield Row.failed(draw, error, self.name)
                 continue
@@ -238,7 +238,7 @@ class _ScheduledLanes:
             return "the joints are measured with errors"
         return ""
 
-    def prepared(
+    def prepare_draw(
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
     ) -> _ReadyDraw | Fallback:
         """Let the executive plan a draw."""
@@ -360,7 +360,7 @@ class _ControlledLanes:
                 return f"the law '{law.name}' does not control the {key.replace('_', '-')}"
         return ""
 
-    def prepared(
+    def prepare_draw(
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
     ) -> _ReadyDraw | Fallback:
         """Check that a draw can be in a batch, whose other flights its error would end."""

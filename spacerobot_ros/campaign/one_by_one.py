@@ -67,7 +67,7 @@ class FlightsEngine(_OneByOneEngine):
     name = "flights"
 
     def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
-        """Return why not, as a clause."""
+        """Return the reason why this engine cannot fly a campaign, as a clause."""
         try:
             require_flyable(campaign.scenario)
         except SpaceRobotError as error:
@@ -178,7 +178,7 @@ class RosEngine(_OneByOneEngine):
     name = "ros"
 
     def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
-        """Return why not, as a clause."""
+        """Return the reason why this engine cannot fly a campaign, as a clause."""
         return "it kills nodes on the way" if campaign.scenario.kills else ""
 
     def flown(self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]) -> Flight:

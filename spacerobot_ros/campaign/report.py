@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from spacerobot_ros.campaign.config import Campaign, Criterion, meets
-from spacerobot_ros.campaign.dataset import DRAWN, Dataset
-from spacerobot_ros.campaign.draws import Draws, needed
+from spacerobot_ros.campaign.dataset import DRAW_PREFIX, Dataset
+from spacerobot_ros.campaign.draws import Draws, require_module
 from spacerobot_ros.campaign.statistics import (
     PERCENTILES,
     Influence,
@@ -92,7 +92,7 @@ class Results:
         dataset = Dataset(folder)
         campaign, table = dataset.campaign(), dataset.table()
         columns: dict[str, Any] = {}
-        text = needed("pyarrow").string()
+        text = require_module("pyarrow").string()
         for name in table.column_names:
             column = table[name]
             if name in _TEXT_COLUMNS or column.type == text:
@@ -134,7 +134,7 @@ class Results:
     def drawn(self) -> dict[str, Array]:
         """(N,) drawn values, by name of the dispersion; numbers only."""
         names = [each.name for each in self.campaign.dispersions]
-        found = {name: self.columns[f"{DRAWN}{name}"] for name in names}
+        found = {name: self.columns[f"{DRAW_PREFIX}{name}"] for name in names}
         return {name: x for name, x in found.items() if isinstance(x, np.ndarray)}
 
     @property
@@ -214,12 +214,12 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     return lines
 
 
-def picture(drawn: Figure, name: str, caption: str) -> str:
+def picture_part(drawn: Figure, name: str, caption: str) -> str:
     """Return a figure for the page."""
     return figure(name, picture_of(drawn, PictureFormat.SVG), caption, escape(caption))
 
 
-def panels(count: int, across: int, height: float = 2.2) -> tuple[Figure, list[Any]]:
+def figure_with_axes(count: int, across: int, height: float = 2.2) -> tuple[Figure, list[Any]]:
     """Return a figure and its axes, ``across`` in a row."""
     rows = -(-count // across)
     figure = Figure(figsize=(9.6, height * rows + 0.2), layout="constrained", facecolor="white")
@@ -230,7 +230,7 @@ def panels(count: int, across: int, height: float = 2.2) -> tuple[Figure, list[A
     return figure, axes[:count]
 
 
-def named(metric: str) -> str:
+def metric_label(metric: str) -> str:
     """Return the name of a metric with its unit, unless the name has it."""
     unit = METRICS[metric.partition(".")[0]].unit
     return (
@@ -290,7 +290,11 @@ def _success_section(results: Results) -> str:
     wall = float(np.nansum(results.columns["wall_time_s"]))
     rows = [
         ("success", f"{100 * success.value:.4g} %", f"{success.count} of {success.total}"),
-        ("95 % interval (Wilson)", f"{100 * success.low:.4g} to {100 * success.high:.4g} %", ""),
+        (
+            "95 % interval (Wilson)",
+            f"{100 * success.interval_low:.4g} to {100 * success.interval_high:.4g} %",
+            "",
+        ),
         ("95 % interval (Clopper-Pearson)", f"{100 * low:.4g} to {100 * high:.4g} %", ""),
         ("flown", f"{wall:.4g} s", "of workers' time"),
     ]
@@ -314,7 +318,7 @@ def _criteria_section(results: Results) -> str:
 def _share_cells(met: Share) -> list[str]:
     return [
         f"{100 * met.value:.4g} % ({met.count} of {met.total})",
-        f"{100 * met.low:.4g} to {100 * met.high:.4g} %",
+        f"{100 * met.interval_low:.4g} to {100 * met.interval_high:.4g} %",
     ]
 
 
@@ -347,7 +351,7 @@ def _percentiles_section(results: Results) -> str:
     for name, values in results.metrics().items():
         there = values[np.isfinite(values)]
         numbers = [there.min(), *percentiles(values), there.max(), there.mean(), there.std()]
-        rows.append([named(name), *(f"{x:.4g}" for x in numbers)])
+        rows.append([metric_label(name), *(f"{x:.4g}" for x in numbers)])
     head = ["metric", "minimum", *(f"{p:g} %" for p in PERCENTILES), "maximum", "mean", "std"]
     return table("percentiles", head, rows)
 
@@ -356,7 +360,7 @@ def _histograms_section(results: Results) -> str:
     names = results.shown[:_MOST_PLOTS]
     if not names:
         return ""
-    figure, axes = panels(len(names), 2)
+    figure, axes = figure_with_axes(len(names), 2)
     bounds = {criterion.metric: criterion for criterion in results.campaign.criteria}
     for panel, name in zip(axes, names, strict=True):
         values = results.columns[name]
@@ -370,12 +374,12 @@ def _histograms_section(results: Results) -> str:
                 if np.isfinite(bound) and abs(bound) < 10 * (np.abs(there).max() + 1e-12):
                     panel.axvline(bound, color=PALETTE[1], linewidth=1.5)
         panel.locator_params(axis="x", nbins=6)
-        panel.set_xlabel(named(name))
+        panel.set_xlabel(metric_label(name))
         panel.set_ylabel("flights")
     caption = (
         "Distributions of the metrics; dotted: percentiles 5, 50 and 95, orange: requirements."
     )
-    return picture(figure, "distributions", caption)
+    return picture_part(figure, "distributions", caption)
 
 
 def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
@@ -410,7 +414,7 @@ def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
     chosen = list(found[:_MOST_PLOTS])
     if not chosen:
         return ""
-    figure, axes = panels(len(chosen), 3, 2.4)
+    figure, axes = figure_with_axes(len(chosen), 3, 2.4)
     passed = results.passed
     # The largest number of points on a page.
     few = np.random.default_rng(0).permutation(len(results))[:2000]
@@ -420,10 +424,10 @@ def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
             of = passed[few] == ok
             panel.plot(x[of], y[of], ".", ms=3, alpha=0.5, color=colour, rasterized=True)
         panel.set_xlabel(each.cause)
-        panel.set_ylabel(named(each.metric))
+        panel.set_ylabel(metric_label(each.metric))
         panel.locator_params(axis="x", nbins=5)
     caption = "The strongest drivers; orange: flights that did not pass."
-    return picture(figure, "scatter", caption)
+    return picture_part(figure, "scatter", caption)
 
 
 def _worst_flights_section(results: Results) -> str:
@@ -434,7 +438,7 @@ def _worst_flights_section(results: Results) -> str:
         values = [f"{results.columns[name][row]:.4g}" for name in names]
         command = f"spacerobot campaign rerun {shlex.quote(str(results.folder))} {number}"
         rows.append([str(number), command, results.columns["outcome"][row], *values])
-    head = ["flight", "command to repeat it and record a bag", "outcome", *map(named, names)]
+    head = ["flight", "command to repeat it and record a bag", "outcome", *map(metric_label, names)]
     return table("worst", head, rows)
 
 
@@ -443,9 +447,13 @@ def _convergence_section(results: Results) -> str:
     at = np.unique(np.geomspace(min(10, count), count, 60).astype(int))
     passed = np.cumsum(results.passed)
     shares = [share(int(passed[k - 1]), int(k)) for k in at]
-    figure, axes = panels(2, 2, 2.4)
+    figure, axes = figure_with_axes(2, 2, 2.4)
     axes[0].fill_between(
-        at, [s.low for s in shares], [s.high for s in shares], color=FAINT, alpha=0.6
+        at,
+        [s.interval_low for s in shares],
+        [s.interval_high for s in shares],
+        color=FAINT,
+        alpha=0.6,
     )
     axes[0].plot(at, [s.value for s in shares], color=PALETTE[0])
     axes[0].set_ylabel("success, with 95 % interval")
@@ -464,7 +472,9 @@ def _convergence_section(results: Results) -> str:
         panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         panel.xaxis.set_minor_formatter(NullFormatter())
-    return picture(figure, "convergence", "Convergence of the numbers with the number of flights.")
+    return picture_part(
+        figure, "convergence", "Convergence of the numbers with the number of flights."
+    )
 
 
 def _dispersions_section(campaign: Campaign) -> str:

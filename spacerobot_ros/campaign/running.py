@@ -12,7 +12,7 @@ from typing import Any
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight
-from spacerobot_ros.campaign.engines import chosen_engine, engine_called, fly_all
+from spacerobot_ros.campaign.engines import engine_by_name, fly_all, select_engine
 from spacerobot_ros.campaign.rows import LANES, Row
 from spacerobot_ros.campaign.workers import THIS_PROCESS, Cluster, Distribution, workers_of
 from spacerobot_ros.errors import ParameterError
@@ -83,7 +83,7 @@ def run_campaign(
     """
     draws = Draws(campaign)
     wanted = campaign.engine if engine == "auto" else engine
-    chosen = chosen_engine(campaign, wanted)
+    chosen = select_engine(campaign, wanted)
     dataset = Dataset(folder)
     done = dataset.begin(campaign)
     numbers = [number for number in range(len(draws)) if number not in done]
@@ -119,7 +119,7 @@ def _fly_rows(
         return
     if not cluster.workers and not cluster.scheduler:
         for row in fly_all(
-            engine_called(engine), campaign, _SelectedDraws(draws, numbers), stopped
+            engine_by_name(engine), campaign, _SelectedDraws(draws, numbers), stopped
         ):
             yield [row]
         return
@@ -142,7 +142,7 @@ class _SelectedDraws(Sequence[Draw]):
         return self._draws[self._numbers[index]]
 
 
-TOLERANCE = 1e-9
+RERUN_TOLERANCE = 1e-9
 """Largest deviation of equal flights, absolute below 1 (SI units) and relative above."""
 
 
@@ -156,7 +156,7 @@ class Rerun:
         The row of the repeated flight.
     deviation
         Largest deviation of a metric; None: the dataset does not have the flight.
-    at
+    worst_metric
         The name of that metric.
     outcome
         Outcome in the dataset; empty: the dataset does not have the flight.
@@ -168,7 +168,7 @@ class Rerun:
 
     row: Row
     deviation: float | None
-    at: str
+    worst_metric: str
     outcome: str
     bag: Path
     note: str = ""
@@ -178,7 +178,7 @@ class Rerun:
         """Whether the metrics agree with the dataset, or cannot be compared with it."""
         if self.deviation is None or self.note:
             return True
-        return self.outcome == self.row.outcome and self.deviation <= TOLERANCE
+        return self.outcome == self.row.outcome and self.deviation <= RERUN_TOLERANCE
 
     @property
     def lines(self) -> list[str]:
@@ -194,7 +194,7 @@ class Rerun:
             f"bag         {self.bag}",
         ]
         if self.deviation is not None:
-            where = f" ({self.at})" if self.at else ""
+            where = f" ({self.worst_metric})" if self.worst_metric else ""
             deviation = f"largest deviation {self.deviation:.2g}{where}"
             lines.append(f"dataset     {self.outcome}; {deviation}")
         else:

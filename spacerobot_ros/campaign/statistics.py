@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.campaign.draws import salib, sobol_problem
+from spacerobot_ros.campaign.draws import import_salib, sobol_problem
 from spacerobot_ros.model.description import Array
 
 Flags = npt.NDArray[np.bool_]
@@ -28,8 +28,8 @@ class Share:
 
     count: int
     total: int
-    low: float
-    high: float
+    interval_low: float
+    interval_high: float
     exact: tuple[float, float]
 
     @property
@@ -40,7 +40,7 @@ class Share:
     def __str__(self) -> str:
         return (
             f"{100 * self.value:.4g} % ({self.count} of {self.total}; 95 % interval "
-            f"{100 * self.low:.4g} to {100 * self.high:.4g} %)"
+            f"{100 * self.interval_low:.4g} to {100 * self.interval_high:.4g} %)"
         )
 
 
@@ -144,7 +144,7 @@ def sobol_indices(
     if not np.all(np.isfinite(values)) or np.ptp(values) == 0.0:
         return {}
     problem = sobol_problem(names)
-    result = salib("analyze.sobol").analyze(problem, values, calc_second_order=False, seed=0)
+    result = import_salib("analyze.sobol").analyze(problem, values, calc_second_order=False, seed=0)
     keys = ("S1", "S1_conf", "ST", "ST_conf")
     columns = zip(*(np.asarray(result[key]).tolist() for key in keys), strict=True)
     return {name: (a, b, c, d) for name, (a, b, c, d) in zip(names, columns, strict=True)}
@@ -159,7 +159,7 @@ def percentiles(values: Array) -> list[float]:
 
 
 @dataclass(frozen=True)
-class Paired:
+class PairedDifference:
     """Paired difference of a metric between two campaigns: its mean, and the interval of that."""
 
     metric: str
@@ -167,16 +167,16 @@ class Paired:
     first: float
     second: float
     difference: float
-    low: float
-    high: float
+    interval_low: float
+    interval_high: float
 
     @property
     def certain(self) -> bool:
         """Whether the interval excludes zero."""
-        return self.low > 0.0 or self.high < 0.0
+        return self.interval_low > 0.0 or self.interval_high < 0.0
 
 
-def paired(metric: str, first: Array, second: Array) -> Paired | None:
+def paired_difference(metric: str, first: Array, second: Array) -> PairedDifference | None:
     """Return the paired difference of a metric (N,) of a second campaign from a first one.
 
     The interval is that of Student for the mean of the differences; None for fewer than two pairs.
@@ -190,7 +190,7 @@ def paired(metric: str, first: Array, second: Array) -> Paired | None:
     difference = second[there] - first[there]
     mean, spread = float(difference.mean()), float(difference.std(ddof=1))
     half = float(t.ppf(0.5 + CONFIDENCE / 2, count - 1)) * spread / np.sqrt(count)
-    return Paired(
+    return PairedDifference(
         metric,
         count,
         float(first[there].mean()),

@@ -27,8 +27,8 @@ from typing import Any
 
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import self_contained
-from spacerobot_ros.campaign.draws import Draw, Draws, needed
-from spacerobot_ros.campaign.engines import engine_called, fly_all
+from spacerobot_ros.campaign.draws import Draw, Draws, require_module
+from spacerobot_ros.campaign.engines import engine_by_name, fly_all
 from spacerobot_ros.campaign.rows import FLIGHTS, Fallback, Row
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.files import warn_once
@@ -132,7 +132,7 @@ def fly_task(
             f"A worker has spacerobot_ros {__version__}, and this process {specification.version}: "
             "all need the same."
         )
-    flying, campaign = engine_called(engine), specification.campaign()
+    flying, campaign = engine_by_name(engine), specification.campaign()
     fly = partial(fly_all, flying) if all_of_them else flying.fly
     return list(fly(campaign, draws, lambda: False))
 
@@ -424,7 +424,7 @@ def workers_of(cluster: Cluster, flights: int) -> Iterator[Workers]:
         finally:
             local.close()
         return
-    needed("distributed")
+    require_module("distributed")
     import dask
     from distributed import Client
 
@@ -489,7 +489,7 @@ class Distribution:
         self._workers, self._specification = workers, Specification(self_contained(campaign))
         self._draws, self._engine, self._stopped = draws, engine, stopped
         self._sizes = {
-            name: float(max(_FIRST_TASK_FLIGHTS, engine_called(name).least))
+            name: float(max(_FIRST_TASK_FLIGHTS, engine_by_name(name).least))
             for name in (engine, FLIGHTS)
         }
         """Flights of a task, by the engine."""
@@ -529,7 +529,7 @@ class Distribution:
                 (self._fallbacks, FLIGHTS) if self._fallbacks else (waiting, self._engine)
             )
             # The last tasks are smaller, so that no worker is alone at the end.
-            share = max(engine_called(engine).least, len(queue) / workers)
+            share = max(engine_by_name(engine).least, len(queue) / workers)
             count = min(len(queue), max(1, round(min(self._sizes[engine], share))))
             self._submit_task([queue.popleft() for _ in range(count)], engine)
 
@@ -557,7 +557,7 @@ class Distribution:
             took = sum(row.wall_time for row in rows if not math.isnan(row.wall_time))
             if took > 0:
                 size = 0.5 * self._sizes[task.engine] + 0.5 * len(rows) * TASK_TIME / took
-                least = engine_called(task.engine).least
+                least = engine_by_name(task.engine).least
                 self._sizes[task.engine] = max(least, min(_MOST_TASK_FLIGHTS, size))
         return [
             replace(row, fallback=self._reasons[number])

@@ -23,10 +23,10 @@ TRIANGLE_SLACK = 0.01
 
 _ROUNDING_ERROR = 1e-12
 
-PER_BODY = 10
+NUMBERS_PER_BODY = 10
 """Numbers per body in :attr:`InertialParameters.vector`."""
 
-PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Rows and columns of a body's six second moments in their matrix."""
 
 
@@ -143,7 +143,7 @@ class InertialParameters:
         For each body: mass, centre (3), second moments xx, yy, zz, xy, xz, yz.
         """
         moments = self.second_moments
-        six = np.stack([moments[..., i, j] for i, j in PAIRS], axis=-1)
+        six = np.stack([moments[..., i, j] for i, j in INERTIA_ENTRIES], axis=-1)
         rows = np.concatenate([self.masses[..., None], self.centers, six], axis=-1)
         return rows.reshape(*self.masses.shape[:-1], -1)
 
@@ -156,7 +156,7 @@ class InertialParameters:
             A number is not finite, a mass is negative, all masses are zero, or principal moments
             are negative or break the triangle inequality.
         """
-        finite = np.isfinite(self.vector).reshape(-1, len(names), PER_BODY).all(axis=(0, 2))
+        finite = np.isfinite(self.vector).reshape(-1, len(names), NUMBERS_PER_BODY).all(axis=(0, 2))
         if not finite.all():
             body = names[int(np.argmin(finite))]
             raise RobotDescriptionError(f"A mass, centre or inertia of '{body}' is not finite.")
@@ -256,7 +256,7 @@ class SymbolicMassProperties(MassProperties):
         rows = ca.SX(len(free), 1)
         for at, index in enumerate(np.flatnonzero(free).tolist()):
             rows[index] = self._p[at]
-        bodies = ca.vertsplit(rows, PER_BODY)
+        bodies = ca.vertsplit(rows, NUMBERS_PER_BODY)
         self.masses = tuple(body[0] for body in bodies)
         self.centers = tuple(body[1:4] for body in bodies)
         self._moments = [body[4:] for body in bodies]
@@ -289,7 +289,7 @@ def free_entries(nominal: InertialParameters) -> npt.NDArray[np.bool_]:
     All masses may. Entries of centres and products of inertia that are zero stay zero; principal
     moments are all zero (a point mass) or all free.
     """
-    rows = nominal.vector.reshape(-1, PER_BODY) != 0.0
+    rows = nominal.vector.reshape(-1, NUMBERS_PER_BODY) != 0.0
     rows[:, 0] = True
     rows[:, 4:7] = rows[:, 4:7].any(axis=1, keepdims=True)
     return np.asarray(rows.reshape(-1))

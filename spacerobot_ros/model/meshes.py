@@ -250,7 +250,7 @@ class _DamagedError(Exception):
 
 
 def _require_sound_mesh(mesh: TriangleMesh) -> TriangleMesh:
-    """Return a mesh without faces of no area, refusing numbers and indices that none has."""
+    """Return a mesh without faces of zero area; refuse invalid coordinates and indices."""
     vertices, faces = mesh.vertices, mesh.faces
     if len(faces) > _MOST_TRIANGLES:
         raise _DamagedError(
@@ -281,7 +281,7 @@ def _read_stl(data: bytes) -> TriangleMesh:
             or len(data) == _STL_HEADER_BYTES + count * _STL_TRIANGLE.itemsize
         ):
             triangles = np.frombuffer(data, _STL_TRIANGLE, count, _STL_HEADER_BYTES)
-            return joined(triangles["corners"].reshape(-1, 3))
+            return mesh_from_corners(triangles["corners"].reshape(-1, 3))
     if not data.lstrip().startswith(b"solid"):
         raise _DamagedError("it is no STL, or the file is cut")
     if b"endsolid" not in data:
@@ -289,10 +289,10 @@ def _read_stl(data: bytes) -> TriangleMesh:
     corners = _STL_VERTEX_PATTERN.findall(data)
     if len(corners) % 3:
         raise _DamagedError("a triangle has not three corners")
-    return joined(_parse_coordinates(corners).reshape(-1, 3))
+    return mesh_from_corners(_parse_coordinates(corners).reshape(-1, 3))
 
 
-def joined(corners: npt.NDArray[Any]) -> TriangleMesh:
+def mesh_from_corners(corners: npt.NDArray[Any]) -> TriangleMesh:
     """Return the mesh of triangles that are given by their corners (3 M, 3): equal ones are one."""
     if not len(corners):
         return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
@@ -344,7 +344,7 @@ def _parse_corner_index(word: bytes, count: int) -> int:
 
 
 def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
-    """Read what trimesh reads; all parts of a scene where they are in it."""
+    """Read a file by trimesh, with every part of a scene at its place."""
     # trimesh takes a second to import, and few robots need it.
     try:
         import trimesh

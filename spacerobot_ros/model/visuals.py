@@ -21,8 +21,8 @@ from spacerobot_ros.errors import MeshError
 from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
 from spacerobot_ros.model.meshes import (
     TriangleMesh,
-    joined,
     mesh_file,
+    mesh_from_corners,
     mesh_of_stl,
     shape_mesh,
     stl_of,
@@ -185,7 +185,7 @@ def _surface_of_revolution(radii: list[float], heights: Array) -> TriangleMesh:
             corners.append(np.stack([low, low_next, high_next], axis=1))
         if s > 0:
             corners.append(np.stack([low, high_next, high], axis=1))
-    return joined(np.concatenate(corners).reshape(-1, 3))
+    return mesh_from_corners(np.concatenate(corners).reshape(-1, 3))
 
 
 def sharp_edges(mesh: TriangleMesh) -> Edges:

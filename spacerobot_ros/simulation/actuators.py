@@ -247,7 +247,7 @@ class FaultyPlant(WrappedPlant):
         self._wrench_factor, self._wrench_held = np.ones(6), np.zeros(6)
         self._actuators_sound = True
         self._seen: tuple[Fault, ...] = ()
-        self.look()
+        self.apply_active_faults()
 
     @property
     def time(self) -> float:
@@ -271,9 +271,9 @@ class FaultyPlant(WrappedPlant):
             self.timeline.clear()
         else:
             self.timeline.read(text.splitlines(), self.time)
-        self.look()
+        self.apply_active_faults()
 
-    def look(self) -> None:
+    def apply_active_faults(self) -> None:
         """Apply the faults that are active at the present time."""
         active = self.timeline.at(self.time + _FAULT_TIME_ROUNDING * self._control_period)
         self._next_tick = self.timeline.next_change / self._control_period - _FAULT_TIME_ROUNDING
@@ -331,7 +331,7 @@ class FaultyPlant(WrappedPlant):
             limited = self.plant.step(*self._faulty_commands(*commands))
         self.tick += 1
         if self.tick >= self._next_tick:
-            self.look()
+            self.apply_active_faults()
         return limited
 
     def _faulty_commands(self, joints: Array, *wrench: Array) -> list[Array]:

@@ -29,7 +29,7 @@ from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.times import SECOND
 
-NEVER = -math.inf
+NO_STAMP = -math.inf
 """The stamp of no command."""
 
 
@@ -159,7 +159,7 @@ class CommandSource:
         (size,) command in force: of the joints (m/s, rad/s, N or N m), or force (N) over torque
         (N m) at the origin of the base link, base components.
     stamp_ns
-        Stamp of the command in force; :data:`NEVER`: there is none.
+        Stamp of the command in force; :data:`NO_STAMP`: there is none.
     arrived
         Whether the command of this tick has arrived, accepted or not (lockstep).
     resting
@@ -181,7 +181,7 @@ class CommandSource:
         self.senders = senders or Senders(SECOND)
         self.sender: int | None = None
         self.command: Array = np.zeros(len(limits))
-        self.stamp_ns: float = NEVER
+        self.stamp_ns: float = NO_STAMP
         self.arrived = self.resting = False
         self.required = True
         self.commanders = 1
@@ -189,7 +189,7 @@ class CommandSource:
     def rest(self) -> None:
         """Revoke the command in force."""
         self.command[:] = 0.0
-        self.stamp_ns = NEVER
+        self.stamp_ns = NO_STAMP
         self.resting = True
 
     def accept(self, values: Array, stamp_ns: float) -> None:
@@ -248,7 +248,7 @@ class CommandValidator:
         """Whether the last command was revoked because it was too old."""
         self.timeouts = 0
         """Number of such revocations."""
-        self.last_stamp_ns: float = NEVER
+        self.last_stamp_ns: float = NO_STAMP
         """Stamp of the last command before the latest of them."""
 
     @property
@@ -263,7 +263,7 @@ class CommandValidator:
     @property
     def in_force(self) -> bool:
         """Whether a command of any source is in force."""
-        return any(source.stamp_ns != NEVER for source in self.sources)
+        return any(source.stamp_ns != NO_STAMP for source in self.sources)
 
     def offer(
         self, source: CommandSource, stamp_ns: int, values: Array | CommandError, now_ns: int
@@ -378,10 +378,10 @@ class CommandValidator:
 
     def drop_old(self, now_ns: int) -> list[CommandSource]:
         """Revoke commands older than the timeout; return their sources."""
-        silent, last = [], NEVER
+        silent, last = [], NO_STAMP
         for source in self.sources:
             age = now_ns - source.stamp_ns
-            if self._timeout and source.stamp_ns != NEVER and age > self._timeout * SECOND:
+            if self._timeout and source.stamp_ns != NO_STAMP and age > self._timeout * SECOND:
                 last = max(last, source.stamp_ns)
                 source.rest()
                 silent.append(source)

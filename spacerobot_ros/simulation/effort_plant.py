@@ -109,19 +109,19 @@ class JointStops:
         K: Array = flat.reshape(q.size, q.size)
         if locked.any():
             if qdot[locked].any():
-                qdot[:], _ = at_rest(np.asarray(np.linalg.inv(K)), qdot, locked)
+                qdot[:], _ = stop_joints(np.asarray(np.linalg.inv(K)), qdot, locked)
                 _, Q = self._equations(x, command)
             # From here on they are fixed joints.
             free = np.where(locked, 0.0, 1.0)
             K, Q = np.where(np.eye(q.size) > 0, K, K * np.outer(free, free)), Q * free
         compliance: Array = np.asarray(np.linalg.inv(K))
         if np.any(inward * qdot < 0.0):
-            touched = pushed_out(compliance, qdot, inward, touched)
-            qdot[:], _ = at_rest(compliance, qdot, touched)
+            touched = joints_stopped(compliance, qdot, inward, touched)
+            qdot[:], _ = stop_joints(compliance, qdot, touched)
         pushed = qdot + self._integration_step * (compliance @ Q)
-        held = pushed_out(compliance, pushed, inward, held)
+        held = joints_stopped(compliance, pushed, inward, held)
         if qdot[held].any():
-            qdot[:], _ = at_rest(compliance, qdot, held)
+            qdot[:], _ = stop_joints(compliance, qdot, held)
         return held, held | touched
 
     def _integrate_step(self, x: Array, command: Array, held: Flags, step: float) -> Array:
@@ -149,7 +149,7 @@ class JointStops:
         return late
 
 
-def at_rest(compliance: Array, rates: Array, joints: Flags) -> tuple[Array, Array]:
+def stop_joints(compliance: Array, rates: Array, joints: Flags) -> tuple[Array, Array]:
     """Return the rates (n,) after impulses that bring some joints to rest, and the impulses (n,).
 
     ``compliance`` (n, n) is the inverse of K.
@@ -162,7 +162,7 @@ def at_rest(compliance: Array, rates: Array, joints: Flags) -> tuple[Array, Arra
     return after, impulses
 
 
-def pushed_out(compliance: Array, rates: Array, inward: Array, guess: Flags) -> Flags:
+def joints_stopped(compliance: Array, rates: Array, inward: Array, guess: Flags) -> Flags:
     """Return the joints (n,) that their stops bring to rest, so that ``inward * rates >= 0``.
 
     ``inward`` is 1 or -1 on a stop and 0 elsewhere. The rates after the impulses are the nearest to
@@ -174,7 +174,7 @@ def pushed_out(compliance: Array, rates: Array, inward: Array, guess: Flags) -> 
     # A set that comes up again is a tie to rounding: either answer is right.
     while joints.tobytes() not in tried:
         tried.add(joints.tobytes())
-        after, impulses = at_rest(compliance, rates, joints)
+        after, impulses = stop_joints(compliance, rates, joints)
         wrong = np.flatnonzero(inward * np.where(joints, impulses, after) < 0.0)
         if not wrong.size:
             break

@@ -34,7 +34,7 @@ class Lockstep:
         """Whether the commands of this tick are complete."""
         return self._commands.complete
 
-    def looks(self, tick: int, *, pose_lost: bool) -> bool:
+    def must_step_at_check(self, tick: int, *, pose_lost: bool) -> bool:
         """Return whether a plant that checks periodically must step.
 
         A state without a pose may get no answer: a commander cannot know that no pose will come

@@ -12,11 +12,11 @@ from support.campaigns import campaign
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
-from spacerobot_ros.campaign.engines import chosen_engine, fly_all
+from spacerobot_ros.campaign.engines import fly_all, select_engine
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.rows import Row
-from spacerobot_ros.campaign.running import TOLERANCE, largest_deviation, run_campaign
+from spacerobot_ros.campaign.running import RERUN_TOLERANCE, largest_deviation, run_campaign
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.planning import Goal
 
@@ -50,7 +50,7 @@ def test_the_same_draw_is_the_same_flight_in_every_engine(tolerance: float, most
     for number, row in one_by_one.items():
         other = lanes[number]
         deviation, at = largest_deviation(row.metrics, other.metrics)
-        assert deviation < TOLERANCE, (number, at, deviation)
+        assert deviation < RERUN_TOLERANCE, (number, at, deviation)
         assert (row.outcome, row.reason) == (other.outcome, other.reason)
         assert row.passed is other.passed
     engines = [row.engine for row in lanes.values()]
@@ -103,7 +103,7 @@ def assert_same_flights(made: Campaign) -> tuple[dict[int, Row], dict[int, Row]]
     for number, row in one_by_one.items():
         other = lanes[number]
         deviation, at = largest_deviation(row.metrics, other.metrics)
-        assert deviation < TOLERANCE, (number, at, deviation)
+        assert deviation < RERUN_TOLERANCE, (number, at, deviation)
         assert (row.outcome, row.reason) == (other.outcome, other.reason)
         assert row.passed is other.passed
     return lanes, one_by_one
@@ -112,7 +112,7 @@ def assert_same_flights(made: Campaign) -> tuple[dict[int, Row], dict[int, Row]]
 def test_coordinated_control_in_lanes_is_that_of_the_plant_and_the_controller() -> None:
     """Masses, noise, biases, goals, starts and gains differ; some come too late."""
     made = controlled(flights=9)
-    assert chosen_engine(made, "auto").name == "lanes"
+    assert select_engine(made, "auto").name == "lanes"
     lanes, _ = assert_same_flights(made)
     assert {row.engine for row in lanes.values()} == {"lanes"}
     assert {row.outcome for row in lanes.values()} == {"reached", "failed"}
@@ -204,17 +204,17 @@ def test_control_in_lanes_is_flown_in_this_process_too(tmp_path: Path) -> None:
 
 def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
     made = campaign(disperse=DISPERSED)
-    assert chosen_engine(made, "auto").name == "lanes"
-    assert chosen_engine(made, "flights").name == "flights"
+    assert select_engine(made, "auto").name == "lanes"
+    assert select_engine(made, "flights").name == "flights"
     stuck = campaign(set={"plant.faults": ["joint_stuck slider_1 at 1"]})
-    assert chosen_engine(stuck, "auto").name == "flights"
+    assert select_engine(stuck, "auto").name == "flights"
     with pytest.raises(SpaceRobotError, match="'lanes' cannot fly this campaign: it has faults"):
-        chosen_engine(stuck, "lanes")
+        select_engine(stuck, "lanes")
     # What would be another kind of flight is not flown as the nominal one.
     for name, values in (("plant.actuation", ["velocity", "effort"]), ("plant.tick_rate", [20])):
         other = campaign(disperse={name: {"choice": values}})
-        assert chosen_engine(other, "auto").name == "flights"
+        assert select_engine(other, "auto").name == "flights"
     background = campaign(set={"planner.plan_in_background": True})
-    assert chosen_engine(background, "auto").name == "ros"
+    assert select_engine(background, "auto").name == "ros"
     for given in ({"plant.sensors.joint_noise": 1e-3}, {"planner.averaging": 3}):
-        assert chosen_engine(campaign(set=given), "auto").name == "flights"
+        assert select_engine(campaign(set=given), "auto").name == "flights"

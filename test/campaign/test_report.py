@@ -213,7 +213,7 @@ def test_counts_below_the_convergence_are_plain_numbers(
         name: values[many] if isinstance(values, np.ndarray) else values
         for name, values in results.columns.items()
     }
-    monkeypatch.setattr(report, "picture", seen)
+    monkeypatch.setattr(report, "picture_part", seen)
     report._convergence_section(replace(results, columns=columns, numbers=many.astype(float)))
     assert any(labels)
     assert all(re.fullmatch(r"\d*", label) for label in labels), labels

@@ -14,14 +14,14 @@ from support.campaigns import campaign
 from spacerobot_ros.campaign import running, workers
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset
-from spacerobot_ros.campaign.draws import Draw, Draws, needed
+from spacerobot_ros.campaign.draws import Draw, Draws, require_module
 from spacerobot_ros.campaign.engines import fly_all
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
 from spacerobot_ros.campaign.report import Results
 from spacerobot_ros.campaign.rows import ERROR, Fallback, Row
 from spacerobot_ros.campaign.running import (
-    TOLERANCE,
+    RERUN_TOLERANCE,
     Progress,
     Rerun,
     largest_deviation,
@@ -188,7 +188,7 @@ def test_a_disk_that_is_full_costs_nothing_that_is_there(
             run_campaign(small(flights=3), tmp_path)
     assert len(Results.of(tmp_path)) == 2
     with monkeypatch.context() as patch:
-        patch.setattr(needed("pyarrow.parquet"), "write_table", full)
+        patch.setattr(require_module("pyarrow.parquet"), "write_table", full)
         with pytest.raises(RecordingError, match=r"The last 1 flights cannot be .*goes on from"):
             run_campaign(small(flights=3), tmp_path)
     assert str(rows(tmp_path)) == str(before)
@@ -262,7 +262,7 @@ def test_rows_flown_again_through_ros_are_the_same(tmp_path: Path, count: int) -
         again = rerun_flight(tmp_path, number, tmp_path / f"{number}.mcap")
         assert again.same, again.lines
         assert again.deviation is not None
-        assert again.deviation < TOLERANCE
+        assert again.deviation < RERUN_TOLERANCE
         assert again.row.draw.values["mass.mass_1"] != 1.0
     if count == 1:
         few = tmp_path / "few"
@@ -306,7 +306,7 @@ def test_a_draw_flown_by_the_whole_stack_is_the_same_flight() -> None:
     assert there.engine == "ros"
     assert there.outcome == here.outcome
     assert there.metrics.keys() == here.metrics.keys()
-    assert largest_deviation(here.metrics, there.metrics)[0] < TOLERANCE
+    assert largest_deviation(here.metrics, there.metrics)[0] < RERUN_TOLERANCE
     assert there.wall_time > 0
 
 
@@ -356,4 +356,4 @@ def test_the_servicer_is_the_same_in_lanes_one_by_one_and_in_the_stack(
         for here, there in zip(lanes, rows_of, strict=False):
             assert (here.outcome, here.reason) == (there.outcome, there.reason)
             deviation, at = largest_deviation(there.metrics, here.metrics)
-            assert deviation < TOLERANCE, (there.engine, at)
+            assert deviation < RERUN_TOLERANCE, (there.engine, at)

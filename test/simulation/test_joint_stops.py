@@ -15,7 +15,7 @@ from support.random_robots import random_robot_urdf
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState
-from spacerobot_ros.simulation.effort_plant import at_rest, pushed_out
+from spacerobot_ros.simulation.effort_plant import joints_stopped, stop_joints
 
 TICK = 0.01
 MASS, SLIDER, STROKE = 10.0, 2.0, 0.3  # kg, kg, m
@@ -256,8 +256,8 @@ def test_stops_bring_the_rates_to_the_nearest_admissible(seed: int) -> None:
         distance = float((x - rates) @ K @ (x - rates))
         if np.all(inward * x >= -1e-12) and distance < best:
             best, nearest = distance, x
-    chosen = pushed_out(compliance, rates, inward, guess & (inward != 0.0))
-    found, impulses = at_rest(compliance, rates, chosen)
+    chosen = joints_stopped(compliance, rates, inward, guess & (inward != 0.0))
+    found, impulses = stop_joints(compliance, rates, chosen)
     np.testing.assert_allclose(found, nearest, atol=1e-10)
     np.testing.assert_allclose(K @ (found - rates), impulses, atol=1e-10)
 

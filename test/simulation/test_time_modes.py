@@ -19,16 +19,16 @@ def test_a_plant_without_a_pose_steps_at_its_second_look_in_a_tick() -> None:
     plant = build_plant(SpaceRobot.from_file(robot_file("sliding_masses")), config)
     commands = CommandValidator(plant, config)
     for first in (0, 1, 2):
-        assert not Lockstep(commands).looks(first, pose_lost=True), "its first look"
+        assert not Lockstep(commands).must_step_at_check(first, pose_lost=True), "its first look"
     time = Lockstep(commands)
     assert not time.may_step
-    assert [time.looks(3, pose_lost=True), time.waits] == [False, False]
-    assert [time.looks(3, pose_lost=False), time.waits] == [False, True]
-    assert [time.looks(3, pose_lost=True), time.waits] == [True, True]
-    assert [time.looks(4, pose_lost=True), time.waits] == [False, False]
+    assert [time.must_step_at_check(3, pose_lost=True), time.waits] == [False, False]
+    assert [time.must_step_at_check(3, pose_lost=False), time.waits] == [False, True]
+    assert [time.must_step_at_check(3, pose_lost=True), time.waits] == [True, True]
+    assert [time.must_step_at_check(4, pose_lost=True), time.waits] == [False, False]
     commands.sources[0].arrived = True
     assert time.may_step
-    assert time.looks(5, pose_lost=False)
+    assert time.must_step_at_check(5, pose_lost=False)
 
 
 def test_ticks_are_due_by_the_clock_two_at_a_time_and_ten_at_most() -> None:

@@ -370,7 +370,7 @@ class PlantNode(FlightNode):
             return  # A subscriber that comes now is shown the state after the pause.
         self._look_for_commanders()
         assert self._lockstep is not None
-        if self._lockstep.looks(self._tick, pose_lost=self._reported.sensors.dropout):
+        if self._lockstep.must_step_at_check(self._tick, pose_lost=self._reported.sensors.dropout):
             self._step()
         elif self._lockstep.waits and self._publisher.has_new_readers():
             self._publisher.publish(self.time_ns, all_topics=True)
