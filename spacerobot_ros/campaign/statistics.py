@@ -144,7 +144,7 @@ def sobol_indices(
     if not np.all(np.isfinite(values)) or np.ptp(values) == 0.0:
         return {}
     problem = sobol_problem(names)
-    result = import_salib("analyze.sobol").analyze(problem, values, calc_second_order=False, seed=0)
+    result = import_salib("analyze.sobol").analyze(problem, values, calc_second_order=False, seed=1)
     keys = ("S1", "S1_conf", "ST", "ST_conf")
     columns = zip(*(np.asarray(result[key]).tolist() for key in keys), strict=True)
     return {name: (a, b, c, d) for name, (a, b, c, d) in zip(names, columns, strict=True)}
