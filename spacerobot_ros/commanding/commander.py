@@ -332,7 +332,8 @@ class Commander(ABC):
                 "odom: two messages of one time differ; more than one node publishes it, and such "
                 "poses are not used.",
             )
-        self.answer()
+        if self._awaits_odom():
+            self.answer()
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
         """Take joints of the present time, and answer the state that they complete."""
@@ -469,6 +470,10 @@ class Commander(ABC):
     @abstractmethod
     def _follow_plant(self) -> None:
         """Have the executive know whether the plant obeys."""
+
+    def _awaits_odom(self) -> bool:
+        """Whether an odom that comes after the joints of its state matters."""
+        return True
 
     def _report_waiting(self, goal: IdentifiedGoal, message: str) -> None:  # noqa: B027
         """Report a goal that nothing is done for yet."""

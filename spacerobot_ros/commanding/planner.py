@@ -156,6 +156,10 @@ class PlannerCommander(Commander):
         if self.executive is not None:
             self.executive.plant_rests = self.plant.rests
 
+    def _awaits_odom(self) -> bool:
+        # With a goal to plan for or to evaluate, even a pose that comes after its joints counts.
+        return self.executive is not None and self.executive.measuring
+
     def answer(self) -> None:
         """Answer a state as soon as its joints are there; only plans need its pose."""
         executive = self.executive
