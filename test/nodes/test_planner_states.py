@@ -245,6 +245,9 @@ def test_another_description_replaces_the_robot_and_ends_its_goal(harness: Harne
     fake.describe()
     fake.describe()  # The same again changes nothing.
     fake.goals.publish(goal_at(NEAR))
+    # The state is to come after the goal, however long the functions of the robot are compiled.
+    fake.wait_for_log("Goal unstamped-1")
+    harness.settle(fake.probe)
     fake.show(1)
     harness.spin_until(
         lambda: (
