@@ -137,8 +137,6 @@ class _SelectedDraws(Sequence[Draw]):
         return len(self._numbers)
 
     def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [self._draws[number] for number in self._numbers[index]]
         return self._draws[self._numbers[index]]
 
 
