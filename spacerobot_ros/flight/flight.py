@@ -7,6 +7,7 @@ bag (:mod:`~spacerobot_ros.flight.reading`). A bag need not hold everything: par
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -517,10 +518,11 @@ class FlightLog:
         }
         if self._thrusters is not None:
             sources["propellant"] = self._propellant
-        self._states = {name: _Rows(source.size) for name, source in sources.items()}
-        self._sources = [(self._states[name], source) for name, source in sources.items()]
+        self._sources, self._parts = sources, tuple(sources.values())
+        self._states = _Rows(sum(source.size for source in self._parts))
+        """All quantities of a state side by side."""
         self._commands = {
-            source.topic: (_Rows(1), _Rows(len(source.limits))) for source in commands.sources
+            source.topic: (array("q"), _Rows(len(source.limits))) for source in commands.sources
         }
         self._lost: list[int] = []
         self._sensors = reported.sensors
@@ -529,18 +531,17 @@ class FlightLog:
         """Add the present state."""
         if self._thrusters is not None:
             self._propellant[0] = self._thrusters.propellant
-        for rows, source in self._sources:
-            rows.add(source)
+        np.concatenate(self._parts, out=self._states.next_row())
         if self._sensors.dropout:
             self._lost.append(tick)
 
     def add_command(self, topic: str, tick: int, values: Array) -> None:
         """Add a command."""
         if topic not in self._commands:
-            self._commands[topic] = _Rows(1), _Rows(len(values))
+            self._commands[topic] = array("q"), _Rows(len(values))
         ticks, rows = self._commands[topic]
-        ticks.add(tick)
-        rows.add(values)
+        ticks.append(tick)
+        rows.next_row()[:] = values
 
     def flight(
         self,
@@ -555,8 +556,10 @@ class FlightLog:
         wall_time: float,
     ) -> Flight:
         """Return the flight."""
-        states = {name: rows.array() for name, rows in self._states.items()}
-        count = len(states["pose"])
+        table = self._states.table()
+        count, ends = len(table), np.cumsum([source.size for source in self._parts])
+        columns = np.split(table, ends[:-1], axis=1)
+        states = {name: each.copy() for name, each in zip(self._sources, columns, strict=True)}
         lost = np.zeros((count, 1))
         lost[self._lost] = 1.0
         states["pose_lost"] = lost
@@ -567,7 +570,7 @@ class FlightLog:
             joint_names=tuple(robot.joint_names),
             series={name: Signal(time, values) for name, values in states.items()},
             commands={
-                topic: Commands(ticks.array()[:, 0].astype(np.int64), rows.array())
+                topic: Commands(np.array(ticks, np.int64), rows.table().copy())
                 for topic, (ticks, rows) in self._commands.items()
             },
             statuses=tuple(self.statuses),
@@ -592,11 +595,13 @@ class _Rows:
         self._table = np.empty((_FIRST_CAPACITY, size))
         self._count = 0
 
-    def add(self, row: Array | float) -> None:
+    def next_row(self) -> Array:
+        """Return one more row, which the caller fills."""
         if self._count == len(self._table):
             self._table = np.concatenate([self._table, np.empty_like(self._table)])
-        self._table[self._count] = row
         self._count += 1
+        return self._table[self._count - 1]
 
-    def array(self) -> Array:
-        return self._table[: self._count].copy()
+    def table(self) -> Array:
+        """Return all rows so far, not copied."""
+        return self._table[: self._count]
